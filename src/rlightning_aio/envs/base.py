@@ -1,0 +1,137 @@
+"""`BaseEnv`: what every environment is to the runtime, whoever wrote it.
+
+Rule: an env knows its simulator and its config, never its group, its process or
+its channel. `reset` and `step` speak `EnvRet`; a backend whose step is exactly
+Gymnasium's may also offer it bare (`bare_step`), which saves the wrapping.
+"""
+
+from __future__ import annotations
+
+import abc
+import copy
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import gymnasium as gym
+
+from rlightning_aio.config import EnvConfig
+from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
+
+__all__ = ["BareStep", "BaseEnv", "PreprocessFn", "Result", "default_env_preprocess_fn"]
+
+PreprocessFn = Callable[[PolicyResponse], Any]
+Result = EnvRet | MultiAgentEnvRet | list[EnvRet]
+BareStep = Callable[[Any], tuple[Any, Any, Any, Any, dict[str, Any]]]
+
+
+def default_env_preprocess_fn(policy_resp: PolicyResponse) -> Any:
+    """The action as the policy gave it."""
+    return policy_resp.action
+
+
+class BaseEnv(abc.ABC):
+    """One environment (or ``num_envs`` vectorised ones) behind one interface.
+
+    Subclasses call ``super().__init__`` first, create their simulator, and either set
+    ``self.env`` or override the two space getters. A worker builds, resets, steps and
+    closes an env on its main thread, one call at a time.
+
+    Args:
+        config: the config entry; the env keeps a deep copy.
+        worker_index: 0-based index of this env within its entry.
+        preprocess_fn: turns a `PolicyResponse` into what the simulator steps with.
+
+    Attributes:
+        env_id: ``<entry name>-<worker index>``, the same after a restart.
+        transforms_actions: set it on a subclass whose `step` takes actions that need not
+            fit the action space (chunks, logits, dicts).
+        agents: agent names of a multi-agent env, in order; empty otherwise.
+    """
+
+    transforms_actions: ClassVar[bool] = False
+
+    env: Any = None
+    agents: tuple[str, ...] = ()
+
+    def __init__(
+        self,
+        config: EnvConfig,
+        worker_index: int = 0,
+        preprocess_fn: PreprocessFn | None = None,
+        **kwargs: Any,
+    ) -> None:
+        del kwargs  # Accepted so that subclasses may pass on what they were given.
+        self.config = copy.deepcopy(config)
+        self.worker_index = worker_index
+        self.env_id = f"{config.name}-{worker_index}"
+        self.num_envs = config.num_envs
+        self.max_episode_steps = config.max_episode_steps
+        self._preprocess_fn = preprocess_fn or default_env_preprocess_fn
+
+    @abc.abstractmethod
+    def reset(
+        self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
+    ) -> Result:
+        """Start a new episode.
+
+        Args:
+            seed: for the simulator; with ``num_envs > 1`` sub-environment k takes ``seed + k``.
+            options: simulator-specific.
+        """
+
+    @abc.abstractmethod
+    def step(self, policy_resp: PolicyResponse) -> Result:
+        """Advance by one step with the action that the preprocess function makes."""
+
+    def bare_step(self) -> BareStep | None:
+        """The simulator's own ``action -> (obs, reward, terminated, truncated, info)``.
+
+        Return it only if `step` adds nothing to it; None (the default) has the runtime
+        call `step`.
+        """
+        return None
+
+    def init(self) -> EnvMeta:
+        """Called once after construction, in the worker; returns `get_metadata`."""
+        return self.get_metadata()
+
+    def get_metadata(self) -> EnvMeta:
+        """Id, spaces and counts of this env."""
+        return EnvMeta(
+            env_id=self.env_id,
+            observation_space=self.get_observation_space(),
+            action_space=self.get_action_space(),
+            num_envs=self.num_envs,
+            agents=self.agents,
+            max_episode_steps=self.max_episode_steps,
+        )
+
+    def get_observation_space(self) -> gym.Space[Any]:
+        """Space of ``EnvRet.observation``; batched when ``num_envs > 1``."""
+        return self.env.observation_space
+
+    def get_action_space(self) -> gym.Space[Any]:
+        """Space of the actions that `step` takes; batched when ``num_envs > 1``."""
+        return self.env.action_space
+
+    def render(self) -> Any:
+        """One frame, as the simulator renders it."""
+        return self.env.render()
+
+    def offload(self) -> None:
+        """Free device memory until `reload`; envs that hold none need not support it."""
+        raise NotImplementedError(f"backend {self.config.backend!r} has no offload()")
+
+    def reload(self) -> None:
+        """Take the memory freed by `offload` again."""
+        raise NotImplementedError(f"backend {self.config.backend!r} has no reload()")
+
+    def is_finish(self) -> bool:
+        """Whether a remote client's loop should end; asked after every step."""
+        return False
+
+    def on_disconnect(self) -> None:
+        """The trainer is gone: bring the env to a safe state (a robot stops). Default: nothing."""
+
+    def close(self) -> None:
+        """Release everything; called once, also after a failed step. Default: nothing."""

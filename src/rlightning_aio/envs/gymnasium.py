@@ -1,0 +1,65 @@
+"""`gymnasium` and `mujoco`: any environment that `gymnasium.make` can make."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+
+from rlightning_aio.config import EnvConfig
+from rlightning_aio.envs.base import BareStep, BaseEnv, PreprocessFn, default_env_preprocess_fn
+from rlightning_aio.types import EnvRet, PolicyResponse
+
+__all__ = ["GymnasiumEnv", "MujocoEnv"]
+
+
+class GymnasiumEnv(BaseEnv):
+    """A single Gymnasium environment; ``env_kwargs`` go to `gymnasium.make`.
+
+    The step limit is the config's ``max_episode_steps``, or the registered one.
+    """
+
+    def __init__(
+        self,
+        config: EnvConfig,
+        worker_index: int = 0,
+        preprocess_fn: PreprocessFn | None = None,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(config, worker_index, preprocess_fn, **kwargs)
+        # The runtime checks observations against the space itself, once, where it
+        # copies them; Gymnasium's checker would stay in the path of every step.
+        make_kwargs = {"disable_env_checker": True, **config.env_kwargs}
+        self.env = gym.make(config.task, max_episode_steps=config.max_episode_steps, **make_kwargs)
+        if self.max_episode_steps is None and self.env.spec is not None:
+            self.max_episode_steps = self.env.spec.max_episode_steps
+
+    def reset(
+        self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
+    ) -> EnvRet:
+        observation, info = self.env.reset(seed=seed, options=options)
+        return EnvRet(env_id=self.env_id, observation=observation, info=info)
+
+    def step(self, policy_resp: PolicyResponse) -> EnvRet:
+        observation, reward, terminated, truncated, info = self.env.step(
+            self._preprocess_fn(policy_resp)
+        )
+        return EnvRet(
+            env_id=self.env_id,
+            observation=observation,
+            last_reward=reward,
+            last_terminated=terminated,
+            last_truncated=truncated,
+            info=info,
+        )
+
+    def bare_step(self) -> BareStep | None:
+        plain = type(self).step is GymnasiumEnv.step
+        return self.env.step if plain and self._preprocess_fn is default_env_preprocess_fn else None
+
+    def close(self) -> None:
+        self.env.close()
+
+
+class MujocoEnv(GymnasiumEnv):
+    """Gymnasium's MuJoCo tasks (HalfCheetah-v5, Ant-v5, …)."""

@@ -1,0 +1,145 @@
+"""Every error the runtime raises, in one tree.
+
+Rule: a message says which env it is about, what was being done, and what to do
+next; the class says whose fault it is. Errors that carry results hold what did
+succeed, so that nothing is lost by an exception.
+Absent on purpose: exceptions that rebuild a user's own exception type.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rlightning_aio.batch import BatchedData
+
+__all__ = [
+    "BadAction",
+    "ConfigError",
+    "EnvBusy",
+    "EnvHung",
+    "EnvRaised",
+    "GroupClosed",
+    "NothingPending",
+    "RLightningError",
+    "RemoteTraceback",
+    "StartFailed",
+    "UnknownEnv",
+    "WorkerDied",
+]
+
+
+class RLightningError(Exception):
+    """Base of every error raised by this package."""
+
+
+class ConfigError(RLightningError, ValueError):
+    """The configuration is wrong; the message names file, entry and field."""
+
+
+class BadAction(RLightningError, ValueError):
+    """An action's shape, dtype or count doesn't fit; nothing was sent."""
+
+
+class UnknownEnv(RLightningError, KeyError):
+    """No env of this group has that id."""
+
+    def __str__(self) -> str:
+        # KeyError would print the message quoted.
+        return str(self.args[0]) if self.args else ""
+
+
+class EnvBusy(RLightningError, RuntimeError):
+    """An env was asked again before its outstanding reply was collected; nothing was sent."""
+
+
+class NothingPending(RLightningError, RuntimeError):
+    """A collect would never end: no request is outstanding."""
+
+
+class GroupClosed(RLightningError, RuntimeError):
+    """The group was used before ``init`` or after ``close``."""
+
+
+class RemoteTraceback(Exception):
+    """The traceback text of an exception that was raised where the env lives.
+
+    It stands as the ``__cause__`` of `EnvRaised`, so that Python prints it above
+    the local traceback.
+    """
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self.text = text
+
+    def __str__(self) -> str:
+        return "\n" + self.text
+
+
+class EnvFault(RLightningError):
+    """Base of what goes wrong with one env while the group itself stays usable.
+
+    Attributes:
+        env_id: the env at fault.
+        results: for `step` and `reset`, the results of the other envs of the same
+            call, which did succeed; None where the call had no other envs.
+        others: further faults of the same call.
+    """
+
+    def __init__(self, message: str, *, env_id: str) -> None:
+        super().__init__(message)
+        self.env_id = env_id
+        self.results: BatchedData | None = None
+        self.others: tuple[EnvFault, ...] = ()
+
+
+class EnvRaised(EnvFault):
+    """The env's own code raised; the remote traceback is the cause. The env stays usable.
+
+    Attributes:
+        exception_type: qualified name of the remote exception's class.
+        exception_text: ``str()`` of the remote exception.
+        traceback_text: the remote traceback as text.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        env_id: str,
+        exception_type: str,
+        exception_text: str,
+        traceback_text: str,
+    ) -> None:
+        super().__init__(message, env_id=env_id)
+        self.exception_type = exception_type
+        self.exception_text = exception_text
+        self.traceback_text = traceback_text
+        self.__cause__ = RemoteTraceback(traceback_text)
+
+
+class WorkerDied(EnvFault):
+    """The process of an env ended without being asked to.
+
+    Attributes:
+        exit_code: the process's exit code; negative for a signal; None if unknown.
+        stderr_tail: the last lines it wrote to stderr.
+    """
+
+    def __init__(
+        self, message: str, *, env_id: str, exit_code: int | None, stderr_tail: str
+    ) -> None:
+        super().__init__(message, env_id=env_id)
+        self.exit_code = exit_code
+        self.stderr_tail = stderr_tail
+
+
+class EnvHung(WorkerDied):
+    """An env took longer than its timeout; its worker was dumped, then killed.
+
+    ``stderr_tail`` ends with the stack dump of the worker's threads.
+    """
+
+
+class StartFailed(EnvFault):
+    """An env could not be built; ``init`` has stopped everything it had started."""

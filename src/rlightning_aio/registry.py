@@ -1,0 +1,137 @@
+"""Which backends exist, and how a name becomes an env class.
+
+Rule: naming a backend imports nothing; the class is imported where it is built,
+which is in a worker. Three sources, the first that knows the name wins: classes
+registered in this process, built-in backends, entry points of the group
+``rlightning_aio.envs``.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import importlib.metadata
+import importlib.util
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeVar
+
+from rlightning_aio.errors import ConfigError
+
+if TYPE_CHECKING:
+    from rlightning_aio.envs.base import BaseEnv
+
+__all__ = ["BACKENDS", "ENVS", "Backend", "Registry"]
+
+ENTRY_POINT_GROUP = "rlightning_aio.envs"
+
+EnvClass = TypeVar("EnvClass", bound="type[BaseEnv]")
+
+
+@dataclass(frozen=True, slots=True)
+class Backend:
+    """A built-in backend.
+
+    Attributes:
+        name: what a config entry's ``backend`` says.
+        target: ``module:Class`` of the env class.
+        module: the simulator's top module; it is looked for, never imported.
+        distribution: the package whose version is shown.
+        extra: the extra of this package that brings it; empty for core dependencies.
+        cpu_bound: one core's worth of plain computing for each step, so that several
+            envs may share a worker (``envs_per_process: auto``).
+        vectorized: whether ``num_envs`` above 1 is supported.
+    """
+
+    name: str
+    target: str
+    module: str
+    distribution: str
+    extra: str = ""
+    cpu_bound: bool = False
+    vectorized: bool = False
+
+    @property
+    def install_command(self) -> str:
+        """The one command that installs the simulator."""
+        return f"pip install 'rlightning-aio[{self.extra}]'" if self.extra else (
+            "pip install rlightning-aio"
+        )
+
+    def installed_version(self) -> str | None:
+        """Version of the simulator in this interpreter, or None if it isn't installed."""
+        if importlib.util.find_spec(self.module) is None:
+            return None
+        try:
+            return importlib.metadata.version(self.distribution)
+        except importlib.metadata.PackageNotFoundError:
+            return "unknown"
+
+
+BACKENDS: dict[str, Backend] = {
+    backend.name: backend
+    for backend in (
+        Backend("mujoco", "rlightning_aio.envs.gymnasium:MujocoEnv", "mujoco", "mujoco",
+                cpu_bound=True),
+        Backend("gymnasium", "rlightning_aio.envs.gymnasium:GymnasiumEnv", "gymnasium",
+                "gymnasium", cpu_bound=True),
+    )
+}
+
+
+class Registry:
+    """Env classes by backend name."""
+
+    def __init__(self) -> None:
+        self._classes: dict[str, type[BaseEnv]] = {}
+
+    def register(self, name: str) -> Callable[[EnvClass], EnvClass]:
+        """Class decorator: makes the class known as backend `name`.
+
+        Registering another class under a taken name replaces it: a module that is
+        reloaded, or imported under two names, is not an error.
+        """
+
+        def remember(env_class: EnvClass) -> EnvClass:
+            self._classes[name] = env_class
+            return env_class
+
+        return remember
+
+    def registered(self, name: str) -> type[BaseEnv] | None:
+        """The class registered in this process under `name`, if any."""
+        return self._classes.get(name)
+
+    def knows(self, name: str) -> bool:
+        """Whether `name` can be resolved, without importing anything."""
+        return name in self.names()
+
+    def names(self) -> list[str]:
+        """Every resolvable backend name, sorted."""
+        entry_points = importlib.metadata.entry_points(group=ENTRY_POINT_GROUP)
+        return sorted({*self._classes, *BACKENDS, *(ep.name for ep in entry_points)})
+
+    def resolve(self, name: str) -> type[BaseEnv]:
+        """Import and return the class of backend `name`.
+
+        Raises:
+            ConfigError: no such backend; the nearest known names are suggested.
+            ImportError: the class's module, or its simulator, is not installed.
+        """
+        if (env_class := self._classes.get(name)) is not None:
+            return env_class
+        if (backend := BACKENDS.get(name)) is not None:
+            module_name, _, class_name = backend.target.partition(":")
+            return getattr(importlib.import_module(module_name), class_name)
+        for entry_point in importlib.metadata.entry_points(group=ENTRY_POINT_GROUP, name=name):
+            return entry_point.load()
+        raise ConfigError(self.unknown(name))
+
+    def unknown(self, name: str) -> str:
+        """The message for a backend that nobody knows."""
+        near = difflib.get_close_matches(name, self.names(), n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        return f"unknown backend {name!r}{hint} Known: {', '.join(self.names())}"
+
+
+ENVS = Registry()
