@@ -75,6 +75,12 @@ BACKENDS: dict[str, Backend] = {
                 cpu_bound=True),
         Backend("gymnasium", "rlightning_aio.envs.gymnasium:GymnasiumEnv", "gymnasium",
                 "gymnasium", cpu_bound=True),
+        Backend("isaac_manager_based", "rlightning_aio.envs.isaac:IsaacManagerBasedEnv",
+                "isaaclab", "isaaclab", extra="isaac", vectorized=True),
+        Backend("isaac_marl", "rlightning_aio.envs.isaac:IsaacMarlEnv",
+                "isaaclab", "isaaclab", extra="isaac", vectorized=True),
+        Backend("piper", "rlightning_aio.envs.piper:PiperEnv", "piper_sdk", "piper-sdk",
+                extra="piper"),
     )
 }
 
