@@ -114,6 +114,19 @@ class BaseEnv(abc.ABC):
         """Space of the actions that `step` takes; batched when ``num_envs > 1``."""
         return self.env.action_space
 
+    def sub_env_seeds(self, seed: int | list[int]) -> list[int]:
+        """One seed for each sub-environment: ``seed + k``, or the list that was given.
+
+        Raises:
+            ValueError: a list of another length than ``num_envs`` of the config.
+        """
+        count = self.config.num_envs
+        if not isinstance(seed, list):
+            return [int(seed) + k for k in range(count)]
+        if len(seed) != count:
+            raise ValueError(f"{self.env_id}: {len(seed)} seeds for {count} sub-environments")
+        return [int(one) for one in seed]
+
     def render(self) -> Any:
         """One frame, as the simulator renders it."""
         return self.env.render()

@@ -27,12 +27,18 @@ class GymnasiumEnv(BaseEnv):
         **kwargs: Any,
     ) -> None:
         super().__init__(config, worker_index, preprocess_fn, **kwargs)
-        # The runtime checks observations against the space itself, once, where it
-        # copies them; Gymnasium's checker would stay in the path of every step.
-        make_kwargs = {"disable_env_checker": True, **config.env_kwargs}
-        self.env = gym.make(config.task, max_episode_steps=config.max_episode_steps, **make_kwargs)
+        self.env = self._make()
         if self.max_episode_steps is None and self.env.spec is not None:
             self.max_episode_steps = self.env.spec.max_episode_steps
+
+    def _make(self) -> Any:
+        """Make the simulator that the config names; subclasses wrap or replace it."""
+        # The runtime checks observations against the space itself, once, where it
+        # copies them; Gymnasium's checker would stay in the path of every step.
+        make_kwargs = {"disable_env_checker": True, **self.config.env_kwargs}
+        return gym.make(
+            self.config.task, max_episode_steps=self.config.max_episode_steps, **make_kwargs
+        )
 
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
