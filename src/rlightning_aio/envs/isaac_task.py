@@ -1,0 +1,195 @@
+"""From a config entry to a running Isaac Lab environment.
+
+Rule: nothing of Isaac Lab is imported before `make_simulator` is called, and then in
+the order that the installed generation needs: 3 reads the task's configuration before
+it launches, 2.3 launches before anything else of it can be imported.
+Absent on purpose: stepping, which is `isaac`'s.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import threading
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, cast
+
+import gymnasium as gym
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from rlightning_aio.errors import ConfigError
+
+if TYPE_CHECKING:
+    from rlightning_aio.config import EnvConfig
+
+__all__ = ["IsaacOptions", "make_simulator"]
+
+# Stopping Isaac Sim ends the process it runs in, so what was launched stays until the
+# process goes. Without Isaac Sim the entries hold nothing.
+_launched: list[Any] = []
+
+
+class IsaacOptions(BaseModel):
+    """What ``env_kwargs`` of the Isaac backends may hold."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    device: str | None = None
+    """Simulation device; None takes ``cuda:0`` where there is one, else ``cpu``."""
+    overrides: dict[str, Any] = Field(default_factory=dict)
+    """Fields of the task's configuration, dotted or nested: ``sim.dt: 0.01``."""
+    env_class: str | None = None
+    """``module::Class`` of the environment, for a task given by its configuration class."""
+    launcher: dict[str, Any] = Field(default_factory=dict)
+    """Arguments of ``AppLauncher`` (2.3) or ``launch_simulation`` (3)."""
+
+
+def make_simulator(env_id: str, config: EnvConfig, default_env_class: str | None) -> Any:
+    """Launch what the task needs and build its environment, unwrapped.
+
+    Args:
+        env_id: for messages.
+        config: its ``task`` is a registered name, ``package:name`` with the package that
+            registers it, or ``module::Class`` of a configuration.
+        default_env_class: ``module::Class`` built from a configuration class for which
+            ``env_kwargs.env_class`` names none.
+
+    Raises:
+        ConfigError: an option, an override or the task doesn't exist; or, for Isaac Lab
+            2.3, this isn't the main thread.
+    """
+    options = _read_options(env_id, config)
+    device = options.device or _default_device()
+    app: Any = importlib.import_module("isaaclab.app")
+    launcher_args = {"headless": True, **options.launcher, "device": device}
+    if hasattr(app, "launch_simulation"):
+        cfg = _make_cfg(env_id, config, options, device)
+        runtime = app.launch_simulation(cfg, launcher_args)
+        runtime.__enter__()
+        _launched.append(runtime)
+    else:
+        if not _launched:
+            _launched.append(_launch_isaac_sim(env_id, app, launcher_args))
+        cfg = _make_cfg(env_id, config, options, device)
+    if "::" not in config.task:
+        return gym.make(config.task, cfg=cfg).unwrapped
+    env_class = options.env_class or default_env_class
+    if env_class is None:
+        raise ConfigError(
+            f"{env_id}: task {config.task!r} is a configuration class; say which environment "
+            "it is for in env_kwargs.env_class, as 'module::Class'"
+        )
+    return _load(env_id, "env_kwargs.env_class", env_class)(cfg=cfg)
+
+
+def _launch_isaac_sim(env_id: str, app: Any, launcher_args: dict[str, Any]) -> Any:
+    if threading.current_thread() is not threading.main_thread():
+        raise ConfigError(
+            f"{env_id}: Isaac Sim starts on the main thread only; use placement: process"
+        )
+    return app.AppLauncher(**launcher_args)
+
+
+def _read_options(env_id: str, config: EnvConfig) -> IsaacOptions:
+    try:
+        return IsaacOptions.model_validate(config.env_kwargs)
+    except ValidationError as error:
+        known = ", ".join(IsaacOptions.model_fields)
+        faults = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
+        raise ConfigError(f"{env_id}: env_kwargs: {faults}. Known fields: {known}") from None
+
+
+def _default_device() -> str:
+    torch: Any = importlib.import_module("torch")
+    return "cuda:0" if torch.cuda.is_available() else "cpu"
+
+
+def _make_cfg(env_id: str, config: EnvConfig, options: IsaacOptions, device: str) -> Any:
+    """The task's configuration, with this entry's settings in it."""
+    tasks: Any = importlib.import_module("isaaclab_tasks.utils")
+    if "::" in config.task:
+        cfg = _load(env_id, "task", config.task)()
+        if hasattr(tasks, "resolve_presets"):
+            cfg = tasks.resolve_presets(cfg)
+        cfg.sim.device = device
+        cfg.scene.num_envs = config.num_envs
+    else:
+        importlib.import_module("isaaclab_tasks")
+        package, _, name = config.task.rpartition(":")
+        if package:
+            importlib.import_module(package)
+        _check_registered(env_id, name)
+        cfg = tasks.parse_env_cfg(name, device=device, num_envs=config.num_envs)
+    if hasattr(cfg, "compute_final_obs"):
+        cfg.compute_final_obs = True
+    _apply(cfg, options.overrides, f"{env_id}: env_kwargs.overrides")
+    if config.max_episode_steps is not None:
+        # Half a step short: the simulator rounds up, and the product may exceed the whole.
+        cfg.episode_length_s = (config.max_episode_steps - 0.5) * cfg.decimation * cfg.sim.dt
+    return cfg
+
+
+def _check_registered(env_id: str, name: str) -> None:
+    if name in gym.registry:
+        return
+    near = difflib.get_close_matches(name, gym.registry, n=1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    raise ConfigError(
+        f"{env_id}: task {name!r} is not registered{hint} "
+        "Write 'package:name' if another package registers it, "
+        "or 'module::Class' for a configuration class"
+    )
+
+
+def _load(env_id: str, field: str, name: str) -> Any:
+    """The object that ``module::Class`` names."""
+    module_name, _, attribute = name.partition("::")
+    try:
+        return getattr(importlib.import_module(module_name), attribute)
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(f"{env_id}: {field}: {name!r} can't be loaded: {error}") from error
+
+
+def _apply(target: Any, overrides: Mapping[str, Any], where: str) -> None:
+    """Set fields of a configuration tree of objects, dicts and lists, in place."""
+    for dotted, value in overrides.items():
+        field = f"{where}.{dotted}"
+        parent = target
+        *path, last = dotted.split(".")
+        for name in path:
+            parent = _child(parent, name, field)
+        current = _child(parent, last, field)
+        if isinstance(value, Mapping) and current is not None:
+            _apply(current, cast("Mapping[str, Any]", value), field)
+        else:
+            given = cast("Any", value)
+            _set_child(parent, last, tuple(given) if isinstance(current, tuple) else given)
+
+
+def _child(parent: Any, name: str, field: str) -> Any:
+    """The part of `parent` called `name`: an item of a dict or a list, or an attribute."""
+    children = _children(parent)
+    if name in children:
+        return children[name]
+    near = difflib.get_close_matches(name, children, n=1)
+    hint = (
+        f"; did you mean {near[0]!r}?" if near else f"; it has {', '.join(children) or 'nothing'}"
+    )
+    raise ConfigError(f"{field}: there is no {name!r} in {type(parent).__name__}{hint}")
+
+
+def _children(parent: Any) -> dict[str, Any]:
+    if isinstance(parent, dict):
+        return cast("dict[str, Any]", parent)
+    if isinstance(parent, list | tuple):
+        return {str(index): item for index, item in enumerate(cast("list[Any]", parent))}
+    return getattr(parent, "__dict__", {})
+
+
+def _set_child(parent: Any, name: str, value: Any) -> None:
+    if isinstance(parent, dict):
+        parent[name] = value
+    elif isinstance(parent, list):
+        parent[int(name)] = value
+    else:
+        setattr(parent, name, value)

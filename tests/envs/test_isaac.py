@@ -1,0 +1,295 @@
+"""The Isaac Lab backends on the real simulator, kit-less, on the CPU.
+
+These run in the virtual environment that holds Isaac Lab (docs/backends.md); robots and
+ground come from `isaac_assets`.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from rlightning_aio.config import EnvConfig
+from rlightning_aio.errors import ConfigError
+from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from rlightning_aio.envs.base import BaseEnv
+
+torch: Any = pytest.importorskip("torch")
+pytest.importorskip("isaaclab")
+
+pytestmark = [
+    pytest.mark.simulators,
+    pytest.mark.timeout(600),  # Kernels are compiled the first time.
+    pytest.mark.filterwarnings("default"),  # The simulator warns about its own future.
+]
+
+MANAGER_BASED = "Isaac-Cartpole"
+MARL = "Isaac-Pendulum-MARL-Direct"
+CARTPOLE_CFG = "isaaclab_tasks.core.cartpole.cartpole_manager_env_cfg::CartpoleEnvCfg"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _assets(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    from envs.isaac_assets import write_assets
+
+    root: Path = write_assets(tmp_path_factory.mktemp("assets"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ISAACSIM_ASSET_ROOT", str(root))
+        yield
+
+
+@pytest.fixture
+def make() -> Iterator[Any]:
+    """Builds envs; each is closed before the next and at the end."""
+    live: list[BaseEnv] = []
+
+    def build(task: str = MANAGER_BASED, backend: str = "isaac_manager_based", **fields: Any):
+        from rlightning_aio.envs.isaac import IsaacManagerBasedEnv, IsaacMarlEnv
+
+        close()
+        env_class = IsaacMarlEnv if backend == "isaac_marl" else IsaacManagerBasedEnv
+        env_kwargs = {"device": "cpu", **fields.pop("env_kwargs", {})}
+        config = EnvConfig(
+            name="isaac", backend=backend, task=task, env_kwargs=env_kwargs, **fields
+        )
+        live.append(env_class(config))
+        return live[-1]
+
+    def close() -> None:
+        while live:
+            live.pop().close()
+
+    yield build
+    close()
+
+
+def actions(num_steps: int, num_envs: int) -> np.ndarray:
+    return np.random.default_rng(0).normal(size=(num_steps, num_envs, 1)).astype(np.float32)
+
+
+def respond(action: Any) -> PolicyResponse:
+    return PolicyResponse("isaac-0", action=action)
+
+
+def bare_simulator(task: str, num_envs: int, max_episode_length: int) -> Any:
+    """The simulator with nothing of this package around it."""
+    import gymnasium as gym
+    from isaaclab.app import launch_simulation
+    from isaaclab_tasks.utils import parse_env_cfg
+
+    cfg = parse_env_cfg(task, device="cpu", num_envs=num_envs)
+    cfg.compute_final_obs = True
+    cfg.episode_length_s = (max_episode_length - 0.5) * cfg.decimation * cfg.sim.dt
+    with launch_simulation(cfg):
+        return gym.make(task, cfg=cfg).unwrapped
+
+
+def test_spaces_are_batched_and_hold_what_comes_out(make: Any) -> None:
+    """With 4 sub-environments every array has a leading axis of 4 and fits the spaces."""
+    env = make(num_envs=4)
+    meta = env.init()
+    assert meta.observation_space["policy"].shape == (4, 4)
+    assert meta.action_space.shape == (4, 1)
+    assert meta.max_episode_steps == 300
+    first = env.reset(seed=0)
+    then = env.step(respond(actions(1, 4)[0]))
+    for ret in (first, then):
+        assert isinstance(ret, EnvRet)
+        observation = {group: tensor.numpy() for group, tensor in ret.observation.items()}
+        assert meta.observation_space.contains(observation)
+    assert then.last_reward.shape == (4,)
+    assert then.last_reward.dtype == torch.float32
+    assert then.last_terminated.dtype == then.last_truncated.dtype == torch.bool
+
+
+def test_one_sub_environment_has_no_batch_axis(make: Any) -> None:
+    """With num_envs 1 observations are single, and reward and flags Python scalars."""
+    env = make(num_envs=1)
+    meta = env.init()
+    assert meta.observation_space["policy"].shape == (4,)
+    assert meta.action_space.shape == (1,)
+    env.reset(seed=0)
+    ret = env.step(respond(np.zeros(1, np.float32)))
+    assert ret.observation["policy"].shape == (4,)
+    assert type(ret.last_reward) is float
+    assert type(ret.last_terminated) is type(ret.last_truncated) is bool
+
+
+def test_the_first_reset_is_like_every_other(make: Any) -> None:
+    """The same seed gives the same observation, fresh velocities included, from the start."""
+    env = make(num_envs=4)
+    first, second = env.reset(seed=5).observation, env.reset(seed=5).observation
+    assert torch.equal(first["policy"], second["policy"])
+    assert first["policy"][:, 2:].abs().min() > 0
+    assert not torch.equal(first["policy"], env.reset(seed=6).observation["policy"])
+
+
+def test_manager_based_steps_equal_the_bare_simulators(make: Any) -> None:
+    """200 steps, resets within them included, are those of the simulator alone."""
+    env = make(num_envs=4, max_episode_steps=60)
+    assert env.max_episode_steps == 60
+    ours = [env.reset(seed=1)] + [env.step(respond(a)) for a in actions(200, 4)]
+    env.close()
+    bare = bare_simulator(MANAGER_BASED, 4, 60)
+    try:
+        bare.reset(seed=1)
+        observation, _ = bare.reset(seed=1)
+        assert torch.equal(ours[0].observation["policy"], observation["policy"])
+        num_ended = 0
+        for ret, action in zip(ours[1:], actions(200, 4), strict=True):
+            observation, reward, terminated, truncated, extras = bare.step(torch.tensor(action))
+            assert torch.equal(ret.observation["policy"], observation["policy"])
+            assert torch.equal(ret.last_reward, reward)
+            assert torch.equal(ret.last_terminated, terminated)
+            assert torch.equal(ret.last_truncated, truncated)
+            ended = bool((terminated | truncated).any())
+            assert ("final_obs" in ret.info) == ("episode_info" in ret.info) == ended
+            if ended:
+                num_ended += 1
+                assert torch.equal(ret.info["final_obs"]["policy"], extras["final_obs"]["policy"])
+        assert num_ended >= 3
+    finally:
+        bare.close()
+
+
+def test_marl_steps_equal_the_bare_simulators(make: Any) -> None:
+    """200 steps of both agents, resets within them included, are those of the simulator alone."""
+    env = make(MARL, "isaac_marl", num_envs=3, max_episode_steps=40)
+    steps = actions(200, 3)
+    ours = [env.reset(seed=1)]
+    ours += [env.step(respond({"cart": a, "pendulum": -a})) for a in steps]
+    env.close()
+    bare = bare_simulator(MARL, 3, 40)
+    try:
+        bare.reset(seed=1)
+        observation, _ = bare.reset(seed=1)
+        assert all(torch.equal(ours[0].observation[k], observation[k]) for k in observation)
+        num_ended = 0
+        for ret, action in zip(ours[1:], steps, strict=True):
+            by_agent = {"cart": torch.tensor(action), "pendulum": -torch.tensor(action)}
+            observation, reward, terminated, truncated, extras = bare.step(by_agent)
+            for agent in ("cart", "pendulum"):
+                assert torch.equal(ret.observation[agent], observation[agent])
+                assert torch.equal(ret.last_reward[agent], reward[agent])
+                assert torch.equal(ret.last_terminated[agent], terminated[agent])
+                assert torch.equal(ret.last_truncated[agent], truncated[agent])
+                if "final_obs" in ret.info:
+                    final_obs = extras[agent]["final_obs"]
+                    assert torch.equal(ret.info["final_obs"][agent], final_obs)
+            ended = bool((terminated["cart"] | truncated["cart"]).any())
+            assert ("final_obs" in ret.info) == ended
+            num_ended += ended
+        assert num_ended >= 3
+    finally:
+        bare.close()
+
+
+def test_marl_speaks_by_agent(make: Any) -> None:
+    """Spaces and results of a multi-agent task are dicts by agent, batched in each."""
+    env = make(MARL, "isaac_marl", num_envs=2)
+    meta = env.init()
+    assert meta.agents == ("cart", "pendulum")
+    assert meta.observation_space["cart"].shape == (2, 4)
+    assert meta.observation_space["pendulum"].shape == (2, 3)
+    assert meta.action_space["pendulum"].shape == (2, 1)
+    env.reset(seed=0)
+    zeros = np.zeros((2, 1), np.float32)
+    ret = env.step(respond({"cart": zeros, "pendulum": zeros}))
+    assert isinstance(ret, MultiAgentEnvRet)
+    assert ret.last_reward["cart"].shape == (2,)
+    single = make(MARL, "isaac_marl", num_envs=1)
+    single.reset(seed=0)
+    ret = single.step(respond({"cart": zeros[0], "pendulum": zeros[0]}))
+    assert ret.observation["pendulum"].shape == (3,)
+    assert type(ret.last_terminated["cart"]) is bool
+
+
+def test_results_are_never_overwritten(make: Any) -> None:
+    """What a step handed out is the same after 60 more, over resets of sub-environments."""
+    env = make(num_envs=2, max_episode_steps=20)
+    env.reset(seed=0)
+    kept: list[tuple[EnvRet, list[Any]]] = []
+    for action in actions(60, 2):
+        ret = env.step(respond(action))
+        tensors = [*_tensors(ret)]
+        kept.append((ret, [tensor.clone() for tensor in tensors]))
+    for ret, copies in kept:
+        assert all(torch.equal(a, b) for a, b in zip(_tensors(ret), copies, strict=True))
+
+
+def _tensors(ret: EnvRet) -> Iterator[Any]:
+    yield from (ret.observation["policy"], ret.last_reward)
+    yield from (ret.last_terminated, ret.last_truncated)
+    if "final_obs" in ret.info:
+        yield ret.info["final_obs"]["policy"]
+
+
+def test_torch_and_numpy_actions_do_the_same(make: Any) -> None:
+    """An action counts the same as a tensor, as an array and as a read-only array."""
+    env = make(num_envs=2)
+    array = actions(1, 2)[0]
+    frozen = array.copy()
+    frozen.setflags(write=False)
+    outcomes: list[Any] = []
+    for action in (torch.tensor(array), array, frozen):
+        env.reset(seed=0)
+        outcomes.append(env.step(respond(action)).observation["policy"])
+    assert torch.equal(outcomes[0], outcomes[1])
+    assert torch.equal(outcomes[0], outcomes[2])
+
+
+def test_a_second_live_env_is_refused(make: Any) -> None:
+    """Isaac Lab has one env in a process: a second names the first, and works after its close."""
+    from rlightning_aio.envs.isaac import IsaacManagerBasedEnv
+
+    first = make(num_envs=2)
+    second = EnvConfig(
+        name="other", backend="isaac_manager_based", task=MANAGER_BASED, num_envs=2,
+        env_kwargs={"device": "cpu"},
+    )  # fmt: skip
+    with pytest.raises(ConfigError, match=r"other-0.*one live env.*isaac-0.*envs_per_process"):
+        IsaacManagerBasedEnv(second)
+    first.close()
+    env = IsaacManagerBasedEnv(second)
+    env.close()
+    env.close()
+
+
+def test_a_configuration_class_with_overrides(make: Any) -> None:
+    """`module::Class` builds that configuration, with dotted and nested fields changed."""
+    overrides = {
+        "events.reset_cart_position.params.position_range": [2.0, 2.0],
+        "sim": {"dt": 0.01},
+        "episode_length_s": 1.0,
+    }
+    env = make(CARTPOLE_CFG, num_envs=2, env_kwargs={"overrides": overrides})
+    assert env.env.cfg.sim.dt == 0.01
+    assert env.max_episode_steps == 50
+    assert env.reset(seed=0).observation["policy"][:, 0].tolist() == pytest.approx([2.0, 2.0])
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"task": "Isaac-Cartpol"}, r"isaac-0: task 'Isaac-Cartpol'.*did you mean 'Isaac-Cart"),
+        ({"task": "nowhere::Cfg"}, r"isaac-0: task: 'nowhere::Cfg' can't be loaded"),
+        ({"env_kwargs": {"devize": "cpu"}}, r"isaac-0: env_kwargs: devize.*device"),
+        ({"env_kwargs": {"overrides": {"sim.td": 1}}}, r"overrides\.sim\.td: there is no 'td'"),
+        (
+            {"task": CARTPOLE_CFG, "backend": "isaac_marl"},
+            r"isaac-0: .*env_kwargs\.env_class",
+        ),
+    ],
+)
+def test_faults_of_the_config_are_named(make: Any, fields: Any, message: str) -> None:
+    """A task, option or override that doesn't exist is named, and the process stays free."""
+    with pytest.raises(ConfigError, match=message):
+        make(**fields)
+    make(num_envs=1)

@@ -1,0 +1,97 @@
+"""What can be said of Isaac Lab's launch order and overrides without Isaac Lab."""
+
+from __future__ import annotations
+
+import math
+import sys
+import threading
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import pytest
+
+from rlightning_aio.config import EnvConfig
+from rlightning_aio.envs import isaac_task
+from rlightning_aio.errors import ConfigError
+
+CONFIG = EnvConfig(
+    name="isaac", backend="isaac_manager_based", task="stub_package::Cfg", num_envs=3,
+    env_kwargs={"device": "cuda:1", "launcher": {"enable_cameras": True}},
+)  # fmt: skip
+
+
+class Cfg:
+    """The fields that every Isaac Lab configuration has."""
+
+    def __init__(self) -> None:
+        self.sim = SimpleNamespace(device="cuda:0", dt=0.01)
+        self.scene = SimpleNamespace(num_envs=1)
+        self.decimation = 2
+        self.episode_length_s = 5.0
+
+
+@pytest.fixture
+def events(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Stands in for an installed 2.3; records what is done in which order."""
+    events: list[Any] = []
+
+    def app_launcher(**kwargs: Any) -> object:
+        events.append(("launch", kwargs))
+        return object()
+
+    class Watched(ModuleType):
+        def __getattr__(self, name: str) -> Any:
+            events.append(("use", self.__name__))
+            raise AttributeError(name)
+
+    app = ModuleType("isaaclab.app")
+    app.AppLauncher = app_launcher  # type: ignore[attr-defined]
+    package = ModuleType("stub_package")
+    package.Cfg = Cfg  # type: ignore[attr-defined]
+    package.Env = lambda cfg: cfg  # type: ignore[attr-defined]
+    for name, module in {
+        "isaaclab": ModuleType("isaaclab"),
+        "isaaclab.app": app,
+        "isaaclab_tasks": Watched("isaaclab_tasks"),
+        "isaaclab_tasks.utils": Watched("isaaclab_tasks.utils"),
+        "stub_package": package,
+    }.items():
+        monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.setattr(isaac_task, "_launched", [])
+    return events
+
+
+def test_isaac_lab_2_launches_its_app_before_all_else(events: list[Any]) -> None:
+    """Without `launch_simulation` the app starts first, once, with the entry's arguments."""
+    for _ in range(2):
+        cfg = isaac_task.make_simulator("isaac-0", CONFIG, "stub_package::Env")
+        assert (cfg.sim.device, cfg.scene.num_envs) == ("cuda:1", 3)
+    launch = ("launch", {"headless": True, "enable_cameras": True, "device": "cuda:1"})
+    assert events[0] == launch
+    assert ("use", "isaaclab_tasks.utils") in events
+    assert events.count(launch) == 1
+
+
+def test_isaac_lab_2_needs_the_main_thread(events: list[Any]) -> None:
+    """Isaac Sim can't be started from another thread; the message says what can be done."""
+    raised: list[Exception] = []
+
+    def build() -> None:
+        try:
+            isaac_task.make_simulator("isaac-0", CONFIG, "stub_package::Env")
+        except ConfigError as error:
+            raised.append(error)
+
+    thread = threading.Thread(target=build)
+    thread.start()
+    thread.join()
+    assert "main thread only; use placement: process" in str(raised[0])
+    assert events == []
+
+
+@pytest.mark.parametrize("steps", [1, 7, 50, 333, 1000])
+def test_the_step_limit_survives_the_simulators_rounding(events: list[Any], steps: int) -> None:
+    """`max_episode_steps` becomes a length in seconds that rounds up to the same steps."""
+    config = CONFIG.model_copy(update={"max_episode_steps": steps})
+    cfg = isaac_task.make_simulator("isaac-0", config, "stub_package::Env")
+    assert math.ceil(cfg.episode_length_s / (cfg.decimation * cfg.sim.dt)) == steps
