@@ -7,7 +7,6 @@ Absent on purpose: everything visual.
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 from pxr import Gf, Usd, UsdGeom, UsdPhysics
@@ -102,7 +101,3 @@ def _write_ground(path: Path) -> None:
     plane.CreateAxisAttr("Z")
     UsdPhysics.CollisionAPI.Apply(plane.GetPrim())
     stage.Save()
-
-
-if __name__ == "__main__":
-    print(write_assets(Path(sys.argv[1])))
