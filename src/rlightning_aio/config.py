@@ -1,29 +1,56 @@
 """`EnvConfig` and `load_config`: the only door for what users configure.
 
-Rule: whatever is wrong is said here, in one message that names file, entry and
-field, before any process starts. OmegaConf reads, pydantic checks.
+Rule: whatever is wrong is said here, before any process starts, in one message that
+names file, entry and field of every problem. OmegaConf reads, pydantic checks one
+entry, and what remains (names that must exist) is checked without importing any of it.
+Absent on purpose: defaults that depend on the machine; those are the group's business.
 """
 
 from __future__ import annotations
 
-from typing import Any, Literal
+import difflib
+import importlib.util
+import os
+import reprlib
+import shutil
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.machinery import PathFinder
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
-__all__ = ["EnvConfig"]
+from rlightning_aio.errors import ConfigError
+from rlightning_aio.registry import BACKENDS, ENVS
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
+
+__all__ = ["EnvConfig", "check_installed", "load_config", "parse_configs"]
+
+_TOP_LEVEL = ("envs", "env", "imports")
 
 
 class EnvConfig(BaseModel):
     """One entry of ``envs:``, which makes ``num_workers`` envs of one kind."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
-    name: str
+    name: str = Field(min_length=1)
     """Name of the entry; its envs are called ``<name>-0``, ``<name>-1``, …"""
     backend: str
     """Simulator backend; see ``rlightning-aio backends``."""
-    task: str
-    """Task name within the backend."""
+    task: str = ""
+    """Task name within the backend; required by every backend but ``env_server``."""
     num_workers: int = Field(default=1, ge=1)
     """Envs of this entry."""
     num_envs: int = Field(default=1, ge=1)
@@ -38,7 +65,7 @@ class EnvConfig(BaseModel):
     """Passed to the backend."""
     placement: Literal["process", "inline", "ray"] = "process"
     """Where the envs live: worker processes, this process, or Ray actors."""
-    envs_per_process: int | Literal["auto"] = "auto"
+    envs_per_process: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
     """Envs that share a worker."""
     step_timeout: float | None = Field(default=None, gt=0)
     """Seconds that one step may take before the env counts as hung."""
@@ -50,7 +77,7 @@ class EnvConfig(BaseModel):
     """What to do when a worker dies or hangs."""
     max_restarts: int = Field(default=3, ge=0)
     """Restarts in a row, without a step in between, before giving up."""
-    imports: tuple[str, ...] = ()
+    imports: tuple[str, ...] = Field(default=(), strict=False)
     """Modules imported in the worker before the env is built."""
     interpreter: str | None = None
     """Python of another virtual environment for this entry's workers."""
@@ -58,3 +85,452 @@ class EnvConfig(BaseModel):
     """Environment variables of the worker, set before anything is imported."""
     cpu_affinity: bool = False
     """Pin worker k to the k-th core this process may use."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _suggest_known_names(cls, fields: Any) -> Any:
+        names = cast("Iterable[Any]", fields) if isinstance(fields, Mapping) else ()
+        for name in names:
+            if name not in cls.model_fields:
+                raise ValueError(f"{name}: {_unknown_field(name, cls.model_fields)}")
+        return cast("Any", fields)
+
+    @field_validator("env_vars", mode="before")
+    @classmethod
+    def _write_numbers_out(cls, env_vars: Any) -> Any:
+        # YAML makes numbers of `OMP_NUM_THREADS: 1`. A boolean stays refused: programs
+        # disagree on whether it is spelt 1, true or True.
+        if not isinstance(env_vars, Mapping):
+            return env_vars
+        items = cast("Mapping[Any, Any]", env_vars).items()
+        return {k: str(v) if type(v) in (int, float) else v for k, v in items}
+
+    @field_validator("env_vars")
+    @classmethod
+    def _accept_usable_names(cls, env_vars: dict[str, str]) -> dict[str, str]:
+        for name, value in env_vars.items():
+            if not name or "=" in name or "\0" in name + value:
+                raise ValueError(f"{name!r} can't be set in an environment")
+        return env_vars
+
+    @field_validator("interpreter")
+    @classmethod
+    def _expand_home(cls, interpreter: str | None) -> str | None:
+        # pathlib would make `python` of `./python`, which is looked for elsewhere.
+        return interpreter and os.path.expanduser(interpreter)  # noqa: PTH111
+
+
+def load_config(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> list[EnvConfig]:
+    """Read a YAML file with ``envs:`` (or ``env:``) and, optionally, ``imports:``.
+
+    Args:
+        path: the file.
+        overrides: ``key=value`` each, applied in order; keys are dotted from the top of the
+            file (``envs.0.num_workers=8``), values are YAML.
+
+    Returns:
+        The entries in order. The file's ``imports`` come first in each entry's own.
+
+    Raises:
+        ConfigError: the file can't be read, an override fits nothing, or the content is
+            wrong; every problem found is in the message.
+    """
+    source = os.fspath(path)
+    return _parse(_read_yaml(source, overrides), source)
+
+
+def parse_configs(cfgs: object) -> list[EnvConfig]:
+    """Check what a user configured in Python.
+
+    Args:
+        cfgs: an `EnvConfig`, a plain mapping of its fields, or an OmegaConf node of them; a
+            list of these; or a mapping with ``envs:`` (or ``env:``) and ``imports:`` as in
+            a file.
+
+    Raises:
+        ConfigError: something is wrong; every problem found is in the message.
+    """
+    return _parse(cfgs, "environment configuration")
+
+
+def check_installed(configs: Iterable[EnvConfig]) -> None:
+    """Look for the simulators of built-in backends, importing none of them.
+
+    Entries that run elsewhere (under another ``interpreter``, on a Ray cluster) are left
+    alone: what is installed here says nothing about there.
+
+    Raises:
+        ConfigError: one is missing; the message has the command that installs it.
+    """
+    problems = _Problems("simulator not installed")
+    for index, config in enumerate(configs):
+        backend = BACKENDS.get(config.backend)
+        if backend is None or not _runs_here(config) or ENVS.registered(config.backend):
+            continue
+        if backend.installed_version() is None:
+            problems.add(
+                f"envs.{index} ({config.name!r}), backend",
+                f"{backend.name!r} needs {backend.distribution}: {backend.install_command}",
+            )
+    problems.raise_any()
+
+
+@dataclass(slots=True)
+class _Problems:
+    """What was found wrong with one source, in the order of the source."""
+
+    source: str
+    lines: list[str] = field(default_factory=list[str])
+
+    def add(self, where: str, what: str) -> None:
+        self.lines.append(f"{where}: {what}" if where else what)
+
+    def raise_any(self) -> None:
+        if len(self.lines) == 1:
+            raise ConfigError(f"{self.source}: {self.lines[0]}")
+        if self.lines:
+            listed = "".join(f"\n  {line}" for line in self.lines)
+            raise ConfigError(f"{self.source}: {len(self.lines)} problems{listed}")
+
+
+# ---- a document: entries and what they share
+
+
+@dataclass(slots=True)
+class _Entry:
+    """One entry while it is checked.
+
+    Attributes:
+        place: how messages call it.
+        config: its fields; those at fault stand at their defaults, so that the checks
+            still to come see all the others.
+        faulty: the fields at fault.
+    """
+
+    place: str
+    config: EnvConfig
+    faulty: set[str]
+
+
+def _parse(cfgs: object, source: str) -> list[EnvConfig]:
+    problems = _Problems(source)
+    key, listed, imports = _split(_plain(cfgs, source), problems)
+    entries: list[_Entry] = []
+    for index, fields in enumerate(listed):
+        entry = _read_entry(_plain(fields, source), f"{key}.{index}", problems)
+        if entry is not None:
+            entry.config = _with_imports(entry.config, imports)
+            entries.append(entry)
+    for entry in entries:
+        _check_entry(entry, problems)
+    _check_names(entries, problems)
+    _check_imports(entries, imports, problems)
+    problems.raise_any()
+    return [entry.config for entry in entries]
+
+
+def _split(document: object, problems: _Problems) -> tuple[str, list[Any], tuple[str, ...]]:
+    """The key of the entries, the entries themselves, and the imports they share."""
+    if isinstance(document, EnvConfig):
+        return "envs", [document], ()
+    if not isinstance(document, Mapping):
+        return "envs", _listed(document, "envs", problems), ()
+    fields = cast("Mapping[Any, Any]", document)
+    if not {"env", "envs"} & fields.keys() and {"name", "backend"} & fields.keys():
+        return "envs", [fields], ()
+    for name in fields:
+        if name not in _TOP_LEVEL:
+            problems.add(str(name), _unknown_field(name, _TOP_LEVEL))
+    key = "envs" if "envs" in fields or "env" not in fields else "env"
+    if {"env", "envs"} <= fields.keys():
+        problems.add("env", "means the same as envs, which is there too; keep one of them")
+    imports = _shared_imports(fields.get("imports", ()), problems)
+    return key, _listed(fields.get(key, ()), key, problems), imports
+
+
+def _listed(entries: object, key: str, problems: _Problems) -> list[Any]:
+    shown = _show(entries)
+    if not isinstance(entries, list | tuple):
+        hint = "; load_config reads files" if isinstance(entries, str | Path) else ""
+        problems.add(key, f"should be a list of entries, got {shown}{hint}")
+        return []
+    if not entries:
+        problems.add(key, "no entries; give at least one, with name, backend and task")
+    return list(cast("Sequence[Any]", entries))
+
+
+def _shared_imports(imports: object, problems: _Problems) -> tuple[str, ...]:
+    if isinstance(imports, list | tuple):
+        modules = cast("Sequence[Any]", imports)
+        if all(isinstance(module, str) for module in modules):
+            return tuple(modules)
+    problems.add("imports", f"should be a list of module names, got {_show(imports)}")
+    return ()
+
+
+def _with_imports(config: EnvConfig, shared: tuple[str, ...]) -> EnvConfig:
+    if not shared:
+        return config
+    return config.model_copy(update={"imports": tuple(dict.fromkeys((*shared, *config.imports)))})
+
+
+# ---- an entry: its fields
+
+
+def _read_entry(entry: object, place: str, problems: _Problems) -> _Entry | None:
+    if isinstance(entry, EnvConfig):
+        return _Entry(f"{place} ({entry.name!r})", entry, set())
+    if not isinstance(entry, Mapping):
+        problems.add(place, f"should be a mapping of fields, got {_show(entry)}")
+        return None
+    given = cast("Mapping[Any, Any]", entry)
+    if name := given.get("name"):
+        place = f"{place} ({_show(name)})"
+    known = EnvConfig.model_fields
+    for unknown in (k for k in given if k not in known):
+        problems.add(f"{place}, {unknown}", _unknown_field(unknown, known))
+    fields = {k: _plain(v, place) for k, v in given.items() if k in known}
+    try:
+        return _Entry(place, EnvConfig.model_validate(fields), set())
+    except ValidationError as error:
+        faults = error.errors(include_url=False)
+    for path, text in _explain(faults, fields):
+        problems.add(f"{place}, {path}", text)
+    faulty = {str(fault["loc"][0]) for fault in faults}
+    right = {k: v for k, v in fields.items() if k not in faulty}
+    return _Entry(place, EnvConfig.model_validate({"name": "?", "backend": "?"} | right), faulty)
+
+
+def _explain(
+    faults: Sequence[ErrorDetails], fields: Mapping[str, Any]
+) -> Iterator[tuple[str, str]]:
+    """Path and text of each fault; the branches of a union share a path, so one text."""
+    texts: dict[str, list[str]] = {}
+    inputs: dict[str, str] = {}
+    for fault in faults:
+        path = _path(fault["loc"], fields)
+        text = fault["msg"].removeprefix("Value error, ").removeprefix("Input ")
+        texts.setdefault(path, []).append("is required" if fault["type"] == "missing" else text)
+        if fault["type"] not in ("missing", "value_error"):
+            inputs[path] = f", got {_show(fault['input'])}"
+    for path, (first, *others) in texts.items():
+        alternatives = [first, *(other.removeprefix("should be ") for other in others)]
+        yield path, " or ".join(alternatives) + inputs.get(path, "")
+
+
+def _path(location: Sequence[int | str], fields: Mapping[str, Any]) -> str:
+    """The dotted path of a fault, without the marks pydantic adds for unions and keys."""
+    value: Any = fields
+    parts: list[str] = []
+    for part in location:
+        try:
+            value = value[part]
+        except (KeyError, IndexError, TypeError):
+            break
+        parts.append(str(part))
+    return ".".join(parts or map(str, location[:1]))
+
+
+# ---- what entries name: backends, modules, programs
+
+
+def _runs_here(config: EnvConfig) -> bool:
+    """Whether the entry's workers see the modules that this process sees."""
+    return config.interpreter is None and config.placement != "ray"
+
+
+def _check_entry(entry: _Entry, problems: _Problems) -> None:
+    for name, check in _CHECKS.items():
+        if name not in entry.faulty and (text := check(entry.config)) is not None:
+            problems.add(f"{entry.place}, {name}", text)
+
+
+def _check_backend(config: EnvConfig) -> str | None:
+    # Imported modules register backends, and another environment has its own.
+    if config.imports or not _runs_here(config) or ENVS.knows(config.backend):
+        return None
+    return ENVS.unknown(config.backend)
+
+
+def _check_task(config: EnvConfig) -> str | None:
+    return None if config.task or config.backend == "env_server" else "is required"
+
+
+def _check_num_envs(config: EnvConfig) -> str | None:
+    backend = None if ENVS.registered(config.backend) else BACKENDS.get(config.backend)
+    if config.num_envs == 1 or backend is None or backend.vectorized:
+        return None
+    return f"backend {backend.name!r} makes single envs; use num_workers: {config.num_envs}"
+
+
+def _check_placement(config: EnvConfig) -> str | None:
+    if config.placement != "inline":
+        return None
+    ignored = [name for name in ("interpreter", "env_vars") if getattr(config, name)]
+    if not ignored:
+        return None
+    return f"'inline' is this very process, to which {' and '.join(ignored)} can't apply"
+
+
+def _check_interpreter(config: EnvConfig) -> str | None:
+    path = config.interpreter
+    if path is None or shutil.which(path) is not None:
+        return None
+    if Path(path).is_dir():
+        return f"{path!r} is a directory; name the program in it, such as {path}/bin/python"
+    reason = "is not executable" if Path(path).exists() else "doesn't exist"
+    return f"{path!r} {reason}"
+
+
+_CHECKS: dict[str, Callable[[EnvConfig], str | None]] = {
+    "backend": _check_backend,
+    "task": _check_task,
+    "num_envs": _check_num_envs,
+    "placement": _check_placement,
+    "interpreter": _check_interpreter,
+}
+
+
+def _check_names(entries: Sequence[_Entry], problems: _Problems) -> None:
+    first: dict[str, _Entry] = {}
+    for entry in entries:
+        if "name" in entry.faulty:
+            continue
+        owner = first.setdefault(entry.config.name, entry)
+        if owner is not entry:
+            taken_by = owner.place.partition(" ")[0]
+            problems.add(
+                f"{entry.place}, name",
+                f"is the name of {taken_by} too; envs are told apart by their entry's name",
+            )
+
+
+def _check_imports(entries: Sequence[_Entry], shared: tuple[str, ...], problems: _Problems) -> None:
+    here = [entry for entry in entries if _runs_here(entry.config)]
+    for module in shared if here else ():
+        if not _is_importable(module):
+            problems.add("imports", _not_importable(module))
+    for entry in here:
+        for module in entry.config.imports:
+            if module not in shared and not _is_importable(module):
+                problems.add(f"{entry.place}, imports", _not_importable(module))
+
+
+def _not_importable(module: str) -> str:
+    return f"no module {module!r} on this Python's path"
+
+
+def _is_importable(module: str) -> bool:
+    """Whether a module can be found, without running any part of it.
+
+    `importlib.util.find_spec` would import the packages above a submodule.
+    """
+    if module in sys.modules:
+        return True
+    top, *below = module.split(".")
+    if not all(part.isidentifier() for part in (top, *below)):
+        return False
+    spec = sys.modules[top].__spec__ if top in sys.modules else importlib.util.find_spec(top)
+    path = top
+    for part in below:
+        if spec is None or spec.submodule_search_locations is None:
+            return False
+        path = f"{path}.{part}"
+        spec = PathFinder.find_spec(path, list(spec.submodule_search_locations))
+    return spec is not None
+
+
+# ---- words for people
+
+
+def _unknown_field(name: object, known: Iterable[str]) -> str:
+    near = difflib.get_close_matches(str(name), list(known), n=1)
+    return (
+        f"unknown field; did you mean {near[0]!r}?"
+        if near
+        else (f"unknown field; known: {', '.join(known)}")
+    )
+
+
+def _show(value: object) -> str:
+    return reprlib.repr(value)
+
+
+# ---- OmegaConf, imported only where its nodes or files are met: it takes a tenth of a
+# second, and workers import this module too
+
+
+def _plain(value: object, source: str) -> Any:
+    """`value`, with an OmegaConf node turned into plain containers."""
+    omegaconf = sys.modules.get("omegaconf")
+    if omegaconf is None or not isinstance(value, omegaconf.Container):
+        return value
+    try:
+        return omegaconf.OmegaConf.to_container(value, resolve=True, throw_on_missing=True)
+    except omegaconf.errors.OmegaConfBaseException as error:
+        raise ConfigError(f"{source}: {_first_line(error)}") from None
+
+
+def _first_line(error: Exception) -> str:
+    where = getattr(error, "full_key", None)
+    text = str(error).partition("\n")[0]
+    return f"{where}: {text}" if where else text
+
+
+def _read_yaml(source: str, overrides: Sequence[str]) -> Any:
+    import yaml  # noqa: PLC0415
+    from omegaconf import OmegaConf  # noqa: PLC0415
+    from omegaconf.errors import OmegaConfBaseException  # noqa: PLC0415
+
+    try:
+        document = OmegaConf.load(source)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{source}: {_not_yaml(error)}") from None
+    except OmegaConfBaseException as error:
+        raise ConfigError(f"{source}: {_first_line(error)}") from None
+    except OSError as error:
+        # OmegaConf itself raises one, without errno, for a file that holds a bare value.
+        reason = error.strerror or "should hold envs: and a list of entries"
+        raise ConfigError(f"{source}: {reason}") from None
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{source}: not a UTF-8 text file ({error.reason})") from None
+    _override(document, source, overrides)
+    return _plain(document, source)
+
+
+def _not_yaml(error: Exception) -> str:
+    mark = getattr(error, "problem_mark", None)
+    problem = getattr(error, "problem", None) or str(error)
+    where = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
+    return f"{where}not valid YAML: {problem}"
+
+
+def _override(document: Any, source: str, overrides: Sequence[str]) -> None:
+    problems = _Problems(source)
+    for override in overrides:
+        if (problem := _apply(document, override)) is not None:
+            problems.add(f"override {override!r}", problem)
+    problems.raise_any()
+
+
+def _apply(document: Any, override: str) -> str | None:
+    """Apply one override in place; what is wrong with it, if anything is."""
+    import yaml  # noqa: PLC0415
+    from omegaconf import OmegaConf  # noqa: PLC0415
+    from omegaconf.errors import OmegaConfBaseException  # noqa: PLC0415
+
+    key, equals, text = override.partition("=")
+    top, dot, below = key.partition(".")
+    if not equals or top not in _TOP_LEVEL:
+        return "should read like envs.0.num_workers=8"
+    if top in ("env", "envs"):
+        # Either word reaches the entries, whichever the file uses.
+        top = "env" if "env" in document and "envs" not in document else "envs"
+    try:
+        value = OmegaConf.to_container(OmegaConf.from_dotlist([f"value={text}"]), resolve=False)
+        OmegaConf.update(document, top + dot + below, cast("dict[str, Any]", value)["value"])
+    except yaml.YAMLError as error:
+        return f"the value is {_not_yaml(error)}"
+    except (OmegaConfBaseException, TypeError, ValueError) as error:
+        return f"nothing is there ({_first_line(error)})"
+    return None

@@ -12,13 +12,14 @@ import difflib
 import importlib
 import importlib.metadata
 import importlib.util
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
 from rlightning_aio.errors import ConfigError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from rlightning_aio.envs.base import BaseEnv
 
 __all__ = ["BACKENDS", "ENVS", "Backend", "Registry"]
@@ -54,9 +55,8 @@ class Backend:
     @property
     def install_command(self) -> str:
         """The one command that installs the simulator."""
-        return f"pip install 'rlightning-aio[{self.extra}]'" if self.extra else (
-            "pip install rlightning-aio"
-        )
+        package = f"'rlightning-aio[{self.extra}]'" if self.extra else "rlightning-aio"
+        return f"pip install {package}"
 
     def installed_version(self) -> str | None:
         """Version of the simulator in this interpreter, or None if it isn't installed."""
@@ -68,6 +68,8 @@ class Backend:
             return "unknown"
 
 
+# One row for one backend.
+# fmt: off
 BACKENDS: dict[str, Backend] = {
     backend.name: backend
     for backend in (
@@ -91,6 +93,7 @@ BACKENDS: dict[str, Backend] = {
                 extra="piper"),
     )
 }
+# fmt: on
 
 
 class Registry:
@@ -104,7 +107,12 @@ class Registry:
 
         Registering another class under a taken name replaces it: a module that is
         reloaded, or imported under two names, is not an error.
+
+        Raises:
+            TypeError: no name was given, as in a bare ``@ENVS.register``.
         """
+        if not isinstance(name, str):  # pyright: ignore[reportUnnecessaryIsInstance]
+            raise TypeError("name the backend: @ENVS.register('my_backend')")
 
         def remember(env_class: EnvClass) -> EnvClass:
             self._classes[name] = env_class
@@ -144,8 +152,8 @@ class Registry:
     def unknown(self, name: str) -> str:
         """The message for a backend that nobody knows."""
         near = difflib.get_close_matches(name, self.names(), n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        return f"unknown backend {name!r}{hint} Known: {', '.join(self.names())}"
+        hint = f"did you mean {near[0]!r}? " if near else ""
+        return f"unknown backend {name!r}; {hint}known: {', '.join(self.names())}"
 
 
 ENVS = Registry()
