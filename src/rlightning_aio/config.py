@@ -221,8 +221,7 @@ def _parse(cfgs: object, source: str) -> list[EnvConfig]:
         if entry is not None:
             entry.config = _with_imports(entry.config, imports)
             entries.append(entry)
-    for entry in entries:
-        _check_entry(entry, problems)
+            _check_entry(entry, problems)
     _check_names(entries, problems)
     _check_imports(entries, imports, problems)
     problems.raise_any()
@@ -260,11 +259,11 @@ def _listed(entries: object, key: str, problems: _Problems) -> list[Any]:
 
 
 def _shared_imports(imports: object, problems: _Problems) -> tuple[str, ...]:
-    if isinstance(imports, list | tuple):
-        modules = cast("Sequence[Any]", imports)
-        if all(isinstance(module, str) for module in modules):
-            return tuple(modules)
-    problems.add("imports", f"should be a list of module names, got {_show(imports)}")
+    shown = _show(imports)
+    modules = cast("Sequence[Any]", imports) if isinstance(imports, list | tuple) else (None,)
+    if all(isinstance(module, str) for module in modules):
+        return tuple(modules)
+    problems.add("imports", f"should be a list of module names, got {shown}")
     return ()
 
 
@@ -310,6 +309,7 @@ def _explain(
     for fault in faults:
         path = _path(fault["loc"], fields)
         text = fault["msg"].removeprefix("Value error, ").removeprefix("Input ")
+        text = text.replace("valid tuple", "list")
         texts.setdefault(path, []).append("is required" if fault["type"] == "missing" else text)
         if fault["type"] not in ("missing", "value_error"):
             inputs[path] = f", got {_show(fault['input'])}"

@@ -1,0 +1,80 @@
+"""What holds for every test: nothing outlives it, and async tests run on both loops.
+
+Rule: a test that passes its assertions and leaves a process, a descriptor, shared
+memory or a task behind has failed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+import pytest_asyncio
+import uvloop
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable, Iterator
+
+# For the loops that tests make themselves; pytest-asyncio has an option for its own.
+os.environ["PYTHONASYNCIODEBUG"] = "1"
+
+
+def pytest_asyncio_loop_factories() -> dict[str, Callable[[], asyncio.AbstractEventLoop]]:
+    return {"asyncio": asyncio.new_event_loop, "uvloop": uvloop.new_event_loop}
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if pytest_asyncio.is_async_test(item):
+            # First in, last out: the tasks of other fixtures have ended by then.
+            item.fixturenames.insert(0, no_task_left_behind.__name__)
+
+
+def _children() -> set[str]:
+    """Child processes, zombies included."""
+    found: set[str] = set()
+    for children in Path("/proc/self/task").glob("*/children"):
+        for pid in children.read_text().split():
+            try:
+                command = Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ")
+            except FileNotFoundError:
+                continue
+            found.add(f"process {pid}: {command.decode()[:80] or 'a zombie'}")
+    return found
+
+
+def _descriptors() -> set[str]:
+    found: set[str] = set()
+    for number in os.listdir("/proc/self/fd"):
+        try:
+            found.add(f"descriptor {number}: {os.readlink(f'/proc/self/fd/{number}')}")
+        except FileNotFoundError:
+            continue  # The one that the listing itself needed.
+    return found
+
+
+def _held() -> set[str]:
+    named = {f"shared memory: {name}" for name in os.listdir("/dev/shm")}
+    return _children() | _descriptors() | named
+
+
+@pytest.fixture(autouse=True)
+def nothing_left_behind() -> Iterator[None]:
+    before = _held()
+    yield
+    left = _held() - before
+    if left:
+        gc.collect()  # What merely awaits collection is in nobody's hands.
+        left = _held() - before
+    assert not left, f"the test left behind {sorted(left)}"
+
+
+@pytest_asyncio.fixture
+async def no_task_left_behind() -> AsyncIterator[None]:
+    yield
+    left = asyncio.all_tasks() - {asyncio.current_task()}
+    assert not left, f"the test left behind {left}"
