@@ -49,16 +49,16 @@ def _children() -> set[str]:
 
 def _descriptors() -> set[str]:
     found: set[str] = set()
-    for number in os.listdir("/proc/self/fd"):
+    for descriptor in Path("/proc/self/fd").iterdir():
         try:
-            found.add(f"descriptor {number}: {os.readlink(f'/proc/self/fd/{number}')}")
+            found.add(f"descriptor {descriptor.name}: {descriptor.readlink()}")
         except FileNotFoundError:
             continue  # The one that the listing itself needed.
     return found
 
 
 def _held() -> set[str]:
-    named = {f"shared memory: {name}" for name in os.listdir("/dev/shm")}
+    named = {f"shared memory: {path.name}" for path in Path("/dev/shm").iterdir()}
     return _children() | _descriptors() | named
 
 

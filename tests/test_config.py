@@ -1,0 +1,526 @@
+"""Configuration: what is accepted, and what a wrong one says."""
+
+from __future__ import annotations
+
+import json
+import math
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import hypothesis.strategies as st
+import pytest
+import yaml
+from hypothesis import HealthCheck, example, given, settings
+from omegaconf import OmegaConf
+from pydantic import ValidationError
+
+from rlightning_aio.config import EnvConfig, check_installed, load_config, parse_configs
+from rlightning_aio.errors import ConfigError
+from rlightning_aio.registry import BACKENDS, ENVS, Backend
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    Write = Callable[[object], Path]
+
+CONFIGS = Path(__file__).parents[1] / "configs"
+HOPPER: dict[str, Any] = {"name": "hopper", "backend": "mujoco", "task": "Hopper-v5"}
+CARTPOLE: dict[str, Any] = {"name": "cartpole", "backend": "gymnasium", "task": "CartPole-v1"}
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Write:
+    """Writes a document (or the text of one) to a file."""
+
+    def write(document: object) -> Path:
+        path = tmp_path / "config.yaml"
+        path.write_text(document if isinstance(document, str) else yaml.safe_dump(document))
+        return path
+
+    return write
+
+
+def problems_of(cfgs: object) -> str:
+    with pytest.raises(ConfigError) as caught:
+        parse_configs(cfgs)
+    return str(caught.value)
+
+
+# ---- what is accepted
+
+
+def test_a_file_gives_its_entries_in_order(write: Write) -> None:
+    """Entries keep their order, fields their values, and the rest takes defaults."""
+    path = write({"envs": [HOPPER | {"num_workers": 3}, CARTPOLE | {"max_episode_steps": 50}]})
+    assert load_config(path) == [
+        EnvConfig(name="hopper", backend="mujoco", task="Hopper-v5", num_workers=3),
+        EnvConfig(name="cartpole", backend="gymnasium", task="CartPole-v1", max_episode_steps=50),
+    ]
+
+
+def test_env_means_envs(write: Write) -> None:
+    """RLightning's files say either word."""
+    assert load_config(write({"env": [HOPPER]})) == load_config(write({"envs": [HOPPER]}))
+
+
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        lambda fields: fields,
+        lambda fields: [fields],
+        lambda fields: (fields,),
+        lambda fields: EnvConfig(**fields),
+        lambda fields: [EnvConfig(**fields)],
+        lambda fields: {"envs": [fields]},
+        lambda fields: {"env": [EnvConfig(**fields)]},
+        OmegaConf.create,
+        lambda fields: OmegaConf.create([fields]),
+        lambda fields: [OmegaConf.create(fields)],
+        lambda fields: OmegaConf.create({"envs": [fields]}).envs,
+        lambda fields: OmegaConf.create({"env": [fields]}),
+        lambda fields: dict(OmegaConf.create(fields).items()),
+    ],
+)
+def test_every_way_to_hand_over_an_entry_means_the_same(wrap: Callable[[Any], object]) -> None:
+    """An entry may come alone or listed, as a model, a dict or an OmegaConf node."""
+    fields = HOPPER | {"env_kwargs": {"frame_skip": 3, "nested": [{"a": 1}]}}
+    (config,) = parse_configs(wrap(fields))
+    assert config == EnvConfig(**fields)
+    assert type(config.env_kwargs["nested"]) is list
+
+
+def test_imports_of_the_file_come_before_an_entry_s_own(write: Write) -> None:
+    """Shared imports reach every entry, first, and no module is listed twice."""
+    document = {"imports": ["json", "os.path"], "envs": [HOPPER, CARTPOLE]}
+    document["envs"][1] = CARTPOLE | {"imports": ["re", "json"]}
+    first, second = load_config(write(document))
+    assert first.imports == ("json", "os.path")
+    assert second.imports == ("json", "os.path", "re")
+
+
+def test_interpolations_are_resolved(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
+    """OmegaConf's references work, to other fields and to the environment."""
+    monkeypatch.setenv("HOPPER_TASK", "Hopper-v5")
+    entry = HOPPER | {"task": "${oc.env:HOPPER_TASK}", "num_workers": 4}
+    other = CARTPOLE | {"num_workers": "${envs.0.num_workers}"}
+    first, second = load_config(write({"envs": [entry, other]}))
+    assert (first.task, second.num_workers) == ("Hopper-v5", 4)
+
+
+def test_numbers_in_env_vars_are_written_out() -> None:
+    """YAML reads a thread count as a number; the environment holds text."""
+    (config,) = parse_configs(HOPPER | {"env_vars": {"OMP_NUM_THREADS": 1, "SHARE": 0.5}})
+    assert config.env_vars == {"OMP_NUM_THREADS": "1", "SHARE": "0.5"}
+
+
+def test_an_interpreter_is_looked_up_as_a_shell_would() -> None:
+    """A name on the PATH, a path, and a home directory all work."""
+    for interpreter in (sys.executable, Path(sys.executable).name):
+        (config,) = parse_configs(HOPPER | {"interpreter": interpreter})
+        assert config.interpreter == interpreter
+    assert EnvConfig(**HOPPER, interpreter="~/bin/python").interpreter == str(
+        Path.home() / "bin/python"
+    )
+
+
+def test_an_env_server_needs_no_task() -> None:
+    """Its clients bring the task; every other backend must be told."""
+    if "env_server" not in ENVS.names():
+        pytest.skip("no env_server yet")
+    (config,) = parse_configs({"name": "robots", "backend": "env_server"})
+    assert config.task == ""
+
+
+def test_another_environment_s_modules_are_not_judged_from_here() -> None:
+    """Under another interpreter, imports and backends are that interpreter's affair."""
+    fields = HOPPER | {"interpreter": sys.executable, "imports": ["no_such_module"]}
+    assert parse_configs(fields)[0].imports == ("no_such_module",)
+    parse_configs(HOPPER | {"interpreter": sys.executable, "backend": "theirs"})
+    check_installed(parse_configs(fields))
+
+
+def test_an_imported_module_may_bring_the_backend() -> None:
+    """With imports, an unknown backend is left for the worker to find."""
+    (config,) = parse_configs(HOPPER | {"backend": "brought", "imports": ["json"]})
+    assert config.backend == "brought"
+
+
+def test_looking_for_modules_imports_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A module, its package and a namespace package above it are found without being run."""
+    package = tmp_path / "space" / "package"
+    package.mkdir(parents=True)
+    (package / "__init__.py").write_text("raise RuntimeError")
+    (package / "module.py").write_text("raise RuntimeError")
+    monkeypatch.syspath_prepend(tmp_path)
+    parse_configs(HOPPER | {"imports": ["space", "space.package", "space.package.module"]})
+    assert "no module 'space.package.other'" in problems_of(
+        HOPPER | {"imports": ["space.package.other"]}
+    )
+    assert "no module 'space.package.module.deeper'" in problems_of(
+        HOPPER | {"imports": ["space.package.module.deeper"]}
+    )
+    assert not [name for name in sys.modules if name.startswith("space")]
+
+
+words = st.text(st.characters(categories=["L", "N", "P"], exclude_characters="?"), min_size=1)
+
+
+@given(
+    fields=st.fixed_dictionaries(
+        {
+            "name": words,
+            "backend": st.sampled_from(["mujoco", "gymnasium"]),
+            "task": words,
+        },
+        optional={
+            "num_workers": st.integers(1, 10**6),
+            "max_episode_steps": st.none() | st.integers(1, 10**9),
+            "num_cpus": st.integers(1, 99) | st.floats(0.01, 99),
+            "num_gpus": st.floats(0, 8),
+            "envs_per_process": st.just("auto") | st.integers(1, 99),
+            "step_timeout": st.none() | st.floats(1e-3, 1e9),
+            "on_worker_death": st.sampled_from(["restart", "raise"]),
+            "max_restarts": st.integers(0, 99),
+            "env_vars": st.dictionaries(st.from_regex(r"\A[A-Z_]+\Z"), st.text("ab= ")),
+            "cpu_affinity": st.booleans(),
+            "env_kwargs": st.dictionaries(
+                st.text("abc", min_size=1),
+                st.recursive(
+                    st.none() | st.booleans() | st.integers() | st.text("xyz 0:-#'"),
+                    lambda inner: (
+                        st.lists(inner, max_size=3)
+                        | st.dictionaries(st.text("abc", min_size=1), inner, max_size=3)
+                    ),
+                    max_leaves=6,
+                ),
+                max_size=3,
+            ),
+        },
+    )
+)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+def test_a_file_says_what_python_says(fields: dict[str, Any], write: Write) -> None:
+    """Writing an entry to YAML and reading it back gives the entry, through pickle too."""
+    config = EnvConfig(**fields)
+    path = write(json.dumps({"envs": [fields]}, ensure_ascii=False))
+    assert load_config(path) == parse_configs(fields) == [config]
+    assert pickle.loads(pickle.dumps(config)) == config
+
+
+# ---- overrides
+
+
+def test_overrides_reach_fields_by_dotted_keys(write: Write) -> None:
+    """Values are YAML, later ones win, and what is missing on the way is made."""
+    path = write({"envs": [HOPPER, CARTPOLE | {"env_kwargs": {"a": 1, "b": 2}}]})
+    first, second = load_config(
+        path,
+        [
+            "envs.0.num_workers=4",
+            "envs.0.num_workers=8",
+            "envs.0.env_kwargs.frame_skip=3",
+            "envs.1.env_kwargs.b=[x, {y: 1}]",
+            "envs.1.task=a=b",
+            "imports=[json]",
+        ],
+    )
+    assert (first.num_workers, first.env_kwargs, first.imports) == (8, {"frame_skip": 3}, ("json",))
+    assert second.env_kwargs == {"a": 1, "b": ["x", {"y": 1}]}
+    assert second.task == "a=b"
+
+
+@pytest.mark.parametrize("in_file", ["env", "envs"])
+@pytest.mark.parametrize("in_override", ["env", "envs"])
+def test_overrides_may_say_env_or_envs(write: Write, in_file: str, in_override: str) -> None:
+    """Either word reaches the entries, whichever the file uses."""
+    path = write({in_file: [HOPPER]})
+    assert load_config(path, [f"{in_override}.0.num_workers=8"])[0].num_workers == 8
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "envs.0.num_workers",
+        "=8",
+        "num_workers=8",
+        "0.num_workers=8",
+        "envs.1.num_workers=8",
+        "envs.first.num_workers=8",
+        "envs.0.env_kwargs=[1",
+        "envs.0.task=${",
+        "",
+    ],
+)
+def test_an_override_that_fits_nothing_is_named(write: Write, override: str) -> None:
+    """The message has the file and the override, whatever is wrong with it."""
+    path = write({"envs": [HOPPER]})
+    with pytest.raises(ConfigError) as caught:
+        load_config(path, ["envs.0.num_workers=2", override])
+    assert str(caught.value).startswith(f"{path}: ")
+    assert override in str(caught.value)
+
+
+def test_an_overridden_field_is_checked_like_any_other(write: Write) -> None:
+    """An override can't smuggle in a field or a type that the file may not have."""
+    with pytest.raises(ConfigError, match=r"envs\.0 \('hopper'\), num_worker: .*'num_workers'"):
+        load_config(write({"envs": [HOPPER]}), ["envs.0.num_worker=8"])
+    with pytest.raises(ConfigError, match=r"num_workers: should be a valid integer, got 'many'"):
+        load_config(write({"envs": [HOPPER]}), ["envs.0.num_workers=many"])
+
+
+# ---- what is refused
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "said"),
+    [
+        ("num_worker", 3, "unknown field; did you mean 'num_workers'?"),
+        ("zzz", 3, "unknown field; known: name, backend, task"),
+        ("num_workers", "many", "should be a valid integer, got 'many'"),
+        ("num_workers", "4", "should be a valid integer, got '4'"),
+        ("num_workers", True, "should be a valid integer, got True"),
+        ("num_workers", 0, "should be greater than or equal to 1, got 0"),
+        ("num_workers", None, "should be a valid integer, got None"),
+        ("max_episode_steps", 0, "should be greater than or equal to 1, got 0"),
+        ("step_timeout", -1, "should be greater than 0, got -1"),
+        ("start_timeout", math.nan, "should be greater than 0, got nan"),
+        ("placement", "inlin", "should be 'process', 'inline' or 'ray', got 'inlin'"),
+        ("on_worker_death", "ignore", "should be 'restart' or 'raise', got 'ignore'"),
+        ("envs_per_process", "many", "should be a valid integer or 'auto', got 'many'"),
+        ("envs_per_process", 0, "should be greater than or equal to 1 or 'auto', got 0"),
+        ("env_kwargs", [1], "should be a valid dictionary, got [1]"),
+        ("imports", "json", "should be a list, got 'json'"),
+        ("imports", ["json", 3], "should be a valid string, got 3"),
+        ("imports", ["no_such_module"], "no module 'no_such_module' on this Python's path"),
+        ("imports", ["not a name"], "no module 'not a name' on this Python's path"),
+        ("imports", [""], "no module '' on this Python's path"),
+        ("env_vars", {"A": True}, "should be a valid string, got True"),
+        ("env_vars", {"A=B": "1"}, "'A=B' can't be set in an environment"),
+        ("env_vars", {"": "1"}, "'' can't be set in an environment"),
+        ("env_vars", {"A": "\0"}, "'A' can't be set in an environment"),
+        ("interpreter", "/no/such/python", "'/no/such/python' doesn't exist"),
+        ("interpreter", "no-such-python", "'no-such-python' doesn't exist"),
+        ("interpreter", "/", "'/' is a directory; name the program in it"),
+        ("interpreter", __file__, "is not executable"),
+        ("backend", "mujco", "unknown backend 'mujco'; did you mean 'mujoco'? known: "),
+        ("backend", "zzz", "unknown backend 'zzz'; known: "),
+        ("num_envs", 4, "backend 'mujoco' makes single envs; use num_workers: 4"),
+        ("task", "", "is required"),
+        ("task", 5, "should be a valid string, got 5"),
+    ],
+)
+def test_a_wrong_field_is_named_with_file_and_entry(
+    write: Write, field: str, value: object, said: str
+) -> None:
+    """One problem makes one line: file, entry by index and name, field, what and why."""
+    path = write({"envs": [CARTPOLE, HOPPER | {field: value}]})
+    with pytest.raises(ConfigError) as caught:
+        load_config(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: envs.1 ('hopper'), {field}")
+    assert said in message
+    assert "\n" not in message
+    assert caught.value.__cause__ is None
+
+
+@pytest.mark.parametrize("missing", ["name", "backend", "task"])
+def test_a_missing_field_is_named(missing: str) -> None:
+    """The three fields without a default are required."""
+    fields = {name: value for name, value in HOPPER.items() if name != missing}
+    assert f", {missing}: is required" in problems_of([fields])
+
+
+def test_a_name_is_not_empty() -> None:
+    """Envs are called after their entry, so there must be something to call them."""
+    assert "envs.0, name: " in problems_of(HOPPER | {"name": ""})
+
+
+def test_two_entries_can_t_share_a_name() -> None:
+    """Their envs would have the same ids."""
+    message = problems_of([HOPPER, CARTPOLE, CARTPOLE | {"name": "hopper"}])
+    assert "envs.2 ('hopper'), name: is the name of envs.0 too" in message
+
+
+def test_inline_envs_share_this_process(write: Write) -> None:
+    """What only a new process could honour is refused, not ignored."""
+    fields = HOPPER | {"placement": "inline", "env_vars": {"A": "1"}}
+    assert "envs.0 ('hopper'), placement: 'inline' is this very process" in problems_of(fields)
+
+
+def test_every_problem_of_a_file_is_in_the_one_message(write: Write) -> None:
+    """A user mends a file once, not once for each mistake."""
+    path = write(
+        {
+            "import": ["json"],
+            "imports": ["no_such_module"],
+            "envs": [
+                HOPPER | {"num_worker": 1, "num_workers": "x", "num_envs": 2, "backend": "mujoco"},
+                "not an entry",
+                {"backend": "zzz", "interpreter": "/no/such/python"},
+                HOPPER,
+            ],
+        }
+    )
+    with pytest.raises(ConfigError) as caught:
+        load_config(path)
+    head, *lines = str(caught.value).split("\n")
+    assert head == f"{path}: {len(lines)} problems"
+    assert [line.split(": ")[0].strip() for line in lines] == [
+        "import",
+        "envs.0 ('hopper'), num_worker",
+        "envs.0 ('hopper'), num_workers",
+        "envs.0 ('hopper'), num_envs",
+        "envs.1",
+        "envs.2, name",
+        "envs.2, task",
+        "envs.2, interpreter",
+        "envs.3 ('hopper'), name",
+        "imports",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("envs: [1\nb: 2", "line 2, column 2: not valid YAML"),
+        ("envs: 1\nenvs: 2", "line 2, column 1: not valid YAML: found duplicate key envs"),
+        ("envs: !!python/object:os.system x", "not valid YAML"),
+        ("", "envs: no entries"),
+        ("envs: []", "envs: no entries"),
+        ("env: []", "env: no entries"),
+        ("envs:", "envs: should be a list of entries, got None"),
+        ("envs: {name: a}", "envs: should be a list of entries, got {'name': 'a'}"),
+        ("7", "should hold envs: and a list of entries"),
+        ("envs: ${no.such.key}", "envs: Interpolation key 'no.such.key' not found"),
+        ("envs: [{name: '???'}]", "envs[0].name: Missing mandatory value"),
+        ("env: []\nenvs: []", "env: means the same as envs"),
+        ("imports: json\nenvs: []", "imports: should be a list of module names, got 'json'"),
+        ("evns: []", "evns: unknown field; did you mean 'envs'?"),
+    ],
+)
+def test_a_file_without_entries_says_why(write: Write, text: str, said: str) -> None:
+    """Whether it doesn't parse, is empty, or holds something else."""
+    path = write(text)
+    with pytest.raises(ConfigError) as caught:
+        load_config(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert said in str(caught.value)
+
+
+def test_a_file_that_can_t_be_read_is_named(tmp_path: Path) -> None:
+    """Missing, a directory, or not text."""
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\xfa")
+    for name in ("missing.yaml", "", "binary.yaml"):
+        with pytest.raises(ConfigError) as caught:
+            load_config(tmp_path / name)
+        assert str(caught.value).startswith(f"{tmp_path / name}: ")
+
+
+@pytest.mark.parametrize("cfgs", [None, 3, [], (), {}, [None], [[HOPPER]], object()])
+def test_what_is_no_configuration_is_refused(cfgs: object) -> None:
+    """Nothing but entries is taken for one."""
+    assert problems_of(cfgs).startswith("environment configuration: ")
+
+
+def test_a_path_is_sent_to_load_config() -> None:
+    """A likely slip gets its answer."""
+    assert "load_config reads files" in problems_of("configs/hopper.yaml")
+    assert "load_config reads files" in problems_of(CONFIGS / "hopper.yaml")
+
+
+def test_the_model_itself_suggests_the_nearest_name() -> None:
+    """Who makes an EnvConfig in Python is told as well."""
+    with pytest.raises(ValidationError, match=r"num_worker: .* did you mean 'num_workers'"):
+        EnvConfig(**HOPPER, num_worker=3)
+
+
+@given(text=st.text() | st.text("envs:[]{}-, \n\tab'\"&*!?|>%#0.$"))
+@example(text="[" * 1000)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+def test_no_text_escapes_as_another_exception(text: str, write: Write) -> None:
+    """Whatever a file holds, it is entries or a ConfigError."""
+    try:
+        configs = load_config(write(text))
+    except ConfigError:
+        return
+    assert configs
+
+
+values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: (
+        st.lists(inner, max_size=4)
+        | st.dictionaries(
+            st.sampled_from(["env", "envs", "imports", *EnvConfig.model_fields]) | st.integers(),
+            inner,
+            max_size=6,
+        )
+    ),
+)
+
+
+@given(cfgs=values)
+@settings(deadline=None)
+def test_no_value_escapes_as_another_exception(cfgs: object) -> None:
+    """Whatever Python hands over, it is entries or a ConfigError."""
+    try:
+        configs = parse_configs(cfgs)
+    except ConfigError:
+        return
+    assert configs
+
+
+# ---- simulators
+
+
+@pytest.fixture
+def absent(monkeypatch: pytest.MonkeyPatch) -> Backend:
+    backend = Backend(
+        "absent", "nowhere:Env", "no_such_simulator", "no-such-simulator", extra="absent"
+    )
+    monkeypatch.setitem(BACKENDS, "absent", backend)
+    return backend
+
+
+def test_a_missing_simulator_comes_with_its_command(absent: Backend) -> None:
+    """Every entry that lacks one is named, with what to type."""
+    configs = parse_configs([HOPPER, CARTPOLE | {"backend": "absent"}])
+    with pytest.raises(ConfigError) as caught:
+        check_installed(configs)
+    assert "envs.1 ('cartpole'), backend" in str(caught.value)
+    assert "pip install 'rlightning-aio[absent]'" in str(caught.value)
+
+
+def test_installed_simulators_pass() -> None:
+    """What the package itself depends on is there."""
+    check_installed(parse_configs([HOPPER, CARTPOLE]))
+
+
+# ---- what comes with the project
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
+def test_the_project_s_own_configs_are_right(path: Path) -> None:
+    """Each file in configs/ parses and names entries."""
+    assert load_config(path)
+
+
+def test_the_multi_task_example_is_two_tasks_of_one_action_shape() -> None:
+    """It is there to show two tasks under one policy."""
+    import gymnasium as gym
+
+    configs = load_config(CONFIGS / "multi_task.yaml")
+    envs = [gym.make(config.task, **config.env_kwargs) for config in configs]
+    assert len({config.task for config in configs}) == 2
+    assert len({env.action_space.shape for env in envs}) == 1
+    for env in envs:
+        env.close()
+
+
+def test_importing_the_module_does_not_load_omegaconf() -> None:
+    """Workers import it too, and have no YAML to read."""
+    code = "import rlightning_aio.config, sys; sys.exit('omegaconf' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
