@@ -283,8 +283,8 @@ def _read_entry(entry: object, place: str, problems: _Problems) -> _Entry | None
         problems.add(place, f"should be a mapping of fields, got {_show(entry)}")
         return None
     given = cast("Mapping[Any, Any]", entry)
-    if name := given.get("name"):
-        place = f"{place} ({_show(name)})"
+    if isinstance(name := given.get("name"), str) and name:
+        place = f"{place} ({name!r})"
     known = EnvConfig.model_fields
     for unknown in (k for k in given if k not in known):
         problems.add(f"{place}, {unknown}", _unknown_field(unknown, known))
