@@ -15,8 +15,9 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium as gym
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
+from rlightning_aio.envs.options import load_named, read_options
 from rlightning_aio.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ def make_simulator(env_id: str, config: EnvConfig, default_env_class: str | None
         ConfigError: an option, an override or the task doesn't exist; or, for Isaac Lab
             2.3, this isn't the main thread.
     """
-    options = _read_options(env_id, config)
+    options = read_options(IsaacOptions, env_id, config.env_kwargs)
     device = options.device or _default_device()
     app: Any = importlib.import_module("isaaclab.app")
     launcher_args = {"headless": True, **options.launcher, "device": device}
@@ -79,7 +80,7 @@ def make_simulator(env_id: str, config: EnvConfig, default_env_class: str | None
             f"{env_id}: task {config.task!r} is a configuration class; say which environment "
             "it is for in env_kwargs.env_class, as 'module::Class'"
         )
-    return _load(env_id, "env_kwargs.env_class", env_class)(cfg=cfg)
+    return load_named(env_id, "env_kwargs.env_class", env_class, "::")(cfg=cfg)
 
 
 def _launch_isaac_sim(env_id: str, app: Any, launcher_args: dict[str, Any]) -> Any:
@@ -88,15 +89,6 @@ def _launch_isaac_sim(env_id: str, app: Any, launcher_args: dict[str, Any]) -> A
             f"{env_id}: Isaac Sim starts on the main thread only; use placement: process"
         )
     return app.AppLauncher(**launcher_args)
-
-
-def _read_options(env_id: str, config: EnvConfig) -> IsaacOptions:
-    try:
-        return IsaacOptions.model_validate(config.env_kwargs)
-    except ValidationError as error:
-        known = ", ".join(IsaacOptions.model_fields)
-        faults = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
-        raise ConfigError(f"{env_id}: env_kwargs: {faults}. Known fields: {known}") from None
 
 
 def _default_device() -> str:
@@ -108,7 +100,7 @@ def _make_cfg(env_id: str, config: EnvConfig, options: IsaacOptions, device: str
     """The task's configuration, with this entry's settings in it."""
     tasks: Any = importlib.import_module("isaaclab_tasks.utils")
     if "::" in config.task:
-        cfg = _load(env_id, "task", config.task)()
+        cfg = load_named(env_id, "task", config.task, "::")()
         if hasattr(tasks, "resolve_presets"):
             cfg = tasks.resolve_presets(cfg)
         cfg.sim.device = device
@@ -139,15 +131,6 @@ def _check_registered(env_id: str, name: str) -> None:
         "Write 'package:name' if another package registers it, "
         "or 'module::Class' for a configuration class"
     )
-
-
-def _load(env_id: str, field: str, name: str) -> Any:
-    """The object that ``module::Class`` names."""
-    module_name, _, attribute = name.partition("::")
-    try:
-        return getattr(importlib.import_module(module_name), attribute)
-    except (ImportError, AttributeError) as error:
-        raise ConfigError(f"{env_id}: {field}: {name!r} can't be loaded: {error}") from error
 
 
 def _apply(target: Any, overrides: Mapping[str, Any], where: str) -> None:

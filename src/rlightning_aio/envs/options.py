@@ -1,0 +1,52 @@
+"""`env_kwargs` of backends that declare what they take as a pydantic model.
+
+Rule: what is wrong is said in one message that names the env and each field.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from rlightning_aio.errors import ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+__all__ = ["load_named", "read_options"]
+
+Options = TypeVar("Options", bound=BaseModel)
+
+
+def read_options(model: type[Options], env_id: str, env_kwargs: Mapping[str, Any]) -> Options:
+    """`env_kwargs` as `model`.
+
+    Raises:
+        ConfigError: a field is unknown, missing or of the wrong type or value.
+    """
+    try:
+        return model.model_validate(env_kwargs)
+    except ValidationError as error:
+        known = ", ".join(model.model_fields)
+        faults = "; ".join(_describe(fault) for fault in error.errors())
+        raise ConfigError(f"{env_id}: env_kwargs: {faults}. Known fields: {known}") from None
+
+
+def load_named(env_id: str, field: str, name: str, separator: str = ":") -> Any:
+    """The object that ``module:name`` (or ``module::name``) stands for.
+
+    Raises:
+        ConfigError: the module can't be imported, or has no such name.
+    """
+    module_name, _, attribute = name.partition(separator)
+    try:
+        return getattr(import_module(module_name), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(f"{env_id}: {field}: {name!r} can't be loaded: {error}") from error
+
+
+def _describe(fault: Any) -> str:
+    place = ".".join(map(str, fault["loc"]))
+    return f"{place}: {fault['msg']}" if place else fault["msg"]

@@ -1,0 +1,55 @@
+"""`Pace`: the control rate of envs that live in real time.
+
+Rule: deadlines are kept on a grid, so that no error adds up; what was missed is never
+made up for in a rush.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+__all__ = ["Pace"]
+
+
+class Pace:
+    """Deadlines at a fixed rate, on the monotonic clock.
+
+    Args:
+        hz: deadlines per second.
+        clock: returns seconds.
+        sleep: takes seconds.
+    """
+
+    def __init__(
+        self,
+        hz: float,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._period = 1 / hz
+        self._clock = clock
+        self._sleep = sleep
+        self._due = clock() + self._period
+
+    def restart(self) -> None:
+        """The next deadline is one period from now."""
+        self._due = self._clock() + self._period
+
+    def wait(self) -> float:
+        """Sleep until the deadline and set the next; by how many seconds it was missed.
+
+        A deadline missed by less than a period leaves the grid where it is; after a longer
+        delay the grid starts anew.
+        """
+        late = self._clock() - self._due
+        if late < 0:
+            self._sleep(-late)
+        if late < self._period:
+            self._due += self._period
+        else:
+            self.restart()
+        return max(0.0, late)
