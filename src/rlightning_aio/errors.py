@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BadAction",
+    "ClientRefused",
     "ConfigError",
     "EnvBusy",
     "EnvHung",
@@ -124,6 +125,7 @@ class WorkerDied(EnvFault):
     Attributes:
         exit_code: the process's exit code; negative for a signal; None if unknown.
         stderr_tail: the last lines it wrote to stderr.
+        env_ids: the envs whose outstanding request this error answers.
     """
 
     def __init__(
@@ -132,6 +134,7 @@ class WorkerDied(EnvFault):
         super().__init__(message, env_id=env_id)
         self.exit_code = exit_code
         self.stderr_tail = stderr_tail
+        self.env_ids: tuple[str, ...] = ()
 
 
 class EnvHung(WorkerDied):
@@ -143,3 +146,7 @@ class EnvHung(WorkerDied):
 
 class StartFailed(EnvFault):
     """An env could not be built; ``init`` has stopped everything it had started."""
+
+
+class ClientRefused(RLightningError, ConnectionError):
+    """An env_server will not let this env client in, now or later; the message has its reason."""

@@ -42,6 +42,8 @@ class Backend:
         cpu_bound: one core's worth of plain computing for each step, so that several
             envs may share a worker (``envs_per_process: auto``).
         vectorized: whether ``num_envs`` above 1 is supported.
+        preload: modules that are safe to import before workers are forked and slow to
+            import after: no threads, no devices.
     """
 
     name: str
@@ -51,6 +53,7 @@ class Backend:
     extra: str = ""
     cpu_bound: bool = False
     vectorized: bool = False
+    preload: tuple[str, ...] = ()
 
     @property
     def install_command(self) -> str:
@@ -74,16 +77,17 @@ BACKENDS: dict[str, Backend] = {
     backend.name: backend
     for backend in (
         Backend("mujoco", "rlightning_aio.envs.gymnasium:MujocoEnv", "mujoco", "mujoco",
-                cpu_bound=True),
+                cpu_bound=True,
+                preload=("rlightning_aio.envs.gymnasium", "gymnasium.envs.mujoco")),
         Backend("gymnasium", "rlightning_aio.envs.gymnasium:GymnasiumEnv", "gymnasium",
-                "gymnasium", cpu_bound=True),
-        Backend("ale", "rlightning_aio.envs.ale:AleEnv", "ale_py", "ale-py", extra="ale",
+                "gymnasium", cpu_bound=True, preload=("rlightning_aio.envs.gymnasium",)),
+        Backend("ale", "rlightning_aio.envs.ale:ALEEnv", "ale_py", "ale-py", extra="ale",
                 cpu_bound=True, vectorized=True),
         Backend("pettingzoo", "rlightning_aio.envs.pettingzoo:PettingZooEnv", "pettingzoo",
                 "pettingzoo", extra="pettingzoo", cpu_bound=True),
         Backend("envpool", "rlightning_aio.envs.envpool:EnvPoolEnv", "envpool", "envpool",
                 extra="envpool", vectorized=True),
-        Backend("maniskill", "rlightning_aio.envs.maniskill:ManiSkillEnv", "mani_skill",
+        Backend("maniskill", "rlightning_aio.envs.maniskill:ManiskillEnv", "mani_skill",
                 "mani-skill", extra="maniskill", vectorized=True),
         Backend("isaac_manager_based", "rlightning_aio.envs.isaac:IsaacManagerBasedEnv",
                 "isaaclab", "isaaclab", extra="isaac", vectorized=True),

@@ -1,0 +1,95 @@
+"""rlightning_aio: many reinforcement-learning environments in worker processes, used as one.
+
+The public names. Each is imported when it is first used: a worker needs few of them.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rlightning_aio.batch import BatchedData
+    from rlightning_aio.config import EnvConfig, load_config
+    from rlightning_aio.envs.base import BaseEnv, default_env_preprocess_fn
+    from rlightning_aio.errors import (
+        BadAction,
+        ConfigError,
+        EnvBusy,
+        EnvHung,
+        EnvRaised,
+        GroupClosed,
+        NothingPending,
+        RLightningError,
+        StartFailed,
+        UnknownEnv,
+        WorkerDied,
+    )
+    from rlightning_aio.group.aio import EnvGroup, EnvHandle, build_env_group, run
+    from rlightning_aio.registry import ENVS
+    from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "batch": ("BatchedData",),
+    "config": ("EnvConfig", "load_config"),
+    "envs.base": ("BaseEnv", "default_env_preprocess_fn"),
+    "errors": (
+        "BadAction",
+        "ConfigError",
+        "EnvBusy",
+        "EnvHung",
+        "EnvRaised",
+        "GroupClosed",
+        "NothingPending",
+        "RLightningError",
+        "StartFailed",
+        "UnknownEnv",
+        "WorkerDied",
+    ),
+    "group.aio": ("EnvGroup", "EnvHandle", "build_env_group", "run"),
+    "registry": ("ENVS",),
+    "types": ("EnvMeta", "EnvRet", "MultiAgentEnvRet", "PolicyResponse"),
+}
+_HOME = {name: home for home, names in _HOMES.items() for name in names}
+
+__all__ = [
+    "ENVS",
+    "BadAction",
+    "BaseEnv",
+    "BatchedData",
+    "ConfigError",
+    "EnvBusy",
+    "EnvConfig",
+    "EnvGroup",
+    "EnvHandle",
+    "EnvHung",
+    "EnvMeta",
+    "EnvRaised",
+    "EnvRet",
+    "GroupClosed",
+    "MultiAgentEnvRet",
+    "NothingPending",
+    "PolicyResponse",
+    "RLightningError",
+    "StartFailed",
+    "UnknownEnv",
+    "WorkerDied",
+    "build_env_group",
+    "default_env_preprocess_fn",
+    "load_config",
+    "run",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__", "sync"]

@@ -1,0 +1,357 @@
+"""The asynchronous `EnvGroup` and the driver that waits on an asyncio event loop.
+
+Waiting is `asyncio.wait(..., return_when=FIRST_COMPLETED)` over one future for each
+source (a worker, a fork server, a server socket), never one for each env.
+Absent on purpose: rules. Every one of them is in the core.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Coroutine, Mapping, Sequence
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+from rlightning_aio.batch import BatchedData
+from rlightning_aio.group.build import PreprocessFn, plan_group
+from rlightning_aio.group.facade import AutoResetContext, Facade, sole, steps_of
+from rlightning_aio.group.wait import Operation
+from rlightning_aio.hosts.base import Source
+from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
+
+__all__ = ["AioDriver", "EnvGroup", "EnvHandle"]
+
+T = TypeVar("T")
+
+
+class AioDriver:
+    """Watches sources with `loop.add_reader` and waits for operations to end."""
+
+    def __init__(self) -> None:
+        self._futures: dict[Source, asyncio.Future[None]] = {}
+        self._writing: set[Source] = set()
+        self._descriptors: dict[Source, int] = {}
+        self._broken: BaseException | None = None
+
+    def watch(self, source: Source) -> None:
+        """See `base.Watcher.watch`."""
+        loop = asyncio.get_running_loop()
+        self._futures[source] = loop.create_future()
+        self._descriptors[source] = source.fileno()
+        loop.add_reader(source.fileno(), self._readable, source)
+
+    def unwatch(self, source: Source) -> None:
+        """See `base.Watcher.unwatch`. Whoever waits for `source` wakes."""
+        future = self._futures.pop(source, None)
+        if future is None:
+            return
+        descriptor = self._descriptors.pop(source)
+        loop = future.get_loop()
+        if not loop.is_closed():
+            loop.remove_reader(descriptor)
+            if source in self._writing:
+                loop.remove_writer(descriptor)
+        self._writing.discard(source)
+        if not future.done():
+            future.set_result(None)
+
+    def watch_writable(self, source: Source, wanted: bool) -> None:
+        """See `base.Watcher.watch_writable`."""
+        loop = asyncio.get_running_loop()
+        if wanted:
+            self._writing.add(source)
+            loop.add_writer(source.fileno(), source.on_writable)
+        elif source in self._writing:
+            self._writing.discard(source)
+            loop.remove_writer(source.fileno())
+
+    def _readable(self, source: Source) -> None:
+        try:
+            source.on_readable()
+        except BaseException as error:  # An event loop would log it and let the waiter hang.
+            self._broken = error
+        future = self._futures.get(source)
+        if future is not None:
+            # Invariant: whoever starts to wait from now on gets a future that is not done;
+            # what has just been told is in the core already.
+            self._futures[source] = future.get_loop().create_future()
+            future.set_result(None)
+
+    async def run(self, operation: Operation[T]) -> T:
+        """Wait until `operation` ends; its result. Cancelling closes the operation."""
+        try:
+            wait = operation.send(None)  # pyright: ignore[reportArgumentType]
+            while True:
+                await self._block(wait.until)
+                if self._broken is not None:
+                    raise self._broken
+                wait = operation.send(time.monotonic())
+        except StopIteration as stop:
+            return stop.value
+        finally:
+            operation.close()
+
+    async def _block(self, until: float | None) -> None:
+        timeout = None if until is None else until - time.monotonic()
+        if timeout is not None and timeout <= 0:
+            await asyncio.sleep(0)
+        elif self._futures:
+            await asyncio.wait(
+                self._futures.values(), timeout=timeout, return_when=asyncio.FIRST_COMPLETED
+            )
+        else:
+            await asyncio.sleep(timeout or 0)
+
+
+class EnvGroup(Facade):
+    """Many envs used as one, from an asyncio event loop.
+
+    Make one with `build_env_group` and use it as a context manager, which initialises it on
+    entry and closes it on exit::
+
+        async with build_env_group(load_config("configs/halfcheetah.yaml")) as group:
+            batch, _ = await group.reset(seed=0)
+
+    Not thread-safe: use it from the loop that initialised it.
+    """
+
+    _driver: AioDriver
+
+    @staticmethod
+    def _new_driver() -> AioDriver:
+        return AioDriver()
+
+    async def init(self) -> list[EnvMeta]:
+        """Start all workers, in parallel, and build their envs.
+
+        Returns one `EnvMeta` for each env, in order. If it fails or is cancelled, nothing is
+        left running.
+
+        Raises:
+            StartFailed: an env could not be built, or took longer than ``start_timeout``.
+            ConfigError: the envs' action spaces have different shapes (a `ValueError`).
+            GroupClosed: the group was closed before.
+        """
+        return await self._driver.run(self._fleet.start(time.monotonic()))
+
+    async def __aenter__(self) -> Self:
+        await self.init()
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        await self.close()
+
+    async def reset(
+        self,
+        seed: int | Sequence[int] | Mapping[str, int] | None = None,
+        options: dict[str, Any] | None = None,
+        env_ids: Sequence[str] | None = None,
+    ) -> tuple[BatchedData, list[bool]]:
+        """Start a new episode in all envs, or in those of `env_ids`.
+
+        Args:
+            seed: env k of the group gets ``seed + k`` (k counts sub-environments); a sequence
+                gives one seed for each env, a mapping seeds by id.
+            options: passed to each env.
+            env_ids: which envs; the results come in this order.
+
+        Returns the first observations, and flags that are all False. Cancelled, it leaves the
+        results to `collect_async`.
+
+        Raises:
+            EnvBusy: an env has a reply outstanding; nothing was sent.
+            EnvRaised, WorkerDied, EnvHung: an env failed; the others' results are in the
+                error's ``results``.
+        """
+        return await self._driver.run(
+            self._core.reset(time.monotonic(), seed, options, env_ids)
+        )
+
+    async def step(self, batch: BatchedData) -> tuple[BatchedData, list[bool] | None]:
+        """Step the envs of `batch` and wait for all of them.
+
+        Returns results with the same ids in the same order, and None; inside `auto_reset` a
+        flag for each result. Cancelled, it leaves the results to `collect_async`.
+
+        Raises:
+            BadAction, EnvBusy, UnknownEnv: before anything is sent.
+            EnvRaised, WorkerDied, EnvHung: an env failed; the others' results are in the
+                error's ``results``.
+        """
+        return await self._driver.run(self._core.step(batch, time.monotonic()))
+
+    async def collect_async(
+        self,
+        timeout: float | None = None,
+        wait_all: bool = False,
+        min_results: int = 1,
+        max_results: int | None = None,
+        deadline: float | None = None,
+    ) -> tuple[BatchedData, list[bool]]:
+        """Wait for results of `step_async`; never returns an empty batch.
+
+        Args:
+            timeout: seconds of a further window, opened when the first result is ready, in
+                which more results join.
+            wait_all: wait for all that are pending.
+            min_results: don't return before that many are ready (or all that are pending).
+            max_results: leave what is above to the next call, first come first served.
+            deadline: seconds in all, from now.
+
+        Returns results in the order of their arrival, and a flag for each (inside
+        `auto_reset` whether it reached the step limit). Cancelling loses no result.
+
+        Raises:
+            NothingPending: no request is outstanding.
+            TimeoutError: `deadline` has passed; the next call gets the results.
+            EnvRaised, WorkerDied, EnvHung: the answer to one request; the results of others
+                stay for the next call.
+            RuntimeError: another collector is waiting.
+        """
+        self._check_collect(timeout, wait_all, min_results, max_results, deadline)
+        return await self._driver.run(
+            self._core.collect(
+                time.monotonic(),
+                timeout=timeout,
+                wait_all=wait_all,
+                min_results=min_results,
+                max_results=max_results,
+                deadline=deadline,
+            )
+        )
+
+    def auto_reset(
+        self, max_episode_steps: int | None = None, on_done: bool = True
+    ) -> AutoResetContext:
+        """Reset envs at their step limit, in place of their next step.
+
+        Args:
+            max_episode_steps: the limit for all envs; None takes each entry's own.
+            on_done: also reset envs whose episode has ended by itself.
+
+        An env that has made the limit's number of steps returns a True flag; its next step is
+        replaced by a reset that returns reward 0 and a False flag. Works with ``with`` and
+        ``async with``.
+
+        Raises:
+            ValueError: the limit isn't a positive int, or it is None and an env has none.
+            RuntimeError: contexts don't nest.
+        """
+        return self._auto_reset(max_episode_steps, on_done)
+
+    def __getitem__(self, env_id: str) -> EnvHandle:
+        """A handle on one env; raises `UnknownEnv`."""
+        return EnvHandle(self, self._core.slots.find_one(env_id))
+
+    async def offload(self) -> None:
+        """Have every env free its device memory until `reload`."""
+        await self._driver.run(self._core.call_all(time.monotonic(), "offload"))
+
+    async def reload(self) -> None:
+        """Have every env take its device memory again."""
+        await self._driver.run(self._core.call_all(time.monotonic(), "reload"))
+
+    async def close(self) -> None:
+        """Close all envs and end their workers, by force after a second and a half.
+
+        Idempotent. Whoever waits on the group gets `GroupClosed`; results that were not
+        collected are gone.
+        """
+        await self._driver.run(self._fleet.close(time.monotonic()))
+        self._closed()
+
+
+class EnvHandle:
+    """One env of an asynchronous group."""
+
+    def __init__(self, group: EnvGroup, slot: int) -> None:
+        self._group = group
+        self._slot = slot
+
+    @property
+    def env_id(self) -> str:
+        """Its id."""
+        return self._group.env_ids[self._slot]
+
+    async def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> EnvRet | MultiAgentEnvRet:
+        """Start a new episode; `seed` is the env's own."""
+        seeds = None if seed is None else [seed]
+        return sole(await self._group.reset(seeds, options, [self.env_id]))
+
+    async def step(self, response: PolicyResponse | Any) -> EnvRet | MultiAgentEnvRet:
+        """Step with a `PolicyResponse`, or with a bare action."""
+        return sole(await self._group.step(steps_of(self.env_id, response)))
+
+    async def call(self, name: str, *args: Any, **kwargs: Any) -> Any:
+        """Call method `name` of the env (or, if it has none, of its simulator); its value.
+
+        Raises:
+            EnvRaised: the method raised, or its value can't be pickled.
+        """
+        group = self._group
+        return await group._driver.run(  # pyright: ignore[reportPrivateUsage]
+            group._core.call(  # pyright: ignore[reportPrivateUsage]
+                time.monotonic(), self._slot, name, args, kwargs
+            )
+        )
+
+    async def get_attr(self, name: str, target: str = "unwrapped") -> Any:
+        """Attribute `name` of the simulator (``unwrapped``) or its outermost wrapper (``outer``)."""
+        return await self.call("get_attr", name, target)
+
+    async def set_attr(self, name: str, value: Any, target: str = "unwrapped") -> None:
+        """Set attribute `name` of the simulator or its outermost wrapper; done on return."""
+        await self.call("set_attr", name, value, target)
+
+    async def render(self) -> Any:
+        """One frame, as the simulator renders it."""
+        return await self.call("render")
+
+    async def offload(self) -> None:
+        """Free device memory until `reload`."""
+        await self.call("offload")
+
+    async def reload(self) -> None:
+        """Take device memory again."""
+        await self.call("reload")
+
+
+def build_env_group(
+    cfgs: Any,
+    preprocess_fn: PreprocessFn | Sequence[PreprocessFn | None] | None = None,
+    mixed_actions: bool = False,
+    zero_copy: bool = False,
+) -> EnvGroup:
+    """A group of the configured envs; nothing is started yet.
+
+    Args:
+        cfgs: an `EnvConfig`, a list of them, plain dicts, or OmegaConf nodes.
+        preprocess_fn: turns a `PolicyResponse` into what the simulator steps with; one for
+            all, a list with one for each entry, or one for each env. Anything that
+            cloudpickle takes.
+        mixed_actions: allow envs whose action spaces have different shapes.
+        zero_copy: hand out observations as read-only views, valid until that env's next
+            request, where the rows of a batch are contiguous.
+
+    Raises:
+        ConfigError: something is wrong with the configuration or a preprocess function.
+    """
+    plan = plan_group(cfgs, preprocess_fn, mixed_actions=mixed_actions, zero_copy=zero_copy)
+    return EnvGroup(plan)
+
+
+def run(main: Coroutine[Any, Any, T]) -> T:
+    """Run `main` to its end on a uvloop event loop (or asyncio's, where uvloop is missing)."""
+    try:
+        import uvloop
+    except ImportError:
+        return asyncio.run(main)
+    return uvloop.run(main)

@@ -1,0 +1,526 @@
+"""The core: decides what every request, reply and failure means, and never waits.
+
+Operations are generators. Where one can't go on, it yields a `Wait`; the driver blocks
+until a source has told something or the time has come, and sends the time back in.
+Rule: no I/O beyond handing bytes to hosts, no clock, no event loop. Everything that is
+asynchronous and everything that is synchronous runs through this one implementation.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlightning_aio.batch import BatchedData
+from rlightning_aio.errors import (
+    EnvBusy,
+    EnvFault,
+    EnvRaised,
+    GroupClosed,
+    NothingPending,
+    RLightningError,
+)
+from rlightning_aio.group.actions import write_actions
+from rlightning_aio.group.auto_reset import NO_RESETS, AutoReset
+from rlightning_aio.group.fleet import Fleet
+from rlightning_aio.group.results import collected
+from rlightning_aio.group.slots import BUSY, IDLE, READY
+from rlightning_aio.group.stats import Stats
+from rlightning_aio.group.wait import Operation, Wait, earliest
+from rlightning_aio.hosts.base import Host
+from rlightning_aio.hosts.worker import ErrorText
+from rlightning_aio.protocol.info import InfoSchema
+from rlightning_aio.protocol.rings import OP_BITS, RESET, ROW_MASK, SEQ_SHIFT, STEP
+from rlightning_aio.protocol.slab import NO_SEED
+
+__all__ = ["Core"]
+
+CALL: Final = 3
+Flags: TypeAlias = "list[bool]"
+
+
+@dataclass(slots=True)
+class Ticket:
+    """A call that waits for requests of its own, beside `collect_async`."""
+
+    owner: int
+    remaining: int
+    faults: list[EnvFault] = field(default_factory=list[EnvFault])
+    value: Any = None
+
+
+class Core:
+    """Requests, replies and their rules; see `Fleet` for how hosts come and go.
+
+    Attributes:
+        zero_copy: observations are handed out as views where their rows are contiguous.
+        info_width: bytes of a row's info that any schema uses.
+    """
+
+    def __init__(self, fleet: Fleet, *, zero_copy: bool) -> None:
+        self.fleet = fleet
+        self.zero_copy = zero_copy
+        self.slots = fleet.slots
+        self.auto = AutoReset(fleet.slots)
+        self.stats = Stats(fleet.slots)
+        self._ready: deque[NDArray[np.intp]] = deque()
+        self._ready_count = 0
+        self._in_flight = 0
+        self._faults: deque[EnvFault] = deque()
+        self._tickets: dict[int, Ticket] = {}
+        self._next_owner = 1
+        self._rests: dict[int, Any] = {}
+        self._collecting = False
+        self.info_width = 0
+        fleet.deliver_to(self)
+
+    # -- requests -----------------------------------------------------------------
+
+    def slots_of(self, batch: BatchedData) -> NDArray[np.intp]:
+        """Slots of a batch's envs; free for a batch that answers one of ours."""
+        slots = batch.slots_in(self)
+        if slots is None:
+            slots = self.slots.find(batch.env_ids())
+            if len(slots) > 1 and len(set(batch.env_ids())) < len(slots):
+                raise EnvBusy(f"{_first_double(batch.env_ids())!r} comes twice in one batch")
+        return slots
+
+    def _check_sendable(self, slots: NDArray[np.intp], what: str) -> None:
+        self.check_open()
+        self.fleet.check_usable(slots)
+        table = self.slots
+        states = table.state[slots]
+        if states.any():
+            slot = int(slots[np.flatnonzero(states)[0]])
+            state = "has not replied yet" if table.state[slot] == BUSY else "was not collected"
+            raise EnvBusy(
+                f"can't {what} {table.describe(slot)}: its last request {state}; collect it first"
+                "; nothing was sent"
+            )
+
+    def step_async(self, batch: BatchedData, now: float) -> None:
+        """Send a batch of steps that `collect` will answer."""
+        self._send_steps(batch, self.slots_of(batch), 0, now)
+
+    def _send_steps(
+        self, batch: BatchedData, slots: NDArray[np.intp], owner: int, now: float
+    ) -> None:
+        table = self.slots
+        self._check_sendable(slots, "step")
+        letters = write_actions(batch, slots, table, self.fleet.slabs)
+        resets = self.auto.due(slots)
+        if self.fleet.lost:
+            resets = resets | self.fleet.claim_lost(slots)
+        if letters is None:
+            self._send_entries(slots, resets, owner, now)
+            return
+        by_letter = np.zeros(len(slots), np.bool_)
+        by_letter[letters.positions] = True
+        by_letter &= ~resets
+        plain = ~by_letter
+        if plain.any():
+            self._send_entries(slots[plain], resets[plain], owner, now)
+        self._send_letters(slots, letters, by_letter, owner, now)
+
+    def _send_entries(
+        self, slots: NDArray[np.intp], resets: NDArray[np.bool_], owner: int, now: float
+    ) -> None:
+        """Send steps, and resets in place of some, whose arguments lie in the rows."""
+        table = self.slots
+        op = STEP
+        codes = table.code[slots]
+        if resets is not NO_RESETS and resets.any():
+            op = STEP + resets  # RESET == STEP + 1
+            codes = codes + resets
+            self.fleet.write_seeds(slots[resets], np.full(np.count_nonzero(resets), NO_SEED))
+        entries = (self._mark_sent(slots, op, owner, now) << SEQ_SHIFT) | codes
+        self._post(slots, entries)
+
+    def _post(self, slots: NDArray[np.intp], entries: NDArray[np.int64]) -> None:
+        """Hand entries to their hosts, with one call for each run of slots of one host."""
+        hosts = self.slots.host[slots]
+        hosts_of = self.fleet.hosts
+        cuts = np.flatnonzero(hosts[1:] != hosts[:-1])
+        start = 0
+        for end in (*(cuts + 1).tolist(), len(slots)):
+            hosts_of[hosts[start]].request(entries[start:end])
+            start = end
+
+    def _mark_sent(
+        self, slots: NDArray[np.intp], op: int | NDArray[Any], owner: int, now: float
+    ) -> NDArray[np.int64]:
+        table = self.slots
+        numbers = table.number[slots] + 1
+        table.number[slots] = numbers
+        table.state[slots] = BUSY
+        table.op[slots] = op
+        table.owner[slots] = owner
+        table.sent_ns[slots] = int(now * 1e9)
+        if owner == 0:
+            self._in_flight += len(slots)
+        return numbers
+
+    def _send_letters(
+        self,
+        slots: NDArray[np.intp],
+        letters: Any,
+        wanted: NDArray[np.bool_],
+        owner: int,
+        now: float,
+    ) -> None:
+        table = self.slots
+        for position, (action, extras) in zip(
+            letters.positions.tolist(), letters.contents, strict=True
+        ):
+            if wanted[position]:
+                slot = int(slots[position])
+                numbers = self._mark_sent(slots[position : position + 1], STEP, owner, now)
+                host = self.fleet.hosts[table.host[slot]]
+                host.request_step(slot - host.first_slot, int(numbers[0]), action, extras)
+
+    # -- replies (called by the fleet) --------------------------------------------
+
+    def on_reports(self, host: Host, entries: NDArray[np.int64]) -> None:
+        """See `base.Inbox.on_reports`."""
+        table = self.slots
+        slots = ((entries >> OP_BITS) & ROW_MASK) + host.first_slot
+        current = (table.number[slots] == entries >> SEQ_SHIFT) & (table.state[slots] == BUSY)
+        if not current.all():
+            slots = slots[current]  # A late reply to a request that was given up.
+        self._replied(slots)
+
+    def on_rest(self, host: Host, row: int, number: int, rest: bytes | dict[str, Any]) -> None:
+        """See `base.Inbox.on_rest`."""
+        slot = host.first_slot + row
+        if self._is_current(slot, number):
+            if rest:
+                self._rests[slot] = rest
+            self._replied(np.array([slot], np.intp))
+
+    def on_value(self, host: Host, row: int, number: int, value: Any) -> None:
+        """See `base.Inbox.on_value`."""
+        slot = host.first_slot + row
+        if self._is_current(slot, number):
+            self.slots.state[slot] = IDLE
+            ticket = self._tickets[int(self.slots.owner[slot])]
+            ticket.value = value
+            ticket.remaining -= 1
+
+    def on_error(self, host: Host, row: int, number: int, error: ErrorText) -> None:
+        """See `base.Inbox.on_error`."""
+        slot = host.first_slot + row
+        if not self._is_current(slot, number):
+            return
+        doing = {STEP: "step", RESET: "reset", CALL: "call"}[int(self.slots.op[slot])]
+        self.fail(
+            [slot],
+            EnvRaised(
+                f"{self.slots.describe(slot)} raised in {doing}: {error.type_name}: {error.text}; "
+                "the remote traceback is above; reset the env to go on",
+                env_id=self.slots.env_ids[slot],
+                exception_type=error.type_name,
+                exception_text=error.text,
+                traceback_text=error.traceback,
+            ),
+        )
+
+    def on_schema(self, host: Host, number: int, schema: InfoSchema) -> None:
+        """See `base.Inbox.on_schema`."""
+        self.slots.schemas[host.first_slot][number] = schema
+        self.info_width = max(self.info_width, schema.size)
+
+    def _is_current(self, slot: int, number: int) -> bool:
+        table = self.slots
+        return table.state[slot] == BUSY and table.number[slot] == number
+
+    def _replied(self, slots: NDArray[np.intp]) -> None:
+        """Replies have come: give each to the call that waits for it."""
+        if not len(slots):
+            return
+        table = self.slots
+        table.state[slots] = READY
+        if self.fleet.recovering:
+            self.fleet.note_restarted(slots, self._rests)
+        owners = table.owner[slots]
+        if self._tickets and owners.any():
+            for owner in np.unique(owners).tolist():
+                mine = owners == owner
+                if owner:
+                    self._tickets[owner].remaining -= int(np.count_nonzero(mine))
+                else:
+                    self._queue(slots[mine])
+            return
+        self._queue(slots)
+
+    def _queue(self, slots: NDArray[np.intp]) -> None:
+        self._ready.append(slots)
+        self._ready_count += len(slots)
+        self._in_flight -= len(slots)
+
+    def fail(self, slots: Sequence[int], fault: EnvFault) -> None:
+        """End the requests of `slots`, all of which are outstanding, with one error."""
+        table = self.slots
+        owners = {int(table.owner[slot]) for slot in slots}
+        for owner in owners:
+            mine = [slot for slot in slots if table.owner[slot] == owner]
+            table.state[mine] = IDLE
+            if owner:
+                ticket = self._tickets[owner]
+                ticket.remaining -= len(mine)
+                ticket.faults.append(fault)
+            else:
+                self._in_flight -= len(mine)
+                self._faults.append(fault)
+
+    # -- collect ------------------------------------------------------------------
+
+    def collect(
+        self,
+        now: float,
+        *,
+        timeout: float | None,
+        wait_all: bool,
+        min_results: int,
+        max_results: int | None,
+        deadline: float | None,
+    ) -> Operation[tuple[BatchedData, Flags]]:
+        """See `EnvGroup.collect_async`."""
+        if self._collecting:
+            raise RLightningError(
+                "another collect_async is already waiting on this group; one collector at a time"
+            )
+        self._collecting = True
+        try:
+            end = None if deadline is None else now + deadline
+            window = None
+            while True:
+                self.fleet.sweep()
+                if self._faults:
+                    raise self._faults.popleft()
+                ready, total = self._ready_count, self._ready_count + self._in_flight
+                if not total and not self.fleet.elastic:
+                    raise NothingPending(
+                        "nothing to collect: no request is outstanding; send one with step_async"
+                    )
+                most = total if max_results is None else min(total, max_results)
+                need = most if wait_all else min(min_results, most)
+                if ready and timeout is not None and window is None:
+                    window = now + timeout
+                open_window = window is not None and now < window and ready < most
+                if ready and ready >= need and not open_window:
+                    break
+                if end is not None and now >= end:
+                    raise TimeoutError(
+                        f"{ready} of the {max(need, 1)} results needed came within {deadline} s; "
+                        "nothing is lost, the next collect_async gets them"
+                    )
+                if ready and open_window:
+                    wanted = most - ready
+                else:
+                    wanted = 1 if timeout is not None else max(need - ready, 1)
+                until = earliest(end, window if ready >= need else None)
+                now = yield from self._wait(wanted, until)
+        finally:
+            self._collecting = False
+        return self._take(most)
+
+    def _wait(self, wanted: int, until: float | None) -> Operation[float]:
+        """One turn of waiting for `wanted` more replies; the time after it."""
+        if self.fleet.run_inline(wanted) or self.fleet.order(wanted):
+            return (yield Wait(0.0))
+        now = yield Wait(earliest(until, self.fleet.next_check()))
+        self.fleet.check(now)
+        return now
+
+    def _take(self, most: int) -> tuple[BatchedData, Flags]:
+        """Hand out up to `most` ready results, first come first served."""
+        taken: list[NDArray[np.intp]] = []
+        count = 0
+        while self._ready and count < most:
+            slots = self._ready.popleft()
+            if count + len(slots) > most:
+                self._ready.appendleft(slots[most - count :])
+                slots = slots[: most - count]
+            taken.append(slots)
+            count += len(slots)
+        self._ready_count -= count
+        slots = taken[0] if len(taken) == 1 else np.concatenate(taken)
+        return self._hand_out(slots, synchronous=False)
+
+    def _hand_out(
+        self, slots: NDArray[np.intp], *, synchronous: bool
+    ) -> tuple[BatchedData, Flags]:
+        self.slots.state[slots] = IDLE
+        batch = collected(self, slots, self._rests)
+        flags = self.auto.account(slots, batch)
+        self.stats.account(batch, synchronous=synchronous)
+        return batch, flags
+
+    # -- calls that wait for their own replies ------------------------------------
+
+    def _new_ticket(self, count: int) -> Ticket:
+        ticket = Ticket(self._next_owner, count)
+        self._next_owner += 1
+        self._tickets[ticket.owner] = ticket
+        return ticket
+
+    def _await_ticket(self, ticket: Ticket) -> Operation[None]:
+        """Until all replies of `ticket` are there. Given up, they go to `collect_async`."""
+        try:
+            while True:
+                self.fleet.sweep()
+                if ticket.remaining <= 0:
+                    return
+                yield from self._wait(ticket.remaining, None)
+        finally:
+            del self._tickets[ticket.owner]
+            if ticket.remaining > 0:
+                self._disown(ticket)
+
+    def _disown(self, ticket: Ticket) -> None:
+        table = self.slots
+        mine = np.flatnonzero((table.owner == ticket.owner) & (table.state != IDLE))
+        table.owner[mine] = 0
+        self._in_flight += len(mine)
+        self._faults.extend(ticket.faults)
+        ready = mine[table.state[mine] == READY]
+        if len(ready):
+            self._queue(ready)
+
+    def step(self, batch: BatchedData, now: float) -> Operation[tuple[BatchedData, Flags | None]]:
+        """See `EnvGroup.step`."""
+        slots = self.slots_of(batch)
+        self.fleet.check_steppable(slots)
+        ticket = self._new_ticket(len(slots))
+        try:
+            self._send_steps(batch, slots, ticket.owner, now)
+        except BaseException:
+            del self._tickets[ticket.owner]
+            raise
+        yield from self._await_ticket(ticket)
+        results, flags = self._settled(ticket, slots)
+        return results, flags if self.auto.active else None
+
+    def reset(
+        self,
+        now: float,
+        seed: int | Sequence[int] | Mapping[str, int] | None,
+        options: dict[str, Any] | None,
+        env_ids: Sequence[str] | None,
+    ) -> Operation[tuple[BatchedData, Flags]]:
+        """See `EnvGroup.reset`."""
+        table = self.slots
+        slots = table.all if env_ids is None else table.find(env_ids)
+        seeds = self._seeds(seed, slots)
+        self._check_sendable(slots, "reset")
+        self.fleet.forget_lost(slots)
+        ticket = self._new_ticket(len(slots))
+        if options is None:
+            self.fleet.write_seeds(slots, seeds)
+            numbers = self._mark_sent(slots, RESET, ticket.owner, now)
+            self._post(slots, (numbers << SEQ_SHIFT) | (table.code[slots] + 1))
+        else:
+            numbers = self._mark_sent(slots, RESET, ticket.owner, now)
+            for slot, number, s in zip(slots.tolist(), numbers.tolist(), seeds, strict=True):
+                host = self.fleet.hosts[table.host[slot]]
+                host.request_reset(
+                    slot - host.first_slot, number, None if s == NO_SEED else int(s), options
+                )
+        yield from self._await_ticket(ticket)
+        return self._settled(ticket, slots)
+
+    def _seeds(
+        self, seed: int | Sequence[int] | Mapping[str, int] | None, slots: NDArray[np.intp]
+    ) -> NDArray[np.int64]:
+        """One seed for each slot: env k gets ``seed + k``, counting sub-environments."""
+        table = self.slots
+        if seed is None:
+            return np.full(len(slots), NO_SEED)
+        if isinstance(seed, Mapping):
+            given = {table.find_one(env_id): value for env_id, value in seed.items()}
+            chosen = [given.get(slot, NO_SEED) for slot in slots.tolist()]
+        elif isinstance(seed, Sequence | np.ndarray):
+            if len(seed) != len(slots):
+                raise ValueError(f"{len(seed)} seeds for {len(slots)} envs; give one for each")
+            chosen = list(seed)
+        else:
+            if seed < 0:
+                raise ValueError(f"seed must be at least 0, not {seed}")
+            return table.seed_offset[slots] + int(seed)
+        for value in chosen:
+            if value != NO_SEED and value < 0:
+                raise ValueError(f"seeds must be at least 0, not {value}")
+        return np.array(chosen, np.int64)
+
+    def _settled(
+        self, ticket: Ticket, slots: NDArray[np.intp]
+    ) -> tuple[BatchedData, Flags]:
+        """The results of a call, in its order; its faults, with the results, as an error."""
+        if not ticket.faults:
+            return self._hand_out(slots, synchronous=True)
+        done = slots[self.slots.state[slots] == READY]
+        fault = ticket.faults[0]
+        fault.others = tuple(ticket.faults[1:])
+        if len(done):
+            fault.results = self._hand_out(done, synchronous=True)[0]
+            fault.add_note(
+                f"{len(done)} other envs of the same call are done; their results are in "
+                "the error's `results`"
+            )
+        raise fault
+
+    def call(
+        self, now: float, slot: int, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]
+    ) -> Operation[Any]:
+        """Call a method of one env; its value."""
+        slots = np.array([slot], np.intp)
+        self._check_sendable(slots, f"call {name} of")
+        ticket = self._new_ticket(1)
+        number = int(self._mark_sent(slots, CALL, ticket.owner, now)[0])
+        host = self.fleet.hosts[self.slots.host[slot]]
+        host.request_call(slot - host.first_slot, number, name, args, kwargs)
+        yield from self._await_ticket(ticket)
+        if ticket.faults:
+            raise ticket.faults[0]
+        return ticket.value
+
+    def call_all(self, now: float, name: str) -> Operation[None]:
+        """Call a method of every env, all at once."""
+        slots = self.slots.all
+        self._check_sendable(slots, f"call {name} of")
+        ticket = self._new_ticket(len(slots))
+        numbers = self._mark_sent(slots, CALL, ticket.owner, now)
+        for slot, number in zip(slots.tolist(), numbers.tolist(), strict=True):
+            host = self.fleet.hosts[self.slots.host[slot]]
+            host.request_call(slot - host.first_slot, number, name, (), {})
+        yield from self._await_ticket(ticket)
+        if ticket.faults:
+            raise ticket.faults[0]
+
+    def pending(self) -> int:
+        """Requests that `collect_async` has still to answer, ready or not."""
+        return self._in_flight + self._ready_count
+
+    def check_open(self) -> None:
+        """Raises `GroupClosed` before `init` and after `close`."""
+        if not self.fleet.open:
+            raise GroupClosed(
+                "this group is closed; build a new one"
+                if self.fleet.closed
+                else "this group has not been initialised; call init() first, or use it in a "
+                "with block"
+            )
+
+
+def _first_double(ids: Sequence[str]) -> str:
+    seen: set[str] = set()
+    for id_ in ids:
+        if id_ in seen:
+            return id_
+        seen.add(id_)
+    raise AssertionError("no id comes twice")

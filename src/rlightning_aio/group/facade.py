@@ -1,0 +1,192 @@
+"""What the asynchronous and the synchronous `EnvGroup` share: everything that never waits."""
+
+from __future__ import annotations
+
+import time
+import warnings
+import weakref
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Any, Self
+
+import gymnasium as gym
+
+from rlightning_aio.batch import BatchedData
+from rlightning_aio.group.build import Plan, build_fleet
+from rlightning_aio.group.core import Core
+from rlightning_aio.hosts.base import Watcher
+from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
+
+__all__ = ["AutoResetContext", "Facade", "sole", "steps_of"]
+
+
+def sole(results: tuple[BatchedData, Any]) -> EnvRet | MultiAgentEnvRet:
+    """The one result of a batch of one."""
+    return results[0].values()[0]
+
+
+def steps_of(env_id: str, response: PolicyResponse | Any) -> BatchedData:
+    """A batch of one step."""
+    if not isinstance(response, PolicyResponse):
+        response = PolicyResponse(env_id, response)
+    return BatchedData([env_id], [response])
+
+
+class AutoResetContext:
+    """Open while envs are reset at their step limit; see `EnvGroup.auto_reset`."""
+
+    def __init__(self, core: Core, max_episode_steps: int | None, on_done: bool) -> None:
+        self._core = core
+        self._limit = max_episode_steps
+        self._on_done = on_done
+
+    def __enter__(self) -> Self:
+        self._core.auto.begin(self._limit, on_done=self._on_done)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._core.auto.end()
+
+    async def __aenter__(self) -> Self:
+        return self.__enter__()
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._core.auto.end()
+
+
+class Facade:
+    """The plain methods of an `EnvGroup`."""
+
+    def __init__(self, plan: Plan) -> None:
+        self._driver = self._new_driver()
+        self._fleet = build_fleet(plan, self._driver)
+        self._core = Core(self._fleet, zero_copy=plan.zero_copy)
+        self._finalizer = weakref.finalize(self, self._fleet.abandon)
+
+    @staticmethod
+    def _new_driver() -> Watcher:
+        raise NotImplementedError
+
+    @property
+    def _metas(self) -> list[EnvMeta]:
+        self._core.check_open()
+        return self._fleet.metas
+
+    # -- what it holds ------------------------------------------------------------
+
+    @property
+    def env_ids(self) -> list[str]:
+        """Ids of the envs, in order."""
+        return list(self._core.slots.env_ids)
+
+    def __len__(self) -> int:
+        """Envs of the group, each env_server counted once."""
+        return len(self._core.slots)
+
+    def size(self) -> int:
+        """Local envs of the group."""
+        return len(self._core.slots)
+
+    def get_observation_spaces(self) -> list[gym.Space[Any] | None]:
+        """Observation space of each env, in order."""
+        return [meta.observation_space for meta in self._metas]
+
+    def get_action_spaces(self) -> list[gym.Space[Any] | None]:
+        """Action space of each env, in order."""
+        return [meta.action_space for meta in self._metas]
+
+    # -- requests -----------------------------------------------------------------
+
+    def step_async(self, batch: BatchedData) -> None:
+        """Have the envs of `batch` step; `collect_async` gets the results. Never blocks.
+
+        Args:
+            batch: a batch of responses, from `BatchedData.respond` (columns, fast) or made of
+                `PolicyResponse` values.
+
+        Raises (before anything is sent):
+            BadAction: an action's shape, dtype or count doesn't fit.
+            EnvBusy: an env has a reply outstanding, or comes twice.
+            UnknownEnv: no env of this group has that id.
+        """
+        self._core.step_async(batch, time.monotonic())
+
+    @staticmethod
+    def _check_collect(
+        timeout: float | None,
+        wait_all: bool,
+        min_results: int,
+        max_results: int | None,
+        deadline: float | None,
+    ) -> None:
+        for name, seconds in (("timeout", timeout), ("deadline", deadline)):
+            if seconds is not None and not seconds > 0:
+                raise ValueError(f"{name} must be a positive number of seconds, not {seconds!r}")
+        if min_results < 1:
+            raise ValueError(f"min_results must be at least 1, not {min_results!r}")
+        if max_results is not None and max_results < 1:
+            raise ValueError(f"max_results must be at least 1, not {max_results!r}")
+        if max_results is not None and min_results > max_results:
+            raise ValueError(
+                f"min_results ({min_results}) is above max_results ({max_results})"
+            )
+        if wait_all and timeout is not None:
+            warnings.warn("collect_async(wait_all=True) ignores timeout", stacklevel=3)
+
+    def _auto_reset(self, max_episode_steps: int | None, on_done: bool) -> AutoResetContext:
+        return AutoResetContext(self._core, max_episode_steps, on_done)
+
+    # -- what was measured --------------------------------------------------------
+
+    def get_stats(self) -> dict[str, Any]:
+        """Throughput and latencies over the last ten seconds.
+
+        Keys: ``steps_per_second``; ``entries`` (by config entry, ``sync`` and ``async`` steps
+        per second); ``batch_size`` (mean, min, max); ``latency_us`` with ``p50`` and ``p99``
+        of ``step`` (in the env), ``wait`` (from sending until the env begins) and
+        ``transfer`` (from the env's end until the result is handed out).
+        """
+        return self._core.stats.summary()
+
+    def get_env_stats(self, reset: bool = False) -> dict[str, dict[str, Any]]:
+        """By env id: results, episodes ended, mean and last return and length.
+
+        Args:
+            reset: start the sums anew after this call.
+        """
+        found = self._core.stats.by_env()
+        if reset:
+            self._core.stats.reset_envs()
+        return found
+
+    def print_timing_summary(self) -> None:
+        """Print the figures of `get_stats` as a table."""
+        stats = self.get_stats()
+        print(f"{stats['steps_per_second']:12.0f} env steps per second")
+        for name, rates in stats["entries"].items():
+            print(f"{rates['sync'] + rates['async']:12.0f}   {name}")
+        for kind, figures in stats["latency_us"].items():
+            print(
+                f"{figures['p50']:12.1f} µs {kind} (median), {figures['p99']:.1f} µs (p99)"
+            )
+
+    def _closed(self) -> None:
+        self._finalizer.detach()
+        _warn_of(self._fleet.close_errors)
+
+
+def _warn_of(errors: Sequence[tuple[str, Any]]) -> None:
+    for env_id, error in errors:
+        warnings.warn(
+            f"close() of env {env_id!r} raised {error.type_name}: {error.text}", stacklevel=4
+        )

@@ -1,0 +1,595 @@
+"""`Fleet`: the hosts of a group, from their first start to their last breath.
+
+Rule: it starts workers, seats their envs in slabs, notices that one is dead or hung,
+replaces it and closes them all; what a reply means to a caller is the core's affair.
+Invariant: a request that a dead worker owed is answered exactly once, by a marked
+result of its replacement or by one error.
+"""
+
+from __future__ import annotations
+
+import pickle
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum, auto
+from math import ceil
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlightning_aio.config import EnvConfig
+from rlightning_aio.errors import (
+    ConfigError,
+    EnvHung,
+    GroupClosed,
+    RemoteTraceback,
+    StartFailed,
+    WorkerDied,
+)
+from rlightning_aio.group.slots import BUSY, Slots
+from rlightning_aio.group.wait import Operation, Wait, earliest
+from rlightning_aio.hosts.arena import Arena, map_shared
+from rlightning_aio.hosts.base import Death, Host
+from rlightning_aio.hosts.process import ForkServer
+from rlightning_aio.hosts.worker import AttachOrder, ErrorText, Started
+from rlightning_aio.protocol.columns import leaves
+from rlightning_aio.protocol.info import NO_INFO, PICKLED
+from rlightning_aio.protocol.rings import OP_BITS, RESET, ROW_MASK, SEQ_SHIFT, STEP
+from rlightning_aio.protocol.slab import NO_SEED, Slab
+from rlightning_aio.types import EnvMeta
+
+if TYPE_CHECKING:
+    from rlightning_aio.group.core import Core
+
+__all__ = ["Fleet"]
+
+_CLOSE_SECONDS = 1.5
+"""How long envs may take to close before their worker is killed."""
+
+
+class _Stage(Enum):
+    NEW = auto()
+    BUILDING = auto()
+    BUILT = auto()
+    ATTACHING = auto()
+    UP = auto()
+    FAILED = auto()
+    CLOSED = auto()
+
+
+@dataclass
+class _Member:
+    """What the fleet knows of one host."""
+
+    host: Host
+    config: EnvConfig
+    stage: _Stage = _Stage.NEW
+    started: list[Started] = field(default_factory=list[Started])
+    order: AttachOrder | None = None
+    start_by: float | None = None
+    restarts: int = 0
+    hung_slot: int | None = None
+    rebuild_error: ErrorText | None = None
+    failure: WorkerDied | None = None
+
+    @property
+    def timed(self) -> bool:
+        return self.config.step_timeout is not None or self.config.reset_timeout is not None
+
+
+class Fleet:
+    """The hosts of one group and the memory that they share with it.
+
+    Attributes:
+        lost: slots whose env was replaced while nothing was asked of it; the next step
+            has to tell.
+        restarting: slots whose next reply comes from a replacement, with the cause.
+        recovering: some worker was replaced and has not shown yet that it works.
+    """
+
+    def __init__(self, slots: Slots, arena: Arena, *, mixed_actions: bool) -> None:
+        self.slots = slots
+        self.hosts: list[Host] = []
+        self.slabs: list[Slab] = []
+        self.open = False
+        self.closed = False
+        self.elastic = False
+        self.lost: dict[int, Death] = {}
+        self.restarting: dict[int, Death] = {}
+        self.recovering = False
+        self.metas: list[EnvMeta] = []
+        self.close_errors: list[tuple[str, ErrorText]] = []
+        self.servers: list[ForkServer] = []
+        self._arena = arena
+        self._mixed_actions = mixed_actions
+        self._members: list[_Member] = []
+        self._start_fault: Exception | None = None
+        self._now = 0.0
+        self._timed = False
+        self._unavailable = False
+
+    def deliver_to(self, core: Core) -> None:
+        """Have hosts tell `core` of replies."""
+        self._core = core
+        self.on_reports = core.on_reports
+        self.on_rest = core.on_rest
+        self.on_value = core.on_value
+        self.on_error = core.on_error
+        self.on_schema = core.on_schema
+
+    def add(self, host: Host, config: EnvConfig) -> None:
+        """Take in a host, before `init`; its slots follow those of the host before."""
+        self.hosts.append(host)
+        self._members.append(_Member(host, config))
+        self._timed = self._timed or self._members[-1].timed
+
+    # -- start --------------------------------------------------------------------
+
+    def start(self, now: float) -> Operation[list[EnvMeta]]:
+        """Build all envs in parallel and seat them."""
+        if self.closed:
+            raise GroupClosed("this group is closed; build a new one")
+        if self.open:
+            return self.metas
+        try:
+            self._now = now
+            for member in self._members:
+                self._launch(member, now)
+            yield from self._until(_Stage.BUILT)
+            self._check_actions()
+            self._seat()
+            for member in self._members:
+                assert member.order is not None
+                member.stage = _Stage.ATTACHING
+                member.host.attach(member.order)
+            yield from self._until(_Stage.UP)
+        except BaseException:
+            yield from self.close(self._now)
+            raise
+        self.open = True
+        return self.metas
+
+    def _launch(self, member: _Member, now: float) -> None:
+        member.stage = _Stage.BUILDING
+        member.start_by = now + member.config.start_timeout
+        try:
+            member.host.start()
+        except OSError as error:
+            raise StartFailed(
+                f"can't start a worker for entry {member.config.name!r}: {error}; check its "
+                "`interpreter` and this machine's process and memory limits",
+                env_id=self._first_id(member),
+            ) from error
+
+    def _until(self, stage: _Stage) -> Operation[None]:
+        while any(m.stage.value < stage.value for m in self._members):
+            if self._start_fault is not None:
+                raise self._start_fault
+            self._now = yield Wait(earliest(*(m.start_by for m in self._members)))
+            self._check_start_times()
+        if self._start_fault is not None:
+            raise self._start_fault
+
+    def _check_start_times(self) -> None:
+        for member in self._members:
+            late = member.start_by is not None and self._now >= member.start_by
+            if late and member.stage in (_Stage.BUILDING, _Stage.ATTACHING):
+                member.start_by = None
+                if self.open:
+                    member.host.kill(dump=True)
+                elif self._start_fault is None:
+                    self._start_fault = StartFailed(
+                        f"{self._who(member)} did not start within "
+                        f"{member.config.start_timeout} s; raise start_timeout if it needs longer",
+                        env_id=self._first_id(member),
+                    )
+
+    def _first_id(self, member: _Member) -> str:
+        return self.slots.env_ids[member.host.first_slot]
+
+    def _who(self, member: _Member) -> str:
+        first = member.host.first_slot
+        more = f" (and {member.host.rows - 1} more in its worker)" if member.host.rows > 1 else ""
+        return self.slots.describe(first) + more
+
+    def on_started(self, host: Host, started: list[Started]) -> None:
+        """See `base.Inbox.on_started`."""
+        member = self._members[host.host_id]
+        if member.order is None:
+            member.started = started
+            member.stage = _Stage.BUILT
+        elif [s.layout.key for s in started] != [s.layout.key for s in member.started]:
+            self.on_start_error(
+                host, 0, ErrorText("ValueError", "its spaces changed with the restart", "")
+            )
+
+    def on_start_error(self, host: Host, row: int, error: ErrorText) -> None:
+        """See `base.Inbox.on_start_error`."""
+        member = self._members[host.host_id]
+        if member.order is not None:
+            member.rebuild_error = error
+            host.kill(dump=False)
+            return
+        slot = host.first_slot + row
+        # ConfigError keeps its type: what is wrong with the config is wrong everywhere.
+        fault: Exception
+        if error.type_name == "rlightning_aio.errors.ConfigError":
+            fault = ConfigError(error.text)
+        else:
+            fault = StartFailed(
+                f"{self.slots.describe(slot)} could not be built: {error.type_name}: "
+                f"{error.text}; the remote traceback is above",
+                env_id=self.slots.env_ids[slot],
+            )
+            fault.__cause__ = RemoteTraceback(error.traceback)
+        self._start_fault = self._start_fault or fault
+
+    def on_attached(self, host: Host) -> None:
+        """See `base.Inbox.on_attached`."""
+        member = self._members[host.host_id]
+        member.stage = _Stage.UP
+        member.start_by = None
+
+    def _check_actions(self) -> None:
+        """All envs must take actions of one shape, unless the group was built for more."""
+        self.metas = [s.meta for m in self._members for s in m.started]
+        if self._mixed_actions or not self.metas:
+            return
+        first = self.metas[0]
+        for meta in self.metas[1:]:
+            if _action_shape(meta) != _action_shape(first):
+                raise ConfigError(
+                    f"envs {first.env_id!r} and {meta.env_id!r} have different action spaces: "
+                    f"{first.action_space} and {meta.action_space}; if that is meant, build the "
+                    "group with mixed_actions=True"
+                )
+
+    def _seat(self) -> None:
+        """Give each env a row in the slab of its layout."""
+        table = self.slots
+        started = [s for m in self._members for s in m.started]
+        keys: dict[tuple[object, ...], int] = {}
+        rows_used: list[int] = []
+        for slot, env in enumerate(started):
+            slab = keys.setdefault(env.layout.key, len(keys))
+            if slab == len(rows_used):
+                rows_used.append(0)
+            table.slab[slot], table.row[slot] = slab, rows_used[slab]
+            rows_used[slab] += 1
+            table.by_frame[slot] = env.transforms_actions or env.layout.action_leaves is None
+            table.reads_extras[slot] = env.reads_extras
+            table.seed_offset[slot] = sum(s.meta.num_envs for s in started[:slot])
+        table.letters = bool(table.by_frame.any() or table.reads_extras.any())
+        parts = self._make_slabs([e.layout for e in started], list(keys.values()), rows_used)
+        for member in self._members:
+            first, count = member.host.first_slot, member.host.rows
+            seats = [(int(table.slab[s]), int(table.row[s])) for s in range(first, first + count)]
+            member.order = AttachOrder(tuple(parts), tuple(seats))
+            schemas: dict[int, Any] = {}
+            for row in range(count):
+                table.seat(first + row, member.host.host_id, row)
+                table.schemas[first + row] = schemas
+
+    def _make_slabs(
+        self, layouts: Sequence[Any], slabs: Sequence[int], rows_used: Sequence[int]
+    ) -> list[tuple[Any, int, int]]:
+        parts: list[tuple[Any, int, int]] = []
+        for slab in slabs:
+            layout = layouts[int(np.flatnonzero(self.slots.slab == slab)[0])]
+            size, rows = layout.size(rows_used[slab]), rows_used[slab]
+            offset = self._arena.append(size)
+            memory = map_shared(self._arena.descriptor, offset, size)
+            self.slabs.append(Slab(layout, memory, rows))
+            parts.append((layout, rows, offset))
+        return parts
+
+    # -- requests -----------------------------------------------------------------
+
+    def check_usable(self, slots: NDArray[np.intp]) -> None:
+        """Raises what befell the worker of a slot, if it was given up."""
+        if self._unavailable:
+            for host_id in np.unique(self.slots.host[slots]).tolist():
+                failure = self._members[host_id].failure
+                if failure is not None:
+                    raise failure
+
+    def check_steppable(self, slots: NDArray[np.intp]) -> None:
+        """Raises NotImplementedError for envs that have no synchronous step."""
+
+    def write_seeds(self, slots: NDArray[np.intp], seeds: NDArray[np.int64]) -> None:
+        """Put the seeds of resets into the rows."""
+        if len(self.slabs) == 1:
+            self.slabs[0].seed[self.slots.row[slots]] = seeds
+            return
+        for k, slot in enumerate(slots.tolist()):
+            self.slabs[self.slots.slab[slot]].seed[self.slots.row[slot]] = seeds[k]
+
+    def claim_lost(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Which of `slots` were replaced without anybody being told; the next reply tells."""
+        claimed = np.zeros(len(slots), np.bool_)
+        for k, slot in enumerate(slots.tolist()):
+            death = self.lost.pop(slot, None)
+            if death is not None:
+                self.restarting[slot] = death
+                claimed[k] = True
+        return claimed
+
+    def forget_lost(self, slots: NDArray[np.intp]) -> None:
+        """The envs are about to be reset: there is nothing to tell."""
+        if self.lost:
+            for slot in slots.tolist():
+                self.lost.pop(slot, None)
+
+    def order(self, wanted: int) -> bool:
+        """Ask hosts to wake us when `wanted` results may be ready; True if some are already.
+
+        Each of H busy hosts is asked for the H-th part, rounded up: when `wanted` results
+        are ready in all, at least one host has its part, so nobody wakes us too late.
+        """
+        busy = [host for host in self.hosts if host.in_flight]
+        part = ceil(wanted / len(busy)) if busy else 0
+        came = False
+        for host in busy:
+            came = host.order(min(part, host.in_flight)) or came
+        return came
+
+    def sweep(self) -> None:
+        """Take in results that came without a bell."""
+        for host in self.hosts:
+            # A host that was asked for a single result has rung if it has any.
+            if host.in_flight and host.ordered != 1:
+                host.sweep()
+
+    def run_inline(self, wanted: int) -> bool:
+        """Execute waiting requests of inline hosts, one, or as many as nothing else can give."""
+        inline = [host for host in self.hosts if host.in_flight and host.inline]
+        if not inline:
+            return False
+        if any(host.in_flight for host in self.hosts if not host.inline):
+            wanted = 1
+        for _ in range(wanted):
+            if not any(host.run_one() for host in inline):
+                break
+        return True
+
+    # -- faults -------------------------------------------------------------------
+
+    def next_check(self) -> float | None:
+        """When `check` must be called at the latest."""
+        times: list[float | None] = [m.start_by for m in self._members] if self.lost or (
+            self.restarting
+        ) else []
+        if self._timed:
+            times += [self._expiry(m) for m in self._members if m.timed and m.host.in_flight]
+        return earliest(*times)
+
+    def _expiry(self, member: _Member) -> float | None:
+        """When what a worker executes now will have taken too long."""
+        if member.stage is not _Stage.UP or member.hung_slot is not None:
+            return None
+        entry, since_ns = member.host.executing()
+        limits = (member.config.step_timeout, member.config.reset_timeout)
+        if not entry:
+            return self._now + min(limit for limit in limits if limit is not None)
+        op = int(self.slots.op[self._slot(member.host, entry)])
+        limit = limits[0] if op == STEP else limits[1] if op == RESET else None
+        return None if limit is None else since_ns / 1e9 + limit
+
+    @staticmethod
+    def _slot(host: Host, entry: int) -> int:
+        return host.first_slot + ((entry >> OP_BITS) & ROW_MASK)
+
+    def check(self, now: float) -> None:
+        """Find what has hung, in steps and in restarts."""
+        self._now = now
+        if not self.open:
+            raise GroupClosed("the group was closed while this call was waiting")
+        if self.lost or self.restarting:
+            self._check_start_times()
+        if not self._timed:
+            return
+        for member in self._members:
+            if member.timed and member.host.in_flight:
+                expiry = self._expiry(member)
+                entry, _ = member.host.executing()
+                if entry and expiry is not None and now >= expiry:
+                    member.hung_slot = self._slot(member.host, entry)
+                    member.host.kill(dump=True)
+
+    def on_death(self, host: Host, death: Death) -> None:
+        """See `base.Inbox.on_death`."""
+        member = self._members[host.host_id]
+        if member.stage.value < _Stage.UP.value and member.order is None or not self.open:
+            self._died_starting(member, death)
+            return
+        hung_slot, member.hung_slot = member.hung_slot, None
+        first, last = host.first_slot, host.first_slot + host.rows
+        owed = np.arange(first, last)[self.slots.state[first:last] == BUSY]
+        member.restarts += 1
+        self.recovering = True
+        if hung_slot is not None:
+            death = replace(death, cause=f"hung in {self._doing(hung_slot)} and was killed")
+        elif member.rebuild_error is not None:
+            error_text, member.rebuild_error = member.rebuild_error, None
+            death = replace(
+                death, cause=f"could not be rebuilt: {error_text.type_name}: {error_text.text}"
+            )
+        give_up = member.config.on_worker_death == "raise" or (
+            member.restarts > member.config.max_restarts
+        )
+        error = self._death_error(member, death, owed, hung_slot)
+        if give_up:
+            member.stage = _Stage.FAILED
+            member.failure = error
+            self._unavailable = True
+            if len(owed):
+                self._core.fail(owed.tolist(), error)
+            return
+        self._replace(member, death, owed, error)
+
+    def _died_starting(self, member: _Member, death: Death) -> None:
+        member.stage = _Stage.CLOSED
+        fault = StartFailed(
+            f"the worker of {self._who(member)} {death.cause} while it started"
+            + _said(death.stderr_tail),
+            env_id=self._first_id(member),
+        )
+        self._start_fault = self._start_fault or fault
+
+    def _replace(
+        self, member: _Member, death: Death, owed: NDArray[np.intp], error: WorkerDied
+    ) -> None:
+        """Start a new worker in place of a dead one, and let it answer for what was owed."""
+        table, host = self.slots, member.host
+        calls = [slot for slot in owed.tolist() if table.op[slot] not in (STEP, RESET)]
+        if calls:
+            self._core.fail(calls, error)
+        owed = owed[np.isin(table.op[owed], (STEP, RESET))]
+        schemas: dict[int, Any] = {}
+        # A new list: batches that were handed out go on reading the old one.
+        table.schemas = list(table.schemas)
+        for slot in range(host.first_slot, host.first_slot + host.rows):
+            self.lost[slot] = death
+            table.schemas[slot] = schemas
+        assert member.order is not None
+        try:
+            self._launch(member, self._now)
+        except StartFailed as fault:
+            self.on_death(host, Death(f"could not be replaced: {fault}"))
+            return
+        host.attach(member.order)
+        if len(owed):
+            table.number[owed] += 1
+            table.op[owed] = RESET
+            self.write_seeds(owed, np.full(len(owed), NO_SEED))
+            for slot in owed.tolist():
+                self.restarting[slot] = self.lost.pop(slot)
+            host.request((table.number[owed] << SEQ_SHIFT) | (table.code[owed] + 1))
+
+    def _doing(self, slot: int) -> str:
+        return {STEP: "a step", RESET: "a reset"}.get(int(self.slots.op[slot]), "a call")
+
+    def _death_error(
+        self, member: _Member, death: Death, owed: NDArray[np.intp], hung_slot: int | None
+    ) -> WorkerDied:
+        slot = int(owed[0]) if len(owed) else member.host.first_slot
+        if hung_slot is not None:
+            slot = hung_slot
+        table = self.slots
+        doing = self._doing(slot)
+        last = f"request {int(table.number[slot])}, {doing}" if table.number[slot] else "none"
+        names = ", ".join(table.ids(owed)) or "none"
+        kind = EnvHung if hung_slot is not None else WorkerDied
+        if hung_slot is not None:
+            config = member.config
+            limit = config.step_timeout if table.op[slot] == STEP else config.reset_timeout
+            what = f"{table.describe(slot)} took longer than {limit} s for {doing} and was killed"
+        else:
+            what = f"the worker of {self._who(member)} {death.cause}"
+        error = kind(
+            f"{what} (last request: {last}; envs that owed a reply: {names}; restarts in a row: "
+            f"{member.restarts - 1}, on_worker_death: {member.config.on_worker_death})"
+            + _said(death.stderr_tail),
+            env_id=table.env_ids[slot],
+            exit_code=death.exit_code,
+            stderr_tail=death.stderr_tail,
+        )
+        error.env_ids = tuple(table.ids(owed))
+        return error
+
+    def note_restarted(self, slots: NDArray[np.intp], rests: dict[int, Any]) -> None:
+        """Mark replies that come from a replacement; count what shows that it works."""
+        for slot in slots.tolist():
+            death = self.restarting.pop(slot, None)
+            if death is not None:
+                self._mark(slot, death, rests)
+            elif self.slots.op[slot] == STEP:
+                self._members[int(self.slots.host[slot])].restarts = 0
+        self.recovering = any(member.restarts for member in self._members)
+
+    def _mark(self, slot: int, death: Death, rests: dict[int, Any]) -> None:
+        slab, row = self.slabs[self.slots.slab[slot]], int(self.slots.row[slot])
+        slab.truncated[row] = True
+        slab.episode_length[row] = 0
+        rest = rests.get(slot) or {}
+        if isinstance(rest, bytes):
+            rest = pickle.loads(rest)
+        mark = int(slab.info_mark[row])
+        info = dict(rest.get("info", {}))
+        if mark not in (NO_INFO, PICKLED):
+            info = self.slots.schemas[slot][mark].decode(memoryview(slab.info[row]))
+        rests[slot] = {**rest, "info": {**info, "worker_restarted": death.cause}}
+
+    # -- close --------------------------------------------------------------------
+
+    def close(self, now: float) -> Operation[None]:
+        """Close all envs; kill the workers that don't make it in time. Idempotent."""
+        if self.closed:
+            return
+        self.closed = True
+        self.open = False
+        alive = [m for m in self._members if m.stage not in (_Stage.NEW, _Stage.CLOSED)]
+        for member in alive:
+            if member.stage is _Stage.FAILED:
+                member.stage = _Stage.CLOSED
+            else:
+                member.host.close()
+        try:
+            yield from self._until_closed(alive, now + _CLOSE_SECONDS)
+        finally:
+            for member in self._members:
+                if member.stage is not _Stage.NEW:
+                    member.host.release()
+            for server in self.servers:
+                server.release()
+            self._arena.close()
+
+    def abandon(self) -> None:
+        """Let go of everything at once: the group was dropped without being closed."""
+        if self.closed:
+            return
+        self.closed = True
+        self.open = False
+        started = any(m.stage is not _Stage.NEW for m in self._members)
+        for member in self._members:
+            if member.stage is not _Stage.NEW:
+                member.host.release()
+        for server in self.servers:
+            server.release()
+        self._arena.close()
+        if started:
+            warnings.warn("an EnvGroup was not closed; its envs were killed", ResourceWarning)
+
+    def _until_closed(self, members: list[_Member], by: float) -> Operation[None]:
+        killed = False
+        while any(m.stage is not _Stage.CLOSED for m in members):
+            now = yield Wait(None if killed else by)
+            if now >= by and not killed:
+                killed = True
+                for member in members:
+                    if member.stage is not _Stage.CLOSED:
+                        member.host.kill(dump=False)
+
+    def on_closed(self, host: Host, errors: list[tuple[int, ErrorText]]) -> None:
+        """See `base.Inbox.on_closed`."""
+        self._members[host.host_id].stage = _Stage.CLOSED
+        for row, error in errors:
+            self.close_errors.append((self.slots.env_ids[host.first_slot + row], error))
+
+
+def _action_shape(meta: EnvMeta) -> Any:
+    """Shapes of an action, without the batch axis."""
+    if meta.action_space is None:
+        return None
+    found = leaves(meta.action_space)
+    if found is None:
+        return str(meta.action_space)
+    skip = 1 if meta.num_envs > 1 else 0
+    return [(leaf.path, leaf.shape[skip:]) for leaf in found]
+
+
+def _said(stderr_tail: str) -> str:
+    lines = stderr_tail.strip().splitlines()[-20:]
+    return ("\nThe last lines it wrote:\n  " + "\n  ".join(lines)) if lines else ""

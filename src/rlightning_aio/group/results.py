@@ -1,0 +1,103 @@
+"""Ready rows become a batch: a few copies for each slab, none for each env."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlightning_aio.batch import BatchedData, Origin, ResultColumns
+from rlightning_aio.protocol.columns import Rows, gather, mapped
+from rlightning_aio.protocol.slab import Slab
+
+if TYPE_CHECKING:
+    from rlightning_aio.group.core import Core
+
+__all__ = ["collected"]
+
+def collected(core: Core, slots: NDArray[np.intp], rests: dict[int, Any]) -> BatchedData:
+    """A batch of the results of `slots`, which lie in their rows, in the order of `slots`."""
+    fleet, table = core.fleet, core.slots
+    if len(fleet.slabs) == 1:
+        parts = [_part(core, fleet.slabs[0], slots, None, rests)]
+    else:
+        slabs = table.slab[slots]
+        parts = [
+            _part(core, fleet.slabs[slab], slots[places], places, rests)
+            for slab in np.unique(slabs).tolist()
+            for places in (np.flatnonzero(slabs == slab),)
+        ]
+    return BatchedData.of_results(parts, Origin(core, slots, table))
+
+
+def _part(
+    core: Core,
+    slab: Slab,
+    slots: NDArray[np.intp],
+    positions: NDArray[np.intp] | None,
+    rests: dict[int, Any],
+) -> ResultColumns:
+    table = core.slots
+    rows: Rows = table.row[slots]
+    if slots is table.all:
+        rows = slice(0, slab.rows)
+    terminated, truncated = gather(slab.terminated, rows), gather(slab.truncated, rows)
+    ended = terminated | truncated
+    marks = gather(slab.info_mark, rows)
+    return ResultColumns(
+        slots=slots,
+        table=table,
+        positions=positions,
+        observation=_observations(core, slab, rows),
+        reward=gather(slab.reward, rows),
+        terminated=terminated,
+        truncated=truncated,
+        info_marks=marks,
+        info=gather(slab.info[:, : core.info_width], rows) if core.info_width else None,
+        schemas=table.schemas,
+        rests=_rests(slots, rests) if rests else {},
+        ended=ended,
+        episode_return=gather(slab.episode_return, rows) if ended.any() else None,
+        episode_length=gather(slab.episode_length, rows) if ended.any() else None,
+        done_ns=gather(slab.done_ns, rows),
+        busy_ns=gather(slab.busy_ns, rows),
+        agents=slab.layout.agents,
+    )
+
+
+def _observations(core: Core, slab: Slab, rows: Rows) -> Any:
+    """Fresh columns; read-only views where the group hands those out and the rows allow it."""
+    if slab.observation is None:
+        return None
+    if not core.zero_copy:
+        return gather(slab.observation, rows)
+    contiguous = _contiguous(rows)
+    if contiguous is None:
+        return gather(slab.observation, rows)
+
+    def view(array: NDArray[Any]) -> NDArray[Any]:
+        part = array[contiguous]
+        part.flags.writeable = False
+        return part
+
+    return mapped(view, slab.observation)
+
+
+def _contiguous(rows: Rows) -> slice | None:
+    if isinstance(rows, slice):
+        return rows
+    first, last = int(rows[0]), int(rows[-1])
+    if last - first + 1 == len(rows) and (np.diff(rows) == 1).all():
+        return slice(first, last + 1)
+    return None
+
+
+def _rests(slots: NDArray[np.intp], rests: dict[int, Any]) -> dict[int, Any]:
+    """Take what belongs to `slots`, by row of the batch."""
+    found: dict[int, Any] = {}
+    for row, slot in enumerate(slots.tolist()):
+        rest = rests.pop(slot, None)
+        if rest is not None:
+            found[row] = rest
+    return found

@@ -1,0 +1,113 @@
+"""`Slots`: what the core knows of each env, as one array for each fact.
+
+A slot is an env's position in its group. Facts are arrays so that a batch of thousands
+costs a few vector operations; nothing here walks envs one by one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlightning_aio.config import EnvConfig
+from rlightning_aio.errors import UnknownEnv
+from rlightning_aio.protocol.info import InfoSchema
+from rlightning_aio.protocol.rings import OP_BITS, STEP
+
+__all__ = ["BUSY", "IDLE", "READY", "Slots"]
+
+# States. Invariant: a request is sent to an IDLE slot only; a slot is READY from its
+# reply until the reply is handed out.
+IDLE: Final = 0
+BUSY: Final = 1
+READY: Final = 2
+
+
+class Slots:
+    """Arrays over the envs of a group.
+
+    Attributes:
+        env_ids, configs: of each slot.
+        host: host id; code: ring entry of a step, without its number.
+        state, number, op: of the current request; owner: 0 for `collect_async`, else the
+            id of the call that waits for it; sent_ns: when it was sent.
+        slab, row: where its results lie.
+        by_frame: actions may not fit the row; reads_extras: responses' extras are read there;
+            letters: either is true of any env.
+        seed_offset: sub-environments before it.
+        schemas: of its worker.
+    """
+
+    def __init__(self, configs: Sequence[EnvConfig], env_ids: Sequence[str]) -> None:
+        size = len(env_ids)
+        self.configs = list(configs)
+        self.env_ids = list(env_ids)
+        self._index = {env_id: slot for slot, env_id in enumerate(env_ids)}
+        self.all = np.arange(size)
+        self.host = np.zeros(size, np.int64)
+        self.code = np.zeros(size, np.int64)
+        self.state = np.zeros(size, np.int8)
+        self.number = np.zeros(size, np.int64)
+        self.op = np.zeros(size, np.int8)
+        self.owner = np.zeros(size, np.int64)
+        self.sent_ns = np.zeros(size, np.int64)
+        self.slab = np.zeros(size, np.intp)
+        self.row = np.zeros(size, np.intp)
+        self.by_frame = np.zeros(size, np.bool_)
+        self.reads_extras = np.zeros(size, np.bool_)
+        self.letters = False
+        self.seed_offset = np.zeros(size, np.int64)
+        self.schemas: list[dict[int, InfoSchema]] = [{} for _ in range(size)]
+
+    def __len__(self) -> int:
+        return len(self.env_ids)
+
+    def seat(self, slot: int, host_id: int, row: int) -> None:
+        """Say that `slot` is row `row` of a host."""
+        self.host[slot] = host_id
+        self.code[slot] = (row << OP_BITS) | STEP
+
+    def find(self, env_ids: Sequence[str]) -> NDArray[np.intp]:
+        """Slots of `env_ids`, in their order.
+
+        Raises:
+            UnknownEnv: an id is no env's of this group.
+        """
+        if len(env_ids) == len(self.env_ids) and list(env_ids) == self.env_ids:
+            return self.all
+        index = self._index
+        try:
+            return np.array([index[env_id] for env_id in env_ids], np.intp)
+        except KeyError as missing:
+            raise UnknownEnv(self._unknown(missing.args[0])) from None
+
+    def find_one(self, env_id: str) -> int:
+        """Slot of `env_id`; raises `UnknownEnv`."""
+        try:
+            return self._index[env_id]
+        except KeyError:
+            raise UnknownEnv(self._unknown(env_id)) from None
+
+    def _unknown(self, env_id: Any) -> str:
+        known = ", ".join(self.env_ids[:8]) + (", …" if len(self.env_ids) > 8 else "")
+        return f"no env of this group is called {env_id!r}; its envs are {known}"
+
+    def ids(self, slots: NDArray[np.intp]) -> list[str]:
+        """Ids of `slots`, in order."""
+        env_ids = self.env_ids
+        return [env_ids[slot] for slot in slots.tolist()]
+
+    def names(self, slots: NDArray[np.intp]) -> list[str]:
+        """Config entries of `slots`, in order."""
+        return [self.configs[slot].name for slot in slots.tolist()]
+
+    def describe(self, slot: int) -> str:
+        """How an error message names the env."""
+        config = self.configs[slot]
+        return (
+            f"env {self.env_ids[slot]!r} (entry {config.name!r}, backend {config.backend}, "
+            f"task {config.task!r})"
+        )

@@ -1,0 +1,154 @@
+"""What the group has measured: throughput, batch sizes, latencies, episodes.
+
+Rule: the hot path appends arrays it has anyway to a window; everything that is computed
+from them is computed when somebody asks.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlightning_aio.batch import BatchedData
+from rlightning_aio.group.slots import Slots
+
+__all__ = ["Stats"]
+
+_WINDOW_BATCHES: Final = 1024
+_WINDOW_SECONDS: Final = 10.0
+
+
+@dataclass(slots=True)
+class _Sample:
+    """One batch that was handed out. Times in ns of the monotonic clock."""
+
+    at_ns: int
+    slots: NDArray[np.intp]
+    sent_ns: NDArray[np.int64]
+    done_ns: NDArray[np.int64]
+    busy_ns: NDArray[np.int64]
+    synchronous: bool
+
+
+class Stats:
+    """Windows over what was handed out, and sums over the episodes that have ended."""
+
+    def __init__(self, slots: Slots) -> None:
+        self._table = slots
+        self._samples: deque[_Sample] = deque(maxlen=_WINDOW_BATCHES)
+        self._episodes = np.zeros(len(slots), np.int64)
+        self._returns = np.zeros(len(slots))
+        self._lengths = np.zeros(len(slots), np.int64)
+        self._last_return = np.full(len(slots), np.nan)
+        self._last_length = np.zeros(len(slots), np.int64)
+        self._env_steps = np.zeros(len(slots), np.int64)
+
+    def account(self, batch: BatchedData, *, synchronous: bool) -> None:
+        """Take note of a batch that is handed out."""
+        now = time.monotonic_ns()
+        for part in batch.parts:
+            slots = part.slots
+            self._samples.append(
+                _Sample(
+                    now, slots, self._table.sent_ns[slots], part.done_ns, part.busy_ns,
+                    synchronous,
+                )
+            )
+            self._env_steps[slots] += 1
+            if part.episode_return is not None and part.episode_length is not None:
+                self._note_episodes(
+                    part.slots, part.ended, part.episode_return, part.episode_length
+                )
+
+    def _note_episodes(
+        self,
+        slots: NDArray[np.intp],
+        ended: NDArray[np.bool_],
+        returns: NDArray[np.float64],
+        lengths: NDArray[np.int64],
+    ) -> None:
+        ended = ended & (lengths > 0)
+        for k in np.flatnonzero(ended.reshape(len(slots), -1).any(axis=1)).tolist():
+            slot, mask = slots[k], ended[k]
+            own_returns, own_lengths = np.atleast_1d(returns[k][mask]), lengths[k][mask]
+            self._episodes[slot] += own_returns.size
+            self._returns[slot] += own_returns.sum()
+            self._lengths[slot] += own_lengths.sum()
+            self._last_return[slot] = own_returns.ravel()[-1]
+            self._last_length[slot] = np.ravel(own_lengths)[-1]
+
+    def summary(self) -> dict[str, Any]:
+        """See `EnvGroup.get_stats`."""
+        samples = self._window()
+        if not samples:
+            return {"steps_per_second": 0.0, "entries": {}, "batch_size": {}, "latency_us": {}}
+        seconds = max((samples[-1].at_ns - samples[0].at_ns) / 1e9, 1e-9)
+        sizes = np.array([len(sample.slots) for sample in samples])
+        # The first batch opens the window: what it holds was made before.
+        counted = samples[1:]
+        return {
+            "steps_per_second": sum(len(s.slots) for s in counted) / seconds,
+            "entries": self._by_entry(counted, seconds),
+            "batch_size": {
+                "mean": float(sizes.mean()), "min": int(sizes.min()), "max": int(sizes.max())
+            },
+            "latency_us": self._latencies(samples),
+        }
+
+    def _window(self) -> list[_Sample]:
+        if not self._samples:
+            return []
+        since = self._samples[-1].at_ns - int(_WINDOW_SECONDS * 1e9)
+        return [sample for sample in self._samples if sample.at_ns >= since]
+
+    def _by_entry(self, samples: list[_Sample], seconds: float) -> dict[str, dict[str, float]]:
+        rates: dict[str, dict[str, float]] = {}
+        for sample in samples:
+            kind = "sync" if sample.synchronous else "async"
+            for name in self._table.names(sample.slots):
+                entry = rates.setdefault(name, {"sync": 0.0, "async": 0.0})
+                entry[kind] += 1.0 / seconds
+        return rates
+
+    @staticmethod
+    def _latencies(samples: list[_Sample]) -> dict[str, dict[str, float]]:
+        busy = np.concatenate([s.busy_ns for s in samples])
+        done = np.concatenate([s.done_ns for s in samples])
+        sent = np.concatenate([s.sent_ns for s in samples])
+        taken = np.concatenate([np.full(len(s.slots), s.at_ns) for s in samples])
+        kinds = {"step": busy, "wait": done - busy - sent, "transfer": taken - done}
+        return {
+            kind: {
+                "p50": float(np.percentile(values, 50)) / 1e3,
+                "p99": float(np.percentile(values, 99)) / 1e3,
+            }
+            for kind, values in kinds.items()
+        }
+
+    def by_env(self) -> dict[str, dict[str, Any]]:
+        """See `EnvGroup.get_env_stats`."""
+        found: dict[str, dict[str, Any]] = {}
+        for slot, env_id in enumerate(self._table.env_ids):
+            episodes = int(self._episodes[slot])
+            found[env_id] = {
+                "results": int(self._env_steps[slot]),
+                "episodes": episodes,
+                "mean_return": self._returns[slot] / episodes if episodes else None,
+                "mean_length": self._lengths[slot] / episodes if episodes else None,
+                "last_return": float(self._last_return[slot]) if episodes else None,
+                "last_length": int(self._last_length[slot]) if episodes else None,
+            }
+        return found
+
+    def reset_envs(self) -> None:
+        """Start the sums over episodes anew."""
+        for sums in (
+            self._episodes, self._returns, self._lengths, self._last_length, self._env_steps,
+        ):
+            sums[:] = 0
+        self._last_return[:] = np.nan

@@ -1,0 +1,31 @@
+"""`Wait` and `Operation`: how the core says that it can't go on yet."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass
+from typing import TypeAlias, TypeVar
+
+__all__ = ["Operation", "Wait", "earliest"]
+
+T = TypeVar("T")
+
+
+@dataclass(slots=True)
+class Wait:
+    """Block until a source tells something, or until `until` (monotonic seconds).
+
+    A time that has passed means: look at all sources once, without blocking.
+    """
+
+    until: float | None = None
+
+
+Operation: TypeAlias = Generator[Wait, float, T]
+"""Yields what it waits for, is sent the time, returns its result."""
+
+
+def earliest(*times: float | None) -> float | None:
+    """The first of the times that are known."""
+    known = [time for time in times if time is not None]
+    return min(known) if known else None

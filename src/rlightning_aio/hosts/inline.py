@@ -1,0 +1,184 @@
+"""`InlineHost`: envs in the trainer's own process, with the same rows and rules.
+
+Requests wait in a queue; one is executed whenever a driver has nothing ready and asks
+for it (`run_one`), so sending never blocks here either. An env blocks the process
+while it steps; nothing protects the trainer from an env that crashes.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rlightning_aio.hosts.arena import Arena, map_shared
+from rlightning_aio.hosts.base import Inbox
+from rlightning_aio.hosts.runner import EnvRunner, Rest
+from rlightning_aio.hosts.worker import (
+    AttachOrder,
+    ErrorText,
+    StartOrder,
+    Started,
+    build_env,
+)
+from rlightning_aio.protocol import rings as ring_entries
+from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
+from rlightning_aio.protocol.slab import Slab
+
+__all__ = ["InlineHost"]
+
+
+class InlineHost:
+    """See `base.Host`. It has no descriptor and is never watched."""
+
+    def __init__(
+        self, host_id: int, first_slot: int, order: StartOrder, arena: Arena, inbox: Inbox
+    ) -> None:
+        self.host_id = host_id
+        self.first_slot = first_slot
+        self.rows = len(order.worker_indices)
+        self.in_flight = 0
+        self.ordered = 0
+        self.inline = True
+        self._order = order
+        self._arena = arena
+        self._inbox = inbox
+        self._runners: list[EnvRunner] = []
+        self._queue: deque[Callable[[], None]] = deque()
+        self._schemas = InfoSchemas(self._announce)
+
+    def fileno(self) -> int:
+        """There is none."""
+        raise ValueError("an inline host has no descriptor")
+
+    def on_readable(self) -> None:
+        """Never called."""
+
+    def on_writable(self) -> None:
+        """Never called."""
+
+    def start(self) -> None:
+        """Build the envs here and now."""
+        order = self._order
+        for row, (index, fn) in enumerate(
+            zip(order.worker_indices, order.preprocess_fns, strict=True)
+        ):
+            try:
+                env = build_env(order.config, order.env_class, index, fn)
+                self._runners.append(EnvRunner(env, keeps_tensors=True))
+            except Exception as error:
+                self._inbox.on_start_error(self, row, ErrorText.of(error))
+                return
+        self._inbox.on_started(self, [Started.of(runner) for runner in self._runners])
+
+    def attach(self, order: AttachOrder) -> None:
+        """See `base.Host.attach`."""
+        slabs = [
+            Slab(
+                layout, map_shared(self._arena.descriptor, offset, layout.size(rows)), rows
+            )
+            for layout, rows, offset in order.slabs
+        ]
+        for runner, (slab_index, row) in zip(self._runners, order.rows, strict=True):
+            runner.attach(slabs[slab_index], row, self._schemas.announce)
+        self._inbox.on_attached(self)
+
+    def _announce(self, number: int, schema: InfoSchema) -> None:
+        self._inbox.on_schema(self, number, schema)
+
+    def request(self, entries: NDArray[np.int64]) -> None:
+        """See `base.Host.request`."""
+        for entry in entries.tolist():
+            row = (entry >> ring_entries.OP_BITS) & ring_entries.ROW_MASK
+            number = entry >> ring_entries.SEQ_SHIFT
+            runner = self._runners[row]
+            stepped = entry & ring_entries.OP_MASK == ring_entries.STEP
+            self._enqueue(row, number, runner.step if stepped else runner.reset_from_row)
+
+    def request_step(self, row: int, number: int, action: Any, extras: dict[str, Any]) -> None:
+        """See `base.Host.request_step`."""
+        runner = self._runners[row]
+        self._enqueue(row, number, lambda: runner.step_with(action, extras))
+
+    def request_reset(
+        self, row: int, number: int, seed: int | None, options: dict[str, Any] | None
+    ) -> None:
+        """See `base.Host.request_reset`."""
+        runner = self._runners[row]
+        self._enqueue(row, number, lambda: runner.reset(seed, options))
+
+    def request_call(
+        self, row: int, number: int, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]
+    ) -> None:
+        """See `base.Host.request_call`."""
+
+        def call() -> None:
+            value = self._runners[row].call(name, args, kwargs)
+            self._inbox.on_value(self, row, number, value)
+
+        self.in_flight += 1
+        self._queue.append(lambda: self._guarded(row, number, call))
+
+    def _enqueue(self, row: int, number: int, execute: Callable[[], Rest | None]) -> None:
+        def run() -> None:
+            began = time.monotonic_ns()
+            rest = execute()
+            done = time.monotonic_ns()
+            self._runners[row].stamp(done, done - began)
+            if rest is None:
+                entries = np.array([ring_entries.entry(number, row, 0)], np.int64)
+                self._inbox.on_reports(self, entries)
+            else:
+                self._inbox.on_rest(self, row, number, rest)
+
+        self.in_flight += 1
+        self._queue.append(lambda: self._guarded(row, number, run))
+
+    def _guarded(self, row: int, number: int, run: Callable[[], None]) -> None:
+        try:
+            run()
+        except Exception as error:
+            self._inbox.on_error(self, row, number, ErrorText.of(error))
+
+    def order(self, count: int) -> bool:
+        """Nothing gets ready by itself here."""
+        return False
+
+    def sweep(self) -> None:
+        """Nothing gets ready by itself here."""
+
+    def run_one(self) -> bool:
+        """See `base.Host.run_one`."""
+        if not self._queue:
+            return False
+        self.in_flight -= 1
+        self._queue.popleft()()
+        return True
+
+    def executing(self) -> tuple[int, int]:
+        """Nothing is being executed while somebody can ask."""
+        return 0, 0
+
+    def kill(self, *, dump: bool) -> None:
+        """An inline env can't be killed."""
+
+    def close(self) -> None:
+        """Close the envs here and now."""
+        errors: list[tuple[int, ErrorText]] = []
+        for row, runner in enumerate(self._runners):
+            try:
+                runner.env.close()
+            except Exception as error:
+                errors.append((row, ErrorText.of(error)))
+        self.release()
+        self._inbox.on_closed(self, errors)
+
+    def release(self) -> None:
+        """Drop the envs and what was asked of them."""
+        self._runners.clear()
+        self._queue.clear()
+        self.in_flight = 0

@@ -1,0 +1,313 @@
+"""`EnvRunner`: executes requests on one env and puts the results into its row.
+
+The same code runs in a worker process and, for inline placement, in the trainer.
+What of a result doesn't fit the row (a pickled observation, a nested info) is
+returned as a dict, the *rest*; None means that the row holds everything.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from rlightning_aio.envs.base import BaseEnv, default_env_preprocess_fn
+from rlightning_aio.protocol.columns import row_reader, row_writer
+from rlightning_aio.protocol.info import PICKLED, InfoSchema, InfoWriter
+from rlightning_aio.protocol.slab import NO_SEED, RowLayout, Slab
+from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
+
+__all__ = ["EnvRunner", "Rest"]
+
+Rest = dict[str, Any]
+"""Keys: ``observation``, ``info``, ``extra`` (the result's ``_extra``), ``ret`` (all of it)."""
+
+
+class EnvRunner:
+    """One env and its row.
+
+    Args:
+        env: built, not yet initialised.
+        keeps_tensors: results that hold torch tensors are handed over whole and untouched
+            (inline placement); otherwise tensors become NumPy arrays on the CPU.
+    """
+
+    def __init__(self, env: BaseEnv, *, keeps_tensors: bool = False) -> None:
+        self.env = env
+        self.meta: EnvMeta = env.init()
+        self._keeps_tensors = keeps_tensors
+        self.step: Callable[[], Rest | None] = self._not_attached
+
+    @property
+    def layout(self) -> RowLayout:
+        """The row that this env needs."""
+        meta = self.meta
+        sub_envs = (meta.num_envs,) if meta.num_envs > 1 else ()
+        agents = (len(meta.agents),) if meta.agents else ()
+        if meta.observation_space is None or meta.action_space is None:
+            raise TypeError(
+                f"env {meta.env_id!r} reports no "
+                f"{'observation' if meta.observation_space is None else 'action'} space"
+            )
+        return RowLayout(
+            meta.observation_space, meta.action_space, (*agents, *sub_envs), meta.agents
+        )
+
+    @property
+    def reads_extras(self) -> bool:
+        """Whether anything here can read more of a response than a plain action."""
+        return self.env.bare_step() is None and (
+            not type(self.env).__module__.startswith("rlightning_aio.envs.")
+            or self.env._preprocess_fn is not default_env_preprocess_fn  # pyright: ignore[reportPrivateUsage]
+        )
+
+    @property
+    def transforms_actions(self) -> bool:
+        """Whether an action may have any shape and type."""
+        return (
+            self.env.transforms_actions
+            or self.env._preprocess_fn is not default_env_preprocess_fn  # pyright: ignore[reportPrivateUsage]
+        )
+
+    def attach(self, slab: Slab, row: int, announce: Callable[[InfoSchema], int]) -> None:
+        """Take `row` of `slab` for all further results."""
+        layout = self.layout
+        self._row = row
+        self._slab = slab
+        self._write_observation: Callable[[Any], None] | None = None
+        if slab.observation is not None:
+            self._write_observation = row_writer(
+                layout.observation_space, slab.observation, row, "observation"
+            )
+        self._read_action: Callable[[], Any] | None = None
+        if slab.action is not None:
+            self._read_action = row_reader(layout.action_space, slab.action, row)
+        self._info_writer = InfoWriter(memoryview(slab.info[row]), announce)
+        self._episode_return = np.zeros(layout.head)
+        self._episode_length = np.zeros(layout.head, np.int64)
+        self.step = self._stepper()
+
+        self._done_ns = memoryview(slab.done_ns)
+        self._busy_ns = memoryview(slab.busy_ns)
+
+    def stamp(self, done_ns: int, busy_ns: int) -> None:
+        """Write when the reply was ready and how long the env took."""
+        self._done_ns[self._row] = done_ns
+        self._busy_ns[self._row] = busy_ns
+
+    def action_in_row(self) -> Any:
+        """A copy of the action that the row holds."""
+        if self._read_action is None:
+            raise RuntimeError("actions of this env don't travel in its row")
+        return self._read_action()
+
+    def call(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """Call a method of the env; ``get_attr`` and ``set_attr`` reach through wrappers."""
+        if name == "get_attr":
+            return get_attr(self.env, *args, **kwargs)
+        if name == "set_attr":
+            return set_attr(self.env, *args, **kwargs)
+        method = getattr(self.env, name, None)
+        if method is None:
+            method = getattr(self.env.env, name)
+        return method(*args, **kwargs)
+
+    def _not_attached(self) -> Rest | None:
+        raise RuntimeError("this env has no row yet")
+
+    def _stepper(self) -> Callable[[], Rest | None]:
+        bare = self.env.bare_step()
+        read_action = self._read_action
+        if read_action is None:
+            return lambda: self.step_with(None, {})
+        if bare is None or self._write_observation is None or self._slab.layout.head:
+            return lambda: self.step_with(read_action(), {})
+        self.reset_episode, step = _bare_stepper(
+            bare, read_action, self._write_observation, self._info_writer.write, self._slab,
+            self._row,
+        )
+        return step
+
+    def reset_episode(self) -> None:
+        """Forget what was summed up of the current episode."""
+        self._episode_return[...] = 0.0
+        self._episode_length[...] = 0
+
+    def step_with(self, action: Any, extras: dict[str, Any]) -> Rest | None:
+        """Step with an action that didn't come through the row, or with extras."""
+        bare = self.env.bare_step()
+        if bare is not None:
+            observation, reward, terminated, truncated, info = bare(action)
+            result = EnvRet.model_construct(
+                env_id=self.env.env_id,
+                observation=observation,
+                last_reward=reward,
+                last_terminated=terminated,
+                last_truncated=truncated,
+                info=info,
+            )
+        else:
+            result = self.env.step(PolicyResponse(self.env.env_id, action, **extras))
+        return self._store(result, stepped=True)
+
+    def reset(self, seed: int | None, options: dict[str, Any] | None) -> Rest | None:
+        """Start a new episode."""
+        result = self.env.reset(seed=seed, options=options)
+        self.reset_episode()
+        return self._store(result, stepped=False)
+
+    def reset_from_row(self) -> Rest | None:
+        """Start a new episode with the seed that the row holds."""
+        seed = int(self._slab.seed[self._row])
+        return self.reset(None if seed == NO_SEED else seed, None)
+
+    def _store(self, result: Any, *, stepped: bool) -> Rest | None:
+        if not isinstance(result, EnvRet | MultiAgentEnvRet):
+            raise TypeError(
+                f"{'step' if stepped else 'reset'}() of env {self.env.env_id!r} must return an "
+                f"EnvRet or a MultiAgentEnvRet, not {type(result).__name__}"
+            )
+        rest: Rest = {}
+        if _holds_tensor(result.observation):
+            if self._keeps_tensors:
+                rest["ret"] = result
+            observation = _as_numpy(result.observation)
+        else:
+            observation = result.observation
+        self._store_head(result, stepped=stepped)
+        if "ret" in rest:
+            return rest
+        if self._write_observation is None:
+            rest["observation"] = observation
+        else:
+            self._write_observation(observation)
+        self._store_info(result.info, rest)
+        if result._extra:  # pyright: ignore[reportPrivateUsage]
+            rest["extra"] = result._extra  # pyright: ignore[reportPrivateUsage]
+        return rest or None
+
+    def _store_head(self, result: EnvRet | MultiAgentEnvRet, *, stepped: bool) -> None:
+        slab, row = self._slab, self._row
+        reward, terminated, truncated = slab.reward[row : row + 1], slab.terminated, slab.truncated
+        if not stepped:
+            reward[...] = 0.0
+            terminated[row] = truncated[row] = False
+            return
+        agents = slab.layout.agents
+        self._store_flag("reward", slab.reward, result.last_reward, agents)
+        self._store_flag("terminated", terminated, result.last_terminated, agents)
+        self._store_flag("truncated", truncated, result.last_truncated, agents)
+        self._episode_return += slab.reward[row]
+        self._episode_length += 1
+        ended = terminated[row] | truncated[row]
+        if ended.any():
+            slab.episode_return[row] = self._episode_return
+            slab.episode_length[row] = self._episode_length
+            self._episode_return[ended] = 0.0
+            self._episode_length[ended] = 0
+
+    def _store_flag(self, what: str, column: Any, value: Any, agents: tuple[str, ...]) -> None:
+        head = column.shape[1:]
+        if agents:
+            value = [_as_numpy(value[agent]) for agent in agents]
+        array = np.asarray(_as_numpy(value))
+        if array.shape != head and array.size == column[self._row].size:
+            array = array.reshape(head)  # ManiSkill's (1,) for one sub-environment, say.
+        if array.shape != head:
+            raise ValueError(
+                f"{what} of env {self.env.env_id!r} has shape {array.shape}, expected {head}"
+            )
+        column[self._row] = array
+
+    def _store_info(self, info: dict[str, Any], rest: Rest) -> None:
+        mark = self._info_writer.write(info)
+        if mark == PICKLED:
+            rest["info"] = _as_numpy(info)
+        self._slab.info_mark[self._row] = mark
+
+
+def _bare_stepper(
+    bare: Callable[[Any], tuple[Any, Any, Any, Any, dict[str, Any]]],
+    read_action: Callable[[], Any],
+    write_observation: Callable[[Any], None],
+    write_info: Callable[[dict[str, Any]], int],
+    slab: Slab,
+    row: int,
+) -> tuple[Callable[[], None], Callable[[], Rest | None]]:
+    """The hot path of plain Gymnasium envs: (forget the episode, step).
+
+    Closures over memoryviews: assigning an element of one costs a fifth of assigning an
+    element of an array.
+    """
+    rewards = memoryview(slab.reward)
+    terminations = memoryview(slab.terminated)
+    truncations = memoryview(slab.truncated)
+    marks = memoryview(slab.info_mark)
+    episode_return = 0.0
+    episode_length = 0
+
+    def forget() -> None:
+        nonlocal episode_return, episode_length
+        episode_return, episode_length = 0.0, 0
+
+    def step() -> Rest | None:
+        nonlocal episode_return, episode_length
+        observation, reward, terminated, truncated, info = bare(read_action())
+        write_observation(observation)
+        rewards[row] = reward
+        terminations[row] = terminated
+        truncations[row] = truncated
+        episode_return += reward
+        episode_length += 1
+        if terminated or truncated:
+            slab.episode_return[row] = episode_return
+            slab.episode_length[row] = episode_length
+            episode_return, episode_length = 0.0, 0
+        mark = write_info(info)
+        marks[row] = mark
+        return {"info": info} if mark == PICKLED else None
+
+    return forget, step
+
+
+def _target(env: BaseEnv, target: str) -> Any:
+    inner = env.env
+    if target == "outer" or inner is None:
+        return env if inner is None else inner
+    if target == "unwrapped":
+        return getattr(inner, "unwrapped", inner)
+    raise ValueError(f"target must be 'unwrapped' or 'outer', not {target!r}")
+
+
+def get_attr(env: BaseEnv, name: str, target: str = "unwrapped") -> Any:
+    """Attribute `name` of the simulator itself, or of its outermost wrapper."""
+    return getattr(_target(env, target), name)
+
+
+def set_attr(env: BaseEnv, name: str, value: Any, target: str = "unwrapped") -> None:
+    """Set attribute `name` of the simulator itself, or of its outermost wrapper."""
+    setattr(_target(env, target), name, value)
+
+
+def _is_tensor(value: Any) -> bool:
+    return type(value).__module__.partition(".")[0] == "torch" and hasattr(value, "detach")
+
+
+def _holds_tensor(value: Any) -> bool:
+    if isinstance(value, dict):
+        return any(map(_holds_tensor, value.values()))
+    if isinstance(value, tuple | list):
+        return any(map(_holds_tensor, value))
+    return _is_tensor(value)
+
+
+def _as_numpy(value: Any) -> Any:
+    """`value` with every torch tensor in it as a NumPy array on the CPU."""
+    if _is_tensor(value):
+        return value.detach().cpu().numpy()
+    if isinstance(value, dict):
+        return {key: _as_numpy(inner) for key, inner in value.items()}
+    if type(value) in (tuple, list):
+        return type(value)(_as_numpy(inner) for inner in value)
+    return value

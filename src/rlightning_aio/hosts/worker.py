@@ -1,0 +1,372 @@
+"""The other end of a process host: a plain blocking loop around a few envs.
+
+Rule: one thread, no asyncio; requests are executed in the order in which they were
+sent, and every request gets exactly one reply under its own number. When there is
+nothing to do the worker spins for a moment (where that has paid lately), then sleeps
+on its channel.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import importlib
+import os
+import pickle
+import socket
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import cloudpickle
+
+from rlightning_aio.config import EnvConfig
+from rlightning_aio.envs.base import BaseEnv
+from rlightning_aio.hosts.arena import map_shared
+from rlightning_aio.hosts.runner import EnvRunner, Rest
+from rlightning_aio.protocol import rings as ring_entries
+from rlightning_aio.protocol.frames import BELL, Frame, FrameKind, FrameReader, encode
+from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
+from rlightning_aio.protocol.rings import WorkerRings, rings_size
+from rlightning_aio.protocol.slab import RowLayout, Slab
+from rlightning_aio.registry import ENVS
+from rlightning_aio.types import EnvMeta
+
+__all__ = ["NO_ACTION", "AttachOrder", "ErrorText", "StartOrder", "Started", "Worker", "main"]
+
+NO_ACTION = "the action is in the row"
+_SPIN_SECONDS = 60e-6
+
+
+@dataclass(frozen=True)
+class StartOrder:
+    """What a worker is to build; travels by cloudpickle.
+
+    Attributes:
+        config: the entry.
+        env_class: the class itself where it was registered in the trainer by hand;
+            None lets the worker resolve the entry's backend.
+        worker_indices: which envs of the entry.
+        preprocess_fns: one for each of them; None for the default.
+        spins: whether waiting may burn a core for some microseconds.
+        core: the core to stay on; None for any.
+    """
+
+    config: EnvConfig
+    env_class: type[BaseEnv] | None
+    worker_indices: tuple[int, ...]
+    preprocess_fns: tuple[Any, ...]
+    spins: bool
+    core: int | None
+
+
+@dataclass(frozen=True)
+class AttachOrder:
+    """Where a worker's envs write.
+
+    Attributes:
+        slabs: layout, rows and offset in the arena of each slab.
+        rows: for each env which slab and which row of it.
+    """
+
+    slabs: tuple[tuple[RowLayout, int, int], ...]
+    rows: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True)
+class Started:
+    """What a worker tells of an env that it has built."""
+
+    meta: EnvMeta
+    layout: RowLayout
+    reads_extras: bool
+    transforms_actions: bool
+
+    @classmethod
+    def of(cls, runner: EnvRunner) -> Started:
+        """What `runner` has to tell."""
+        return cls(runner.meta, runner.layout, runner.reads_extras, runner.transforms_actions)
+
+
+@dataclass(frozen=True)
+class ErrorText:
+    """An exception as text: it crosses processes whatever its class is like."""
+
+    type_name: str
+    text: str
+    traceback: str
+
+    @classmethod
+    def of(cls, error: BaseException) -> ErrorText:
+        """`error` in words; a broken ``__str__`` is no obstacle."""
+        kind = type(error)
+        name = kind.__qualname__
+        if kind.__module__ != "builtins":
+            name = f"{kind.__module__}.{name}"
+        try:
+            text = str(error)
+        except Exception as broken:
+            text = f"<its __str__ raised {type(broken).__name__}>"
+        try:
+            lines = "".join(traceback.format_exception(error))
+        except Exception:
+            lines = "".join(traceback.format_tb(error.__traceback__)) + f"{name}: {text}\n"
+        return cls(name, text, lines)
+
+
+def build_env(config: EnvConfig, env_class: type[BaseEnv] | None, index: int, fn: Any) -> BaseEnv:
+    """Import what the entry asks for and build env `index` of it."""
+    for module in config.imports:
+        importlib.import_module(module)
+    env_class = env_class or ENVS.resolve(config.backend)
+    return env_class(config, worker_index=index, preprocess_fn=fn)
+
+
+class TrainerGone(Exception):
+    """The channel has closed from the other side."""
+
+
+class Worker:
+    """Serves the envs of one worker until told to close, or until the trainer is gone.
+
+    Args:
+        channel: blocking stream socket to the trainer.
+        arena: descriptor of the group's shared memory.
+        rings_memory: this worker's rings, mapped.
+        rows: envs that it will hold.
+    """
+
+    def __init__(
+        self, channel: socket.socket, arena: int, rings_memory: memoryview, rows: int
+    ) -> None:
+        self._channel = channel
+        self._arena = arena
+        self._frames = FrameReader()
+        self._rings = WorkerRings(rings_memory, rows)
+        self._runners: list[EnvRunner] = []
+        self._schemas = InfoSchemas(self._send_schema)
+        self._spin_seconds = 0.0
+        self._failed_spins = 0
+        self._attached = False
+        self._closing = False
+
+    def serve(self) -> None:
+        """Run until told to close; envs are closed on every way out."""
+        try:
+            while not self._attached and not self._closing:
+                self._receive(0)
+            while not self._closing:
+                self._run_requests()
+                self._wait()
+        except (TrainerGone, BrokenPipeError, ConnectionResetError):
+            for runner in self._runners:
+                with contextlib.suppress(Exception):
+                    runner.env.on_disconnect()
+        finally:
+            if not self._closing:
+                self._close_envs()
+
+    def _run_requests(self) -> None:
+        """Execute what the ring holds; frames in between, as they come."""
+        rings, runners = self._rings, self._runners
+        clock = time.monotonic_ns
+        began = clock()
+        while True:
+            if rings.has_frame():
+                self._receive(socket.MSG_DONTWAIT)
+                began = clock()
+            request = 0 if self._closing else rings.next_request()
+            if not request:
+                rings.idle()
+                return
+            row = (request >> ring_entries.OP_BITS) & ring_entries.ROW_MASK
+            rings.begin(request, began)
+            runner = runners[row]
+            try:
+                if request & ring_entries.OP_MASK == ring_entries.STEP:
+                    rest = runner.step()
+                else:
+                    rest = runner.reset_from_row()
+            except BaseException as error:
+                self._send_error(row, request >> ring_entries.SEQ_SHIFT, error)
+                began = clock()
+                continue
+            done = clock()
+            runner.stamp(done, done - began)
+            began = done
+            if rest is not None:
+                self._send_rest(row, request >> ring_entries.SEQ_SHIFT, rest)
+            elif rings.report(request):
+                self._channel.send(BELL)
+
+    def _wait(self) -> None:
+        """Return when there may be something to do."""
+        if self._closing or (self._spin_seconds and self._spun()):
+            return
+        if self._rings.fall_asleep():
+            self._receive(0)
+            self._rings.wake_up()
+
+    def _spun(self) -> bool:
+        """Look for work for a few microseconds without sleeping; whether some came.
+
+        A sleeping process takes tens of microseconds to wake. Spinning yields the core to
+        whoever wants it, and pauses for a while after it was in vain a few times.
+        """
+        if self._failed_spins > 8:
+            self._failed_spins = (self._failed_spins + 1) % 64
+            return False
+        has_request, has_frame = self._rings.has_request, self._rings.has_frame
+        until = time.monotonic() + self._spin_seconds
+        while time.monotonic() < until:
+            if has_request() or has_frame():
+                self._failed_spins = 0
+                return True
+            os.sched_yield()
+        self._failed_spins += 1
+        return False
+
+    def _receive(self, flags: int) -> None:
+        try:
+            data = self._channel.recv(1 << 18, flags)
+        except BlockingIOError:
+            return
+        if not data:
+            raise TrainerGone
+        for frame in self._frames.feed(data):
+            self._rings.frame_seen()
+            self._handle(frame)
+
+    def _handle(self, frame: Frame) -> None:
+        """Execute one frame and answer it."""
+        self._rings.begin(ring_entries.entry(frame.number, frame.row, 0), time.monotonic_ns())
+        try:
+            self._handlers[frame.kind](self, frame)
+        except (TrainerGone, BrokenPipeError, ConnectionResetError):
+            raise
+        except BaseException as error:
+            self._send_error(frame.row, frame.number, error)
+        self._rings.idle()
+
+    def _start(self, frame: Frame) -> None:
+        order: StartOrder = cloudpickle.loads(frame.payload)
+        if order.core is not None:
+            os.sched_setaffinity(0, {order.core})
+        self._spin_seconds = _SPIN_SECONDS if order.spins else 0.0
+        for row, (index, fn) in enumerate(
+            zip(order.worker_indices, order.preprocess_fns, strict=True)
+        ):
+            try:
+                env = build_env(order.config, order.env_class, index, fn)
+                self._runners.append(EnvRunner(env))
+            except BaseException as error:
+                self._send_error(row, frame.number, error)
+                return
+        started = [Started.of(runner) for runner in self._runners]
+        # What was built stays: sparing the collector from walking it saves time and pages.
+        gc.collect()
+        gc.freeze()
+        self._send(FrameKind.STARTED, frame, cloudpickle.dumps(started))
+
+    def _attach(self, frame: Frame) -> None:
+        """Map the slabs; the arena's descriptor was inherited for this."""
+        order: AttachOrder = pickle.loads(frame.payload)
+        slabs = [
+            Slab(layout, map_shared(self._arena, offset, layout.size(rows)), rows)
+            for layout, rows, offset in order.slabs
+        ]
+        os.close(self._arena)
+        for runner, (slab_index, row) in zip(self._runners, order.rows, strict=True):
+            runner.attach(slabs[slab_index], row, self._schemas.announce)
+        self._attached = True
+        self._send(FrameKind.ATTACHED, frame)
+
+    def _step(self, frame: Frame) -> None:
+        action, extras = pickle.loads(frame.payload)
+        runner = self._runners[frame.row]
+        if type(action) is str and action == NO_ACTION:
+            action = runner.action_in_row()
+        began = time.monotonic_ns()
+        rest = runner.step_with(action, extras)
+        done = time.monotonic_ns()
+        runner.stamp(done, done - began)
+        self._send_rest(frame.row, frame.number, rest or {})
+
+    def _reset(self, frame: Frame) -> None:
+        seed, options = pickle.loads(frame.payload)
+        runner = self._runners[frame.row]
+        began = time.monotonic_ns()
+        rest = runner.reset(seed, options)
+        done = time.monotonic_ns()
+        runner.stamp(done, done - began)
+        self._send_rest(frame.row, frame.number, rest or {})
+
+    def _call(self, frame: Frame) -> None:
+        name, args, kwargs = cloudpickle.loads(frame.payload)
+        value = self._runners[frame.row].call(name, args, kwargs)
+        self._send(FrameKind.VALUE, frame, _dumped(value, f"what {name}() returned"))
+
+    def _close(self, frame: Frame) -> None:
+        self._closing = True
+        errors = self._close_envs()
+        self._send(FrameKind.CLOSED, frame, pickle.dumps(errors))
+
+    _handlers: ClassVar[dict[int, Callable[[Worker, Frame], None]]] = {
+        FrameKind.START: _start,
+        FrameKind.ATTACH: _attach,
+        FrameKind.STEP: _step,
+        FrameKind.RESET: _reset,
+        FrameKind.CALL: _call,
+        FrameKind.CLOSE: _close,
+    }
+
+    def _close_envs(self) -> list[tuple[int, ErrorText]]:
+        errors: list[tuple[int, ErrorText]] = []
+        for row, runner in enumerate(self._runners):
+            try:
+                runner.env.close()
+            except BaseException as error:
+                errors.append((row, ErrorText.of(error)))
+        self._runners.clear()
+        return errors
+
+    def _send(self, kind: FrameKind, asked: Frame, payload: bytes = b"") -> None:
+        self._channel.sendall(encode(kind, asked.row, asked.number, payload))
+        self._rings.count_frame()
+
+    def _send_rest(self, row: int, number: int, rest: Rest) -> None:
+        try:
+            payload = _dumped(rest, "the result")
+        except BaseException as error:
+            self._send_error(row, number, error)
+            return
+        self._channel.sendall(encode(FrameKind.RESULT, row, number, payload))
+        self._rings.count_frame()
+
+    def _send_error(self, row: int, number: int, error: BaseException) -> None:
+        payload = pickle.dumps(ErrorText.of(error))
+        self._channel.sendall(encode(FrameKind.ERROR, row, number, payload))
+        self._rings.count_frame()
+
+    def _send_schema(self, number: int, schema: InfoSchema) -> None:
+        payload = pickle.dumps(schema)
+        self._channel.sendall(encode(FrameKind.INFO_SCHEMA, 0, number, payload))
+        self._rings.count_frame()
+
+
+def _dumped(value: Any, what: str) -> bytes:
+    try:
+        return pickle.dumps(value, pickle.HIGHEST_PROTOCOL)
+    except Exception:
+        try:
+            return cloudpickle.dumps(value)
+        except Exception as error:
+            raise TypeError(f"{what} can't be pickled: {error}") from error
+
+
+def main(channel: socket.socket, arena: int, rings_offset: int, rows: int) -> None:
+    """Run a worker in this process; returns when it has closed."""
+    rings_memory = map_shared(arena, rings_offset, rings_size(rows))
+    Worker(channel, arena, rings_memory, rows).serve()

@@ -1,0 +1,410 @@
+"""A client's end of env_server, without I/O: being let in, and doing each thing once.
+
+Rule: a request is executed at most once; a repeated one gets the reply it got before, an
+older one is refused. Messages and what happens to the connection come in, messages pile
+up to be taken out, and time is an argument.
+Absent on purpose: sockets, keys, and the env itself.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import TYPE_CHECKING, Any, Final, cast
+
+from rlightning_aio.protocol.payload import Outcome, Packed, ResultLayout, SpaceLayout
+from rlightning_aio.protocol.server_session import PATIENCE, random_token
+from rlightning_aio.protocol.space_description import describe
+from rlightning_aio.protocol.wire import (
+    VERSION,
+    Bye,
+    Failure,
+    FromServer,
+    Gone,
+    Hello,
+    Part,
+    Ping,
+    Pong,
+    Reader,
+    Refusal,
+    Reset,
+    Result,
+    Step,
+    Untransferable,
+    Welcome,
+    WireError,
+    Writer,
+    portable,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    import gymnasium as gym
+
+    from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet
+
+__all__ = ["ClientSession", "Ended", "Phase", "Refused", "ResetRequest", "StepRequest"]
+
+_SECONDS_BETWEEN_WARNINGS: Final = 10.0
+_SECONDS_BETWEEN_HELLOS: Final = (0.5, 8.0)
+"""At first, and at most after refusals; doubled from one to the next."""
+
+_MAX_TEXT: Final = 50_000
+
+_log = logging.getLogger(__name__)
+
+
+class Phase(Enum):
+    """How a client stands with its server."""
+
+    AWAY = "not connected"
+    GREETING = "asking to be let in"
+    RESUMING = "reconnected, asking whether the session goes on"
+    SERVING = "serving"
+
+
+@dataclass(frozen=True, slots=True)
+class StepRequest:
+    """Step the env, then call `ClientSession.finish` or `ClientSession.fail`."""
+
+    number: int
+    action: Any
+    extras: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class ResetRequest:
+    """Reset the env, then call `ClientSession.finish` or `ClientSession.fail`."""
+
+    number: int
+    seed: int | list[int] | None = None
+    options: dict[str, Any] | None = field(default=None)
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """The session is over, and with it the trainer's hold on the env; another may follow."""
+
+    cause: str
+
+
+@dataclass(frozen=True, slots=True)
+class Refused:
+    """The server will not let this client in, now or later."""
+
+    code: str
+    text: str
+
+
+Event = StepRequest | ResetRequest | Ended | Refused
+
+
+class ClientSession:
+    """All sessions of one client, one after the other.
+
+    Args:
+        meta: of the env, as it reports it.
+        name: of the client, unique at its server.
+        heartbeat: seconds within which a dead server is found, until the server says its own.
+        free_actions: the env takes actions that need not fit its action space.
+        reads_extras: something reads what the policy attaches beside the action.
+        new_token: makes nonces.
+
+    Attributes:
+        phase: how things stand.
+        outbox: messages to be sent, oldest first; whoever sends them takes them out.
+        malformed: messages dropped because they were none.
+        refusal: why the server said no last, until it says yes.
+
+    Raises:
+        UnsupportedSpace: a space can't be announced.
+    """
+
+    def __init__(
+        self,
+        meta: EnvMeta,
+        name: str,
+        *,
+        heartbeat: float,
+        free_actions: bool = False,
+        reads_extras: bool = False,
+        new_token: Callable[[], int] = random_token,
+    ) -> None:
+        self.phase = Phase.AWAY
+        self.outbox: deque[list[bytes]] = deque()
+        self.malformed = 0
+        self.refusal: str | None = None
+        self._name = name
+        self._heartbeat = heartbeat
+        self._new_token = new_token
+        self._free_actions = free_actions
+        self._hello = Hello(
+            version=VERSION,
+            name=name,
+            nonce=0,
+            observation_space=describe(meta.observation_space, "the observation space"),
+            action_space=describe(meta.action_space, "the action space"),
+            num_envs=meta.num_envs,
+            agents=[*meta.agents],
+            max_episode_steps=meta.max_episode_steps,
+            free_actions=free_actions,
+            reads_extras=reads_extras,
+        )
+        # Neither is None, or it couldn't have been described.
+        observation_space = cast("gym.Space[Any]", meta.observation_space)
+        action_space = cast("gym.Space[Any]", meta.action_space)
+        self._results = ResultLayout(observation_space, meta.num_envs, meta.agents)
+        self._actions = SpaceLayout(action_space, "action")
+        self._reader: Reader[FromServer] = Reader(FromServer)
+        self._writer = Writer()
+        self._session: int | None = None
+        self._number = -1
+        self._reply: list[bytes] = []
+        self._ask_at: float | None = None
+        self._give_up_at: float | None = None
+        self._pause = _SECONDS_BETWEEN_HELLOS[0]
+        self._lost_keys: set[str] = set()
+        self._warned_at: float | None = None
+
+    # The connection
+
+    def connected(self, now: float) -> None:
+        """A connection to the server stands."""
+        self._give_up_at = None
+        self._pause = _SECONDS_BETWEEN_HELLOS[0]
+        if self._session is None:
+            self._greet_at(now)
+        else:
+            self.phase = Phase.RESUMING
+        self._ask(now)
+
+    def disconnected(self, now: float) -> None:
+        """The connection broke; it may come back."""
+        if self.phase is not Phase.AWAY:
+            self.phase, self._ask_at = Phase.AWAY, None
+            if self._session is not None:
+                self._give_up_at = now + 2 * self._heartbeat / PATIENCE
+
+    def _greet_at(self, when: float) -> None:
+        self.phase, self._ask_at = Phase.GREETING, when
+        self._hello.nonce = self._new_token()
+
+    def _ask(self, now: float) -> None:
+        """Say what must be heard, and when to say it again: it may get lost."""
+        if self.phase is Phase.GREETING:
+            self._send(self._hello)
+        elif self._session is not None:
+            self._send(Ping(session=self._session))
+        self._ask_at = now + self._pause
+
+    def deadline(self) -> float | None:
+        """When `tick` is due (monotonic seconds); None if never."""
+        return self._ask_at if self._give_up_at is None else self._give_up_at
+
+    def tick(self, now: float) -> Ended | None:
+        """Ask again, or give the server up, if it is time to."""
+        if self._give_up_at is not None and now >= self._give_up_at:
+            return self._end("the connection to the server broke and did not come back")
+        if self._ask_at is not None and now >= self._ask_at:
+            self._ask(now)
+        return None
+
+    # What arrives
+
+    def receive(self, parts: Sequence[Part], now: float) -> Event | None:
+        """Take in one message; never raises for what it holds.
+
+        Returns:
+            What to do: a `StepRequest` or `ResetRequest` must be answered before the next
+            message is received.
+        """
+        try:
+            message, frames = self._reader.read(parts)
+            if isinstance(message, Welcome):
+                return self._on_welcome(message)
+            if isinstance(message, Refusal):
+                return self._on_refusal(message, now)
+            if message.session != self._session:
+                self._on_stranger(message)
+                return None
+            return self._on_message(message, frames, now)
+        except WireError as error:
+            self._complain(str(error), now)
+            return None
+
+    def _on_message(
+        self,
+        message: Step | Reset | Ping | Pong | Gone | Bye,
+        frames: Sequence[Part],
+        now: float,
+    ) -> Event | None:
+        if isinstance(message, Gone):
+            self._greet_at(now)
+            return self._end(f"the server ended the session: {message.text[:1000]}")
+        if isinstance(message, Bye):
+            # Not at once: a server that closes would only be asked in vain.
+            self._greet_at(now + self._pause)
+            return self._end(f"the server closed: {message.reason[:1000]}")
+        self.phase, self._ask_at = Phase.SERVING, None
+        if isinstance(message, Ping):
+            self._send(Pong(session=message.session, number=message.number))
+            return None
+        return None if isinstance(message, Pong) else self._on_request(message, frames, now)
+
+    def _on_request(
+        self, message: Step | Reset, frames: Sequence[Part], now: float
+    ) -> Event | None:
+        if message.number == self._number:
+            self.outbox.append(self._reply)
+            return None
+        if message.number < self._number:
+            self._refuse_stale(message)
+            return None
+        if isinstance(message, Reset):
+            return ResetRequest(message.number, message.seed, message.options)
+        if self._free_actions:
+            return StepRequest(message.number, message.action, message.extras)
+        try:
+            action = self._actions.unpack(frames, message.texts)
+        except WireError as error:
+            self._complain(str(error), now)
+            self.fail(message.number, type(error).__name__, str(error), "")
+            return None
+        return StepRequest(message.number, action, message.extras)
+
+    def _refuse_stale(self, message: Step | Reset) -> None:
+        text = f"request {message.number} is older than {self._number}, which is done"
+        self._send(
+            Failure(
+                session=message.session,
+                number=message.number,
+                exception_type="StaleRequest",
+                text=text,
+                traceback="",
+            )
+        )
+
+    def _on_welcome(self, welcome: Welcome) -> Event | None:
+        if welcome.session == self._session:
+            # The server is still waiting for the first result, or was when it said so.
+            if self._number == 0:
+                self.outbox.append(self._reply)
+            return None
+        if self.phase is not Phase.GREETING or welcome.nonce != self._hello.nonce:
+            return None
+        self.phase, self._ask_at, self.refusal = Phase.SERVING, None, None
+        self._session = self._hello.previous = welcome.session
+        self._heartbeat = welcome.heartbeat
+        self._number = -1
+        return ResetRequest(0)
+
+    def _on_refusal(self, refusal: Refusal, now: float) -> Event | None:
+        if self.phase is not Phase.GREETING or refusal.nonce != self._hello.nonce:
+            return None
+        self.refusal = refusal.text
+        if not refusal.retry:
+            self._ask_at = None
+            return Refused(refusal.code, refusal.text)
+        _log.info("%s: refused for now: %s", self._name, refusal.text)
+        self._pause = min(2 * self._pause, _SECONDS_BETWEEN_HELLOS[1])
+        self._ask_at = now + self._pause
+        return None
+
+    def _on_stranger(self, message: Step | Reset | Ping | Pong | Gone | Bye) -> None:
+        # The server keeps a session that this client has given up, or never knew of.
+        if not isinstance(message, Gone | Bye | Pong):
+            self._send(Bye(session=message.session, reason="this client holds no such session"))
+
+    def _end(self, cause: str) -> Ended:
+        self._session = self._give_up_at = None
+        self._reply = []
+        return Ended(cause)
+
+    def _complain(self, text: str, now: float) -> None:
+        self.malformed += 1
+        if self._warned_at is None or now - self._warned_at >= _SECONDS_BETWEEN_WARNINGS:
+            self._warned_at = now
+            _log.warning("%s dropped a message (%d so far): %s", self._name, self.malformed, text)
+
+    # What the env did
+
+    def finish(self, number: int, ret: EnvRet | MultiAgentEnvRet) -> None:
+        """Answer request `number` with `ret`.
+
+        What of its info can't travel is left out; one warning names each such key.
+
+        Raises:
+            Misfit: it doesn't fit the announced spaces; nothing was sent.
+        """
+        if self._session is None:
+            return
+        outcome = Outcome(ret.observation, ret.last_reward, ret.last_terminated, ret.last_truncated)
+        result = Result(
+            session=self._session,
+            number=number,
+            sent_ns=ret.ts_env_sent_ns,
+            info=ret.info,
+            # The contract gives this field its name.
+            extra=ret._extra,  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
+        )
+        packed = Packed([], result.texts)
+        header = self._results.pack(outcome, packed)
+        result.reward, result.terminated, result.truncated = header[1:]
+        self._answer(number, self._written(result, packed.frames))
+
+    def _written(self, result: Result, frames: list[bytes]) -> list[bytes]:
+        try:
+            return self._writer.write(result, frames.copy())
+        except Untransferable:
+            lost: list[str] = []
+            result.info = portable(result.info, lost)
+            result.extra = portable(result.extra, lost)
+        try:
+            parts = self._writer.write(result, frames.copy())
+        except Untransferable as error:
+            lost.append(f"everything ({error})")
+            result.info, result.extra = {}, {}
+            parts = self._writer.write(result, frames.copy())
+        if new := sorted({*lost} - self._lost_keys):
+            self._lost_keys.update(new)
+            _log.warning(
+                "%s: of the env's info, %s can't travel and is left out",
+                self._name, ", ".join(new),
+            )  # fmt: skip
+        return parts
+
+    def fail(self, number: int, exception_type: str, text: str, traceback: str) -> None:
+        """Answer request `number` with the exception that it raised."""
+        if self._session is not None:
+            failure = Failure(
+                session=self._session,
+                number=number,
+                exception_type=_sayable(exception_type),
+                text=_sayable(text),
+                traceback=_sayable(traceback),
+            )
+            self._answer(number, self._writer.write(failure))
+
+    def _answer(self, number: int, parts: list[bytes]) -> None:
+        self._number, self._reply = number, parts
+        self.outbox.append(parts)
+
+    def leave(self, reason: str) -> None:
+        """Say goodbye, if there is anyone to say it to."""
+        if self._session is not None:
+            self._send(Bye(session=self._session, reason=reason))
+        self._session = self._ask_at = None
+        self.phase = Phase.AWAY
+
+    def _send(self, message: Any) -> None:
+        self.outbox.append(self._writer.write(message))
+
+
+def _sayable(text: str) -> str:
+    """`text` without what UTF-8 can't say, and no longer than anyone will read."""
+    if len(text) > 2 * _MAX_TEXT:
+        text = f"{text[:_MAX_TEXT]}\n…\n{text[-_MAX_TEXT:]}"
+    return text.encode(errors="replace").decode()

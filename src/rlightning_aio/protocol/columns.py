@@ -1,0 +1,221 @@
+"""Spaces as columns: which spaces fit in fixed-size memory, and how values get in and out.
+
+A tree has the shape of its space: an array for Box, Discrete, MultiBinary and
+MultiDiscrete, a dict for Dict, a tuple for Tuple. Every array of a tree carries rows
+on its first axis.
+Absent on purpose: Text, Sequence, Graph and other spaces without a fixed size; they
+travel pickled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+__all__ = [
+    "Leaf",
+    "Misfit",
+    "Rows",
+    "Tree",
+    "assemble",
+    "gather",
+    "index",
+    "leaf_of",
+    "leaves",
+    "mapped",
+    "row_reader",
+    "row_writer",
+]
+
+Tree: TypeAlias = Any
+"""An array, or a dict or tuple of trees."""
+Rows: TypeAlias = "slice | NDArray[np.intp]"
+"""Which rows: a slice for a contiguous range, else an index array."""
+
+_FIXED = (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete)
+
+
+@dataclass(frozen=True, slots=True)
+class Leaf:
+    """One array of a tree: its place, and the shape and dtype of one row."""
+
+    path: tuple[str | int, ...]
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+
+    @property
+    def name(self) -> str:
+        """The place as a person would write it; empty for a space of one array."""
+        return "".join(f"[{key!r}]" for key in self.path)
+
+
+def leaves(space: gym.Space[Any]) -> tuple[Leaf, ...] | None:
+    """The arrays that a value of `space` consists of, or None if it has no fixed size."""
+    found = list(_walk(space, ()))
+    return None if None in found else tuple(leaf for leaf in found if leaf is not None)
+
+
+def _walk(space: gym.Space[Any], path: tuple[str | int, ...]) -> Iterator[Leaf | None]:
+    if isinstance(space, _FIXED) and space.dtype is not None and space.dtype != object:
+        yield Leaf(path, tuple(space.shape), np.dtype(space.dtype))
+    elif isinstance(space, spaces.Dict):
+        for key, inner in space.spaces.items():
+            yield from _walk(inner, (*path, key))
+    elif isinstance(space, spaces.Tuple):
+        for position, inner in enumerate(space.spaces):
+            yield from _walk(inner, (*path, position))
+    else:
+        yield None
+
+
+def assemble(space: gym.Space[Any], arrays: Iterator[NDArray[Any]]) -> Tree:
+    """Arrange `arrays`, given in the order of `leaves`, in the shape of `space`."""
+    if isinstance(space, spaces.Dict):
+        return {key: assemble(inner, arrays) for key, inner in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        return tuple(assemble(inner, arrays) for inner in space.spaces)
+    return next(arrays)
+
+
+def leaf_of(space_leaves: Sequence[Leaf], tree: Tree) -> Iterator[tuple[Leaf, NDArray[Any]]]:
+    """Each leaf with its array of `tree`."""
+    for leaf in space_leaves:
+        array = tree
+        for key in leaf.path:
+            array = array[key]
+        yield leaf, array
+
+
+def mapped(function: Callable[[NDArray[Any]], Any], tree: Tree) -> Tree:
+    """`tree` with `function` applied to each array."""
+    if isinstance(tree, dict):
+        return {key: mapped(function, inner) for key, inner in tree.items()}
+    if isinstance(tree, tuple):
+        return tuple(mapped(function, inner) for inner in tree)
+    return function(tree)
+
+
+def gather(tree: Tree, rows: Rows) -> Tree:
+    """A fresh copy of `rows` of each array."""
+    if isinstance(tree, np.ndarray):
+        return tree[rows].copy() if isinstance(rows, slice) else tree.take(rows, axis=0)
+    return mapped(lambda array: gather(array, rows), tree)
+
+
+def index(tree: Tree, position: int) -> Tree:
+    """Row `position` of each array: a view, or a NumPy scalar where a row is one number."""
+    return tree[position] if isinstance(tree, np.ndarray) else mapped(lambda a: a[position], tree)
+
+
+class Misfit(ValueError):
+    """A value doesn't fit the space it was declared for."""
+
+
+def _fitted(value: Any, leaf: Leaf, what: str) -> NDArray[Any]:
+    array = np.asarray(value)
+    if array.shape != leaf.shape or not np.can_cast(array.dtype, leaf.dtype, "same_kind"):
+        raise Misfit(
+            f"{what}{leaf.name} doesn't fit its space: expected shape {leaf.shape} and dtype "
+            f"{leaf.dtype}, found shape {array.shape} and dtype {array.dtype}"
+        )
+    return array
+
+
+def row_writer(
+    space: gym.Space[Any], tree: Tree, row: int, what: str, path: tuple[str | int, ...] = ()
+) -> Callable[[Any], None]:
+    """A function that copies one value of `space` into `row` of `tree`.
+
+    Floats may be narrowed (float64 into float32), as Gymnasium's vector environments do.
+
+    Raises (from the function):
+        Misfit: the value has another shape, structure, or kind of dtype; the row may hold
+            a part of it.
+    """
+    if isinstance(space, spaces.Dict):
+        return _dict_writer(space, tree, row, what, path)
+    if isinstance(space, spaces.Tuple):
+        return _tuple_writer(space, tree, row, what, path)
+    leaf = Leaf(path, tree.shape[1:], tree.dtype)
+    if not leaf.shape:
+        return _number_writer(tree, row, leaf, what)
+    view, shape, dtype = tree[row], leaf.shape, leaf.dtype
+
+    def write(value: Any) -> None:
+        if type(value) is not np.ndarray or value.shape != shape or value.dtype is not dtype:
+            value = _fitted(value, leaf, what)
+        view[...] = value
+
+    return write
+
+
+def _number_writer(
+    column: NDArray[Any], row: int, leaf: Leaf, what: str
+) -> Callable[[Any], None]:
+    def write(value: Any) -> None:
+        column[row] = _fitted(value, leaf, what)
+
+    return write
+
+
+def _dict_writer(
+    space: spaces.Dict, tree: Tree, row: int, what: str, path: tuple[str | int, ...]
+) -> Callable[[Any], None]:
+    writers = {
+        key: row_writer(inner, tree[key], row, what, (*path, key))
+        for key, inner in space.spaces.items()
+    }
+
+    def write(value: Any) -> None:
+        if not hasattr(value, "keys") or value.keys() != writers.keys():
+            found = sorted(map(str, value.keys())) if hasattr(value, "keys") else type(value)
+            raise Misfit(
+                f"{what}{Leaf(path, (), np.dtype(bool)).name} doesn't fit its space: expected a "
+                f"dict with keys {sorted(map(str, writers))}, found {found}"
+            )
+        for key, writer in writers.items():
+            writer(value[key])
+
+    return write
+
+
+def _tuple_writer(
+    space: spaces.Tuple, tree: Tree, row: int, what: str, path: tuple[str | int, ...]
+) -> Callable[[Any], None]:
+    writers = [
+        row_writer(inner, part, row, what, (*path, position))
+        for position, (inner, part) in enumerate(zip(space.spaces, tree, strict=True))
+    ]
+
+    def write(value: Any) -> None:
+        if not isinstance(value, tuple | list) or len(value) != len(writers):
+            raise Misfit(
+                f"{what}{Leaf(path, (), np.dtype(bool)).name} doesn't fit its space: expected a "
+                f"tuple of {len(writers)}, found {type(value).__name__}"
+            )
+        for writer, part in zip(writers, value, strict=True):
+            writer(part)
+
+    return write
+
+
+def row_reader(space: gym.Space[Any], tree: Tree, row: int) -> Callable[[], Any]:
+    """A function that returns a copy of the value in `row`, as an env expects it.
+
+    The caller owns the value: nothing that is written to the row later changes it.
+    """
+    if isinstance(space, spaces.Dict):
+        readers = {k: row_reader(inner, tree[k], row) for k, inner in space.spaces.items()}
+        return lambda: {key: reader() for key, reader in readers.items()}
+    if isinstance(space, spaces.Tuple):
+        parts = [row_reader(s, t, row) for s, t in zip(space.spaces, tree, strict=True)]
+        return lambda: tuple(reader() for reader in parts)
+    if tree.ndim == 1:
+        return lambda: tree[row]
+    return tree[row].copy

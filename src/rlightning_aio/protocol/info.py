@@ -1,0 +1,172 @@
+"""Small info dicts in shared memory: written without pickling, decoded only when read.
+
+Most envs report the same few numbers under the same keys at every step. The worker
+announces such a shape once, as a schema, and from then on packs only the values into
+the row. An info that fits no schema (nested, strings, too large) travels pickled.
+Types survive: a NumPy scalar comes back as the NumPy scalar it was.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+__all__ = ["INFO_BYTES", "NO_INFO", "PICKLED", "InfoSchema", "InfoWriter"]
+
+INFO_BYTES: Final = 512
+NO_INFO: Final = 0
+PICKLED: Final = 255
+"""Row marks: 0 no info, 1 to 254 the number of a schema, 255 the info is in the frame."""
+
+_MAX_SCHEMAS: Final = 254
+
+_SCALARS: Final[dict[type, str]] = {
+    float: "d",
+    np.float64: "d",
+    np.float32: "f",
+    int: "q",
+    np.int64: "q",
+    np.int32: "i",
+    bool: "?",
+    np.bool_: "?",
+}
+
+
+@dataclass(frozen=True)
+class InfoSchema:
+    """How a row holds infos of one shape.
+
+    Attributes:
+        keys: the dict's keys, in order.
+        types: the exact type of each value.
+        arrays: for each value shape and dtype if it is an array, else None.
+        format: `struct` format of all values.
+    """
+
+    keys: tuple[str, ...]
+    types: tuple[type, ...]
+    arrays: tuple[tuple[tuple[int, ...], str] | None, ...]
+    format: str
+
+    @classmethod
+    def of(cls, info: dict[str, Any]) -> InfoSchema | None:
+        """The schema of `info`, or None if it can't travel in a row."""
+        arrays: list[tuple[tuple[int, ...], str] | None] = []
+        codes = "="
+        for key, value in info.items():
+            if type(key) is not str:
+                return None
+            if type(value) is np.ndarray and not value.dtype.hasobject:
+                arrays.append((value.shape, value.dtype.str))
+                codes += f"{value.nbytes}s"
+            elif (code := _SCALARS.get(type(value))) is not None:
+                arrays.append(None)
+                codes += code
+            else:
+                return None
+        if struct.calcsize(codes) > INFO_BYTES:
+            return None
+        return cls(tuple(info), tuple(map(type, info.values())), tuple(arrays), codes)
+
+    @property
+    def size(self) -> int:
+        """Bytes of a row that it uses."""
+        return struct.calcsize(self.format)
+
+    def decode(self, row: bytes | memoryview) -> dict[str, Any]:
+        """The info that `row` holds; arrays are fresh and writable."""
+        values = struct.unpack_from(self.format, row)
+        return {
+            key: _restored(value, value_type, array)
+            for key, value, value_type, array in zip(
+                self.keys, values, self.types, self.arrays, strict=True
+            )
+        }
+
+
+def _restored(value: Any, value_type: type, array: tuple[tuple[int, ...], str] | None) -> Any:
+    if array is None:
+        return value_type(value)
+    shape, dtype = array
+    return np.frombuffer(value, dtype).reshape(shape).copy()
+
+
+class InfoWriter:
+    """The worker's side for one env: packs infos into its row.
+
+    Args:
+        row: the row's info bytes, writable.
+        announce: tells the trainer of a new schema; returns its number, or `PICKLED` if
+            the worker has announced too many.
+    """
+
+    def __init__(self, row: memoryview, announce: Callable[[InfoSchema], int]) -> None:
+        self._row = row
+        self._announce = announce
+        self._keys: list[str] = []
+        self._types: list[type] = []
+        self._arrays: list[tuple[int, tuple[int, ...], np.dtype[Any]]] = []
+        self._number = PICKLED
+        self._pack: Callable[..., None] = struct.Struct("").pack_into
+
+    def write(self, info: dict[str, Any]) -> int:
+        """Put `info` into the row; the mark that says how, `PICKLED` if it can't be."""
+        if not info:
+            return NO_INFO
+        if [*info] != self._keys or [*map(type, info.values())] != self._types:
+            self._adopt(info)
+        if self._number == PICKLED:
+            return PICKLED
+        try:
+            if self._arrays:
+                return self._write_arrays(info)
+            self._pack(self._row, 0, *info.values())
+        except struct.error:  # An int beyond 64 bits.
+            return PICKLED
+        return self._number
+
+    def _write_arrays(self, info: dict[str, Any]) -> int:
+        values = list(info.values())
+        for position, shape, dtype in self._arrays:
+            array = values[position]
+            if array.shape != shape or array.dtype != dtype:
+                self._keys = []  # Another schema; take it up at the next write.
+                return PICKLED
+            values[position] = array.tobytes()
+        self._pack(self._row, 0, *values)
+        return self._number
+
+    def _adopt(self, info: dict[str, Any]) -> None:
+        self._keys = [*info]
+        self._types = [*map(type, info.values())]
+        schema = InfoSchema.of(info)
+        self._number = PICKLED if schema is None else self._announce(schema)
+        if schema is not None:
+            self._pack = struct.Struct(schema.format).pack_into
+            self._arrays = [
+                (position, array[0], np.dtype(array[1]))
+                for position, array in enumerate(schema.arrays)
+                if array is not None
+            ]
+
+
+class InfoSchemas:
+    """The schemas that one worker has announced, numbered from 1 (its own side of them)."""
+
+    def __init__(self, send: Callable[[int, InfoSchema], None]) -> None:
+        self._numbers: dict[InfoSchema, int] = {}
+        self._send = send
+
+    def announce(self, schema: InfoSchema) -> int:
+        """The number of `schema`; sent to the trainer when it is new."""
+        number = self._numbers.get(schema)
+        if number is None:
+            if len(self._numbers) >= _MAX_SCHEMAS:
+                return PICKLED
+            number = self._numbers[schema] = len(self._numbers) + 1
+            self._send(number, schema)
+        return number

@@ -1,0 +1,295 @@
+"""Observations, actions, rewards and flags as raw array frames, by their spaces.
+
+Rule: both ends derive the same order of frames from the same announced spaces, so a
+frame carries bytes alone; a frame of another size is refused before anything is made of
+it, and a value of another shape before anything is sent.
+Absent on purpose: Text in frames (strings travel in the header), and messages (`wire`).
+"""
+
+from __future__ import annotations
+
+from math import prod
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, cast
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from rlightning_aio.protocol.columns import Misfit
+from rlightning_aio.protocol.wire import DTYPES, Part, WireError, as_array, read_array
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+__all__ = ["MAX_HEAD", "Outcome", "Packed", "ResultLayout", "SpaceLayout"]
+
+MAX_HEAD = 1 << 20
+"""Rewards of one result."""
+
+
+class Packed(NamedTuple):
+    """What values consist of on the wire: frames, and strings that travel in the header."""
+
+    frames: list[bytes]
+    texts: list[str]
+
+
+class _Arriving(NamedTuple):
+    frames: Iterator[Part]
+    texts: Iterator[str]
+
+
+class SpaceLayout:
+    """How the values of one space travel: one frame for each array, in the space's order.
+
+    Args:
+        space: made of Box, Discrete, MultiBinary, MultiDiscrete, Dict, Tuple and Text.
+        what: what messages call a value, such as ``"observation"``.
+
+    Attributes:
+        num_frames, num_texts: what one value consists of.
+    """
+
+    def __init__(self, space: gym.Space[Any], what: str) -> None:
+        self._node = _node_of(space, what)
+        self.num_frames = self._node.num_frames
+        self.num_texts = self._node.num_texts
+
+    def pack(self, value: Any, packed: Packed) -> None:
+        """Append `value` to `packed`; the bytes are copies.
+
+        Raises:
+            Misfit: it doesn't fit the space; the message says what was expected and found.
+        """
+        self._node.pack(value, packed)
+
+    def unpack(self, frames: Sequence[Part], texts: Sequence[str]) -> Any:
+        """The value that `frames` begins with; its arrays are read-only views of them.
+
+        Raises:
+            WireError: frames are missing or of another size, or a text doesn't belong.
+        """
+        if len(frames) < self.num_frames or len(texts) != self.num_texts:
+            raise WireError(
+                f"{len(frames)} frames and {len(texts)} texts can't hold a value of "
+                f"{self.num_frames} and {self.num_texts}"
+            )
+        return self._node.unpack(_Arriving(iter(frames), iter(texts)))
+
+
+class _Node:
+    num_frames = 0
+    num_texts = 0
+
+    def pack(self, value: Any, packed: Packed) -> None:
+        raise NotImplementedError
+
+    def unpack(self, arriving: _Arriving) -> Any:
+        raise NotImplementedError
+
+
+class _Array(_Node):
+    num_frames = 1
+
+    def __init__(self, space: gym.Space[Any], what: str) -> None:
+        self._dtype = DTYPES[np.dtype(space.dtype).name]
+        self._shape = tuple(cast("tuple[int, ...]", space.shape))
+        self._what = what
+
+    def pack(self, value: Any, packed: Packed) -> None:
+        array = as_array(value)
+        if array.dtype != self._dtype or array.shape != self._shape:
+            array = self._fitted(array)
+        packed.frames.append(array.tobytes())
+
+    def _fitted(self, array: NDArray[Any]) -> NDArray[Any]:
+        if array.shape != self._shape or not np.can_cast(array.dtype, self._dtype, "same_kind"):
+            raise Misfit(
+                f"{self._what} doesn't fit its space: expected shape {self._shape} and dtype "
+                f"{self._dtype}, found shape {array.shape} and dtype {array.dtype}"
+            )
+        return array.astype(self._dtype)
+
+    def unpack(self, arriving: _Arriving) -> Any:
+        return read_array(next(arriving.frames), self._dtype, self._shape)
+
+
+class _Number(_Array):
+    """A Discrete value, which comes back as a NumPy scalar."""
+
+    def __init__(self, space: spaces.Discrete, what: str) -> None:
+        super().__init__(space, what)
+        self._values = range(int(space.start), int(space.start + space.n))
+
+    def unpack(self, arriving: _Arriving) -> Any:
+        number = super().unpack(arriving)[()]
+        if int(number) not in self._values:
+            raise WireError(f"{self._what} is {number}, which is not in its space")
+        return number
+
+
+class _Text(_Node):
+    num_texts = 1
+
+    def __init__(self, space: spaces.Text, what: str) -> None:
+        self._space = space
+        self._what = what
+
+    def pack(self, value: Any, packed: Packed) -> None:
+        if value not in self._space:
+            raise Misfit(f"{self._what} is {value!r}, which is not in {self._space}")
+        packed.texts.append(value)
+
+    def unpack(self, arriving: _Arriving) -> Any:
+        text = next(arriving.texts)
+        if text not in self._space:
+            raise WireError(f"{self._what} is a text that is not in its space")
+        return text
+
+
+class _Parts(_Node):
+    """What Dict and Tuple share: values one after the other."""
+
+    def __init__(self, nodes: dict[Any, _Node], what: str) -> None:
+        self._nodes = nodes
+        self._what = what
+        self.num_frames = sum(node.num_frames for node in nodes.values())
+        self.num_texts = sum(node.num_texts for node in nodes.values())
+
+    def _refuse(self, expected: str, found: str) -> NoReturn:
+        raise Misfit(f"{self._what} doesn't fit its space: expected {expected}, found {found}")
+
+
+class _Dict(_Parts):
+    def pack(self, value: Any, packed: Packed) -> None:
+        if not hasattr(value, "keys") or value.keys() != self._nodes.keys():
+            found = (
+                f"keys {sorted(map(str, value))}"
+                if hasattr(value, "keys")
+                else (type(value).__name__)
+            )
+            self._refuse(f"a dict with keys {sorted(self._nodes)}", found)
+        for key, node in self._nodes.items():
+            node.pack(value[key], packed)
+
+    def unpack(self, arriving: _Arriving) -> Any:
+        return {key: node.unpack(arriving) for key, node in self._nodes.items()}
+
+
+class _Tuple(_Parts):
+    def pack(self, value: Any, packed: Packed) -> None:
+        if not isinstance(value, tuple | list):
+            self._refuse(f"a tuple of {len(self._nodes)}", type(value).__name__)
+        parts = cast("Sequence[Any]", value)
+        if len(parts) != len(self._nodes):
+            self._refuse(f"a tuple of {len(self._nodes)}", f"one of {len(parts)}")
+        for node, part in zip(self._nodes.values(), parts, strict=True):
+            node.pack(part, packed)
+
+    def unpack(self, arriving: _Arriving) -> Any:
+        return tuple(node.unpack(arriving) for node in self._nodes.values())
+
+
+def _node_of(space: gym.Space[Any], what: str) -> _Node:
+    if isinstance(space, spaces.Dict):
+        items = cast("spaces.Dict[Any]", space).spaces.items()
+        return _Dict({key: _node_of(s, f"{what}[{key!r}]") for key, s in items}, what)
+    if isinstance(space, spaces.Tuple):
+        parts = enumerate(cast("spaces.Tuple[Any]", space).spaces)
+        return _Tuple({k: _node_of(s, f"{what}[{k}]") for k, s in parts}, what)
+    if isinstance(space, spaces.Text):
+        return _Text(space, what)
+    return _Number(space, what) if isinstance(space, spaces.Discrete) else _Array(space, what)
+
+
+class Outcome(NamedTuple):
+    """One env's result as values: dicts by agent for multi-agent envs."""
+
+    observation: Any
+    reward: Any
+    terminated: Any
+    truncated: Any
+
+
+class ResultLayout:
+    """How results travel: an observation, then rewards and flags.
+
+    A single env's reward and flags are numbers in the header. Those of several
+    sub-environments or agents are three frames, float64, bool and bool, of shape `head`.
+
+    Attributes:
+        head: ``()``, ``(num_envs,)``, and with agents ``(num_agents,)`` or
+            ``(num_agents, num_envs)``.
+    """
+
+    def __init__(
+        self, observation_space: gym.Space[Any], num_envs: int, agents: Sequence[str]
+    ) -> None:
+        self._observation = SpaceLayout(observation_space, "observation")
+        self._agents = tuple(agents)
+        self._each = (num_envs,) if num_envs > 1 else ()
+        self.head = (len(agents), *self._each) if agents else self._each
+        if prod(self.head) > MAX_HEAD:
+            raise WireError(f"{prod(self.head)} rewards in one result; {MAX_HEAD} are allowed")
+
+    def pack(self, outcome: Outcome, packed: Packed) -> Outcome:
+        """Append `outcome` to `packed`; returns what belongs in the header.
+
+        Raises:
+            Misfit: it doesn't fit the layout.
+        """
+        self._observation.pack(outcome.observation, packed)
+        if not self.head:
+            reward, terminated, truncated = (_scalar(value) for value in outcome[1:])
+            return Outcome(None, float(reward), bool(terminated), bool(truncated))
+        for name, dtype in (("reward", "float64"), ("terminated", "bool"), ("truncated", "bool")):
+            column = self._column(getattr(outcome, name), name)
+            packed.frames.append(column.astype(DTYPES[dtype]).tobytes())
+        return Outcome(None, None, None, None)
+
+    def _column(self, value: Any, name: str) -> NDArray[Any]:
+        try:
+            if self._agents:
+                parts = (as_array(value.get(agent, 0)) for agent in self._agents)
+                return np.stack([np.broadcast_to(part, self._each) for part in parts])
+            return np.broadcast_to(as_array(value), self.head)
+        except ValueError as error:
+            raise Misfit(f"last_{name} doesn't have the shape {self.head}: {error}") from None
+
+    def unpack(
+        self, frames: Sequence[Part], texts: Sequence[str], header: tuple[Any, Any, Any]
+    ) -> Outcome:
+        """The outcome that `frames` begins with; `header` is what `pack` gave for it.
+
+        Raises:
+            WireError: it doesn't fit the layout.
+        """
+        observation = self._observation.unpack(frames, texts)
+        if not self.head:
+            if None in header:
+                raise WireError("a result lacks its reward or a flag")
+            return Outcome(observation, *header)
+        rest = frames[self._observation.num_frames :]
+        if len(rest) < 3:
+            raise WireError("a result lacks the frames of its rewards and flags")
+        columns = (
+            read_array(part, DTYPES[dtype], self.head)
+            for part, dtype in zip(rest, ("float64", "bool", "bool"), strict=False)
+        )
+        return Outcome(observation, *map(self._by_agent, columns))
+
+    def _by_agent(self, column: NDArray[Any]) -> Any:
+        return dict(zip(self._agents, column, strict=True)) if self._agents else column
+
+    def cut_short(self, observation: Any) -> Outcome:
+        """An outcome that only says: truncated at `observation`."""
+        if not self.head:
+            return Outcome(observation, 0.0, False, True)
+        reward, flags = np.zeros(self.head), np.zeros(self.head, bool)
+        return Outcome(observation, *map(self._by_agent, (reward, flags, ~flags)))
+
+
+def _scalar(value: Any) -> Any:
+    return value if isinstance(value, int | float) else as_array(value).item()

@@ -1,0 +1,267 @@
+"""Two rings of numbered entries in memory shared by a trainer and one worker.
+
+The trainer appends requests and reads reports; the worker reads requests and appends
+reports. Each side sleeps on the channel; a *bell* (see `frames`) wakes it, and is
+rung only when the other side has said that it sleeps.
+
+Invariant: every word has one writer. A writer publishes (entry first, then the
+counter) and fences before it looks whether the other side sleeps; a sleeper says so
+and fences before it looks at the counter a last time. So one of the two always sees
+the other, and no wake-up is lost (Dekker's rule).
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = [
+    "OP_BITS",
+    "RESET",
+    "ROW_BITS",
+    "SEQ_SHIFT",
+    "STEP",
+    "TrainerRings",
+    "WorkerRings",
+    "entry",
+    "fence",
+    "rings_size",
+]
+
+# An entry is one int64: request number, row within the worker, operation.
+OP_BITS: Final = 8
+ROW_BITS: Final = 16
+SEQ_SHIFT: Final = OP_BITS + ROW_BITS
+ROW_MASK: Final = (1 << ROW_BITS) - 1
+OP_MASK: Final = (1 << OP_BITS) - 1
+
+# Invariant: RESET == STEP + 1, so that a batch of steps becomes resets by adding a mask.
+STEP: Final = 1
+RESET: Final = 2
+
+# Words, each on a cache line of its own: false sharing would cost both sides.
+_LINE: Final = 8
+_REQUESTS_SENT: Final = 0 * _LINE
+_REPORTS_SENT: Final = 1 * _LINE
+_REPORTS_READ: Final = 2 * _LINE
+_WANTED: Final = 3 * _LINE
+_WORKER_ASLEEP: Final = 4 * _LINE
+_FRAMES_TO_WORKER: Final = 5 * _LINE
+_FRAMES_TO_TRAINER: Final = 6 * _LINE
+_CURRENT: Final = 7 * _LINE
+_CURRENT_SINCE_NS: Final = 7 * _LINE + 1
+_WORDS: Final = 8 * _LINE
+
+# _WANTED holds an order number above this many bits, so that an order is obeyed once.
+_WANTED_BITS: Final = 24
+_WANTED_MASK: Final = (1 << _WANTED_BITS) - 1
+
+
+def _new_fence() -> Callable[[], None]:
+    """Releasing and retaking a held lock orders all memory accesses around it.
+
+    On x86 both are locked instructions; on ARM a store-release followed by a
+    load-acquire of the same word.
+    """
+    lock = threading.Lock()
+    lock.acquire()
+    release, acquire = lock.release, lock.acquire
+
+    def fence() -> None:
+        release()
+        acquire()
+
+    return fence
+
+
+fence = _new_fence()
+
+
+def entry(number: int, row: int, op: int) -> int:
+    """One ring entry."""
+    return (number << SEQ_SHIFT) | (row << OP_BITS) | op
+
+
+def _capacity(rows: int) -> int:
+    # One request of an env may be in flight, so no more than `rows` entries are unread.
+    return 1 << rows.bit_length()
+
+
+def rings_size(rows: int) -> int:
+    """Bytes that the words and both rings of a worker with `rows` envs take."""
+    return 8 * (_WORDS + 2 * _capacity(rows))
+
+
+def _split(buffer: memoryview, rows: int) -> tuple[memoryview, memoryview, memoryview]:
+    words = buffer.cast("B")[: rings_size(rows)].cast("q")
+    capacity = _capacity(rows)
+    return words, words[_WORDS : _WORDS + capacity], words[_WORDS + capacity :]
+
+
+class TrainerRings:
+    """The trainer's side: appends requests, reads reports, orders a bell."""
+
+    def __init__(self, buffer: memoryview, rows: int) -> None:
+        self._words, requests, reports = _split(buffer, rows)
+        self._requests: NDArray[np.int64] = np.frombuffer(requests, np.int64)
+        self._reports: NDArray[np.int64] = np.frombuffer(reports, np.int64)
+        self._capacity = _capacity(rows)
+        self._mask = self._capacity - 1
+        self._sent = 0
+        self._read = 0
+        self._orders = 0
+        self._frames_sent = 0
+
+    def request(self, entries: NDArray[np.int64]) -> bool:
+        """Append `entries` in order; True if the worker sleeps and must be rung."""
+        count = len(entries)
+        start = self._sent & self._mask
+        room = self._capacity - start
+        if count <= room:
+            self._requests[start : start + count] = entries
+        else:
+            self._requests[start:] = entries[:room]
+            self._requests[: count - room] = entries[room:]
+        self._sent += count
+        fence()
+        self._words[_REQUESTS_SENT] = self._sent
+        return self.worker_sleeps()
+
+    def worker_sleeps(self) -> bool:
+        """Whether the worker must be rung to see what was just published."""
+        fence()
+        return self._words[_WORKER_ASLEEP] != 0
+
+    def count_frame(self) -> bool:
+        """Tell the worker that one more frame lies in the channel; True if it must be rung.
+
+        Call it after the frame was handed to the channel.
+        """
+        self._frames_sent += 1
+        self._words[_FRAMES_TO_WORKER] = self._frames_sent
+        return self.worker_sleeps()
+
+    def unread(self) -> int:
+        """Reports that wait to be read."""
+        return self._words[_REPORTS_SENT] - self._read
+
+    def reports(self) -> NDArray[np.int64]:
+        """Read all reports there are, in order."""
+        sent = self._words[_REPORTS_SENT]
+        count = sent - self._read
+        if not count:
+            return self._reports[:0]
+        fence()
+        start = self._read & self._mask
+        room = self._capacity - start
+        if count <= room:
+            found = self._reports[start : start + count].copy()
+        else:
+            found = np.concatenate((self._reports[start:], self._reports[: count - room]))
+        fence()
+        self._read = sent
+        self._words[_REPORTS_READ] = sent
+        return found
+
+    def want(self, count: int) -> bool:
+        """Order one bell as soon as `count` reports are unread; True if they already are."""
+        self._orders += 1
+        self._words[_WANTED] = (self._orders << _WANTED_BITS) | count
+        fence()
+        return self.unread() >= count
+
+    def forget_want(self) -> None:
+        """Withdraw the order: the trainer is awake."""
+        self._words[_WANTED] = 0
+
+    def frames_from_worker(self) -> int:
+        """Frames that the worker has sent so far, bells excluded."""
+        return self._words[_FRAMES_TO_TRAINER]
+
+    def current(self) -> tuple[int, int]:
+        """The entry that the worker is executing (0 if none), and since when.
+
+        The time is in ns of the monotonic clock, which all processes share.
+        """
+        return self._words[_CURRENT], self._words[_CURRENT_SINCE_NS]
+
+
+class WorkerRings:
+    """The worker's side: reads requests, appends reports, says when it sleeps."""
+
+    def __init__(self, buffer: memoryview, rows: int) -> None:
+        self._words, self._requests, self._reports = _split(buffer, rows)
+        self._mask = _capacity(rows) - 1
+        self._read = 0
+        self._sent = 0
+        self._obeyed = 0
+        self._frames_sent = 0
+        self._frames_seen = 0
+
+    def has_request(self) -> bool:
+        """Whether an entry waits in the ring."""
+        return self._words[_REQUESTS_SENT] != self._read
+
+    def next_request(self) -> int:
+        """The next entry, in order; 0 if there is none."""
+        if self._words[_REQUESTS_SENT] == self._read:
+            return 0
+        fence()
+        found = self._requests[self._read & self._mask]
+        self._read += 1
+        return found
+
+    def has_frame(self) -> bool:
+        """Whether a frame lies in the channel that `frame_seen` has not counted."""
+        return self._words[_FRAMES_TO_WORKER] != self._frames_seen
+
+    def frame_seen(self) -> None:
+        """Count a frame that was read from the channel."""
+        self._frames_seen += 1
+
+    def begin(self, current: int, now_ns: int) -> None:
+        """Say which entry is being executed."""
+        self._words[_CURRENT_SINCE_NS] = now_ns
+        self._words[_CURRENT] = current
+
+    def idle(self) -> None:
+        """Say that nothing is being executed."""
+        self._words[_CURRENT] = 0
+
+    def report(self, done: int) -> bool:
+        """Append a report; True if the trainer ordered a bell for what is unread now."""
+        words = self._words
+        self._reports[self._sent & self._mask] = done
+        self._sent += 1
+        fence()
+        words[_REPORTS_SENT] = self._sent
+        fence()
+        wanted = words[_WANTED]
+        if wanted == self._obeyed or not wanted:
+            return False
+        if self._sent - words[_REPORTS_READ] < wanted & _WANTED_MASK:
+            return False
+        self._obeyed = wanted
+        return True
+
+    def count_frame(self) -> None:
+        """Say that one more frame was handed to the channel."""
+        self._frames_sent += 1
+        self._words[_FRAMES_TO_TRAINER] = self._frames_sent
+
+    def fall_asleep(self) -> bool:
+        """Say that this worker sleeps; False if something came meanwhile."""
+        self._words[_WORKER_ASLEEP] = 1
+        fence()
+        if self.has_request() or self.has_frame():
+            self._words[_WORKER_ASLEEP] = 0
+            return False
+        return True
+
+    def wake_up(self) -> None:
+        """Say that this worker is awake."""
+        self._words[_WORKER_ASLEEP] = 0

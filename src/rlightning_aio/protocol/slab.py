@@ -1,0 +1,122 @@
+"""The slab: one block of shared memory with a row for each env of the same layout.
+
+A row holds what one request and its reply consist of: action and seed on the way in,
+observation, reward, flags, info and times on the way out. Columns are stored one after
+the other, so that many rows are read or written with one copy each.
+Invariant: the trainer writes a row only while the env has no request in flight; the
+worker writes it only while it has one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import prod
+from typing import Any, Final
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from rlightning_aio.protocol.columns import Leaf, Tree, assemble, leaves
+from rlightning_aio.protocol.info import INFO_BYTES
+
+__all__ = ["NO_SEED", "RowLayout", "Slab"]
+
+NO_SEED: Final = -1
+_ALIGNMENT: Final = 64
+
+
+@dataclass(frozen=True)
+class RowLayout:
+    """What a row consists of. Envs with equal `key` share a slab and stack into one batch.
+
+    Attributes:
+        observation_space, action_space: as the env reports them.
+        head: shape of reward and flags: ``()``, ``(num_envs,)``, and with agents
+            ``(num_agents, ...)``.
+        agents: agent names of a multi-agent env.
+    """
+
+    observation_space: gym.Space[Any]
+    action_space: gym.Space[Any]
+    head: tuple[int, ...]
+    agents: tuple[str, ...]
+
+    @property
+    def observation_leaves(self) -> tuple[Leaf, ...] | None:
+        """Arrays of an observation, or None if observations travel pickled."""
+        return leaves(self.observation_space)
+
+    @property
+    def action_leaves(self) -> tuple[Leaf, ...] | None:
+        """Arrays of an action, or None if actions travel pickled."""
+        return leaves(self.action_space)
+
+    @property
+    def key(self) -> tuple[object, ...]:
+        """Equal for layouts whose rows are interchangeable in memory."""
+        return (self.observation_leaves, self.action_leaves, self.head, self.agents)
+
+    def _arrays(self) -> Iterator[tuple[tuple[int, ...], np.dtype[Any]]]:
+        for leaf in (*(self.observation_leaves or ()), *(self.action_leaves or ())):
+            yield leaf.shape, leaf.dtype
+        for dtype in (np.float64, np.bool_, np.bool_, np.float64, np.int64):
+            yield self.head, np.dtype(dtype)
+        for dtype in (np.uint8, np.int64, np.int64, np.int64):
+            yield (), np.dtype(dtype)
+        yield (INFO_BYTES,), np.dtype(np.uint8)
+
+    def size(self, rows: int) -> int:
+        """Bytes of a slab with `rows` rows."""
+        return sum(
+            _aligned(rows * prod(shape) * dtype.itemsize) for shape, dtype in self._arrays()
+        )
+
+    def arrays(self, buffer: memoryview, rows: int) -> Iterator[NDArray[Any]]:
+        """The columns over `buffer`, in a fixed order."""
+        offset = 0
+        for shape, dtype in self._arrays():
+            count = rows * prod(shape)
+            yield np.frombuffer(buffer, dtype, count, offset).reshape(rows, *shape)
+            offset += _aligned(count * dtype.itemsize)
+
+
+def _aligned(size: int) -> int:
+    return -(-size // _ALIGNMENT) * _ALIGNMENT
+
+
+class Slab:
+    """Columns over one block of memory; both sides map the same block.
+
+    Attributes:
+        observation, action: trees of ``[rows, ...]``; None where they travel pickled.
+        reward: ``[rows, *head]`` float64; terminated, truncated: ``[rows, *head]`` bool.
+        episode_return: ``[rows, *head]`` float64, episode_length: ``[rows, *head]`` int64;
+            valid where an episode has just ended.
+        info_mark: ``[rows]`` uint8, see `info`; info: ``[rows, INFO_BYTES]`` uint8.
+        seed: ``[rows]`` int64, of a reset; `NO_SEED` for none.
+        done_ns: ``[rows]`` int64, monotonic time at which the reply was ready.
+        busy_ns: ``[rows]`` int64, time that the env itself took.
+    """
+
+    def __init__(self, layout: RowLayout, buffer: memoryview, rows: int) -> None:
+        self.layout = layout
+        self.rows = rows
+        arrays = layout.arrays(buffer, rows)
+        self.observation: Tree | None = None
+        if layout.observation_leaves is not None:
+            self.observation = assemble(layout.observation_space, arrays)
+        self.action: Tree | None = None
+        if layout.action_leaves is not None:
+            self.action = assemble(layout.action_space, arrays)
+        self.reward = next(arrays)
+        self.terminated = next(arrays)
+        self.truncated = next(arrays)
+        self.episode_return = next(arrays)
+        self.episode_length = next(arrays)
+        self.info_mark = next(arrays)
+        self.seed = next(arrays)
+        self.done_ns = next(arrays)
+        self.busy_ns = next(arrays)
+        self.info = next(arrays)

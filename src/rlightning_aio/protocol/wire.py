@@ -1,0 +1,342 @@
+"""The messages between a trainer and the env clients that dial in, as bytes.
+
+Rule: a message is one msgpack header and any number of raw array frames; what arrives
+is checked for size, type and shape before it is believed, and whatever is wrong with it
+raises `WireError` and nothing else. docs/wire-format.md is this file for people.
+Absent on purpose: I/O, pickle, and every notion of who said what before (see
+`server_session` and `client_session`).
+"""
+
+from __future__ import annotations
+
+from math import prod
+from typing import TYPE_CHECKING, Annotated, Any, Final, Generic, TypeAlias, TypeVar, cast
+
+import msgspec
+import numpy as np
+from msgspec import Meta, Struct
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+__all__ = [
+    "DTYPES",
+    "MAX_FRAME_BYTES",
+    "MAX_HEADER_BYTES",
+    "MAX_NAME_LENGTH",
+    "MAX_PARTS",
+    "VERSION",
+    "Bye",
+    "Failure",
+    "FromClient",
+    "FromServer",
+    "Gone",
+    "Hello",
+    "Part",
+    "Ping",
+    "Pong",
+    "Reader",
+    "Refusal",
+    "Reset",
+    "Result",
+    "Step",
+    "Untransferable",
+    "Welcome",
+    "WireError",
+    "Writer",
+    "as_array",
+    "portable",
+    "read_array",
+]
+
+VERSION: Final = 1
+MAX_HEADER_BYTES: Final = 4 << 20
+MAX_FRAME_BYTES: Final = 64 << 20
+MAX_PARTS: Final = 1024
+"""Header and frames of one message."""
+MAX_NAME_LENGTH: Final = 128
+
+DTYPES: Final[Mapping[str, np.dtype[Any]]] = {
+    name: np.dtype(name).newbyteorder("<")
+    for name in (
+        "bool", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64",
+        "float16", "float32", "float64",
+    )
+}  # fmt: skip
+"""What arrays may consist of; little-endian on the wire."""
+
+_ARRAY_EXTENSION: Final = 1
+_MAX_NESTING: Final = 32
+
+Part: TypeAlias = bytes | memoryview
+Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+Name = Annotated[str, Meta(min_length=1, max_length=MAX_NAME_LENGTH)]
+
+
+class WireError(ValueError):
+    """What arrived is not a message that this format allows."""
+
+
+class Untransferable(ValueError):
+    """What was to be sent can't be said in this format."""
+
+
+class Hello(Struct, tag="hello", tag_field="type", kw_only=True):
+    """Client: I own an env, let me in. Answered by `Welcome` or `Refusal` of the same nonce."""
+
+    version: Count
+    name: Name
+    nonce: Count
+    observation_space: dict[str, Any]
+    action_space: dict[str, Any]
+    num_envs: Annotated[int, Meta(ge=1, le=1 << 20)] = 1
+    agents: Annotated[list[Name], Meta(max_length=256)] = []
+    max_episode_steps: Annotated[int, Meta(ge=1, le=2**63 - 1)] | None = None
+    free_actions: bool = False
+    """Actions need not fit the action space: the client transforms them."""
+    reads_extras: bool = False
+    """Something at the client reads what the policy attaches beside the action."""
+    previous: Count = 0
+    """The session that this client held before, which ends now; 0 for none."""
+
+
+class Welcome(Struct, tag="welcome", tag_field="type", kw_only=True):
+    """Server: you are in. The client resets its env and sends result 0."""
+
+    nonce: Count
+    session: Count
+    env_id: str
+    heartbeat: Annotated[float, Meta(gt=0, le=86400)]
+
+
+class Refusal(Struct, tag="refusal", tag_field="type", kw_only=True):
+    """Server: you are not in. ``retry`` tells whether asking again later may help."""
+
+    nonce: Count
+    code: str
+    text: str
+    retry: bool
+
+
+class Step(Struct, tag="step", tag_field="type", kw_only=True, omit_defaults=True):
+    """Server: step the env. The action is in frames, or in ``action`` where it is free."""
+
+    session: Count
+    number: Count
+    texts: list[str] = []
+    action: Any = None
+    extras: dict[str, Any] = {}
+
+
+class Reset(Struct, tag="reset", tag_field="type", kw_only=True, omit_defaults=True):
+    """Server: reset the env."""
+
+    session: Count
+    number: Count
+    seed: int | list[int] | None = None
+    options: dict[str, Any] | None = None
+
+
+class Result(Struct, tag="result", tag_field="type", kw_only=True, omit_defaults=True):
+    """Client: what request ``number`` gave. The observation is in frames."""
+
+    session: Count
+    number: Count
+    sent_ns: int
+    reward: float | None = None
+    terminated: bool | None = None
+    truncated: bool | None = None
+    texts: list[str] = []
+    info: dict[str, Any] = {}
+    extra: dict[str, Any] = {}
+
+
+class Failure(Struct, tag="error", tag_field="type", kw_only=True):
+    """Client: request ``number`` raised."""
+
+    session: Count
+    number: Count
+    exception_type: str
+    text: str
+    traceback: str
+
+
+class Ping(Struct, tag="ping", tag_field="type", kw_only=True):
+    """Either side: are you there? See docs/wire-format.md for what ``number`` says."""
+
+    session: Count
+    number: Count = 0
+
+
+class Pong(Struct, tag="pong", tag_field="type", kw_only=True):
+    """Either side: I am; ``number`` is the ping's."""
+
+    session: Count
+    number: Count = 0
+
+
+class Gone(Struct, tag="gone", tag_field="type", kw_only=True):
+    """Server: that session is over; say hello again."""
+
+    session: Count
+    text: str = ""
+
+
+class Bye(Struct, tag="bye", tag_field="type", kw_only=True):
+    """Either side: I am leaving."""
+
+    session: Count
+    reason: str = ""
+
+
+FromClient: TypeAlias = Hello | Result | Failure | Ping | Pong | Bye
+FromServer: TypeAlias = Welcome | Refusal | Step | Reset | Ping | Pong | Gone | Bye
+Message = TypeVar("Message")
+
+
+def read_array(part: Part, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    """`part` as an array: a read-only view of it.
+
+    Raises:
+        WireError: it has another size, or is no array of bools.
+    """
+    size = prod(shape) * dtype.itemsize
+    if len(part) != size:
+        raise WireError(f"a frame for {dtype}{list(shape)} has {len(part)} bytes, not {size}")
+    if not size:
+        return np.zeros(shape, dtype)
+    array = np.frombuffer(part, dtype).reshape(shape)
+    # Any other byte would make a bool that equals neither True nor False.
+    if dtype.kind == "b" and array.view(np.uint8).max() > 1:
+        raise WireError("a frame of bools holds bytes other than 0 and 1")
+    return array
+
+
+def as_array(value: Any) -> NDArray[Any]:
+    """`value` as NumPy; tensors come from their device to the CPU."""
+    if hasattr(value, "detach"):
+        value = value.detach().cpu()
+    return np.asarray(value)
+
+
+class Reader(Generic[Message]):
+    """Reads messages of the kinds `kinds`, which must be a union of message types."""
+
+    def __init__(self, kinds: Any) -> None:
+        decoder = msgspec.msgpack.Decoder(kinds, ext_hook=self._array)
+        self._decode = cast("Callable[[Part], Message]", decoder.decode)
+        self._reference = msgspec.msgpack.Decoder(tuple[str, list[Count], Count])
+        self._unread: dict[int, Part] = {}
+
+    def read(self, parts: Sequence[Part]) -> tuple[Message, Sequence[Part]]:
+        """The message that `parts` is, and its frames.
+
+        Raises:
+            WireError: it isn't one.
+        """
+        if not 1 <= len(parts) <= MAX_PARTS:
+            raise WireError(f"a message has {len(parts)} parts; 1 to {MAX_PARTS} are allowed")
+        header, frames = parts[0], parts[1:]
+        if len(header) > MAX_HEADER_BYTES:
+            raise WireError(f"a header has {len(header)} bytes; {MAX_HEADER_BYTES} are allowed")
+        # Each frame may be named once, or a small message could unfold to any size.
+        self._unread = dict(enumerate(frames))
+        try:
+            return self._decode(header), frames
+        except WireError:
+            raise
+        # Bad UTF-8 and deep nesting are not msgspec's own errors.
+        except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+            raise WireError(f"a header can't be read: {error}") from None
+
+    def _array(self, code: int, data: memoryview) -> NDArray[Any]:
+        if code != _ARRAY_EXTENSION:
+            raise WireError(f"a header uses the unknown extension {code}")
+        dtype_name, shape, position = self._reference.decode(data)
+        dtype = DTYPES.get(dtype_name)
+        part = self._unread.pop(position, None)
+        if dtype is None or part is None or len(shape) > _MAX_NESTING:
+            raise WireError(f"a header names an array {dtype_name!r}{shape} that is not there")
+        return read_array(part, dtype, tuple(shape)).copy()
+
+
+class Writer:
+    """Writes messages; arrays found in the header's values become frames."""
+
+    def __init__(self) -> None:
+        self._encode = msgspec.msgpack.Encoder(enc_hook=self._plain).encode
+        self._frames: list[bytes] = []
+
+    def write(self, message: Struct, frames: list[bytes] | None = None) -> list[bytes]:
+        """The parts of `message`: its header, then `frames`, then arrays within the header.
+
+        Raises:
+            Untransferable: a value has no form in this format, or is too large.
+        """
+        self._frames = frames = [] if frames is None else frames
+        try:
+            header = self._encode(message)
+        except Untransferable:
+            raise
+        # What msgspec raises for ints beyond 64 bits, lone surrogates, cycles.
+        except (TypeError, ValueError, OverflowError, RecursionError) as error:
+            raise Untransferable(str(error)) from None
+        if len(header) > MAX_HEADER_BYTES:
+            raise Untransferable(f"{len(header)} bytes; {MAX_HEADER_BYTES} are allowed")
+        if len(frames) >= MAX_PARTS:
+            raise Untransferable(f"{len(frames)} arrays; fewer than {MAX_PARTS} are allowed")
+        return [header, *frames]
+
+    def _plain(self, value: Any) -> Any:
+        if isinstance(value, np.generic):
+            return cast("Any", value.item())
+        if hasattr(value, "detach") or isinstance(value, np.ndarray):
+            return self._framed(as_array(cast("Any", value)))
+        raise Untransferable(f"a {type(value).__qualname__} can't travel")
+
+    def _framed(self, array: NDArray[Any]) -> Any:
+        dtype = DTYPES.get(array.dtype.name)
+        if dtype is None:
+            return array.tolist()
+        if array.nbytes > MAX_FRAME_BYTES:
+            raise Untransferable(
+                f"an array has {array.nbytes} bytes; {MAX_FRAME_BYTES} are allowed"
+            )
+        reference = (array.dtype.name, array.shape, len(self._frames))
+        self._frames.append(array.astype(dtype, copy=False).tobytes())
+        return msgspec.msgpack.Ext(_ARRAY_EXTENSION, msgspec.msgpack.encode(reference))
+
+
+def portable(values: Mapping[str, Any], lost: list[str]) -> dict[str, Any]:
+    """The part of `values` that can travel; the paths of what can't are appended to `lost`."""
+    kept = _portable(dict(values), "", lost, Writer(), depth=0)
+    return cast("dict[str, Any]", kept)
+
+
+class _Lost:
+    """Stands for a value that can't travel."""
+
+
+class _Value(Struct):
+    value: Any
+
+
+def _portable(value: Any, path: str, lost: list[str], writer: Writer, depth: int) -> Any:
+    if isinstance(value, dict) and depth < _MAX_NESTING:
+        kept: dict[Any, Any] = {}
+        for key, inner in cast("dict[Any, Any]", value).items():
+            place = f"{path}.{key}" if path else str(key)
+            portable_inner = _portable(inner, place, lost, writer, depth + 1)
+            if not isinstance(key, str | int):
+                lost.append(place)
+            elif portable_inner is not _Lost:
+                kept[key] = portable_inner
+        return kept
+    try:
+        writer.write(_Value(value))
+    except Untransferable:
+        lost.append(path)
+        return _Lost
+    return cast("Any", value)

@@ -1,0 +1,7 @@
+"""The synchronous facade: the same group without ``await``, event loop or thread."""
+
+from __future__ import annotations
+
+from rlightning_aio.group.sync import EnvGroup, EnvHandle, build_env_group
+
+__all__ = ["EnvGroup", "EnvHandle", "build_env_group"]
