@@ -1,0 +1,379 @@
+"""`RemoteHost`: the trainer's end of env_server, a ZMQ ROUTER without a thread.
+
+Rule: one descriptor wakes the driver, which then calls `RemoteHost.pump`; everything
+that means something happens in `protocol.server_session`. The descriptor is an epoll
+over ZMQ's own, which only tell that something changed, and an eventfd that is set
+whenever there is something to be had without a change.
+"""
+
+from __future__ import annotations
+
+import difflib
+import ipaddress
+import logging
+import os
+import select
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, cast
+
+import zmq
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
+from zmq.utils import z85
+
+from rlightning_aio.errors import ConfigError, StartFailed
+from rlightning_aio.protocol.server_session import PATIENCE, ServerSessions
+from rlightning_aio.protocol.wire import MAX_FRAME_BYTES
+from rlightning_aio.remote.keys import PUBLIC_SUFFIX, read_keys, read_server_keys
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from rlightning_aio.config import EnvConfig
+    from rlightning_aio.protocol.server_session import RemoteResult
+    from rlightning_aio.protocol.wire import Part
+    from rlightning_aio.types import EnvMeta
+
+__all__ = ["RemoteHost", "ServerSettings", "server_settings"]
+
+_MESSAGES_A_PUMP: Final = 1000
+"""Read in one go at most, so that a flood doesn't keep the driver."""
+_UNSENT_A_CLIENT: Final = 100
+_LINGER_MS: Final = 200
+_HANDSHAKE_MS: Final = 5000
+_COPIED_BYTES: Final = 4096
+"""Larger frames are not copied out of ZMQ's memory."""
+_ROUTES_REMEMBERED: Final = 4096
+_SECONDS_BETWEEN_WARNINGS: Final = 10.0
+
+_log = logging.getLogger(__name__)
+
+
+class ServerSettings(BaseModel):
+    """``env_kwargs`` of an env_server entry."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    host: str = "127.0.0.1"
+    """Address to listen on; a public one needs ``keys``, or ``insecure: true``."""
+    port: int = Field(default=0, ge=0, le=65535, validation_alias=AliasChoices("port", "zmq_port"))
+    """Port to listen on; 0 picks a free one."""
+    min_clients: int = Field(default=1, ge=1)
+    """Clients that ``reset`` waits for."""
+    connect_timeout: float = Field(default=60.0, gt=0)
+    """Seconds that ``reset`` waits for them."""
+    heartbeat: float = Field(default=5.0, ge=0.1, le=86400)
+    """Seconds within which a dead client is found."""
+    keys: Path | None = None
+    """The server's directory of ``rlightning-aio keygen``; only clients listed there come in."""
+    insecure: bool = False
+    """Listen on a public address without keys: whoever reaches it may be an env."""
+
+
+_FIELDS: Final = (*ServerSettings.model_fields, "zmq_port")
+
+
+def server_settings(config: EnvConfig) -> ServerSettings:
+    """The checked ``env_kwargs`` of an env_server entry.
+
+    Raises:
+        ConfigError: naming entry and field.
+    """
+    place = f"entry {config.name!r}, env_kwargs"
+    for name in config.env_kwargs:
+        if name not in _FIELDS:
+            near = difflib.get_close_matches(name, _FIELDS, n=1)
+            hint = f"did you mean {near[0]!r}? " if near else ""
+            raise ConfigError(f"{place}.{name}: unknown field; {hint}Known: {', '.join(_FIELDS)}")
+    try:
+        settings = ServerSettings.model_validate(config.env_kwargs)
+    except ValidationError as error:
+        fault = error.errors(include_url=False)[0]
+        raise ConfigError(
+            f"{place}.{fault['loc'][0]}: {fault['msg']}, got {fault['input']!r}"
+        ) from None
+    if not (_is_loopback(settings.host) or settings.keys or settings.insecure):
+        raise ConfigError(
+            f"{place}.host: {settings.host!r} can be reached from other machines, and without "
+            "keys anyone there could pose as an env; set keys (see `rlightning-aio keygen`), "
+            "or insecure: true if the network is your own"
+        )
+    return settings
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+class RemoteHost:
+    """Listens for env clients and speaks with them; never blocks.
+
+    Args:
+        server_id: env_id of the server; its clients' envs are ``<server_id>/<name>``.
+        settings: see `ServerSettings`.
+        step_timeout, reset_timeout: seconds after which a client that owes a step or a
+            reset counts as lost; None for never.
+
+    Raises:
+        ConfigError: the keys can't be read.
+    """
+
+    def __init__(
+        self,
+        server_id: str,
+        settings: ServerSettings,
+        *,
+        step_timeout: float | None = None,
+        reset_timeout: float | None = None,
+    ) -> None:
+        self.server_id = server_id
+        self.settings = settings
+        self._sessions = ServerSessions(
+            server_id,
+            heartbeat=settings.heartbeat,
+            step_timeout=step_timeout,
+            reset_timeout=reset_timeout,
+        )
+        self._gate = None if settings.keys is None else _Gate(settings.keys)
+        self._users: dict[bytes, str | None] = {}
+        self._address: str | None = None
+        self._context: zmq.Context[zmq.Socket[bytes]] | None = None
+        self._router: zmq.Socket[bytes]
+        self._epoll: select.epoll
+        self._more = -1
+        self._has_more = False
+
+    @property
+    def address(self) -> str:
+        """Where clients connect to, as ``tcp://host:port``."""
+        if self._address is None:
+            raise RuntimeError(f"{self.server_id} does not listen yet")
+        return self._address
+
+    @property
+    def clients(self) -> Mapping[str, EnvMeta]:
+        """The envs of the clients that are here, by client name."""
+        return self._sessions.clients
+
+    @property
+    def malformed(self) -> int:
+        """Messages that were dropped because they were none."""
+        return self._sessions.malformed
+
+    def start(self) -> None:
+        """Listen.
+
+        Raises:
+            StartFailed: the address can't be had.
+        """
+        self._context = zmq.Context[zmq.Socket[bytes]]()
+        self._epoll = select.epoll()
+        self._more = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._epoll.register(self._more, select.EPOLLIN)
+        try:
+            self._listen(self._context)
+        except zmq.ZMQError as error:
+            settings = self.settings
+            self.close()
+            raise StartFailed(
+                f"{self.server_id} can't listen on {settings.host}:{settings.port}: "
+                f"{error.strerror}; choose another env_kwargs.port (0 picks a free one) or host",
+                env_id=self.server_id,
+            ) from None
+
+    def _listen(self, context: zmq.Context[zmq.Socket[bytes]]) -> None:
+        settings = self.settings
+        router = self._router = context.socket(zmq.ROUTER)
+        # Sends to a connection that is no more must fail, not vanish.
+        router.set(zmq.ROUTER_MANDATORY, 1)
+        router.set(zmq.MAXMSGSIZE, MAX_FRAME_BYTES)
+        router.set(zmq.SNDHWM, _UNSENT_A_CLIENT)
+        router.set(zmq.LINGER, _LINGER_MS)
+        router.set(zmq.HANDSHAKE_IVL, _HANDSHAKE_MS)
+        router.set(zmq.HEARTBEAT_IVL, max(1, int(1000 * settings.heartbeat / PATIENCE)))
+        router.set(zmq.HEARTBEAT_TIMEOUT, max(2, int(2000 * settings.heartbeat / PATIENCE)))
+        if self._gate is not None:
+            self._epoll.register(self._gate.open(context), select.EPOLLIN)
+            router.set(zmq.CURVE_SERVER, 1)
+            router.set(zmq.CURVE_SECRETKEY, self._gate.secret)
+            router.set_string(zmq.ZAP_DOMAIN, "rlightning-aio")
+        host = "127.0.0.1" if settings.host == "localhost" else settings.host
+        if ":" in host:
+            router.set(zmq.IPV6, 1)
+            host = f"[{host}]"
+        router.bind(f"tcp://{host}:{settings.port or '*'}")
+        self._epoll.register(_descriptor(router), select.EPOLLIN)
+        self._address = router.get_string(zmq.LAST_ENDPOINT).rstrip("\0")
+
+    def fileno(self) -> int:
+        """Readable, and staying so, while there is something for `pump` to do."""
+        return self._epoll.fileno()
+
+    def deadline(self) -> float | None:
+        """When `pump` is due even if nothing comes (monotonic seconds); None if never."""
+        return self._sessions.deadline()
+
+    def pump(self, now: float) -> None:
+        """Read all there is, send what is due; never blocks."""
+        if self._has_more:
+            self._has_more = False
+            os.eventfd_read(self._more)
+        if self._gate is not None:
+            self._gate.answer(now)
+        for _ in range(_MESSAGES_A_PUMP):
+            # Asking is what makes ZMQ's descriptor unreadable again.
+            if not _is_readable(self._router):
+                break
+            self._receive(now)
+        self._sessions.tick(now)
+        self._flush(now)
+
+    def _receive(self, now: float) -> None:
+        frame = self._router.recv(zmq.NOBLOCK, copy=False)
+        route = frame.bytes
+        user = self._user(route, frame)
+        parts: list[Part] = []
+        while frame.more:
+            frame = self._router.recv(zmq.NOBLOCK, copy=False)
+            small = len(frame) < _COPIED_BYTES
+            parts.append(frame.bytes if small else frame.buffer.toreadonly())
+        self._sessions.receive(route, user, parts, now)
+
+    def _user(self, route: bytes, frame: zmq.Frame) -> str | None:
+        """Whose key the connection has proved; asked once for each connection."""
+        if self._gate is None:
+            return None
+        if route not in self._users:
+            if len(self._users) >= _ROUTES_REMEMBERED:
+                self._users.clear()
+            self._users[route] = str(frame.get("User-Id"))
+        return self._users[route]
+
+    def _flush(self, now: float) -> None:
+        """Send what is due, and see to it that nothing is left that nobody is woken for."""
+        outbox = self._sessions.outbox
+        while outbox:
+            route, parts = outbox.popleft()
+            try:
+                self._router.send_multipart([route, *parts], zmq.NOBLOCK, copy=False)
+            except zmq.Again:
+                # It reads nothing, or slowly; what is lost here is asked for again.
+                continue
+            except zmq.ZMQError as error:
+                if error.errno != zmq.EHOSTUNREACH:
+                    raise
+                self._sessions.unreachable(route, now)
+        # Sending takes in what ZMQ has to tell, so its descriptor may have fallen silent.
+        more = self._sessions.has_results or _is_readable(self._router)
+        if more and not self._has_more:
+            self._has_more = True
+            os.eventfd_write(self._more, 1)
+
+    def submit(
+        self, client: str, number: int, action: Any, extras: Mapping[str, Any], now: float
+    ) -> bool:
+        """Ask a client to step; see `ServerSessions.submit`."""
+        will_answer = self._sessions.submit(client, number, action, extras, now)
+        self._flush(now)
+        return will_answer
+
+    def submit_reset(
+        self,
+        client: str,
+        number: int,
+        seed: int | list[int] | None,
+        options: dict[str, Any] | None,
+        now: float,
+    ) -> bool:
+        """Ask a client to reset; see `ServerSessions.submit_reset`."""
+        will_answer = self._sessions.submit_reset(client, number, seed, options, now)
+        self._flush(now)
+        return will_answer
+
+    def take(self) -> list[RemoteResult]:
+        """All results that are ready, oldest first; each is handed out once."""
+        return self._sessions.take()
+
+    def close(self) -> None:
+        """Say goodbye to the clients and stop listening; idempotent, at most 0.2 s."""
+        if self._context is None:
+            return
+        context, self._context = self._context, None
+        if self._address is not None:
+            self._sessions.close("the trainer closed its group")
+            self._flush(0.0)
+        self._epoll.close()
+        os.close(self._more)
+        context.destroy(linger=_LINGER_MS)
+
+
+def _descriptor(socket: zmq.Socket[bytes]) -> int:
+    return cast("int", socket.get(zmq.FD))
+
+
+def _is_readable(socket: zmq.Socket[bytes]) -> bool:
+    return bool(cast("int", socket.get(zmq.EVENTS)) & zmq.POLLIN)
+
+
+class _Gate:
+    """Lets in whose CURVE key lies in the server's directory of clients (ZAP, RFC 27).
+
+    Args:
+        directory: as `remote.keys.make_keys` lays it out.
+
+    Attributes:
+        secret: the server's own key.
+
+    Raises:
+        ConfigError: the server's key can't be read.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self.secret, self._clients = read_server_keys(directory)
+        self._names: dict[bytes, str] = {}
+        self._read_at_ns = 0
+        self._warned_at: float | None = None
+        self._socket: zmq.Socket[bytes] | None = None
+
+    def open(self, context: zmq.Context[zmq.Socket[bytes]]) -> int:
+        """Begin to be asked; the descriptor that tells of a question."""
+        self._socket = context.socket(zmq.REP)
+        self._socket.bind("inproc://zeromq.zap.01")
+        return _descriptor(self._socket)
+
+    def answer(self, now: float) -> None:
+        """Answer all questions; never blocks."""
+        socket = self._socket
+        while socket is not None and _is_readable(socket):
+            version, request_id, _, address, _, mechanism, *credentials = socket.recv_multipart()
+            name = self._name(credentials[0]) if mechanism == b"CURVE" else None
+            if name is None:
+                self._warn(address.decode(errors="replace"), now)
+            verdict = (b"400", b"not on the list", b"") if name is None else (
+                b"200", b"", name.encode(),
+            )  # fmt: skip
+            socket.send_multipart([version, request_id, *verdict, b""])
+
+    def _name(self, key: bytes) -> str | None:
+        """Whose key it is. The directory is read again whenever it has changed."""
+        changed_at_ns = self._clients.stat().st_mtime_ns if self._clients.is_dir() else -1
+        if changed_at_ns != self._read_at_ns:
+            self._read_at_ns = changed_at_ns
+            self._names = self._listed()
+        return self._names.get(z85.encode(key))
+
+    def _listed(self) -> dict[bytes, str]:
+        names: dict[bytes, str] = {}
+        for path in sorted(self._clients.glob(f"*{PUBLIC_SUFFIX}")):
+            try:
+                names[read_keys(path).public] = path.stem
+            except ConfigError as error:
+                _log.warning("%s; its client stays out", error)
+        return names
+
+    def _warn(self, address: str, now: float) -> None:
+        if self._warned_at is None or now - self._warned_at >= _SECONDS_BETWEEN_WARNINGS:
+            self._warned_at = now
+            _log.warning("a client at %s has a key that is not in %s", address, self._clients)

@@ -1,0 +1,324 @@
+"""`RemoteEnvClient`: an env of this machine, stepped by a trainer on another.
+
+Rule: a plain blocking loop on the caller's thread. The env is reset, stepped and stopped
+by that thread alone; what is said to the server, and when, is `client_session`'s affair;
+whether the connection lives is ZMQ's, whose own thread goes on while the env steps.
+Absent on purpose: threads, and anything that unpickles.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import time
+import traceback
+from math import ceil
+from typing import TYPE_CHECKING, Any, Final, Self
+
+import zmq
+from zmq.utils.monitor import recv_monitor_message
+
+from rlightning_aio.envs.base import default_env_preprocess_fn
+from rlightning_aio.errors import ClientRefused, ConfigError
+from rlightning_aio.protocol.client_session import (
+    ClientSession,
+    Ended,
+    Phase,
+    Refused,
+    ResetRequest,
+    StepRequest,
+)
+from rlightning_aio.protocol.columns import Misfit
+from rlightning_aio.protocol.server_session import PATIENCE
+from rlightning_aio.protocol.space_description import UnsupportedSpace
+from rlightning_aio.protocol.wire import MAX_FRAME_BYTES
+from rlightning_aio.remote.keys import read_client_keys
+from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+    from rlightning_aio.envs.base import BaseEnv
+    from rlightning_aio.protocol.client_session import Event
+
+__all__ = ["RemoteEnvClient"]
+
+_RECONNECT_MS: Final = (100, 5000)
+"""From one attempt to connect to the next: at first, and at most; doubled in between."""
+_HANDSHAKE_MS: Final = 5000
+_LINGER_MS: Final = 500
+
+_log = logging.getLogger(__name__)
+
+_Socket = zmq.Socket[bytes]
+
+
+class RemoteEnvClient:
+    """Lends one env to the env_server of a trainer's group.
+
+    It dials in, and dials again with growing pauses whenever the server is gone; each time
+    it is let in, the env is reset and a new session begins. Whenever a session ends without
+    the env's doing, ``env.on_disconnect()`` is called, so that a robot stops.
+
+    Args:
+        env: newly built; the client owns it from now on, initialises it and closes it.
+        hostname, port: of the server.
+        keys: directory of the client's keys, see ``rlightning-aio keygen``; None connects
+            without, which a server with keys refuses.
+        name: unique at the server; by default this machine's name and the process id.
+        heartbeat: seconds within which a dead server is found; the server's own setting
+            takes over once it has answered.
+
+    Attributes:
+        name: as given, or made.
+        num_steps: steps that the env has taken for trainers.
+        num_sessions: how often it was let in.
+
+    Raises:
+        ConfigError: the env's spaces can't be announced, or the keys can't be read.
+    """
+
+    def __init__(
+        self,
+        env: BaseEnv,
+        hostname: str,
+        port: int,
+        *,
+        keys: str | os.PathLike[str] | None = None,
+        name: str | None = None,
+        heartbeat: float = 5.0,
+    ) -> None:
+        self.name = name or f"{socket.gethostname()}-{os.getpid()}"
+        self.num_steps = 0
+        self.num_sessions = 0
+        self._env = env
+        self._address = f"tcp://{f'[{hostname}]' if ':' in hostname else hostname}:{port}"
+        self._keys = None if keys is None else read_client_keys(keys)
+        self._heartbeat = heartbeat
+        try:
+            self._session = ClientSession(
+                env.init(),
+                self.name,
+                heartbeat=heartbeat,
+                free_actions=env.transforms_actions or _preprocesses(env),
+                reads_extras=_reads_extras(env),
+            )
+        except UnsupportedSpace as error:
+            raise ConfigError(f"env {env.env_id!r} can't be a remote client: {error}") from None
+        self._todo: StepRequest | ResetRequest | None = None
+        self._trouble = ""
+        self._context: zmq.Context[_Socket] | None = None
+        self._dealer: _Socket
+        self._monitor: _Socket
+        self._poller: zmq.Poller
+        self._closed = False
+
+    @property
+    def state(self) -> str:
+        """How things stand, in a few words."""
+        trouble = self._session.refusal or self._trouble
+        phase = self._session.phase.value
+        if not trouble or self._session.phase is Phase.SERVING:
+            return phase
+        return f"{phase} ({trouble})"
+
+    def connect(self, timeout: float | None = None) -> None:
+        """Dial in and wait until the server has let this client in.
+
+        Args:
+            timeout: seconds; None waits as long as it takes.
+
+        Raises:
+            TimeoutError: nobody let it in; the message has the last reason known.
+            ClientRefused: the server will never let it in as it is.
+        """
+        if self._closed:
+            raise RuntimeError("this client is closed")
+        if self._context is None:
+            self._dial()
+        end = None if timeout is None else time.monotonic() + timeout
+        while self._session.phase is not Phase.SERVING:
+            if end is not None and time.monotonic() >= end:
+                raise TimeoutError(
+                    f"{self._address} did not let {self.name!r} in within {timeout} s: {self.state}"
+                )
+            self._turn(end)
+
+    def run(self) -> None:
+        """Serve until ``env.is_finish()`` says so; connects first if need be.
+
+        Raises:
+            ClientRefused: the server will never let this client in.
+            Exception: whatever the env raises in the reset that opens a session, in
+                ``is_finish``, or in ``on_disconnect``. Errors of steps and later resets go to
+                the trainer instead.
+        """
+        try:
+            self.connect()
+            while not self._env.is_finish():
+                request, self._todo = self._todo, None
+                while request is None:
+                    self._turn(None)
+                    request, self._todo = self._todo, None
+                self._execute(request)
+        except BaseException as error:
+            self._leave(f"{type(error).__name__}: {error}")
+            raise
+        self._leave("the env is finished")
+
+    def close(self) -> None:
+        """Leave the server and close the env; idempotent."""
+        if self._closed:
+            return
+        self._closed = True
+        if self._context is not None:
+            self._leave("the client was closed")
+            self._dealer.disable_monitor()
+            self._monitor.close(linger=0)
+            self._dealer.close(linger=_LINGER_MS)
+            self._context.term()
+        self._env.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        exc_traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    # The connection
+
+    def _dial(self) -> None:
+        self._context = zmq.Context[_Socket]()
+        dealer = self._dealer = self._context.socket(zmq.DEALER)
+        # A message for a connection that is no more must not wait for the next one.
+        dealer.set(zmq.IMMEDIATE, 1)
+        dealer.set(zmq.MAXMSGSIZE, MAX_FRAME_BYTES)
+        dealer.set(zmq.RECONNECT_IVL, _RECONNECT_MS[0])
+        dealer.set(zmq.RECONNECT_IVL_MAX, _RECONNECT_MS[1])
+        dealer.set(zmq.HANDSHAKE_IVL, _HANDSHAKE_MS)
+        dealer.set(zmq.HEARTBEAT_IVL, max(1, int(1000 * self._heartbeat / PATIENCE)))
+        dealer.set(zmq.HEARTBEAT_TIMEOUT, max(2, int(2000 * self._heartbeat / PATIENCE)))
+        if self._keys is not None:
+            dealer.set(zmq.CURVE_SERVERKEY, self._keys.server)
+            dealer.set(zmq.CURVE_PUBLICKEY, self._keys.public)
+            dealer.set(zmq.CURVE_SECRETKEY, self._keys.secret)
+        if "[" in self._address:
+            dealer.set(zmq.IPV6, 1)
+        self._monitor = dealer.get_monitor_socket()
+        self._poller = zmq.Poller()
+        self._poller.register(dealer, zmq.POLLIN)
+        self._poller.register(self._monitor, zmq.POLLIN)
+        dealer.connect(self._address)
+
+    def _turn(self, until: float | None) -> None:
+        """Wait for something to happen, at most `until`, and take it in."""
+        times = [t for t in (until, self._session.deadline()) if t is not None]
+        wait_ms = ceil(1000 * max(0.0, min(times) - time.monotonic())) if times else None
+        ready = dict(self._poller.poll(wait_ms))
+        if self._monitor in ready:
+            self._watch()
+        if self._dealer in ready:
+            parts = self._dealer.recv_multipart(zmq.NOBLOCK)
+            self._obey(self._session.receive(parts, time.monotonic()))
+        self._obey(self._session.tick(time.monotonic()))
+        self._flush()
+
+    def _watch(self) -> None:
+        """Take in what has become of the connection."""
+        event = recv_monitor_message(self._monitor)["event"]
+        if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
+            self._trouble = ""
+            self._session.connected(time.monotonic())
+        elif event == zmq.EVENT_DISCONNECTED:
+            self._session.disconnected(time.monotonic())
+        elif event == zmq.EVENT_CONNECT_RETRIED and not self._trouble:
+            self._trouble = f"nobody answers at {self._address}"
+        elif event in _REFUSED_HANDSHAKES:
+            self._trouble = _REFUSED_HANDSHAKES[event]
+
+    def _flush(self) -> None:
+        outbox = self._session.outbox
+        while outbox:
+            parts = outbox.popleft()
+            try:
+                self._dealer.send_multipart(parts, zmq.NOBLOCK, copy=False)
+            except zmq.Again:
+                # No connection, or a full one; what is lost is asked for again.
+                continue
+
+    def _leave(self, reason: str) -> None:
+        self._session.leave(reason)
+        self._flush()
+
+    # The env
+
+    def _obey(self, event: Event | None) -> None:
+        if isinstance(event, Refused):
+            raise ClientRefused(f"{self._address} refused the client {self.name!r}: {event.text}")
+        if isinstance(event, Ended):
+            self._todo = None
+            _log.warning("%s: session over: %s", self.name, event.cause)
+            self._env.on_disconnect()
+        elif event is not None:
+            self._todo = event
+
+    def _execute(self, request: StepRequest | ResetRequest) -> None:
+        if request.number == 0:
+            self.num_sessions += 1
+            self._answer(0, self._env.reset())
+            return
+        try:
+            self._answer(request.number, self._perform(request))
+        except Exception as error:  # noqa: BLE001  # Whatever it is, the trainer learns of it.
+            self._session.fail(request.number, *_in_words(error))
+            self._flush()
+
+    def _perform(self, request: StepRequest | ResetRequest) -> Any:
+        if isinstance(request, ResetRequest):
+            return self._env.reset(seed=request.seed, options=request.options)
+        response = PolicyResponse(self._env.env_id, request.action, **request.extras)
+        ret = self._env.step(response)
+        self.num_steps += 1
+        return ret
+
+    def _answer(self, number: int, ret: Any) -> None:
+        if not isinstance(ret, EnvRet | MultiAgentEnvRet):
+            raise Misfit(f"the env returned {type(ret).__name__}, not an EnvRet")
+        self._session.finish(number, ret)
+        self._flush()
+
+
+def _preprocesses(env: BaseEnv) -> bool:
+    function = env._preprocess_fn  # pyright: ignore[reportPrivateUsage]
+    return function is not default_env_preprocess_fn
+
+
+def _reads_extras(env: BaseEnv) -> bool:
+    """Whether anything here can read more of a response than its action."""
+    built_in = type(env).__module__.startswith("rlightning_aio.envs.")
+    return env.bare_step() is None and (not built_in or _preprocesses(env))
+
+
+def _in_words(error: Exception) -> tuple[str, str, str]:
+    """Type, text and traceback of `error`; a broken ``__str__`` is no obstacle."""
+    kind = type(error)
+    name = f"{kind.__module__}.{kind.__qualname__}".removeprefix("builtins.")
+    try:
+        text, lines = str(error), "".join(traceback.format_exception(error))
+    except Exception as broken:  # noqa: BLE001  # It is the env author's code.
+        text = f"<its __str__ raised {type(broken).__name__}>"
+        lines = "".join(traceback.format_tb(error.__traceback__)) + f"{name}: {text}\n"
+    return name, text, lines
+
+
+_REFUSED_HANDSHAKES: Final[dict[int, str]] = {
+    zmq.EVENT_HANDSHAKE_FAILED_AUTH: "the server does not know this client's key",
+    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: "the server speaks another security: keys on one side?",
+    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: "the server broke the handshake: is this its key?",
+}

@@ -1,0 +1,166 @@
+"""The CURVE keys of an env_server and its clients: making them and reading them.
+
+Rule: key files are ZeroMQ's certificates, so that its tools read them; a key is 40
+characters of Z85. ``make_keys(directory, names)`` lays out one directory for each machine, so that
+setting up a client is copying one of them: ``server/`` has the server's secret and, in
+``clients/``, the public key of every client that may come in; ``<name>/`` has one
+client's secret and the server's public key. Deleting a file in ``server/clients/`` shuts
+that client out.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import zmq
+
+from rlightning_aio.errors import ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+__all__ = [
+    "ClientKeys",
+    "KeyPair",
+    "ServerKeys",
+    "make_keys",
+    "read_client_keys",
+    "read_keys",
+    "read_server_keys",
+]
+
+PUBLIC_SUFFIX: Final = ".key"
+_SECRET_SUFFIX: Final = ".key_secret"  # noqa: S105  # The name of a file, not a secret.
+_SERVER: Final = "server"
+_CLIENT: Final = "client"
+_ALLOWED: Final = "clients"
+# Z85 spelt out, see https://rfc.zeromq.org/spec/32/
+_KEY: Final = r'"([0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40})"'
+
+
+class KeyPair(NamedTuple):
+    """A public key and, where the file has it, the secret one; Z85 text."""
+
+    public: bytes
+    secret: bytes | None = None
+
+
+class ServerKeys(NamedTuple):
+    """What a server needs: its own secret, Z85 text, and where its clients' keys lie."""
+
+    secret: bytes
+    clients: Path
+
+
+class ClientKeys(NamedTuple):
+    """What a client needs to prove itself, and to know its server; Z85 text."""
+
+    public: bytes
+    secret: bytes
+    server: bytes
+
+
+def make_keys(directory: str | os.PathLike[str], names: Sequence[str]) -> list[Path]:
+    """Make the server's keys, unless they exist, and those of the clients `names`.
+
+    Args:
+        directory: made if missing.
+        names: of clients; letters, digits, ``.``, ``_`` and ``-``.
+
+    Returns:
+        The directories that belong on the clients' machines, in the order of `names`.
+
+    Raises:
+        ConfigError: a name can't be a file's, or has keys already; nothing was written.
+    """
+    top = Path(directory)
+    for name in names:
+        if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9._-]*", name) or name == _SERVER:
+            raise ConfigError(
+                f"{name!r} can't name a client's keys: use letters, digits, '.', '_' and '-', "
+                f"and not {_SERVER!r}"
+            )
+        if (top / name).exists():
+            raise ConfigError(f"{top / name} exists; remove it to make new keys for {name!r}")
+    allowed = top / _SERVER / _ALLOWED
+    allowed.mkdir(parents=True, exist_ok=True)
+    server = top / _SERVER / (_SERVER + _SECRET_SUFFIX)
+    if not server.exists():
+        _write_pair(top / _SERVER, _SERVER)
+    server_keys = read_keys(server)
+    for name in names:
+        (top / name).mkdir()
+        keys = _write_pair(top / name, _CLIENT)
+        (top / name / (_SERVER + PUBLIC_SUFFIX)).write_text(_render(KeyPair(server_keys.public)))
+        (allowed / (name + PUBLIC_SUFFIX)).write_text(_render(KeyPair(keys.public)))
+    return [top / name for name in names]
+
+
+def _write_pair(directory: Path, name: str) -> KeyPair:
+    public, secret = zmq.curve_keypair()
+    keys = KeyPair(public, secret)
+    path = directory / (name + _SECRET_SUFFIX)
+    with os.fdopen(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "w") as file:
+        file.write(_render(keys))
+    (directory / (name + PUBLIC_SUFFIX)).write_text(_render(KeyPair(public)))
+    return keys
+
+
+def read_client_keys(directory: str | os.PathLike[str]) -> ClientKeys:
+    """The keys in a client's directory, as `make_keys` lays it out.
+
+    Raises:
+        ConfigError: a file is missing or is no key; the message names it.
+    """
+    public, secret = _read_secret(Path(directory) / (_CLIENT + _SECRET_SUFFIX))
+    return ClientKeys(public, secret, read_keys(Path(directory) / (_SERVER + PUBLIC_SUFFIX)).public)
+
+
+def read_server_keys(directory: str | os.PathLike[str]) -> ServerKeys:
+    """The keys in a server's directory, as `make_keys` lays it out.
+
+    Raises:
+        ConfigError: a file is missing or is no key; the message names it.
+    """
+    _, secret = _read_secret(Path(directory) / (_SERVER + _SECRET_SUFFIX))
+    clients = Path(directory) / _ALLOWED
+    if not clients.is_dir():
+        raise ConfigError(f"{clients} is no directory; the public keys of clients belong there")
+    return ServerKeys(secret, clients)
+
+
+def _read_secret(path: Path) -> tuple[bytes, bytes]:
+    keys = read_keys(path)
+    if keys.secret is None:
+        raise ConfigError(f"{path} has no line secret-key; `rlightning-aio keygen` makes keys")
+    return keys.public, keys.secret
+
+
+def read_keys(path: Path) -> KeyPair:
+    """The keys in one file.
+
+    Raises:
+        ConfigError: it can't be read, or is no key; the message names it.
+    """
+    try:
+        text = path.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(
+            f"can't read the key {path}: {error}; `rlightning-aio keygen` makes keys"
+        ) from None
+    public = re.search(rf"^\s*public-key\s*=\s*{_KEY}\s*$", text, re.MULTILINE)
+    secret = re.search(rf"^\s*secret-key\s*=\s*{_KEY}\s*$", text, re.MULTILINE)
+    if public is None:
+        raise ConfigError(f"{path} has no line public-key with a key of 40 characters")
+    return KeyPair(public[1].encode(), secret[1].encode() if secret else None)
+
+
+def _render(keys: KeyPair) -> str:
+    lines = ["# A key of rlightning-aio.", "curve", f'    public-key = "{keys.public.decode()}"']
+    if keys.secret is not None:
+        lines[0] = "# A key of rlightning-aio. SECRET: leave no copy where others can read it."
+        lines.append(f'    secret-key = "{keys.secret.decode()}"')
+    return "\n".join([*lines, ""])
