@@ -124,7 +124,7 @@ class BaseEnv(abc.ABC):
         if not isinstance(seed, list):
             return [int(seed) + k for k in range(count)]
         if len(seed) != count:
-            raise ValueError(f"{self.env_id}: {len(seed)} seeds for {count} sub-environments")
+            raise ValueError(f"env {self.env_id!r}: {len(seed)} seeds for {count} sub-environments")
         return [int(one) for one in seed]
 
     def render(self) -> Any:

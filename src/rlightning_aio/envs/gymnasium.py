@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 
-from rlightning_aio.config import EnvConfig
 from rlightning_aio.envs.base import BareStep, BaseEnv, PreprocessFn, default_env_preprocess_fn
+from rlightning_aio.envs.tensors import as_numpy
 from rlightning_aio.types import EnvRet, PolicyResponse
+
+if TYPE_CHECKING:
+    from rlightning_aio.config import EnvConfig
 
 __all__ = ["GymnasiumEnv", "MujocoEnv"]
 
@@ -48,7 +51,7 @@ class GymnasiumEnv(BaseEnv):
 
     def step(self, policy_resp: PolicyResponse) -> EnvRet:
         observation, reward, terminated, truncated, info = self.env.step(
-            self._preprocess_fn(policy_resp)
+            as_numpy(self._preprocess_fn(policy_resp))
         )
         return EnvRet(
             env_id=self.env_id,

@@ -1,0 +1,294 @@
+"""`EnvContract`: tests that hold for every env; whoever writes a backend inherits them.
+
+Rule: a subclass names a config and gets the tests; no test knows a simulator. Collected
+by pytest, but made without it, so that the package needs no test tools.
+Absent on purpose: how fast an env is, and what its observations mean.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from typing import TYPE_CHECKING, Any, ClassVar, cast
+from unittest import SkipTest
+
+import numpy as np
+
+from rlightning_aio.envs.tensors import as_numpy
+from rlightning_aio.registry import ENVS
+from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Generator, Iterator, Sequence
+
+    import gymnasium as gym
+
+    from rlightning_aio.config import EnvConfig
+    from rlightning_aio.envs.base import BaseEnv
+
+__all__ = ["EnvContract", "Outcome", "outcome_of", "same"]
+
+Outcome = tuple[Any, Any, Any, Any]
+"""Observation, reward, terminated, truncated; NumPy arrays and Python scalars in them."""
+
+
+class EnvContract:
+    """Tests of one env against `BaseEnv`'s contract.
+
+    ::
+
+        class TestMyEnv(EnvContract):
+            config = EnvConfig(name="mine", backend="my_backend", task="MyTask-v1")
+
+    Attributes:
+        config: the config entry that the env is made from.
+        resets_itself: sub-environments that ended start over in the next step, unasked.
+        num_steps: how many steps the trajectories have.
+        seed: what they start from.
+    """
+
+    config: ClassVar[EnvConfig]
+    resets_itself: ClassVar[bool] = False
+    num_steps: ClassVar[int] = 200
+    seed: ClassVar[int] = 3
+
+    def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:
+        """The bare simulator's outcomes, of a reset with `seed` and of each action.
+
+        Override it to have the env compared with what it wraps; episodes that end are
+        reset, without a seed, in place of the next action.
+        """
+        del actions
+        raise SkipTest("no bare simulator to compare with")
+
+    def actions(self, env: BaseEnv) -> list[Any]:
+        """Seeded random actions; override it where the action space is unbounded."""
+        space = env.get_action_space()
+        space.seed(self.seed)
+        return [space.sample() for _ in range(self.num_steps)]
+
+    def make_env(self) -> BaseEnv:
+        """The env under test, initialised."""
+        env = ENVS.resolve(self.config.backend)(self.config)
+        env.init()
+        return env
+
+    @contextlib.contextmanager
+    def opened(self) -> Generator[BaseEnv]:
+        """The env under test, closed at the end."""
+        env = self.make_env()
+        try:
+            yield env
+        finally:
+            env.close()
+
+    def outcomes(
+        self, env: BaseEnv, actions: Sequence[Any], *, seed: int | None = None
+    ) -> Iterator[Outcome]:
+        """The env's outcomes, of a reset with `seed` (or the given one) and of each action.
+
+        As `simulate` does, an episode's end is followed by a reset in place of a step,
+        unless the env resets itself.
+        """
+
+        def step(action: Any) -> Outcome:
+            return outcome_of(env.step(PolicyResponse(env.env_id, action)))
+
+        yield outcome_of(env.reset(seed=self.seed if seed is None else seed))
+        ended = False
+        for action in actions:
+            outcome = outcome_of(env.reset()) if ended else step(action)
+            ended = not self.resets_itself and _has_ended(outcome)
+            yield outcome
+
+    def test_metadata_is_what_the_env_was_configured_to_be(self) -> None:
+        """Id, counts and spaces are known as soon as the env is built."""
+        with self.opened() as env:
+            meta = env.get_metadata()
+            assert meta.env_id == f"{self.config.name}-0"
+            assert meta.num_envs >= 1
+            assert meta.observation_space is not None, "no observation space"
+            assert meta.action_space is not None, "no action space"
+            assert meta.max_episode_steps is None or meta.max_episode_steps >= 1
+
+    def test_every_result_fits_the_spaces_and_counts(self) -> None:
+        """Observations are members of the space; rewards and flags have one entry each."""
+        with self.opened() as env:
+            meta = env.get_metadata()
+            shape = (meta.num_envs,) if meta.num_envs > 1 else ()
+            ended = True
+            for action in self.actions(env):
+                result = env.reset() if ended else _step(env, action)
+                outcome = outcome_of(result)
+                _check_membership(outcome[0], env.get_observation_space())
+                if not ended:
+                    _check_columns(outcome, meta.agents, shape)
+                ended = not self.resets_itself and _has_ended(outcome)
+
+    def test_a_reset_gives_no_reward_and_ends_nothing(self) -> None:
+        """After a reset nobody has been rewarded; whoever takes part has not ended."""
+        with self.opened() as env:
+            result = env.reset(seed=self.seed)
+            assert isinstance(result, EnvRet | MultiAgentEnvRet), f"reset() gave {result}"
+            assert not np.any(_entries(result.last_reward, ()))
+            assert not np.any(_entries(result.last_truncated, ()))
+            assert not np.all(_entries(result.last_terminated, ()))
+
+    def test_one_seed_gives_one_trajectory(self) -> None:
+        """The same seed and actions give the same bits, in this env and in another one."""
+        with self.opened() as env, self.opened() as other:
+            actions = self.actions(env)
+            first = list(self.outcomes(env, actions))
+            assert same(first, list(self.outcomes(env, actions))), "not when reset again"
+            assert same(first, list(self.outcomes(other, actions))), "not in another env"
+
+    def test_other_seeds_give_other_trajectories(self) -> None:
+        """The seed matters."""
+        with self.opened() as env:
+            actions = self.actions(env)
+            one = list(self.outcomes(env, actions))
+            assert not same(one, list(self.outcomes(env, actions, seed=self.seed + 1000)))
+
+    def test_results_are_not_overwritten(self) -> None:
+        """What was handed out stays as it was, whatever the env does next."""
+        with self.opened() as env:
+            result = env.reset(seed=self.seed)
+            kept = _copied(outcome_of(result))
+            for action in self.actions(env)[:20]:
+                result_before, kept_before = result, kept
+                result = _step(env, action)
+                kept = _copied(outcome_of(result))
+                assert same(outcome_of(result_before), kept_before)
+                if not self.resets_itself and _has_ended(kept):
+                    break
+
+    def test_bare_steps_are_steps(self) -> None:
+        """`bare_step`, where there is one, gives what `step` gives."""
+        if not self._has_bare_step():
+            raise SkipTest("no bare_step")
+        with self.opened() as env, self.opened() as other:
+            bare = other.bare_step()
+            assert bare is not None
+            env.reset(seed=self.seed)
+            other.reset(seed=self.seed)
+            for action in self.actions(env):
+                outcome = outcome_of(_step(env, action))
+                assert same(outcome, tuple(map(as_numpy, bare(action)[:4])))
+                if not self.resets_itself and _has_ended(outcome):
+                    break
+
+    def _has_bare_step(self) -> bool:
+        with self.opened() as env:
+            return env.bare_step() is not None
+
+    def test_torch_actions_are_taken(self) -> None:
+        """An action may be a torch tensor; it does what the array does."""
+        tensor = _tensor_maker()
+        with self.opened() as env, self.opened() as other:
+            env.reset(seed=self.seed)
+            other.reset(seed=self.seed)
+            for action in self.actions(env)[:3]:
+                assert same(
+                    outcome_of(_step(env, action)),
+                    outcome_of(_step(other, _converted(action, tensor))),
+                )
+
+    def test_it_is_the_bare_simulator(self) -> None:
+        """The env gives what the simulator gives, bit for bit."""
+        with self.opened() as env:
+            actions = self.actions(env)
+            expected = list(self.simulate(actions))
+            assert len(expected) == len(actions) + 1
+            for index, (one, other) in enumerate(
+                zip(self.outcomes(env, actions), expected, strict=True)
+            ):
+                assert same(one, other), f"outcome {index}: {one} is not {other}"
+
+
+def outcome_of(result: Any) -> Outcome:
+    """What a result says, without torch tensors."""
+    assert isinstance(result, EnvRet | MultiAgentEnvRet), f"not a result: {result}"
+    return cast(
+        "Outcome",
+        tuple(
+            map(
+                as_numpy,
+                (
+                    result.observation,
+                    result.last_reward,
+                    result.last_terminated,
+                    result.last_truncated,
+                ),
+            )
+        ),
+    )
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two values are equal in structure, shapes and every bit; NaN equals NaN."""
+    if isinstance(one, dict):
+        entries = cast("dict[Any, Any]", one)
+        return (
+            isinstance(other, dict)
+            and entries.keys() == cast("dict[Any, Any]", other).keys()
+            and all(same(value, other[key]) for key, value in entries.items())
+        )
+    if isinstance(one, tuple | list):
+        members = cast("Sequence[Any]", one)
+        return len(members) == len(other) and all(map(same, members, other))
+    array = np.asarray(one)
+    return np.array_equal(array, np.asarray(other), equal_nan=array.dtype.kind == "f")
+
+
+def _check_membership(observation: Any, space: gym.Space[Any]) -> None:
+    assert space.contains(observation), f"observation not in {space}: {observation}"
+
+
+def _check_columns(outcome: Outcome, agents: tuple[str, ...], shape: tuple[int, ...]) -> None:
+    """Rewards and flags have one entry for each agent and sub-environment."""
+    for name, value in zip(("reward", "terminated", "truncated"), outcome[1:], strict=True):
+        arrays = list(map(np.asarray, _entries(value, agents)))
+        assert {one.shape for one in arrays} == {shape}, f"{name}: {value}"
+        if name != "reward":
+            assert {one.dtype.kind for one in arrays} == {"b"}, f"{name} is not boolean: {value}"
+
+
+def _step(env: BaseEnv, action: Any) -> Any:
+    return env.step(PolicyResponse(env.env_id, action))
+
+
+def _entries(value: Any, agents: Sequence[str]) -> list[Any]:
+    """The values of all agents, or the one value; agents must be named where there are any."""
+    if not isinstance(value, dict):
+        assert not agents, f"not by agent: {value}"
+        return [value]
+    by_agent = cast("dict[str, Any]", value)
+    assert not agents or tuple(by_agent) == tuple(agents), f"not of {agents}: {by_agent}"
+    return list(by_agent.values())
+
+
+def _has_ended(outcome: Outcome) -> bool:
+    """Whether nobody is left in the episode."""
+    _, _, terminated, truncated = outcome
+    flags = zip(_entries(terminated, ()), _entries(truncated, ()), strict=True)
+    return all(bool(np.all(np.logical_or(one, other))) for one, other in flags)
+
+
+def _converted(value: Any, convert: Callable[[Any], Any]) -> Any:
+    """`value` with `convert` applied to every array in it."""
+    if isinstance(value, dict):
+        return {k: _converted(v, convert) for k, v in cast("dict[Any, Any]", value).items()}
+    if isinstance(value, tuple):
+        return tuple(_converted(one, convert) for one in cast("tuple[Any, ...]", value))
+    return convert(value)
+
+
+def _copied(value: Any) -> Any:
+    return _converted(value, lambda one: np.array(one, copy=True))
+
+
+def _tensor_maker() -> Callable[[Any], Any]:
+    try:
+        from torch import as_tensor  # pyright: ignore[reportMissingImports, reportUnknownVariableType]
+    except ImportError:
+        raise SkipTest("no torch here") from None
+    return cast("Callable[[Any], Any]", as_tensor)

@@ -1,0 +1,163 @@
+"""`envpool`: batches of EnvPool's C++ environments, in step or asynchronously.
+
+Rule: a result is what EnvPool's `recv` gave, untouched; actions go to those
+sub-environments that the last result came from.
+Absent on purpose: EnvPool's tasks with several players, whose batches vary in size.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+from gymnasium.vector.utils import batch_space
+
+from rlightning_aio.envs.base import BareStep, BaseEnv, PreprocessFn, default_env_preprocess_fn
+from rlightning_aio.envs.tensors import as_numpy
+from rlightning_aio.errors import ConfigError
+from rlightning_aio.types import EnvRet, PolicyResponse
+
+if TYPE_CHECKING:
+    import gymnasium as gym
+
+    from rlightning_aio.config import EnvConfig
+
+__all__ = ["EnvPoolEnv"]
+
+# Optional and untyped, so imported by name.
+envpool: Any = import_module("envpool")
+
+# Largest int32: EnvPool's seeds lie below it, and as a step limit it means none.
+UNLIMITED = 2**31 - 1
+
+
+class EnvPoolEnv(BaseEnv):
+    """A pool of ``num_envs`` C++ environments; ``env_kwargs`` go to `envpool.make`.
+
+    With ``batch_size`` M below ``num_envs`` the pool is asynchronous: each result holds
+    the M sub-environments that were ready first, so that the others compute while the
+    policy thinks, and the env's spaces and its ``num_envs`` are those of M. In both modes
+    ``info["env_id"]`` (int32 ``[M]``) names the sub-environment of each row.
+
+    A sub-environment that has ended is reset by the step after, which ignores its action
+    and returns reward 0; the result before it holds the final observation.
+    """
+
+    def __init__(
+        self,
+        config: EnvConfig,
+        worker_index: int = 0,
+        preprocess_fn: PreprocessFn | None = None,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(config, worker_index, preprocess_fn, **kwargs)
+        self.num_envs = self._batch_size()
+        self._asynchronous = self.num_envs < config.num_envs
+        # EnvPool's own default is one fixed seed, which would make all envs alike.
+        self._unseeded = np.random.default_rng()
+        self._open(self._drawn_seeds())
+        limit = int(self.env.config["max_episode_steps"])
+        self.max_episode_steps = limit if limit < UNLIMITED else None
+
+    def _batch_size(self) -> int:
+        count = self.config.num_envs
+        batch_size = int(self.config.env_kwargs.get("batch_size") or count)
+        if not 1 <= batch_size <= count:
+            raise ConfigError(
+                f"env {self.env_id!r}: env_kwargs.batch_size is {batch_size}, but must lie "
+                f"between 1 and num_envs, which is {count}"
+            )
+        return batch_size
+
+    def _drawn_seeds(self) -> list[int]:
+        return self._unseeded.integers(UNLIMITED, size=self.config.num_envs).tolist()
+
+    def _open(self, seeds: list[int]) -> None:
+        """Make the pool; its seeds are fixed from then on."""
+        limit = self.config.max_episode_steps
+        self.env = envpool.make(
+            self.config.task,
+            env_type="gymnasium",
+            seed=seeds,
+            num_envs=self.config.num_envs,
+            **({} if limit is None else {"max_episode_steps": limit}),
+            **self.config.env_kwargs,
+        )
+        self._ready: Any = None  # The sub-environments that wait for actions.
+
+    def _reopen(self, seeds: list[int]) -> None:
+        self.env.close()
+        self._open(seeds)
+
+    def reset(
+        self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
+    ) -> EnvRet:
+        """Reset every sub-environment.
+
+        A seed, and in asynchronous mode every reset but the first, makes a new pool:
+        EnvPool takes seeds at construction alone, and what it computes can't be recalled.
+
+        Raises:
+            ValueError: any `options`; EnvPool has none that resets the whole pool.
+        """
+        if options:
+            raise ValueError(f"env {self.env_id!r}: EnvPool takes no reset options: {options}")
+        if seed is not None:
+            self._reopen(self.sub_env_seeds(seed))
+        elif self._asynchronous and self._ready is not None:
+            self._reopen(self._drawn_seeds())
+        self.env.async_reset()
+        observation, _, _, _, info = self._receive()
+        return EnvRet(env_id=self.env_id, observation=observation, info=info)
+
+    def step(self, policy_resp: PolicyResponse) -> EnvRet:
+        observation, reward, terminated, truncated, info = self._step(
+            self._preprocess_fn(policy_resp)
+        )
+        return EnvRet(
+            env_id=self.env_id,
+            observation=observation,
+            last_reward=reward,
+            last_terminated=terminated,
+            last_truncated=truncated,
+            info=info,
+        )
+
+    def bare_step(self) -> BareStep | None:
+        plain = type(self).step is EnvPoolEnv.step
+        return self._step if plain and self._preprocess_fn is default_env_preprocess_fn else None
+
+    def _step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Answer the last result, and wait for the next."""
+        if self._ready is None:
+            raise RuntimeError(f"env {self.env_id!r} was stepped before its first reset")
+        action = np.asarray(as_numpy(action))
+        self.env.send(action if self.num_envs > 1 else action[None], self._ready)
+        return self._receive()
+
+    def _receive(self) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        result = self.env.recv()
+        self._ready = result[-1]["env_id"]
+        return result if self.num_envs > 1 else _first(result)
+
+    def get_observation_space(self) -> gym.Space[Any]:
+        return self._batched(self.env.observation_space)
+
+    def get_action_space(self) -> gym.Space[Any]:
+        return self._batched(self.env.action_space)
+
+    def _batched(self, space: gym.Space[Any]) -> gym.Space[Any]:
+        return batch_space(space, self.num_envs) if self.num_envs > 1 else space
+
+    def close(self) -> None:
+        self.env.close()
+
+
+def _first(batch: Any) -> Any:
+    """What a batch of one holds, without the leading axis."""
+    if isinstance(batch, dict):
+        return {key: _first(value) for key, value in cast("dict[str, Any]", batch).items()}
+    if isinstance(batch, tuple):
+        return tuple(map(_first, cast("tuple[Any, ...]", batch)))
+    return batch[0]

@@ -1,0 +1,147 @@
+"""`pettingzoo`: any parallel environment of PettingZoo, all its agents in each result.
+
+Rule: every result speaks of every possible agent, in the same order, so that a group
+can lay them out once; an agent that isn't taking part is said to have terminated.
+Absent on purpose: turn-based (AEC) environments; PettingZoo converts those itself.
+"""
+
+from __future__ import annotations
+
+import math
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+from gymnasium.spaces import Box, Dict, Discrete, Tuple
+
+from rlightning_aio.envs.base import BaseEnv, PreprocessFn
+from rlightning_aio.envs.tensors import as_numpy
+from rlightning_aio.errors import ConfigError
+from rlightning_aio.types import MultiAgentEnvRet, PolicyResponse
+
+if TYPE_CHECKING:
+    import gymnasium as gym
+
+    from rlightning_aio.config import EnvConfig
+
+__all__ = ["PettingZooEnv"]
+
+DEFAULT_FACTORY = "parallel_env"
+
+
+class PettingZooEnv(BaseEnv):
+    """One parallel environment; ``env_kwargs`` go to the function that makes it.
+
+    ``task`` is ``module`` (``mpe2.simple_spread_v3``), whose ``parallel_env`` is called, or
+    ``module:function`` for a function of another name.
+
+    ``agents`` are the environment's possible agents, and its spaces are Dicts over them.
+    An agent that has left before the episode's end, or hasn't joined yet, keeps an
+    observation of zeros, a reward of 0.0 and the flags it left with (terminated, if it left
+    with none); its action is ignored. Infos are by agent, for those who reported any.
+
+    The config's ``max_episode_steps`` truncates the episode for all agents that are left.
+    """
+
+    def __init__(
+        self,
+        config: EnvConfig,
+        worker_index: int = 0,
+        preprocess_fn: PreprocessFn | None = None,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(config, worker_index, preprocess_fn, **kwargs)
+        self.env = self._factory()(**config.env_kwargs)
+        self.agents = tuple(self.env.possible_agents)
+        self._observation_spaces = {a: self.env.observation_space(a) for a in self.agents}
+        self._action_spaces = {a: self.env.action_space(a) for a in self.agents}
+        if self.max_episode_steps is None:
+            self.max_episode_steps = getattr(self.env.unwrapped, "max_cycles", None)
+
+    def _factory(self) -> Any:
+        module_name, _, function = self.config.task.partition(":")
+        factory = getattr(import_module(module_name), function or DEFAULT_FACTORY, None)
+        if factory is None:
+            raise ConfigError(
+                f"env {self.env_id!r}: module {module_name} has no function "
+                f"{function or DEFAULT_FACTORY}; task names a module with a parallel_env, or "
+                "module:function"
+            )
+        return factory
+
+    def reset(
+        self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
+    ) -> MultiAgentEnvRet:
+        observations, infos = self.env.reset(seed=seed, options=options)
+        self._steps = 0
+        self._terminated = {agent: agent not in observations for agent in self.agents}
+        self._truncated = dict.fromkeys(self.agents, False)
+        return self._result(observations, {}, infos)
+
+    def step(self, policy_resp: PolicyResponse) -> MultiAgentEnvRet:
+        live = list(self.env.agents)  # Some environments empty their list in place.
+        if not live:
+            raise RuntimeError(
+                f"env {self.env_id!r} has no agents: reset it before its first step and after "
+                "the end of each episode"
+            )
+        actions = as_numpy(self._preprocess_fn(policy_resp))
+        observations, rewards, terminated, truncated, infos = self.env.step(
+            {agent: actions[agent] for agent in live}
+        )
+        self._note_flags(live, terminated, truncated)
+        return self._result(observations, rewards, infos)
+
+    def _note_flags(
+        self, live: list[str], terminated: dict[str, bool], truncated: dict[str, bool]
+    ) -> None:
+        """Bring the agents' flags up to date; `live` were there before the step."""
+        there = self.env.agents
+        for agent in {*live, *there}:
+            self._terminated[agent] = bool(terminated.get(agent, False))
+            self._truncated[agent] = bool(truncated.get(agent, False))
+        for agent in set(live) - set(there):
+            # Whoever left has ended, even if the simulator forgot to say so.
+            self._terminated[agent] |= not self._truncated[agent]
+        self._steps += 1
+        if self._steps >= (self.config.max_episode_steps or math.inf):
+            self._truncated |= dict.fromkeys(there, True)
+
+    def _result(
+        self, observations: dict[str, Any], rewards: dict[str, Any], infos: dict[str, Any]
+    ) -> MultiAgentEnvRet:
+        return MultiAgentEnvRet(
+            env_id=self.env_id,
+            observation={
+                agent: observations[agent] if agent in observations else _zeros(space)
+                for agent, space in self._observation_spaces.items()
+            },
+            last_reward={agent: float(rewards.get(agent, 0.0)) for agent in self.agents},
+            last_terminated=dict(self._terminated),
+            last_truncated=dict(self._truncated),
+            info={agent: info for agent, info in infos.items() if info},
+        )
+
+    def get_observation_space(self) -> Dict:
+        return Dict(self._observation_spaces)
+
+    def get_action_space(self) -> Dict:
+        return Dict(self._action_spaces)
+
+    def close(self) -> None:
+        self.env.close()
+
+
+def _zeros(space: gym.Space[Any]) -> Any:
+    """The member of `space` that is nearest to zero."""
+    match space:
+        case Dict():
+            return {key: _zeros(inner) for key, inner in space.spaces.items()}
+        case Tuple():
+            return tuple(map(_zeros, cast("Any", space).spaces))
+        case Discrete():
+            return space.start
+        case Box():
+            return np.clip(np.zeros(space.shape, space.dtype), space.low, space.high)
+        case _:
+            return np.zeros(space.shape or (), space.dtype)

@@ -1,0 +1,57 @@
+"""Whether SAPIEN, ManiSkill's engine, can render here, and how to do without.
+
+Rule: the question is asked in another process, once: Vulkan must not be touched in a
+process that forks workers, and a broken driver may crash whoever asks.
+"""
+
+from __future__ import annotations
+
+import functools
+import subprocess
+import sys
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+__all__ = ["do_without_materials", "render_device_is_usable"]
+
+PROBE = "import sapien.render; sapien.render.RenderMaterial()"
+PROBE_TIMEOUT = 60.0
+
+
+@functools.cache
+def render_device_is_usable() -> bool:
+    """Whether SAPIEN finds a Vulkan device that is new enough for it."""
+    try:
+        probe = subprocess.run(  # noqa: S603 - this very interpreter and a constant
+            [sys.executable, "-c", PROBE], capture_output=True, timeout=PROBE_TIMEOUT, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return False
+    return probe.returncode == 0
+
+
+class UnseenMaterial:
+    """Stands where SAPIEN's `RenderMaterial` can't be made; nobody will see it.
+
+    ManiSkill gives its objects materials even when nothing is rendered.
+    """
+
+    def __init__(self, *_: Any, **__: Any) -> None: ...
+
+    def __getattr__(self, name: str) -> Callable[..., None]:
+        if name.startswith("set_"):
+            return _accept
+        raise AttributeError(name)
+
+
+def _accept(*_: Any, **__: Any) -> None: ...
+
+
+def do_without_materials() -> None:
+    """Let objects be built with no render device; call it before `mani_skill` is imported."""
+    for name in ("sapien.render", "sapien.pysapien.render"):
+        module: Any = import_module(name)
+        module.RenderMaterial = UnseenMaterial

@@ -1,0 +1,177 @@
+"""The `envpool` backend on the real EnvPool."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from envs.bare import gymnasium_outcomes
+
+from rlightning_aio.config import EnvConfig
+from rlightning_aio.envs.contract import EnvContract, Outcome, outcome_of, same
+from rlightning_aio.errors import ConfigError
+from rlightning_aio.types import PolicyResponse
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from rlightning_aio.envs.envpool import EnvPoolEnv
+
+envpool: Any = pytest.importorskip("envpool")
+
+pytestmark = [
+    pytest.mark.simulators,
+    pytest.mark.filterwarnings("ignore:.*precision lowered:UserWarning"),
+]
+
+
+def entry(task: str = "CartPole-v1", num_envs: int = 4, **fields: Any) -> EnvConfig:
+    return EnvConfig(name="pool", backend="envpool", task=task, num_envs=num_envs, **fields)
+
+
+def make(*args: Any, **fields: Any) -> EnvPoolEnv:
+    from rlightning_aio.envs.envpool import EnvPoolEnv
+
+    return EnvPoolEnv(entry(*args, **fields))
+
+
+class PoolContract(EnvContract):
+    resets_itself = True
+
+    def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:
+        limit = self.config.max_episode_steps
+        pool = envpool.make(
+            self.config.task,
+            env_type="gymnasium",
+            num_envs=self.config.num_envs,
+            seed=self.seed,
+            **({} if limit is None else {"max_episode_steps": limit}),
+        )
+        return gymnasium_outcomes(pool, None, actions, resets_itself=True)
+
+
+class TestCartPoles(PoolContract):
+    config = entry()
+
+
+class TestHalfCheetahs(PoolContract):
+    config = entry("HalfCheetah-v5", 3, max_episode_steps=50)
+
+
+class TestAtari(PoolContract):
+    config = entry("Pong-v5", 2)
+
+
+class TestPoolOfOne(EnvContract):
+    config = entry(num_envs=1)
+    resets_itself = True
+
+    def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:
+        pool = envpool.make("CartPole-v1", env_type="gymnasium", num_envs=1, seed=self.seed)
+        batched = gymnasium_outcomes(
+            pool, None, [np.array([a]) for a in actions], resets_itself=True
+        )
+        (observation, *rest) = next(batched)
+        yield observation[0], *rest
+        for outcome in batched:
+            yield tuple(column[0] for column in outcome)
+
+
+def test_asynchronous_results_are_batches_of_whoever_is_ready() -> None:
+    """Spaces and num_envs are the batch's; each sub-environment's own steps are in order."""
+    env = make(num_envs=6, env_kwargs={"batch_size": 2})
+    meta = env.get_metadata()
+    assert meta.num_envs == 2
+    assert meta.observation_space is not None
+    assert meta.observation_space.shape == (2, 4)
+    result = env.reset(seed=5)
+    steps_seen: dict[int, int] = {}
+    for _ in range(300):
+        assert meta.observation_space.contains(result.observation)
+        for index, step in zip(result.info["env_id"], result.info["elapsed_step"], strict=True):
+            assert step in (0, steps_seen.get(int(index), -1) + 1)
+            steps_seen[int(index)] = int(step)
+        result = env.step(PolicyResponse("pool-0", np.zeros(2, np.int64)))
+    assert steps_seen.keys() == set(range(6))
+    env.close()
+
+
+def test_asynchronous_trajectories_are_each_sub_environments_own() -> None:
+    """Whatever the order of arrival, sub-environment k goes the way that its seed leads."""
+    pool = make(num_envs=4, env_kwargs={"batch_size": 2})
+    alone = [make(num_envs=1) for _ in range(4)]
+    expected = [env.reset(seed=9 + k) for k, env in enumerate(alone)]
+    result = pool.reset(seed=9)
+    for _ in range(200):
+        actions = np.arange(2) % 2
+        for row, index in enumerate(result.info["env_id"]):
+            assert same(result.observation[row], expected[index].observation)
+            expected[index] = alone[index].step(PolicyResponse("pool-0", actions[row]))
+        result = pool.step(PolicyResponse("pool-0", actions))
+    for env in (pool, *alone):
+        env.close()
+
+
+def test_asynchronous_pools_can_be_reset_while_they_compute() -> None:
+    """What was under way is forgotten; a seed gives the same start as ever."""
+    env = make(num_envs=4, env_kwargs={"batch_size": 2})
+    starts = []
+    for _ in range(3):
+        result = env.reset(seed=1)
+        starts.append(dict(zip(result.info["env_id"].tolist(), result.observation, strict=True)))
+        env.step(PolicyResponse("pool-0", np.zeros(2, np.int64)))
+    for index in range(4):
+        seen = [start[index] for start in starts if index in start]
+        assert all(same(one, seen[0]) for one in seen)
+    assert env.reset().info["elapsed_step"].tolist() == [0, 0]
+    env.close()
+
+
+def test_a_seed_or_a_list_of_seeds() -> None:
+    """Sub-environment k takes seed + k, or the k-th of a list."""
+    env = make()
+    start = outcome_of(env.reset(seed=7))
+    assert same(start, outcome_of(env.reset(seed=[7, 8, 9, 10])))
+    assert not same(start, outcome_of(env.reset(seed=[8, 7, 9, 10])))
+    with pytest.raises(ValueError, match="'pool-0': 2 seeds for 4 sub-environments"):
+        env.reset(seed=[1, 2])
+    env.close()
+
+
+def test_unseeded_pools_differ() -> None:
+    """EnvPool's fixed default seed doesn't make all workers alike."""
+    envs = [make(), make()]
+    assert not np.array_equal(envs[0].reset().observation, envs[1].reset().observation)
+    for env in envs:
+        env.close()
+
+
+def test_the_final_observation_comes_before_the_reset() -> None:
+    """The step after an end gives the new episode's first observation and no reward."""
+    env = make("Pendulum-v1", 2, max_episode_steps=3)
+    env.reset(seed=0)
+    results = [env.step(PolicyResponse("pool-0", np.ones((2, 1), np.float32))) for _ in range(5)]
+    assert [bool(r.last_truncated.all()) for r in results] == [False, False, True, False, False]
+    assert [int(r.info["elapsed_step"][0]) for r in results] == [1, 2, 3, 0, 1]
+    assert not results[3].last_reward.any()
+    env.close()
+
+
+def test_limits_are_known() -> None:
+    """The configured limit, the task's own, or none."""
+    assert make().get_metadata().max_episode_steps == 500
+    assert make(max_episode_steps=9).get_metadata().max_episode_steps == 9
+    assert make("Blackjack-v1").get_metadata().max_episode_steps is None
+
+
+def test_misuse_is_named() -> None:
+    """Batch sizes that can't be, steps before a reset, and options of a reset."""
+    with pytest.raises(ConfigError, match="batch_size is 5, but must lie between 1 and num_envs"):
+        make(env_kwargs={"batch_size": 5})
+    env = make()
+    with pytest.raises(RuntimeError, match="before its first reset"):
+        env.step(PolicyResponse("pool-0", np.zeros(4, np.int64)))
+    with pytest.raises(ValueError, match="takes no reset options"):
+        env.reset(options={"reset_mask": [True, False, False, False]})
+    env.close()

@@ -1,0 +1,200 @@
+"""The `pettingzoo` backend on real multi-agent environments, and on small awkward ones."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+import pytest
+from gymnasium.spaces import Box, Dict, Discrete, Tuple
+
+from rlightning_aio.config import EnvConfig
+from rlightning_aio.envs.contract import EnvContract, Outcome
+from rlightning_aio.errors import ConfigError
+from rlightning_aio.types import PolicyResponse
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from rlightning_aio.envs.pettingzoo import PettingZooEnv
+    from rlightning_aio.types import MultiAgentEnvRet
+
+pytest.importorskip("pettingzoo")
+pytest.importorskip("mpe2")
+from mpe2 import simple_spread_v3, simple_tag_v3
+from pettingzoo import ParallelEnv
+
+pytestmark = [
+    pytest.mark.simulators,
+    pytest.mark.filterwarnings("ignore:.*precision lowered:UserWarning"),
+]
+
+HERE = __name__
+
+
+def entry(task: str, **fields: Any) -> EnvConfig:
+    return EnvConfig(name="zoo", backend="pettingzoo", task=task, **fields)
+
+
+def make(task: str, **fields: Any) -> PettingZooEnv:
+    from rlightning_aio.envs.pettingzoo import PettingZooEnv
+
+    return PettingZooEnv(entry(task, **fields))
+
+
+def parallel_outcomes(env: Any, seed: int, actions: Sequence[Any]) -> Iterator[Outcome]:
+    """Of a parallel environment whose agents stay together."""
+    nothing = dict.fromkeys(env.possible_agents, 0.0)
+    nobody = dict.fromkeys(env.possible_agents, False)
+    observations, _ = env.reset(seed=seed)
+    yield observations, nothing, nobody, nobody
+    for action in actions:
+        if env.agents:
+            observations, rewards, terminated, truncated, _ = env.step(action)
+            yield observations, dict(rewards), terminated, truncated
+        else:
+            yield env.reset()[0], nothing, nobody, nobody
+    env.close()
+
+
+class TestSimpleSpread(EnvContract):
+    config = entry("mpe2.simple_spread_v3", env_kwargs={"N": 4, "continuous_actions": True})
+
+    def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:
+        env = simple_spread_v3.parallel_env(N=4, continuous_actions=True)
+        return parallel_outcomes(env, self.seed, actions)
+
+
+class TestAgentsWithDifferentSpaces(EnvContract):
+    config = entry("mpe2.simple_tag_v3")
+
+    def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:
+        return parallel_outcomes(simple_tag_v3.parallel_env(), self.seed, actions)
+
+    def test_spaces_are_dicts_by_agent(self) -> None:
+        """Each agent keeps its own spaces; their order is that of `agents`."""
+        with self.opened() as env:
+            assert env.agents == ("adversary_0", "adversary_1", "adversary_2", "agent_0")
+            space = env.get_observation_space()
+            assert isinstance(space, Dict)
+            assert [space[agent].shape for agent in env.agents] == [(16,)] * 3 + [(14,)]
+
+
+def comings_and_goings(**_: Any) -> ParallelEnv:
+    return ComingsAndGoings()
+
+
+class ComingsAndGoings(ParallelEnv):
+    """`early` terminates in step 2, `quitter` is truncated in step 3, `late` joins in step 2,
+    `ghost` vanishes in step 2 with no flag; all are gone after step 4.
+    """
+
+    metadata: ClassVar = {"name": "comings_and_goings"}
+    possible_agents: ClassVar = ["early", "quitter", "ghost", "late"]
+
+    def observation_space(self, agent: str) -> Any:
+        if agent == "ghost":
+            return Dict({"n": Discrete(3, start=5), "pair": Tuple((Box(1, 2, (2,)), Discrete(2)))})
+        return Box(-9, 9, (2,), np.float32)
+
+    def action_space(self, agent: str) -> Any:
+        return Discrete(2)
+
+    def _observations(self) -> dict[str, Any]:
+        ones = np.ones(2, np.float32)
+        ghost = {"n": 6, "pair": (np.full(2, 1.5, np.float32), 1)}
+        return {agent: ghost if agent == "ghost" else ones for agent in self.agents}
+
+    def reset(self, seed: int | None = None, options: Any = None) -> Any:
+        self.agents = ["early", "quitter", "ghost"]
+        self.count = 0
+        return self._observations(), {agent: {} for agent in self.agents}
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        assert actions.keys() == set(self.agents)
+        self.count += 1
+        acting = list(self.agents)
+        if self.count == 2:
+            self.agents = [*acting, "late"]
+        observations = self._observations()
+        terminated = {a: a == "early" and self.count == 2 for a in acting}
+        truncated = {a: a == "quitter" and self.count == 3 for a in acting}
+        if self.count == 2:
+            self.agents.remove("ghost")
+            del observations["ghost"]
+        if self.count == 4:
+            terminated = dict.fromkeys(acting, True)
+        self.agents = [a for a in self.agents if not terminated.get(a) and not truncated.get(a)]
+        infos = {a: {"count": self.count} if a == "late" else {} for a in self.agents}
+        return observations, dict.fromkeys(acting, 1.0), terminated, truncated, infos
+
+
+def awkward_episode(**fields: Any) -> list[MultiAgentEnvRet]:
+    env = make(f"{HERE}:comings_and_goings", **fields)
+    results = [env.reset(seed=0)]
+    for _ in range(4):
+        results.append(env.step(PolicyResponse("zoo-0", dict.fromkeys(env.agents, 1))))
+        assert env.get_observation_space().contains(results[-1].observation)
+    return results
+
+
+def test_every_result_speaks_of_every_agent() -> None:
+    """Agents that left, or haven't come yet, keep a member of their space and their flags."""
+    results = awkward_episode()
+    flags = [
+        {a: (r.last_terminated[a], r.last_truncated[a]) for a in r.last_terminated} for r in results
+    ]
+    here, terminated, truncated = (False, False), (True, False), (False, True)
+    assert [f["early"] for f in flags] == [here, here] + [terminated] * 3
+    assert [f["quitter"] for f in flags] == [here] * 3 + [truncated] * 2
+    assert [f["ghost"] for f in flags] == [here, here] + [terminated] * 3
+    assert [f["late"] for f in flags] == [terminated, terminated, here, here, terminated]
+
+
+def test_who_is_gone_observes_zeros_and_earns_nothing() -> None:
+    """The observation is the member of the space nearest to zero."""
+    last = awkward_episode()[3]
+    assert last.observation["early"].tolist() == [0.0, 0.0]
+    ghost = last.observation["ghost"]
+    assert ghost["n"] == 5
+    assert ghost["pair"][0].tolist() == [1.0, 1.0]
+    assert last.last_reward == {"early": 0.0, "quitter": 1.0, "ghost": 0.0, "late": 1.0}
+
+
+def test_infos_are_by_agent_for_those_who_have_any() -> None:
+    """Empty infos aren't carried around."""
+    assert [result.info for result in awkward_episode()] == [
+        {},
+        {},
+        {"late": {"count": 2}},
+        {"late": {"count": 3}},
+        {},
+    ]
+
+
+def test_the_step_limit_truncates_whoever_is_left() -> None:
+    """Those who ended before keep how they ended."""
+    third = awkward_episode(max_episode_steps=3)[3]
+    assert third.last_truncated == {"early": False, "quitter": True, "ghost": False, "late": True}
+    assert third.last_terminated["early"]
+
+
+def test_the_simulators_own_limit_is_known() -> None:
+    """MPE's is called max_cycles."""
+    assert make("mpe2.simple_v3").get_metadata().max_episode_steps == 25
+    spread = make("mpe2.simple_v3", env_kwargs={"max_cycles": 9})
+    assert spread.get_metadata().max_episode_steps == 9
+
+
+def test_stepping_with_no_agents_left_says_what_to_do() -> None:
+    """Before the first reset and after an episode's end there is nobody to act."""
+    env = make(f"{HERE}:comings_and_goings", max_episode_steps=None)
+    env.env.agents = []
+    with pytest.raises(RuntimeError, match=r"'zoo-0' has no agents: reset it"):
+        env.step(PolicyResponse("zoo-0", {}))
+
+
+def test_a_module_without_such_a_function_is_named() -> None:
+    """The message says what a task may be."""
+    with pytest.raises(ConfigError, match=r"mpe2 has no function parallel_env; task names"):
+        make("mpe2")
