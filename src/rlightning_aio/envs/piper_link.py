@@ -65,7 +65,9 @@ class ArmLink:
         with contextlib.ExitStack() as cleanup:
             if interface == "virtual":
                 sim: Any = import_module("rlightning_aio.envs.piper_sim")
-                cleanup.enter_context(sim.running(sim.VirtualPort(channel)))
+                port = sim.VirtualPort(channel)
+                cleanup.callback(port.close)
+                cleanup.enter_context(sim.running(sim.SimulatedArm(), port))
             self._sdk: Any = piper_sdk.C_PiperInterface_V2(
                 can_name=channel, judge_flag=False, can_auto_init=False
             )

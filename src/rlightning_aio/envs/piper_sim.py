@@ -135,20 +135,18 @@ def run(arm: SimulatedArm, port: Port, feedback_hz: float, stopped: Callable[[],
 
 
 @contextlib.contextmanager
-def running(port: Port, feedback_hz: float = FEEDBACK_HZ) -> Generator[SimulatedArm]:
-    """An arm that lives on `port`, in a thread, for as long as the block; closes the port."""
-    arm = SimulatedArm()
+def running(arm: SimulatedArm, port: Port, feedback_hz: float = FEEDBACK_HZ) -> Generator[None]:
+    """Let the arm live on `port`, in a thread, for as long as the block."""
     stop = threading.Event()
     thread = threading.Thread(
         target=run, args=(arm, port, feedback_hz, stop.is_set), name="simulated arm", daemon=True
     )
     thread.start()
     try:
-        yield arm
+        yield
     finally:
         stop.set()
         thread.join()
-        port.close()
 
 
 def main(arguments: list[str] | None = None) -> None:

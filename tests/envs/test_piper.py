@@ -1,0 +1,444 @@
+"""The Piper backend: the vendor's unmodified SDK against a simulated arm on a real channel."""
+
+from __future__ import annotations
+
+import math
+import signal
+import struct
+import subprocess
+import sys
+import threading
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from rlightning_aio.config import EnvConfig
+from rlightning_aio.errors import BadAction, ConfigError
+from rlightning_aio.types import PolicyResponse
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+pytest.importorskip("piper_sdk")
+pytest.importorskip("serial")
+
+from rlightning_aio.envs.piper import PiperEnv
+from rlightning_aio.envs.piper_arm import Frame, SimulatedArm
+from rlightning_aio.envs.piper_sim import SlcanPort, running
+
+pytestmark = [
+    pytest.mark.simulators,
+    # The SDK calls an argument of python-can by its former name.
+    pytest.mark.filterwarnings("ignore:.*bustype.*:DeprecationWarning"),
+]
+
+READY = [0.0, 0.5, -0.5, 0.0, 0.0, 0.0]
+STOP_COMMAND = Frame(0x150, bytes([1, 0, 0, 0, 0, 0, 0, 0]))
+
+
+class WatchedArm(SimulatedArm):
+    """Remembers every command, and can be made deaf to some or fall silent."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.commands: list[Frame] = []
+        self.deaf_to: set[int] = set()
+        self.silent = False
+        self._changed = threading.Condition()
+
+    def receive(self, frame: Frame) -> list[Frame]:
+        with self._changed:
+            self.commands.append(frame)
+            answers = [] if frame.can_id in self.deaf_to else super().receive(frame)
+            self._changed.notify_all()
+        return answers
+
+    def feedback(self) -> list[Frame]:
+        return [] if self.silent else super().feedback()
+
+    def wait_for(self, predicate: Callable[[], Any]) -> bool:
+        """Whether `predicate` is true after some command, within 5 seconds."""
+        with self._changed:
+            return self._changed.wait_for(predicate, 5)
+
+
+@pytest.fixture
+def port(monkeypatch: pytest.MonkeyPatch) -> Iterator[SlcanPort]:
+    # Real adapters restart when their port is opened; a terminal doesn't.
+    monkeypatch.setenv("CAN_CONFIG", '{"sleep_after_open": 0.0}')
+    port = SlcanPort()
+    yield port
+    port.close()
+
+
+@pytest.fixture
+def arm(port: SlcanPort) -> Iterator[WatchedArm]:
+    arm = WatchedArm()
+    with running(arm, port):
+        yield arm
+
+
+@pytest.fixture
+def make(port: SlcanPort) -> Iterator[Callable[..., PiperEnv]]:
+    """Builds envs on the test's port. Asked for after the arm, so that they are closed first."""
+    made: list[PiperEnv] = []
+
+    def build(num_workers: int = 1, max_episode_steps: int | None = None, **env_kwargs: Any):
+        env_kwargs = {
+            "can_interface": "slcan",
+            "channel": port.path,
+            "control_hz": 50,
+            "speed": 100,
+            "reset_joints": READY,
+            **env_kwargs,
+        }
+        config = EnvConfig(
+            name="arm",
+            backend="piper",
+            task="test",
+            num_workers=num_workers,
+            max_episode_steps=max_episode_steps,
+            env_kwargs=env_kwargs,
+        )
+        made.append(PiperEnv(config))
+        return made[-1]
+
+    yield build
+    for env in made:
+        env.close()
+
+
+def respond(action: Any) -> PolicyResponse:
+    return PolicyResponse("arm-0", action=action)
+
+
+def sent_joints(commands: list[Frame]) -> list[list[int]]:
+    """Every complete set of joint targets, in 0.001 degrees."""
+    halves = [f for f in commands if f.can_id in (0x155, 0x156, 0x157)]
+    sets = zip(halves[::3], halves[1::3], halves[2::3], strict=False)
+    return [[n for f in three for n in struct.unpack(">ii", f.data)] for three in sets]
+
+
+def test_a_reset_goes_to_the_configured_position(arm: WatchedArm, make: Any) -> None:
+    """After a reset the motors are on and every joint is at its place, in rad."""
+    env = make(reset_gripper=0.05)
+    assert arm.enabled == [False] * 6
+    ret = env.reset(seed=0)
+    assert all(arm.enabled)
+    assert ret.observation["joint_positions"] == pytest.approx(READY, abs=0.021)
+    assert env.get_observation_space().contains(ret.observation)
+    assert ret.info == {"arm_status": "NORMAL", "late": 0.0}
+
+
+def test_joint_targets_travel_in_thousandths_of_degrees(arm: WatchedArm, make: Any) -> None:
+    """An action in rad and m is sent in the units of the protocol, at the set speed."""
+    env = make(speed=40)
+    env.reset()
+    arm.commands.clear()
+    env.step(respond([0.1, 0.6, -0.7, 0.2, -0.3, 1.0, 0.0335]))
+    assert sent_joints(arm.commands) == [[5730, 34377, -40107, 11459, -17189, 57296]]
+    assert Frame(0x151, bytes([1, 1, 40, 0, 0, 0, 0, 0])) in arm.commands
+    assert Frame(0x159, struct.pack(">iHBB", 33500, 1000, 1, 0)) in arm.commands
+
+
+def test_steps_take_the_arm_to_the_target(arm: WatchedArm, make: Any) -> None:
+    """Held for a while, an action is where the arm ends up, by its own feedback."""
+    env = make()
+    env.reset()
+    target = np.array([0.4, 0.8, -0.9, 0.3, -0.2, 0.5, 0.02], np.float32)
+    for _ in range(60):
+        ret = env.step(respond(target))
+        assert env.get_observation_space().contains(ret.observation)
+    assert ret.observation["joint_positions"] == pytest.approx(target[:6], abs=1e-4)
+    assert ret.observation["gripper"] == pytest.approx(target[6:], abs=1e-4)
+    expected = arm.end_pose(target[:6].tolist())
+    assert ret.observation["end_pose"][:3] * 1000 == pytest.approx(expected[:3], abs=0.1)
+    assert np.degrees(ret.observation["end_pose"][3:]) == pytest.approx(expected[3:], abs=0.1)
+    assert (ret.last_reward, ret.last_terminated, ret.last_truncated) == (0.0, False, False)
+
+
+def test_an_observation_is_newer_than_its_action(arm: WatchedArm, make: Any) -> None:
+    """At a control rate above the feedback rate a step still waits for what the action did."""
+    env = make(control_hz=200)
+    env.reset()
+    before = env.step(respond([*READY, 0.0])).observation["joint_positions"][0]
+    for turn in range(1, 6):
+        ret = env.step(respond([0.5 * turn, *READY[1:], 0.0]))
+        assert ret.observation["joint_positions"][0] > before
+        before = ret.observation["joint_positions"][0]
+
+
+def test_end_poses_are_reached_or_reported(arm: WatchedArm, make: Any) -> None:
+    """A pose is reached in m and rad; one that has no solution moves nothing and is no error."""
+    env = make(control="end_pose", gripper=False)
+    env.reset()
+    goal = arm.end_pose([0.2, 0.7, -0.8, 0.1, 0.2, 0.1])
+    action = [*(value / 1000 for value in goal[:3]), *np.radians(goal[3:])]
+    for _ in range(60):
+        ret = env.step(respond(action))
+    assert ret.observation["end_pose"] == pytest.approx(action, abs=2e-3)
+    assert "gripper" not in ret.observation
+    ret = env.step(respond([0.69, 0.0, 0.79, 0.0, 0.0, 0.0]))
+    assert ret.info["arm_status"] == "NO_SOLUTION"
+    assert ret.observation["end_pose"] == pytest.approx(action, abs=2e-3)
+    assert env.step(respond(action)).info["arm_status"] == "NORMAL"
+
+
+@pytest.mark.parametrize(
+    ("control", "index", "value", "message"),
+    [
+        ("joint", 0, 2.7, r"arm-0: joint_1 = 2\.7 rad is outside \[-2\.6179, 2\.6179\]"),
+        ("joint", 1, -0.01, r"joint_2 = -0\.01 rad is outside \[0, 3\.14\]"),
+        ("joint", 4, math.nan, r"joint_5 = nan rad is outside"),
+        ("joint", 5, math.inf, r"joint_6 = inf rad is outside"),
+        ("joint", 6, 0.08, r"gripper = 0\.08 m is outside \[0, 0\.07\]"),
+        ("end_pose", 2, -0.1, r"z = -0\.1 m is outside \[0, 0\.8\]"),
+    ],
+)
+def test_a_number_beyond_its_limits_is_never_sent(
+    arm: WatchedArm, make: Any, control: str, index: int, value: float, message: str
+) -> None:
+    """The error names the number, its value and its limits; the arm holds its position."""
+    env = make(control=control)
+    env.reset()
+    action = [*READY, 0.0] if control == "joint" else [0.05, 0.0, 0.2, 0.0, 1.4, 0.0, 0.0]
+    env.step(respond(action))
+    arm.commands.clear()
+    action[index] = value
+    with pytest.raises(BadAction, match=message):
+        env.step(respond(action))
+    assert arm.wait_for(lambda: sent_joints(arm.commands))
+    # The safe stop is all that went out: hold where the arm is.
+    assert {frame.can_id for frame in arm.commands} == {0x151, 0x155, 0x156, 0x157}
+    held = np.radians(np.array(sent_joints(arm.commands)[-1]) / 1000)
+    assert held == pytest.approx(arm.joints, abs=1e-4)
+
+
+def test_the_action_space_is_the_limits(arm: WatchedArm, make: Any) -> None:
+    """Every member of the space is accepted, its corners included; limits can be narrowed."""
+    env = make(limits={"joint_1": [-0.5, 0.5], "gripper": [0.0, 0.03]})
+    space = env.get_action_space()
+    assert space.low[0] == -0.5
+    assert space.high[6] <= 0.03
+    env.reset()
+    env.step(respond(space.low))
+    env.step(respond(space.high))
+    with pytest.raises(BadAction, match=r"joint_1 = 0\.6 rad is outside \[-0\.5, 0\.5\]"):
+        env.step(respond([0.6, *space.low[1:]]))
+
+
+def test_an_action_of_the_wrong_shape_is_named(arm: WatchedArm, make: Any) -> None:
+    """The error says how many numbers there are, which, and what came instead."""
+    env = make()
+    env.reset()
+    with pytest.raises(BadAction, match=r"shape \(7,\): joint_1, .*gripper; got \(6,\)"):
+        env.step(respond(READY))
+
+
+STOPS = {
+    "hold": lambda arm: sent_joints(arm.commands) and not arm.emergency_stopped,
+    "emergency_stop": lambda arm: arm.emergency_stopped,
+    "disable": lambda arm: not any(arm.enabled),
+}
+
+
+@pytest.mark.parametrize("safe_stop", STOPS)
+@pytest.mark.parametrize("cause", ["exception", "interrupt", "close", "on_disconnect"])
+def test_every_way_out_ends_in_the_safe_stop(
+    arm: WatchedArm, make: Any, safe_stop: str, cause: str
+) -> None:
+    """An exception in a step, a close and a lost trainer each stop the arm as configured."""
+    env = make(safe_stop=safe_stop, speed=20)
+    env.reset()
+    far = [1.5, 2.0, -2.0, 1.0, 1.0, 1.0, 0.0]
+    env.step(respond(far))
+    assert np.abs(arm.joints - arm.targets).max() > 0.5
+    arm.commands.clear()
+    if cause in ("exception", "interrupt"):
+        error = ZeroDivisionError if cause == "exception" else KeyboardInterrupt
+
+        def fail(policy_resp: PolicyResponse) -> Any:
+            raise error
+
+        env._preprocess_fn = fail
+        with pytest.raises(error):
+            env.step(respond(far))
+    else:
+        getattr(env, cause)()
+    assert arm.wait_for(lambda: STOPS[safe_stop](arm))
+    if safe_stop == "hold":
+        assert arm.wait_for(lambda: np.abs(arm.joints - arm.targets).max() < 0.05)
+        assert all(arm.enabled)
+
+
+def test_a_stopped_arm_moves_again_only_after_a_reset(arm: WatchedArm, make: Any) -> None:
+    """Steps before the first reset, and after a safe stop, are refused and send nothing."""
+    env = make()
+    with pytest.raises(RuntimeError, match=r"arm-0: the arm is stopped; reset\(\)"):
+        env.step(respond([*READY, 0.0]))
+    assert sent_joints(arm.commands) == []
+    env.reset()
+    env.on_disconnect()
+    with pytest.raises(RuntimeError, match="stopped"):
+        env.step(respond([*READY, 0.0]))
+    env.reset()
+    env.step(respond([*READY, 0.0]))
+
+
+def test_an_emergency_stop_is_ended_only_on_request(arm: WatchedArm, make: Any) -> None:
+    """Whoever pressed it, a plain reset leaves the stop alone and says how to end it."""
+    env = make()
+    env.reset()
+    arm.emergency_stopped = True
+    with pytest.raises(RuntimeError, match="arm-0: the arm reports EMERGENCY_STOP"):
+        env.step(respond([*READY, 0.0]))
+    with pytest.raises(RuntimeError, match=r"under emergency stop.*\"resume\": True"):
+        env.reset()
+    assert arm.emergency_stopped
+    env.reset(options={"resume": True})
+    assert not arm.emergency_stopped
+    env.step(respond([*READY, 0.0]))
+
+
+def test_lost_feedback_is_an_error_and_an_emergency_stop(arm: WatchedArm, make: Any) -> None:
+    """Without feedback nobody knows what to hold, so the arm's own stop is used."""
+    env = make(feedback_timeout=0.6)
+    env.reset()
+    arm.silent = True
+    with pytest.raises(ConnectionError, match=r"no feedback from the arm .* for 0\.6 s.*0x2A5"):
+        env.step(respond([*READY, 0.0]))
+    assert arm.wait_for(lambda: STOP_COMMAND in arm.commands)
+
+
+def test_an_arm_that_says_nothing_is_a_clear_error(make: Any, port: SlcanPort) -> None:
+    """With nobody on the channel building the env fails in time, and leaves it free."""
+    message = r"no feedback from the arm on slcan channel.*0\.2 s.*is it powered"
+    for _ in range(2):
+        with pytest.raises(ConnectionError, match=message):
+            make(connect_timeout=0.2)
+
+
+def test_a_channel_that_is_not_there_is_a_clear_error(arm: WatchedArm, make: Any) -> None:
+    """The message says which channel, and for SocketCAN how to bring it up."""
+    with pytest.raises(ConnectionError, match="slcan channel '/dev/nothing' can't be opened"):
+        make(channel="/dev/nothing")
+    with pytest.raises(ConnectionError, match=r"socketcan channel 'can9'.*ip link set can9 up"):
+        make(can_interface="socketcan", channel="can9")
+
+
+def test_motors_that_stay_off_end_the_reset(arm: WatchedArm, make: Any) -> None:
+    """Switching on is tried until the limit, then given up with the arm's own status."""
+    env = make(connect_timeout=0.5)
+    arm.deaf_to.add(0x471)
+    with pytest.raises(TimeoutError, match=r"motors .* not enabled after 0\.5 s.*NORMAL"):
+        env.reset()
+
+
+def test_a_position_that_is_not_reached_ends_the_reset(arm: WatchedArm, make: Any) -> None:
+    """The error names the joint that is furthest off, and the arm is stopped."""
+    env = make(move_timeout=0.5, safe_stop="emergency_stop")
+    arm.deaf_to.add(0x156)
+    with pytest.raises(TimeoutError, match=r"joint_3 is at 0\.000 rad, not -0\.500"):
+        env.reset()
+    assert arm.wait_for(lambda: arm.emergency_stopped)
+
+
+def test_commands_that_the_bus_loses_are_repeated(arm: WatchedArm, make: Any) -> None:
+    """A reset whose first targets are lost still arrives."""
+    env = make()
+    arm.deaf_to.update({0x155, 0x156, 0x157})
+    lost = threading.Thread(
+        target=lambda: arm.wait_for(lambda: sent_joints(arm.commands)) and arm.deaf_to.clear()
+    )
+    lost.start()
+    ret = env.reset()
+    lost.join()
+    assert ret.observation["joint_positions"] == pytest.approx(READY, abs=0.021)
+
+
+def test_the_step_limit_truncates(arm: WatchedArm, make: Any) -> None:
+    """The step that reaches `max_episode_steps` says so; a reset starts the count anew."""
+    env = make(max_episode_steps=3)
+    for _ in range(2):
+        env.reset()
+        flags = [env.step(respond([*READY, 0.0])).last_truncated for _ in range(3)]
+        assert flags == [False, False, True]
+
+
+def test_one_channel_has_one_env(arm: WatchedArm, make: Any, port: SlcanPort) -> None:
+    """A second env on the channel is refused; after a close it may have it."""
+    env = make()
+    with pytest.raises(ConfigError, match=r"channel: .* is in use by arm-0; give a list"):
+        make()
+    with pytest.raises(ConfigError, match="2 channels for 3 envs"):
+        make(num_workers=3, channel=["can0", "can1"])
+    env.close()
+    env.close()
+    env = make(num_workers=1, channel=[port.path])
+    assert env.reset().info["arm_status"] == "NORMAL"
+
+
+def read_images() -> dict[str, np.ndarray]:
+    return {"wrist": np.full((4, 6, 3), 7, np.uint8)}
+
+
+def reward(observation: dict[str, Any], action: np.ndarray) -> float:
+    return float(-abs(observation["joint_positions"][0] - action[0]))
+
+
+def test_cameras_and_reward_come_from_hooks(arm: WatchedArm, make: Any) -> None:
+    """Images join the observation under their declared spaces; the reward is the hook's."""
+    env = make(
+        cameras={"read": f"{__name__}:read_images", "images": {"wrist": [4, 6, 3]}},
+        reward=f"{__name__}:reward",
+    )
+    assert env.get_observation_space()["wrist"].shape == (4, 6, 3)
+    ret = env.reset()
+    assert env.get_observation_space().contains(ret.observation)
+    ret = env.step(respond([1.0, *READY[1:], 0.0]))
+    assert ret.observation["wrist"][0, 0, 0] == 7
+    assert ret.last_reward == pytest.approx(ret.observation["joint_positions"][0] - 1.0)
+
+
+@pytest.mark.parametrize(
+    ("env_kwargs", "message"),
+    [
+        ({"chanel": "can0"}, r"arm-0: env_kwargs: chanel: .*Known fields: .*channel"),
+        ({"control_hz": 0}, r"env_kwargs: control_hz: .*greater than 0"),
+        ({"limits": {"joint_7": [0, 1]}}, r"limits\.joint_7: an action .* has joint_1"),
+        ({"limits": {"joint_1": [-3, 3]}}, r"limits\.joint_1: .* not within the arm's own"),
+        ({"reset_joints": [0, 0, 1, 0, 0, 0]}, r"reset_joints: joint_3 = 1.0 rad is outside"),
+        ({"reward": "nowhere:at_all"}, r"env_kwargs\.reward: 'nowhere:at_all' can't be loaded"),
+    ],
+)
+def test_faults_of_the_config_are_named(
+    arm: WatchedArm, make: Any, env_kwargs: dict[str, Any], message: str
+) -> None:
+    """What is wrong in `env_kwargs` is named before the channel is opened."""
+    with pytest.raises(ConfigError, match=message):
+        make(**env_kwargs)
+
+
+def test_a_virtual_channel_brings_its_own_arm(make: Any) -> None:
+    """`can_interface: virtual` needs no hardware and no second process, time after time."""
+    for _ in range(2):
+        env = make(can_interface="virtual", channel="dry run")
+        env.reset()
+        for _ in range(40):
+            ret = env.step(respond([0.3, 0.6, -0.6, 0.0, 0.0, 0.0, 0.01]))
+        assert ret.observation["joint_positions"][0] == pytest.approx(0.3, abs=1e-3)
+        env.close()
+
+
+def test_the_arm_can_live_in_another_process(make: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`python -m rlightning_aio.envs.piper_sim` prints a channel and ends when told to."""
+    command = [sys.executable, "-m", "rlightning_aio.envs.piper_sim", "--feedback-hz", "50"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout
+        channel = process.stdout.readline().strip()
+        env = make(channel=channel)
+        assert env.reset().observation["joint_positions"] == pytest.approx(READY, abs=0.021)
+        env.close()
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(10) == 0
