@@ -184,7 +184,7 @@ def _at(tree: Tree, leaf: Leaf) -> Any:
 
 
 def _castable(array: NDArray[Any], leaf: Leaf) -> bool:
-    return np.can_cast(array.dtype, leaf.dtype, "same_kind")
+    return array.dtype == leaf.dtype or np.can_cast(array.dtype, leaf.dtype, "same_kind")
 
 
 def _misfit(what: str, found: NDArray[Any], leaf: Leaf, rows: int | None = None) -> str:

@@ -35,7 +35,7 @@ from rlightning_aio.group.wait import Operation, Wait, earliest
 from rlightning_aio.hosts.base import Host
 from rlightning_aio.hosts.worker import ErrorText
 from rlightning_aio.protocol.info import InfoSchema
-from rlightning_aio.protocol.rings import OP_BITS, RESET, ROW_MASK, SEQ_SHIFT, STEP
+from rlightning_aio.protocol.rings import OP_BITS, OP_MASK, RESET, SLOT_MASK, STEP
 from rlightning_aio.protocol.slab import NO_SEED
 
 __all__ = ["Core"]
@@ -49,6 +49,7 @@ class Ticket:
     """A call that waits for requests of its own, beside `collect_async`."""
 
     owner: int
+    slots: NDArray[np.intp]
     remaining: int
     faults: list[EnvFault] = field(default_factory=list[EnvFault])
     value: Any = None
@@ -75,6 +76,7 @@ class Core:
         self._tickets: dict[int, Ticket] = {}
         self._next_owner = 1
         self._rests: dict[int, Any] = {}
+        self._reports: list[NDArray[np.int64]] = []
         self._collecting = False
         self.info_width = 0
         fleet.deliver_to(self)
@@ -95,7 +97,7 @@ class Core:
         self.fleet.check_usable(slots)
         table = self.slots
         states = table.state[slots]
-        if states.any():
+        if np.count_nonzero(states):
             slot = int(slots[np.flatnonzero(states)[0]])
             state = "has not replied yet" if table.state[slot] == BUSY else "was not collected"
             raise EnvBusy(
@@ -131,15 +133,11 @@ class Core:
         self, slots: NDArray[np.intp], resets: NDArray[np.bool_], owner: int, now: float
     ) -> None:
         """Send steps, and resets in place of some, whose arguments lie in the rows."""
-        table = self.slots
         op = STEP
-        codes = table.code[slots]
-        if resets is not NO_RESETS and resets.any():
+        if resets is not NO_RESETS and np.count_nonzero(resets):
             op = STEP + resets  # RESET == STEP + 1
-            codes = codes + resets
             self.fleet.write_seeds(slots[resets], np.full(np.count_nonzero(resets), NO_SEED))
-        entries = (self._mark_sent(slots, op, owner, now) << SEQ_SHIFT) | codes
-        self._post(slots, entries)
+        self._post(slots, self._mark_sent(slots, op, owner, now) + op)
 
     def _post(self, slots: NDArray[np.intp], entries: NDArray[np.int64]) -> None:
         """Hand entries to their hosts, with one call for each run of slots of one host."""
@@ -154,16 +152,17 @@ class Core:
     def _mark_sent(
         self, slots: NDArray[np.intp], op: int | NDArray[Any], owner: int, now: float
     ) -> NDArray[np.int64]:
+        """Number the next requests of `slots`; their ring entries, without the operation."""
         table = self.slots
-        numbers = table.number[slots] + 1
-        table.number[slots] = numbers
+        entries = table.renumber(slots)
         table.state[slots] = BUSY
         table.op[slots] = op
-        table.owner[slots] = owner
         table.sent_ns[slots] = int(now * 1e9)
-        if owner == 0:
+        if owner:
+            table.owner[slots] = owner
+        else:
             self._in_flight += len(slots)
-        return numbers
+        return entries
 
     def _send_letters(
         self,
@@ -179,19 +178,27 @@ class Core:
         ):
             if wanted[position]:
                 slot = int(slots[position])
-                numbers = self._mark_sent(slots[position : position + 1], STEP, owner, now)
+                self._mark_sent(slots[position : position + 1], STEP, owner, now)
                 host = self.fleet.hosts[table.host[slot]]
-                host.request_step(slot - host.first_slot, int(numbers[0]), action, extras)
+                host.request_step(slot - host.first_slot, table.number(slot), action, extras)
 
     # -- replies (called by the fleet) --------------------------------------------
 
-    def on_reports(self, host: Host, entries: NDArray[np.int64]) -> None:
-        """See `base.Inbox.on_reports`."""
-        table = self.slots
-        slots = ((entries >> OP_BITS) & ROW_MASK) + host.first_slot
-        current = (table.number[slots] == entries >> SEQ_SHIFT) & (table.state[slots] == BUSY)
-        if not current.all():
-            slots = slots[current]  # A late reply to a request that was given up.
+    def on_reports(self, entries: NDArray[np.int64]) -> None:
+        """See `base.Inbox.on_reports`. They are looked at together, by `absorb`."""
+        self._reports.append(entries)
+
+    def absorb(self) -> None:
+        """Look at what hosts have reported since the last time."""
+        reports = self._reports
+        if not reports:
+            return
+        entries = (reports[0] if len(reports) == 1 else np.concatenate(reports)) & ~OP_MASK
+        reports.clear()
+        slots = (entries >> OP_BITS) & SLOT_MASK
+        current = self.slots.entry[slots] == entries
+        if np.count_nonzero(current) < len(slots):
+            slots = slots[current]  # Late replies to requests that were given up.
         self._replied(slots)
 
     def on_rest(self, host: Host, row: int, number: int, rest: bytes | dict[str, Any]) -> None:
@@ -236,7 +243,7 @@ class Core:
 
     def _is_current(self, slot: int, number: int) -> bool:
         table = self.slots
-        return table.state[slot] == BUSY and table.number[slot] == number
+        return table.state[slot] == BUSY and table.number(slot) == number
 
     def _replied(self, slots: NDArray[np.intp]) -> None:
         """Replies have come: give each to the call that waits for it."""
@@ -246,8 +253,8 @@ class Core:
         table.state[slots] = READY
         if self.fleet.recovering:
             self.fleet.note_restarted(slots, self._rests)
-        owners = table.owner[slots]
-        if self._tickets and owners.any():
+        if self._tickets:
+            owners = table.owner[slots]
             for owner in np.unique(owners).tolist():
                 mine = owners == owner
                 if owner:
@@ -363,8 +370,8 @@ class Core:
 
     # -- calls that wait for their own replies ------------------------------------
 
-    def _new_ticket(self, count: int) -> Ticket:
-        ticket = Ticket(self._next_owner, count)
+    def _new_ticket(self, slots: NDArray[np.intp]) -> Ticket:
+        ticket = Ticket(self._next_owner, slots, len(slots))
         self._next_owner += 1
         self._tickets[ticket.owner] = ticket
         return ticket
@@ -379,16 +386,17 @@ class Core:
                 yield from self._wait(ticket.remaining, None)
         finally:
             del self._tickets[ticket.owner]
+            # Invariant: the owner of an idle slot is 0.
+            self.slots.owner[ticket.slots] = 0
             if ticket.remaining > 0:
                 self._disown(ticket)
 
     def _disown(self, ticket: Ticket) -> None:
-        table = self.slots
-        mine = np.flatnonzero((table.owner == ticket.owner) & (table.state != IDLE))
-        table.owner[mine] = 0
-        self._in_flight += len(mine)
+        """The caller has given up: `collect_async` gets what is still to come."""
+        states = self.slots.state[ticket.slots]
+        self._in_flight += int(np.count_nonzero(states))
         self._faults.extend(ticket.faults)
-        ready = mine[table.state[mine] == READY]
+        ready = ticket.slots[states == READY]
         if len(ready):
             self._queue(ready)
 
@@ -396,7 +404,7 @@ class Core:
         """See `EnvGroup.step`."""
         slots = self.slots_of(batch)
         self.fleet.check_steppable(slots)
-        ticket = self._new_ticket(len(slots))
+        ticket = self._new_ticket(slots)
         try:
             self._send_steps(batch, slots, ticket.owner, now)
         except BaseException:
@@ -419,17 +427,19 @@ class Core:
         seeds = self._seeds(seed, slots)
         self._check_sendable(slots, "reset")
         self.fleet.forget_lost(slots)
-        ticket = self._new_ticket(len(slots))
+        ticket = self._new_ticket(slots)
         if options is None:
             self.fleet.write_seeds(slots, seeds)
-            numbers = self._mark_sent(slots, RESET, ticket.owner, now)
-            self._post(slots, (numbers << SEQ_SHIFT) | (table.code[slots] + 1))
+            self._post(slots, self._mark_sent(slots, RESET, ticket.owner, now) + RESET)
         else:
-            numbers = self._mark_sent(slots, RESET, ticket.owner, now)
-            for slot, number, s in zip(slots.tolist(), numbers.tolist(), seeds, strict=True):
+            self._mark_sent(slots, RESET, ticket.owner, now)
+            for slot, one in zip(slots.tolist(), seeds.tolist(), strict=True):
                 host = self.fleet.hosts[table.host[slot]]
                 host.request_reset(
-                    slot - host.first_slot, number, None if s == NO_SEED else int(s), options
+                    slot - host.first_slot,
+                    table.number(slot),
+                    None if one == NO_SEED else one,
+                    options,
                 )
         yield from self._await_ticket(ticket)
         return self._settled(ticket, slots)
@@ -480,10 +490,10 @@ class Core:
         """Call a method of one env; its value."""
         slots = np.array([slot], np.intp)
         self._check_sendable(slots, f"call {name} of")
-        ticket = self._new_ticket(1)
-        number = int(self._mark_sent(slots, CALL, ticket.owner, now)[0])
+        ticket = self._new_ticket(slots)
+        self._mark_sent(slots, CALL, ticket.owner, now)
         host = self.fleet.hosts[self.slots.host[slot]]
-        host.request_call(slot - host.first_slot, number, name, args, kwargs)
+        host.request_call(slot - host.first_slot, self.slots.number(slot), name, args, kwargs)
         yield from self._await_ticket(ticket)
         if ticket.faults:
             raise ticket.faults[0]
@@ -493,11 +503,11 @@ class Core:
         """Call a method of every env, all at once."""
         slots = self.slots.all
         self._check_sendable(slots, f"call {name} of")
-        ticket = self._new_ticket(len(slots))
-        numbers = self._mark_sent(slots, CALL, ticket.owner, now)
-        for slot, number in zip(slots.tolist(), numbers.tolist(), strict=True):
+        ticket = self._new_ticket(slots)
+        self._mark_sent(slots, CALL, ticket.owner, now)
+        for slot in slots.tolist():
             host = self.fleet.hosts[self.slots.host[slot]]
-            host.request_call(slot - host.first_slot, number, name, (), {})
+            host.request_call(slot - host.first_slot, self.slots.number(slot), name, (), {})
         yield from self._await_ticket(ticket)
         if ticket.faults:
             raise ticket.faults[0]

@@ -36,7 +36,7 @@ from rlightning_aio.hosts.process import ForkServer
 from rlightning_aio.hosts.worker import AttachOrder, ErrorText, Started
 from rlightning_aio.protocol.columns import leaves
 from rlightning_aio.protocol.info import NO_INFO, PICKLED
-from rlightning_aio.protocol.rings import OP_BITS, RESET, ROW_MASK, SEQ_SHIFT, STEP
+from rlightning_aio.protocol.rings import OP_BITS, RESET, SLOT_MASK, STEP
 from rlightning_aio.protocol.slab import NO_SEED, Slab
 from rlightning_aio.types import EnvMeta
 
@@ -269,7 +269,7 @@ class Fleet:
             member.order = AttachOrder(tuple(parts), tuple(seats))
             schemas: dict[int, Any] = {}
             for row in range(count):
-                table.seat(first + row, member.host.host_id, row)
+                table.host[first + row] = member.host.host_id
                 table.schemas[first + row] = schemas
 
     def _make_slabs(
@@ -341,6 +341,7 @@ class Fleet:
             # A host that was asked for a single result has rung if it has any.
             if host.in_flight and host.ordered != 1:
                 host.sweep()
+        self._core.absorb()
 
     def run_inline(self, wanted: int) -> bool:
         """Execute waiting requests of inline hosts, one, or as many as nothing else can give."""
@@ -373,13 +374,13 @@ class Fleet:
         limits = (member.config.step_timeout, member.config.reset_timeout)
         if not entry:
             return self._now + min(limit for limit in limits if limit is not None)
-        op = int(self.slots.op[self._slot(member.host, entry)])
+        op = int(self.slots.op[self._slot(entry)])
         limit = limits[0] if op == STEP else limits[1] if op == RESET else None
         return None if limit is None else since_ns / 1e9 + limit
 
     @staticmethod
-    def _slot(host: Host, entry: int) -> int:
-        return host.first_slot + ((entry >> OP_BITS) & ROW_MASK)
+    def _slot(entry: int) -> int:
+        return (entry >> OP_BITS) & SLOT_MASK
 
     def check(self, now: float) -> None:
         """Find what has hung, in steps and in restarts."""
@@ -395,7 +396,7 @@ class Fleet:
                 expiry = self._expiry(member)
                 entry, _ = member.host.executing()
                 if entry and expiry is not None and now >= expiry:
-                    member.hung_slot = self._slot(member.host, entry)
+                    member.hung_slot = self._slot(entry)
                     member.host.kill(dump=True)
 
     def on_death(self, host: Host, death: Death) -> None:
@@ -404,6 +405,7 @@ class Fleet:
         if member.stage.value < _Stage.UP.value and member.order is None or not self.open:
             self._died_starting(member, death)
             return
+        self._core.absorb()
         hung_slot, member.hung_slot = member.hung_slot, None
         first, last = host.first_slot, host.first_slot + host.rows
         owed = np.arange(first, last)[self.slots.state[first:last] == BUSY]
@@ -461,12 +463,12 @@ class Fleet:
             return
         host.attach(member.order)
         if len(owed):
-            table.number[owed] += 1
+            entries = table.renumber(owed) + RESET
             table.op[owed] = RESET
             self.write_seeds(owed, np.full(len(owed), NO_SEED))
             for slot in owed.tolist():
                 self.restarting[slot] = self.lost.pop(slot)
-            host.request((table.number[owed] << SEQ_SHIFT) | (table.code[owed] + 1))
+            host.request(entries)
 
     def _doing(self, slot: int) -> str:
         return {STEP: "a step", RESET: "a reset"}.get(int(self.slots.op[slot]), "a call")
@@ -479,7 +481,8 @@ class Fleet:
             slot = hung_slot
         table = self.slots
         doing = self._doing(slot)
-        last = f"request {int(table.number[slot])}, {doing}" if table.number[slot] else "none"
+        number = table.number(slot)
+        last = f"request {number}, {doing}" if number else "none"
         names = ", ".join(table.ids(owed)) or "none"
         kind = EnvHung if hung_slot is not None else WorkerDied
         if hung_slot is not None:

@@ -44,7 +44,7 @@ def _part(
         rows = slice(0, slab.rows)
     terminated, truncated = gather(slab.terminated, rows), gather(slab.truncated, rows)
     ended = terminated | truncated
-    marks = gather(slab.info_mark, rows)
+    any_ended = np.count_nonzero(ended) > 0
     return ResultColumns(
         slots=slots,
         table=table,
@@ -53,13 +53,13 @@ def _part(
         reward=gather(slab.reward, rows),
         terminated=terminated,
         truncated=truncated,
-        info_marks=marks,
+        info_marks=gather(slab.info_mark, rows),
         info=gather(slab.info[:, : core.info_width], rows) if core.info_width else None,
         schemas=table.schemas,
         rests=_rests(slots, rests) if rests else {},
         ended=ended,
-        episode_return=gather(slab.episode_return, rows) if ended.any() else None,
-        episode_length=gather(slab.episode_length, rows) if ended.any() else None,
+        episode_return=gather(slab.episode_return, rows) if any_ended else None,
+        episode_length=gather(slab.episode_length, rows) if any_ended else None,
         done_ns=gather(slab.done_ns, rows),
         busy_ns=gather(slab.busy_ns, rows),
         agents=slab.layout.agents,

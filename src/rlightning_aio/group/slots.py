@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.errors import UnknownEnv
 from rlightning_aio.protocol.info import InfoSchema
-from rlightning_aio.protocol.rings import OP_BITS, STEP
+from rlightning_aio.protocol.rings import NUMBER_SHIFT, OP_BITS
 
 __all__ = ["BUSY", "IDLE", "READY", "Slots"]
 
@@ -31,9 +31,11 @@ class Slots:
 
     Attributes:
         env_ids, configs: of each slot.
-        host: host id; code: ring entry of a step, without its number.
-        state, number, op: of the current request; owner: 0 for `collect_async`, else the
-            id of the call that waits for it; sent_ns: when it was sent.
+        host: host id.
+        entry: ring entry of the current request, without its operation; so it also holds the
+            request's number.
+        state, op: of the current request; owner: 0 for `collect_async`, else the id of the
+            call that waits for it; sent_ns: when it was sent.
         slab, row: where its results lie.
         by_frame: actions may not fit the row; reads_extras: responses' extras are read there;
             letters: either is true of any env.
@@ -48,9 +50,8 @@ class Slots:
         self._index = {env_id: slot for slot, env_id in enumerate(env_ids)}
         self.all = np.arange(size)
         self.host = np.zeros(size, np.int64)
-        self.code = np.zeros(size, np.int64)
+        self.entry = self.all << OP_BITS
         self.state = np.zeros(size, np.int8)
-        self.number = np.zeros(size, np.int64)
         self.op = np.zeros(size, np.int8)
         self.owner = np.zeros(size, np.int64)
         self.sent_ns = np.zeros(size, np.int64)
@@ -65,10 +66,15 @@ class Slots:
     def __len__(self) -> int:
         return len(self.env_ids)
 
-    def seat(self, slot: int, host_id: int, row: int) -> None:
-        """Say that `slot` is row `row` of a host."""
-        self.host[slot] = host_id
-        self.code[slot] = (row << OP_BITS) | STEP
+    def number(self, slot: int) -> int:
+        """Number of the current request; 0 before the first."""
+        return int(self.entry[slot]) >> NUMBER_SHIFT
+
+    def renumber(self, slots: NDArray[np.intp]) -> NDArray[np.int64]:
+        """Give the next request of each of `slots` its number; the new entries."""
+        entries = self.entry[slots] + (1 << NUMBER_SHIFT)
+        self.entry[slots] = entries
+        return entries
 
     def find(self, env_ids: Sequence[str]) -> NDArray[np.intp]:
         """Slots of `env_ids`, in their order.

@@ -159,8 +159,8 @@ class Inbox(Protocol):
         """The envs can be asked."""
         ...
 
-    def on_reports(self, host: Host, entries: NDArray[np.int64]) -> None:
-        """Requests are done, and their results lie in the rows."""
+    def on_reports(self, entries: NDArray[np.int64]) -> None:
+        """These requests are done, and their results lie in the rows."""
         ...
 
     def on_rest(self, host: Host, row: int, number: int, rest: bytes | dict[str, Any]) -> None:

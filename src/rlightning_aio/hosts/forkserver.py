@@ -76,6 +76,7 @@ class Fork:
     """Fork worker `host_id`; the channel's and the arena's descriptors ride along."""
 
     host_id: int
+    first_slot: int
     rings_offset: int
     rows: int
 
@@ -288,7 +289,9 @@ def _run_worker(
         from rlightning_aio.hosts import worker
 
         channel = socket.socket(fileno=descriptors[0])
-        worker.main(channel, descriptors[1], order.rings_offset, order.rows)
+        worker.main(
+            channel, descriptors[1], order.rings_offset, order.first_slot, order.rows
+        )
         code = 0
     except BaseException:
         traceback.print_exc()

@@ -93,8 +93,8 @@ class InlineHost:
     def request(self, entries: NDArray[np.int64]) -> None:
         """See `base.Host.request`."""
         for entry in entries.tolist():
-            row = (entry >> ring_entries.OP_BITS) & ring_entries.ROW_MASK
-            number = entry >> ring_entries.SEQ_SHIFT
+            row = ((entry >> ring_entries.OP_BITS) & ring_entries.SLOT_MASK) - self.first_slot
+            number = entry >> ring_entries.NUMBER_SHIFT
             runner = self._runners[row]
             stepped = entry & ring_entries.OP_MASK == ring_entries.STEP
             self._enqueue(row, number, runner.step if stepped else runner.reset_from_row)
@@ -130,8 +130,8 @@ class InlineHost:
             done = time.monotonic_ns()
             self._runners[row].stamp(done, done - began)
             if rest is None:
-                entries = np.array([ring_entries.entry(number, row, 0)], np.int64)
-                self._inbox.on_reports(self, entries)
+                done_entry = ring_entries.entry(number, self.first_slot + row, 0)
+                self._inbox.on_reports(np.array([done_entry], np.int64))
             else:
                 self._inbox.on_rest(self, row, number, rest)
 

@@ -212,7 +212,10 @@ class ProcessHost:
         self._socket = ours
         with theirs:
             self._fork_server.fork(
-                self, theirs, self._arena, Fork(self.host_id, self._rings_offset, self.rows)
+                self,
+                theirs,
+                self._arena,
+                Fork(self.host_id, self.first_slot, self._rings_offset, self.rows),
             )
         self._alive = True
         self._watcher.watch(self)
@@ -360,7 +363,7 @@ class ProcessHost:
         if self._rings.frames_from_worker() > self._frames_received:
             self._read_channel()
         self.in_flight -= len(entries)
-        self._inbox.on_reports(self, entries)
+        self._inbox.on_reports(entries)
 
     def _read_channel(self) -> None:
         while self._socket is not None:

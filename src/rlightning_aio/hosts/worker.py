@@ -135,13 +135,20 @@ class Worker:
         channel: blocking stream socket to the trainer.
         arena: descriptor of the group's shared memory.
         rings_memory: this worker's rings, mapped.
+        first_slot: slot of its first env in the group.
         rows: envs that it will hold.
     """
 
     def __init__(
-        self, channel: socket.socket, arena: int, rings_memory: memoryview, rows: int
+        self,
+        channel: socket.socket,
+        arena: int,
+        rings_memory: memoryview,
+        first_slot: int,
+        rows: int,
     ) -> None:
         self._channel = channel
+        self._first_slot = first_slot
         self._arena = arena
         self._frames = FrameReader()
         self._rings = WorkerRings(rings_memory, rows)
@@ -170,7 +177,7 @@ class Worker:
 
     def _run_requests(self) -> None:
         """Execute what the ring holds; frames in between, as they come."""
-        rings, runners = self._rings, self._runners
+        rings, runners, first_slot = self._rings, self._runners, self._first_slot
         clock = time.monotonic_ns
         began = clock()
         while True:
@@ -181,7 +188,7 @@ class Worker:
             if not request:
                 rings.idle()
                 return
-            row = (request >> ring_entries.OP_BITS) & ring_entries.ROW_MASK
+            row = ((request >> ring_entries.OP_BITS) & ring_entries.SLOT_MASK) - first_slot
             rings.begin(request, began)
             runner = runners[row]
             try:
@@ -190,14 +197,14 @@ class Worker:
                 else:
                     rest = runner.reset_from_row()
             except BaseException as error:
-                self._send_error(row, request >> ring_entries.SEQ_SHIFT, error)
+                self._send_error(row, request >> ring_entries.NUMBER_SHIFT, error)
                 began = clock()
                 continue
             done = clock()
             runner.stamp(done, done - began)
             began = done
             if rest is not None:
-                self._send_rest(row, request >> ring_entries.SEQ_SHIFT, rest)
+                self._send_rest(row, request >> ring_entries.NUMBER_SHIFT, rest)
             elif rings.report(request):
                 self._channel.send(BELL)
 
@@ -241,7 +248,7 @@ class Worker:
 
     def _handle(self, frame: Frame) -> None:
         """Execute one frame and answer it."""
-        self._rings.begin(ring_entries.entry(frame.number, frame.row, 0), time.monotonic_ns())
+        self._rings.begin(ring_entries.entry(frame.number, self._first_slot + frame.row, 0), time.monotonic_ns())
         try:
             self._handlers[frame.kind](self, frame)
         except (TrainerGone, BrokenPipeError, ConnectionResetError):
@@ -366,7 +373,9 @@ def _dumped(value: Any, what: str) -> bytes:
             raise TypeError(f"{what} can't be pickled: {error}") from error
 
 
-def main(channel: socket.socket, arena: int, rings_offset: int, rows: int) -> None:
+def main(
+    channel: socket.socket, arena: int, rings_offset: int, first_slot: int, rows: int
+) -> None:
     """Run a worker in this process; returns when it has closed."""
     rings_memory = map_shared(arena, rings_offset, rings_size(rows))
-    Worker(channel, arena, rings_memory, rows).serve()
+    Worker(channel, arena, rings_memory, first_slot, rows).serve()

@@ -20,10 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 __all__ = [
+    "NUMBER_SHIFT",
     "OP_BITS",
+    "OP_MASK",
     "RESET",
-    "ROW_BITS",
-    "SEQ_SHIFT",
+    "SLOT_MASK",
     "STEP",
     "TrainerRings",
     "WorkerRings",
@@ -32,11 +33,11 @@ __all__ = [
     "rings_size",
 ]
 
-# An entry is one int64: request number, row within the worker, operation.
+# An entry is one int64: request number, slot of the env in its group, operation.
 OP_BITS: Final = 8
-ROW_BITS: Final = 16
-SEQ_SHIFT: Final = OP_BITS + ROW_BITS
-ROW_MASK: Final = (1 << ROW_BITS) - 1
+SLOT_BITS: Final = 20
+NUMBER_SHIFT: Final = OP_BITS + SLOT_BITS
+SLOT_MASK: Final = (1 << SLOT_BITS) - 1
 OP_MASK: Final = (1 << OP_BITS) - 1
 
 # Invariant: RESET == STEP + 1, so that a batch of steps becomes resets by adding a mask.
@@ -81,9 +82,9 @@ def _new_fence() -> Callable[[], None]:
 fence = _new_fence()
 
 
-def entry(number: int, row: int, op: int) -> int:
+def entry(number: int, slot: int, op: int) -> int:
     """One ring entry."""
-    return (number << SEQ_SHIFT) | (row << OP_BITS) | op
+    return (number << NUMBER_SHIFT) | (slot << OP_BITS) | op
 
 
 def _capacity(rows: int) -> int:
