@@ -91,6 +91,7 @@ def make(port: SlcanPort) -> Iterator[Callable[..., PiperEnv]]:
             "control_hz": 50,
             "speed": 100,
             "reset_joints": READY,
+            "feedback_timeout": 2.0,  # The machine may be busy.
             **env_kwargs,
         }
         config = EnvConfig(
@@ -118,6 +119,11 @@ def sent_joints(commands: list[Frame]) -> list[list[int]]:
     halves = [f for f in commands if f.can_id in (0x155, 0x156, 0x157)]
     sets = zip(halves[::3], halves[1::3], halves[2::3], strict=False)
     return [[n for f in three for n in struct.unpack(">ii", f.data)] for three in sets]
+
+
+def in_si_units(pose: list[float]) -> list[float]:
+    """A pose in m and rad, of one in mm and degrees."""
+    return [*(value / 1000 for value in pose[:3]), *np.radians(pose[3:]).tolist()]
 
 
 def test_a_reset_goes_to_the_configured_position(arm: WatchedArm, make: Any) -> None:
@@ -173,8 +179,7 @@ def test_end_poses_are_reached_or_reported(arm: WatchedArm, make: Any) -> None:
     """A pose is reached in m and rad; one that has no solution moves nothing and is no error."""
     env = make(control="end_pose", gripper=False)
     env.reset()
-    goal = arm.end_pose([0.2, 0.7, -0.8, 0.1, 0.2, 0.1])
-    action = [*(value / 1000 for value in goal[:3]), *np.radians(goal[3:])]
+    action = in_si_units(arm.end_pose([0.2, 0.7, -0.8, 0.1, 0.2, 0.1]))
     for _ in range(60):
         ret = env.step(respond(action))
     assert ret.observation["end_pose"] == pytest.approx(action, abs=2e-3)
@@ -202,7 +207,7 @@ def test_a_number_beyond_its_limits_is_never_sent(
     """The error names the number, its value and its limits; the arm holds its position."""
     env = make(control=control)
     env.reset()
-    action = [*READY, 0.0] if control == "joint" else [0.05, 0.0, 0.2, 0.0, 1.4, 0.0, 0.0]
+    action = [*READY, 0.0] if control == "joint" else [*in_si_units(arm.end_pose(READY)), 0.0]
     env.step(respond(action))
     arm.commands.clear()
     action[index] = value

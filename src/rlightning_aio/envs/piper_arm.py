@@ -250,22 +250,20 @@ class SimulatedArm:
         return None
 
     def _search(self, target: tuple[Floats, Floats], start: Floats) -> Floats | None:
-        """Damped least squares on a numerical Jacobian, within the joints' limits.
+        """Damped least squares on the geometric Jacobian, within the joints' limits.
 
         Positions count in metres, so that they weigh as much as angles.
         """
         joints = np.clip(start, _LOWS, _HIGHS)
         for _ in range(40):
-            current = _as_transform(self.end_pose(joints))
-            error = _difference(current, target)
+            links = [_as_transform(pose) for pose in self._kinematics.CalFK(joints.tolist())]
+            error = _difference(links[-1], target)
             if np.abs(error[:3]).max() < 5e-5 and np.abs(error[3:]).max() < 5e-4:
                 return joints
-            jacobian = np.empty((6, 6))
-            for index in range(6):
-                nudged = joints.copy()
-                nudged[index] += 1e-6
-                moved = _as_transform(self.end_pose(nudged))
-                jacobian[:, index] = _difference(current, moved) / 1e-6
+            # Each joint turns about the z axis of its link.
+            axes = np.array([rotation[:, 2] for _, rotation in links])
+            arms = links[-1][0] - np.array([position for position, _ in links])
+            jacobian = np.vstack([np.cross(axes, arms).T, axes.T])
             damped = jacobian.T @ jacobian + 1e-6 * np.eye(6)
             step = np.linalg.solve(damped, jacobian.T @ error)
             joints = np.clip(joints + np.clip(step, -0.5, 0.5), _LOWS, _HIGHS)
