@@ -79,18 +79,21 @@ class AioDriver:
             future.set_result(None)
 
     async def run(self, operation: Operation[T]) -> T:
-        """Wait until `operation` ends; its result. Cancelling closes the operation."""
+        """Wait until `operation` ends; its result. It gets to clean up if it is cancelled."""
         try:
             wait = operation.send(None)  # pyright: ignore[reportArgumentType]
             while True:
-                await self._block(wait.until)
-                if self._broken is not None:
-                    raise self._broken
-                wait = operation.send(time.monotonic())
+                try:
+                    await self._block(wait.until)
+                    if self._broken is not None:
+                        raise self._broken
+                except BaseException as error:
+                    # Thrown, not closed: closing down takes waiting, too.
+                    wait = operation.throw(error)
+                else:
+                    wait = operation.send(time.monotonic())
         except StopIteration as stop:
             return stop.value
-        finally:
-            operation.close()
 
     async def _block(self, until: float | None) -> None:
         timeout = None if until is None else until - time.monotonic()

@@ -60,16 +60,19 @@ class SyncDriver:
             self._epoll.modify(descriptor, events)
 
     def run(self, operation: Operation[T]) -> T:
-        """Wait until `operation` ends; its result. An interrupt closes the operation."""
+        """Wait until `operation` ends; its result. It gets to clean up if it is interrupted."""
         try:
             wait = operation.send(None)  # pyright: ignore[reportArgumentType]
             while True:
-                self._block(wait.until)
-                wait = operation.send(time.monotonic())
+                try:
+                    self._block(wait.until)
+                except BaseException as error:
+                    # Thrown, not closed: closing down takes waiting, too.
+                    wait = operation.throw(error)
+                else:
+                    wait = operation.send(time.monotonic())
         except StopIteration as stop:
             return stop.value
-        finally:
-            operation.close()
 
     def _block(self, until: float | None) -> None:
         timeout = -1.0 if until is None else max(0.0, until - time.monotonic())

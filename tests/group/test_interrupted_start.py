@@ -1,0 +1,70 @@
+"""A start that is given up leaves nothing running and shows the reason alone."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+
+import pytest
+
+import rlightning_aio
+from rlightning_aio.errors import GroupClosed
+
+ENTRY = {"name": "cartpole", "backend": "gymnasium", "task": "CartPole-v1", "num_workers": 2}
+
+
+async def test_cancelling_init_closes_the_group_and_raises_the_cancellation() -> None:
+    """Whoever cancels `init` sees CancelledError; the group is closed, with all it started."""
+    group = rlightning_aio.build_env_group(ENTRY)
+    starting = asyncio.ensure_future(group.init())
+    await asyncio.sleep(0)  # It has sent its first request and waits.
+    starting.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await starting
+    with pytest.raises(GroupClosed):
+        await group.init()
+
+
+async def test_cancelling_init_twice_does_not_wait_for_the_workers() -> None:
+    """The second cancellation ends the orderly close; nothing is left either way."""
+    group = rlightning_aio.build_env_group(ENTRY)
+    starting = asyncio.ensure_future(group.init())
+    await asyncio.sleep(0)
+    starting.cancel()
+    await asyncio.sleep(0)
+    starting.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await starting
+
+
+def test_interrupting_a_synchronous_init_raises_the_interrupt() -> None:
+    """Ctrl-C while workers start is a KeyboardInterrupt, and the group is closed."""
+    script = textwrap.dedent(f"""
+        import rlightning_aio.sync
+        from rlightning_aio.hosts import process
+
+        launch = process.ForkServer._launch
+        def announced(server):
+            launch(server)
+            print("started", flush=True)
+        process.ForkServer._launch = announced
+
+        group = rlightning_aio.sync.build_env_group({ENTRY!r})
+        try:
+            group.init()
+        except KeyboardInterrupt as interrupt:
+            print("interrupted", interrupt.__context__, flush=True)
+    """)
+    child = subprocess.Popen(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, env={**os.environ}
+    )
+    assert child.stdout is not None
+    with child, child.stdout:
+        assert child.stdout.readline() == "started\n"
+        child.send_signal(signal.SIGINT)
+        assert child.stdout.readline() == "interrupted None\n"
+    assert child.returncode == 0
