@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib
+import warnings
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -11,6 +14,8 @@ from rlightning_aio.envs.tensors import as_numpy
 from rlightning_aio.types import EnvRet, PolicyResponse
 
 if TYPE_CHECKING:
+    from collections.abc import Generator
+
     from rlightning_aio.config import EnvConfig
 
 __all__ = ["GymnasiumEnv", "MujocoEnv"]
@@ -72,3 +77,28 @@ class GymnasiumEnv(BaseEnv):
 
 class MujocoEnv(GymnasiumEnv):
     """Gymnasium's MuJoCo tasks (HalfCheetah-v5, Ant-v5, …)."""
+
+    def _make(self) -> Any:
+        with _outdated_assets_accepted():
+            return super()._make()
+
+
+@contextlib.contextmanager
+def _outdated_assets_accepted() -> Generator[None]:
+    """Silence MuJoCo about deprecated attributes in a task's XML; nothing else.
+
+    Gymnasium's own assets use them, so each env of each worker would tell a user who can't
+    do anything about it. Whatever else MuJoCo warns of meanwhile is passed on.
+    """
+    # Its stubs leave out half of it.
+    mujoco: Any = importlib.import_module("mujoco")
+    said: list[str] = []
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(said.append)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+        for text in said:
+            if not (text.startswith("compiler attribute") and "deprecated" in text):
+                before(text) if before else warnings.warn(text, RuntimeWarning, stacklevel=2)
