@@ -7,7 +7,6 @@ while it steps; nothing protects the trainer from an env that crashes.
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from collections.abc import Callable
 from typing import Any
@@ -125,13 +124,10 @@ class InlineHost:
 
     def _enqueue(self, row: int, number: int, execute: Callable[[], Rest | None]) -> None:
         def run() -> None:
-            began = time.monotonic_ns()
             rest = execute()
-            done = time.monotonic_ns()
-            self._runners[row].stamp(done, done - began)
             if rest is None:
-                done_entry = ring_entries.entry(number, self.first_slot + row, 0)
-                self._inbox.on_reports(np.array([done_entry], np.int64))
+                done = ring_entries.entry(number, self.first_slot + row, 0)
+                self._inbox.on_reports(np.array([done], np.int64))
             else:
                 self._inbox.on_rest(self, row, number, rest)
 

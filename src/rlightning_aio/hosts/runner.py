@@ -7,14 +7,16 @@ returned as a dict, the *rest*; None means that the row holds everything.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from rlightning_aio.envs.base import BaseEnv, default_env_preprocess_fn
+from rlightning_aio.hosts.episodes import EpisodeSums
 from rlightning_aio.protocol.columns import row_reader, row_writer
-from rlightning_aio.protocol.info import PICKLED, InfoSchema, InfoWriter
+from rlightning_aio.protocol.info import NO_INFO, PICKLED, InfoSchema, InfoWriter
 from rlightning_aio.protocol.slab import NO_SEED, RowLayout, Slab
 from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
 
@@ -84,17 +86,8 @@ class EnvRunner:
         if slab.action is not None:
             self._read_action = row_reader(layout.action_space, slab.action, row)
         self._info_writer = InfoWriter(memoryview(slab.info[row]), announce)
-        self._episode_return = np.zeros(layout.head)
-        self._episode_length = np.zeros(layout.head, np.int64)
+        self._episodes = EpisodeSums(self._episode_shape(layout.head), self.meta.autoreset)
         self.step = self._stepper()
-
-        self._done_ns = memoryview(slab.done_ns)
-        self._busy_ns = memoryview(slab.busy_ns)
-
-    def stamp(self, done_ns: int, busy_ns: int) -> None:
-        """Write when the reply was ready and how long the env took."""
-        self._done_ns[self._row] = done_ns
-        self._busy_ns[self._row] = busy_ns
 
     def action_in_row(self) -> Any:
         """A copy of the action that the row holds."""
@@ -121,7 +114,8 @@ class EnvRunner:
         read_action = self._read_action
         if read_action is None:
             return lambda: self.step_with(None, {})
-        if bare is None or self._write_observation is None or self._slab.layout.head:
+        plain = self.meta.autoreset == "disabled" and not self._slab.layout.head
+        if bare is None or self._write_observation is None or not plain:
             return lambda: self.step_with(read_action(), {})
         self.reset_episode, step = _bare_stepper(
             bare, read_action, self._write_observation, self._info_writer.write, self._slab,
@@ -129,13 +123,21 @@ class EnvRunner:
         )
         return step
 
+    @property
+    def _takes_turns(self) -> bool:
+        """Whether results come from some of the sub-environments at a time."""
+        return self.env.config.num_envs > self.meta.num_envs
+
+    def _episode_shape(self, head: tuple[int, ...]) -> tuple[int, ...]:
+        return (self.env.config.num_envs,) if self._takes_turns else head
+
     def reset_episode(self) -> None:
         """Forget what was summed up of the current episode."""
-        self._episode_return[...] = 0.0
-        self._episode_length[...] = 0
+        self._episodes.forget()
 
     def step_with(self, action: Any, extras: dict[str, Any]) -> Rest | None:
         """Step with an action that didn't come through the row, or with extras."""
+        began = time.monotonic_ns()
         bare = self.env.bare_step()
         if bare is not None:
             observation, reward, terminated, truncated, info = bare(action)
@@ -149,20 +151,24 @@ class EnvRunner:
             )
         else:
             result = self.env.step(PolicyResponse(self.env.env_id, action, **extras))
-        return self._store(result, stepped=True)
+        return self._store(result, began, stepped=True)
 
     def reset(self, seed: int | None, options: dict[str, Any] | None) -> Rest | None:
         """Start a new episode."""
+        began = time.monotonic_ns()
         result = self.env.reset(seed=seed, options=options)
         self.reset_episode()
-        return self._store(result, stepped=False)
+        return self._store(result, began, stepped=False)
 
     def reset_from_row(self) -> Rest | None:
         """Start a new episode with the seed that the row holds."""
         seed = int(self._slab.seed[self._row])
         return self.reset(None if seed == NO_SEED else seed, None)
 
-    def _store(self, result: Any, *, stepped: bool) -> Rest | None:
+    def _store(self, result: Any, began_ns: int, *, stepped: bool) -> Rest | None:
+        done_ns = time.monotonic_ns()
+        self._slab.done_ns[self._row] = done_ns
+        self._slab.busy_ns[self._row] = done_ns - began_ns
         if not isinstance(result, EnvRet | MultiAgentEnvRet):
             raise TypeError(
                 f"{'step' if stepped else 'reset'}() of env {self.env.env_id!r} must return an "
@@ -198,14 +204,11 @@ class EnvRunner:
         self._store_flag("reward", slab.reward, result.last_reward, agents)
         self._store_flag("terminated", terminated, result.last_terminated, agents)
         self._store_flag("truncated", truncated, result.last_truncated, agents)
-        self._episode_return += slab.reward[row]
-        self._episode_length += 1
         ended = terminated[row] | truncated[row]
-        if ended.any():
-            slab.episode_return[row] = self._episode_return
-            slab.episode_length[row] = self._episode_length
-            self._episode_return[ended] = 0.0
-            self._episode_length[ended] = 0
+        which = np.asarray(result.info["env_id"]) if self._takes_turns else ...
+        slab.episode_return[row], slab.episode_length[row] = self._episodes.add(
+            slab.reward[row], ended, which
+        )
 
     def _store_flag(self, what: str, column: Any, value: Any, agents: tuple[str, ...]) -> None:
         head = column.shape[1:]
@@ -244,6 +247,9 @@ def _bare_stepper(
     terminations = memoryview(slab.terminated)
     truncations = memoryview(slab.truncated)
     marks = memoryview(slab.info_mark)
+    done_times = memoryview(slab.done_ns)
+    busy_times = memoryview(slab.busy_ns)
+    clock = time.monotonic_ns
     episode_return = 0.0
     episode_length = 0
 
@@ -253,7 +259,11 @@ def _bare_stepper(
 
     def step() -> Rest | None:
         nonlocal episode_return, episode_length
+        began = clock()
         observation, reward, terminated, truncated, info = bare(read_action())
+        done = clock()
+        done_times[row] = done
+        busy_times[row] = done - began
         write_observation(observation)
         rewards[row] = reward
         terminations[row] = terminated
@@ -264,8 +274,7 @@ def _bare_stepper(
             slab.episode_return[row] = episode_return
             slab.episode_length[row] = episode_length
             episode_return, episode_length = 0.0, 0
-        mark = write_info(info)
-        marks[row] = mark
+        marks[row] = mark = write_info(info) if info else NO_INFO
         return {"info": info} if mark == PICKLED else None
 
     return forget, step

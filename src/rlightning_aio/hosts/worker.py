@@ -26,10 +26,18 @@ from rlightning_aio.config import EnvConfig
 from rlightning_aio.envs.base import BaseEnv
 from rlightning_aio.hosts.arena import map_shared
 from rlightning_aio.hosts.runner import EnvRunner, Rest
-from rlightning_aio.protocol import rings as ring_entries
 from rlightning_aio.protocol.frames import BELL, Frame, FrameKind, FrameReader, encode
 from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
-from rlightning_aio.protocol.rings import WorkerRings, rings_size
+from rlightning_aio.protocol.rings import (
+    NUMBER_SHIFT,
+    OP_BITS,
+    OP_MASK,
+    SLOT_MASK,
+    STEP,
+    WorkerRings,
+    entry,
+    rings_size,
+)
 from rlightning_aio.protocol.slab import RowLayout, Slab
 from rlightning_aio.registry import ENVS
 from rlightning_aio.types import EnvMeta
@@ -154,6 +162,7 @@ class Worker:
         self._rings = WorkerRings(rings_memory, rows)
         self._runners: list[EnvRunner] = []
         self._schemas = InfoSchemas(self._send_schema)
+        self._timed = False
         self._spin_seconds = 0.0
         self._failed_spins = 0
         self._attached = False
@@ -177,36 +186,37 @@ class Worker:
 
     def _run_requests(self) -> None:
         """Execute what the ring holds; frames in between, as they come."""
-        rings, runners, first_slot = self._rings, self._runners, self._first_slot
-        clock = time.monotonic_ns
-        began = clock()
-        while True:
-            if rings.has_frame():
+        rings = self._rings
+        has_frame, run = rings.has_frame, self._run
+        while not self._closing:
+            if has_frame():
                 self._receive(socket.MSG_DONTWAIT)
-                began = clock()
-            request = 0 if self._closing else rings.next_request()
-            if not request:
-                rings.idle()
-                return
-            row = ((request >> ring_entries.OP_BITS) & ring_entries.SLOT_MASK) - first_slot
-            rings.begin(request, began)
-            runner = runners[row]
-            try:
-                if request & ring_entries.OP_MASK == ring_entries.STEP:
-                    rest = runner.step()
-                else:
-                    rest = runner.reset_from_row()
-            except BaseException as error:
-                self._send_error(row, request >> ring_entries.NUMBER_SHIFT, error)
-                began = clock()
-                continue
-            done = clock()
-            runner.stamp(done, done - began)
-            began = done
-            if rest is not None:
-                self._send_rest(row, request >> ring_entries.NUMBER_SHIFT, rest)
-            elif rings.report(request):
-                self._channel.send(BELL)
+            requests = rings.requests()
+            if not requests:
+                break
+            for request in requests:
+                run(request)
+                if has_frame():
+                    self._receive(socket.MSG_DONTWAIT)
+                    if self._closing:
+                        break
+        rings.idle()
+
+    def _run(self, request: int) -> None:
+        """Execute one request of the ring and report it."""
+        row = ((request >> OP_BITS) & SLOT_MASK) - self._first_slot
+        runner = self._runners[row]
+        if self._timed:
+            self._rings.begin(request, time.monotonic_ns())
+        try:
+            rest = runner.step() if request & OP_MASK == STEP else runner.reset_from_row()
+        except BaseException as error:
+            self._send_error(row, request >> NUMBER_SHIFT, error)
+            return
+        if rest is not None:
+            self._send_rest(row, request >> NUMBER_SHIFT, rest)
+        elif self._rings.report(request):
+            self._channel.send(BELL)
 
     def _wait(self) -> None:
         """Return when there may be something to do."""
@@ -248,7 +258,9 @@ class Worker:
 
     def _handle(self, frame: Frame) -> None:
         """Execute one frame and answer it."""
-        self._rings.begin(ring_entries.entry(frame.number, self._first_slot + frame.row, 0), time.monotonic_ns())
+        self._rings.begin(
+            entry(frame.number, self._first_slot + frame.row, 0), time.monotonic_ns()
+        )
         try:
             self._handlers[frame.kind](self, frame)
         except (TrainerGone, BrokenPipeError, ConnectionResetError):
@@ -262,6 +274,7 @@ class Worker:
         if order.core is not None:
             os.sched_setaffinity(0, {order.core})
         self._spin_seconds = _SPIN_SECONDS if order.spins else 0.0
+        self._timed = (order.config.step_timeout or order.config.reset_timeout) is not None
         for row, (index, fn) in enumerate(
             zip(order.worker_indices, order.preprocess_fns, strict=True)
         ):
@@ -295,19 +308,11 @@ class Worker:
         runner = self._runners[frame.row]
         if type(action) is str and action == NO_ACTION:
             action = runner.action_in_row()
-        began = time.monotonic_ns()
-        rest = runner.step_with(action, extras)
-        done = time.monotonic_ns()
-        runner.stamp(done, done - began)
-        self._send_rest(frame.row, frame.number, rest or {})
+        self._send_rest(frame.row, frame.number, runner.step_with(action, extras) or {})
 
     def _reset(self, frame: Frame) -> None:
         seed, options = pickle.loads(frame.payload)
-        runner = self._runners[frame.row]
-        began = time.monotonic_ns()
-        rest = runner.reset(seed, options)
-        done = time.monotonic_ns()
-        runner.stamp(done, done - began)
+        rest = self._runners[frame.row].reset(seed, options)
         self._send_rest(frame.row, frame.number, rest or {})
 
     def _call(self, frame: Frame) -> None:

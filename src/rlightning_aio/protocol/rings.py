@@ -12,6 +12,7 @@ the other, and no wake-up is lost (Dekker's rule).
 
 from __future__ import annotations
 
+import platform
 import threading
 from collections.abc import Callable
 from typing import Final
@@ -60,6 +61,10 @@ _WORDS: Final = 8 * _LINE
 # _WANTED holds an order number above this many bits, so that an order is obeyed once.
 _WANTED_BITS: Final = 24
 _WANTED_MASK: Final = (1 << _WANTED_BITS) - 1
+
+
+# x86 publishes stores in program order; elsewhere the entry could be seen after its count.
+_STORES_STAY_IN_ORDER: Final = platform.machine() in ("x86_64", "AMD64")
 
 
 def _new_fence() -> Callable[[], None]:
@@ -207,14 +212,18 @@ class WorkerRings:
         """Whether an entry waits in the ring."""
         return self._words[_REQUESTS_SENT] != self._read
 
-    def next_request(self) -> int:
-        """The next entry, in order; 0 if there is none."""
-        if self._words[_REQUESTS_SENT] == self._read:
-            return 0
+    def requests(self) -> list[int]:
+        """Read all entries that wait, in order."""
+        sent = self._words[_REQUESTS_SENT]
+        if sent == self._read:
+            return []
         fence()
-        found = self._requests[self._read & self._mask]
-        self._read += 1
-        return found
+        start = self._read & self._mask
+        end = start + sent - self._read
+        self._read = sent
+        ring = self._requests
+        found = ring[start:end].tolist()
+        return found if end <= len(ring) else found + ring[: end - len(ring)].tolist()
 
     def has_frame(self) -> bool:
         """Whether a frame lies in the channel that `frame_seen` has not counted."""
@@ -237,17 +246,16 @@ class WorkerRings:
         """Append a report; True if the trainer ordered a bell for what is unread now."""
         words = self._words
         self._reports[self._sent & self._mask] = done
-        self._sent += 1
-        fence()
-        words[_REPORTS_SENT] = self._sent
+        self._sent = sent = self._sent + 1
+        if not _STORES_STAY_IN_ORDER:
+            fence()
+        words[_REPORTS_SENT] = sent
         fence()
         wanted = words[_WANTED]
-        if wanted == self._obeyed or not wanted:
-            return False
-        if self._sent - words[_REPORTS_READ] < wanted & _WANTED_MASK:
+        if wanted == self._obeyed or sent - words[_REPORTS_READ] < wanted & _WANTED_MASK:
             return False
         self._obeyed = wanted
-        return True
+        return wanted != 0
 
     def count_frame(self) -> None:
         """Say that one more frame was handed to the channel."""
