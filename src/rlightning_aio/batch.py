@@ -10,17 +10,20 @@ from __future__ import annotations
 
 import pickle
 import time
-from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rlightning_aio.errors import BadAction
 from rlightning_aio.protocol.columns import Tree, index, mapped
 from rlightning_aio.protocol.info import NO_INFO, PICKLED, InfoSchema
 from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from numpy.typing import NDArray
 
 __all__ = ["BatchedData", "EnvTable", "Origin", "ResultColumns"]
 
@@ -91,8 +94,8 @@ class ResultColumns:
         rest = self.rest(row) if self.rests else {}
         if "ret" in rest:
             return rest["ret"].observation
-        return index(self.observation, row) if self.observation is not None else (
-            rest["observation"]
+        return (
+            index(self.observation, row) if self.observation is not None else (rest["observation"])
         )
 
     def info_of(self, row: int) -> dict[str, Any]:
@@ -319,8 +322,10 @@ class BatchedData:
         """Which envs' episodes have ended: ``[n]`` bool, all sub-environments and agents of it."""
         whole = np.empty(len(self), np.bool_)
         for part in self._parts:
-            ended = part.ended if part.ended.ndim == 1 else part.ended.all(
-                axis=tuple(range(1, part.ended.ndim))
+            ended = (
+                part.ended
+                if part.ended.ndim == 1
+                else part.ended.all(axis=tuple(range(1, part.ended.ndim)))
             )
             if part.positions is None:
                 return ended

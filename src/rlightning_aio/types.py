@@ -8,12 +8,15 @@ Absent on purpose: anything that knows where an env runs.
 from __future__ import annotations
 
 import time
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import gymnasium as gym
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
 
-__all__ = ["EnvMeta", "EnvRet", "MultiAgentEnvRet", "PolicyResponse"]
+__all__ = ["Autoreset", "EnvMeta", "EnvRet", "MultiAgentEnvRet", "PolicyResponse"]
+
+Autoreset: TypeAlias = Literal["disabled", "next_step", "same_step"]
+"""See `EnvMeta`."""
 
 
 class PolicyResponse:
@@ -98,6 +101,10 @@ class EnvMeta(BaseModel):
         num_envs: vectorised sub-environments.
         agents: agent names of a multi-agent env, in order; empty otherwise.
         max_episode_steps: the configured limit, or the simulator's own; None if none.
+        autoreset: what a sub-environment does after its episode's end, in Gymnasium's words:
+            wait for a reset (``disabled``); reset itself in the next step, whose action and
+            reward count for nothing (``next_step``); or within the step that ends the
+            episode, whose observation is the next one's first (``same_step``).
     """
 
     model_config = ConfigDict(arbitrary_types_allowed=True)
@@ -108,3 +115,4 @@ class EnvMeta(BaseModel):
     num_envs: int = 1
     agents: tuple[str, ...] = ()
     max_episode_steps: int | None = None
+    autoreset: Autoreset = "disabled"

@@ -7,17 +7,20 @@ comes as columns), and only then does the first byte leave.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import BadAction
-from rlightning_aio.group.slots import Slots
 from rlightning_aio.hosts.worker import NO_ACTION
 from rlightning_aio.protocol.columns import Leaf, Tree, index, leaf_of
-from rlightning_aio.protocol.slab import Slab
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from rlightning_aio.batch import BatchedData
+    from rlightning_aio.group.slots import Slots
+    from rlightning_aio.protocol.slab import Slab
 
 __all__ = ["Letters", "write_actions"]
 

@@ -9,16 +9,19 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Coroutine, Mapping, Sequence
-from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
-from rlightning_aio.batch import BatchedData
 from rlightning_aio.group.build import PreprocessFn, plan_group
 from rlightning_aio.group.facade import AutoResetContext, Facade, sole, steps_of
-from rlightning_aio.group.wait import Operation
-from rlightning_aio.hosts.base import Source
-from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
+
+if TYPE_CHECKING:
+    from collections.abc import Coroutine, Mapping, Sequence
+    from types import TracebackType
+
+    from rlightning_aio.batch import BatchedData
+    from rlightning_aio.group.wait import Operation
+    from rlightning_aio.hosts.base import Source
+    from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
 
 __all__ = ["AioDriver", "EnvGroup", "EnvHandle"]
 
@@ -172,9 +175,7 @@ class EnvGroup(Facade):
             EnvRaised, WorkerDied, EnvHung: an env failed; the others' results are in the
                 error's ``results``.
         """
-        return await self._driver.run(
-            self._core.reset(time.monotonic(), seed, options, env_ids)
-        )
+        return await self._driver.run(self._core.reset(time.monotonic(), seed, options, env_ids))
 
     async def step(self, batch: BatchedData) -> tuple[BatchedData, list[bool] | None]:
         """Step the envs of `batch` and wait for all of them.

@@ -8,14 +8,17 @@ replaced by a reset; so a limit of L gives a period of L + 1 calls.
 from __future__ import annotations
 
 import warnings
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rlightning_aio.batch import BatchedData
-from rlightning_aio.group.slots import Slots
 from rlightning_aio.protocol.rings import STEP
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from rlightning_aio.batch import BatchedData
+    from rlightning_aio.group.slots import Slots
 
 __all__ = ["NO_RESETS", "AutoReset"]
 
@@ -86,6 +89,8 @@ class AutoReset:
         self._counts[slots] = counts
         if self._limits is None:
             return [False] * len(slots)
-        reached = counts >= self._limits[slots]
-        self._due[slots] = reached | (batch.ended & stepped) if self._on_done else reached
+        reached = due = counts >= self._limits[slots]
+        if self._on_done:
+            due = reached | (batch.ended & stepped & ~self._slots.resets_itself[slots])
+        self._due[slots] = due
         return reached.tolist()

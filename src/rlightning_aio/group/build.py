@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cloudpickle
 
@@ -17,12 +17,14 @@ from rlightning_aio.errors import ConfigError
 from rlightning_aio.group.fleet import Fleet
 from rlightning_aio.group.slots import Slots
 from rlightning_aio.hosts.arena import Arena
-from rlightning_aio.hosts.base import Host, Watcher
 from rlightning_aio.hosts.inline import InlineHost
 from rlightning_aio.hosts.process import ForkServer, ProcessHost
 from rlightning_aio.hosts.worker import StartOrder
 from rlightning_aio.registry import BACKENDS, ENVS
 from rlightning_aio.types import PolicyResponse
+
+if TYPE_CHECKING:
+    from rlightning_aio.hosts.base import Host, Watcher
 
 __all__ = ["Plan", "build_fleet", "plan_group"]
 
@@ -169,9 +171,7 @@ def _shares(
     else:
         num_hosts = -(-count // config.envs_per_process)
     envs = list(enumerate(fns))
-    return [
-        envs[count * k // num_hosts : count * (k + 1) // num_hosts] for k in range(num_hosts)
-    ]
+    return [envs[count * k // num_hosts : count * (k + 1) // num_hosts] for k in range(num_hosts)]
 
 
 def _server_for(
@@ -195,4 +195,3 @@ def _server_for(
 
 def _server_key(config: EnvConfig) -> tuple[object, ...]:
     return config.interpreter, tuple(sorted(config.env_vars.items()))
-

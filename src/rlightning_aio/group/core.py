@@ -11,12 +11,10 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import (
     EnvBusy,
     EnvFault,
@@ -27,16 +25,21 @@ from rlightning_aio.errors import (
 )
 from rlightning_aio.group.actions import write_actions
 from rlightning_aio.group.auto_reset import NO_RESETS, AutoReset
-from rlightning_aio.group.fleet import Fleet
 from rlightning_aio.group.results import collected
 from rlightning_aio.group.slots import BUSY, IDLE, READY
 from rlightning_aio.group.stats import Stats
 from rlightning_aio.group.wait import Operation, Wait, earliest
-from rlightning_aio.hosts.base import Host
-from rlightning_aio.hosts.worker import ErrorText
-from rlightning_aio.protocol.info import InfoSchema
 from rlightning_aio.protocol.rings import OP_BITS, OP_MASK, RESET, SLOT_MASK, STEP
 from rlightning_aio.protocol.slab import NO_SEED
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from rlightning_aio.batch import BatchedData
+    from rlightning_aio.group.fleet import Fleet
+    from rlightning_aio.hosts.base import Host
+    from rlightning_aio.hosts.worker import ErrorText
+    from rlightning_aio.protocol.info import InfoSchema
 
 __all__ = ["Core"]
 
@@ -359,9 +362,7 @@ class Core:
         slots = taken[0] if len(taken) == 1 else np.concatenate(taken)
         return self._hand_out(slots, synchronous=False)
 
-    def _hand_out(
-        self, slots: NDArray[np.intp], *, synchronous: bool
-    ) -> tuple[BatchedData, Flags]:
+    def _hand_out(self, slots: NDArray[np.intp], *, synchronous: bool) -> tuple[BatchedData, Flags]:
         self.slots.state[slots] = IDLE
         batch = collected(self, slots, self._rests)
         flags = self.auto.account(slots, batch)
@@ -467,9 +468,7 @@ class Core:
                 raise ValueError(f"seeds must be at least 0, not {value}")
         return np.array(chosen, np.int64)
 
-    def _settled(
-        self, ticket: Ticket, slots: NDArray[np.intp]
-    ) -> tuple[BatchedData, Flags]:
+    def _settled(self, ticket: Ticket, slots: NDArray[np.intp]) -> tuple[BatchedData, Flags]:
         """The results of a call, in its order; its faults, with the results, as an error."""
         if not ticket.faults:
             return self._hand_out(slots, synchronous=True)

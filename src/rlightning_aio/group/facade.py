@@ -5,17 +5,20 @@ from __future__ import annotations
 import time
 import warnings
 import weakref
-from collections.abc import Sequence
-from types import TracebackType
-from typing import Any, Self
-
-import gymnasium as gym
+from typing import TYPE_CHECKING, Any, Self
 
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.group.build import Plan, build_fleet
 from rlightning_aio.group.core import Core
-from rlightning_aio.hosts.base import Watcher
 from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from types import TracebackType
+
+    import gymnasium as gym
+
+    from rlightning_aio.hosts.base import Watcher
 
 __all__ = ["AutoResetContext", "Facade", "sole", "steps_of"]
 
@@ -137,9 +140,7 @@ class Facade:
         if max_results is not None and max_results < 1:
             raise ValueError(f"max_results must be at least 1, not {max_results!r}")
         if max_results is not None and min_results > max_results:
-            raise ValueError(
-                f"min_results ({min_results}) is above max_results ({max_results})"
-            )
+            raise ValueError(f"min_results ({min_results}) is above max_results ({max_results})")
         if wait_all and timeout is not None:
             warnings.warn("collect_async(wait_all=True) ignores timeout", stacklevel=3)
 
@@ -176,9 +177,7 @@ class Facade:
         for name, rates in stats["entries"].items():
             print(f"{rates['sync'] + rates['async']:12.0f}   {name}")
         for kind, figures in stats["latency_us"].items():
-            print(
-                f"{figures['p50']:12.1f} µs {kind} (median), {figures['p99']:.1f} µs (p99)"
-            )
+            print(f"{figures['p50']:12.1f} µs {kind} (median), {figures['p99']:.1f} µs (p99)")
 
     def _closed(self) -> None:
         self._finalizer.detach()

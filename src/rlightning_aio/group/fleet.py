@@ -10,16 +10,13 @@ from __future__ import annotations
 
 import pickle
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum, auto
 from math import ceil
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rlightning_aio.config import EnvConfig
 from rlightning_aio.errors import (
     ConfigError,
     EnvHung,
@@ -32,16 +29,21 @@ from rlightning_aio.group.slots import BUSY, Slots
 from rlightning_aio.group.wait import Operation, Wait, earliest
 from rlightning_aio.hosts.arena import Arena, map_shared
 from rlightning_aio.hosts.base import Death, Host
-from rlightning_aio.hosts.process import ForkServer
 from rlightning_aio.hosts.worker import AttachOrder, ErrorText, Started
 from rlightning_aio.protocol.columns import leaves
 from rlightning_aio.protocol.info import NO_INFO, PICKLED
 from rlightning_aio.protocol.rings import OP_BITS, RESET, SLOT_MASK, STEP
 from rlightning_aio.protocol.slab import NO_SEED, Slab
-from rlightning_aio.types import EnvMeta
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from rlightning_aio.config import EnvConfig
     from rlightning_aio.group.core import Core
+    from rlightning_aio.hosts.process import ForkServer
+    from rlightning_aio.types import EnvMeta
 
 __all__ = ["Fleet"]
 
@@ -260,7 +262,12 @@ class Fleet:
             rows_used[slab] += 1
             table.by_frame[slot] = env.transforms_actions or env.layout.action_leaves is None
             table.reads_extras[slot] = env.reads_extras
-            table.seed_offset[slot] = sum(s.meta.num_envs for s in started[:slot])
+            # Seeds are the sub-environments', of which a result may hold some only.
+            table.seed_offset[slot] = sum(
+                max(s.meta.num_envs, config.num_envs)
+                for s, config in zip(started[:slot], table.configs, strict=False)
+            )
+            table.resets_itself[slot] = env.meta.autoreset != "disabled"
         table.letters = bool(table.by_frame.any() or table.reads_extras.any())
         parts = self._make_slabs([e.layout for e in started], list(keys.values()), rows_used)
         for member in self._members:
@@ -359,9 +366,9 @@ class Fleet:
 
     def next_check(self) -> float | None:
         """When `check` must be called at the latest."""
-        times: list[float | None] = [m.start_by for m in self._members] if self.lost or (
-            self.restarting
-        ) else []
+        times: list[float | None] = (
+            [m.start_by for m in self._members] if self.lost or (self.restarting) else []
+        )
         if self._timed:
             times += [self._expiry(m) for m in self._members if m.timed and m.host.in_flight]
         return earliest(*times)

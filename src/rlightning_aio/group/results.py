@@ -5,16 +5,18 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rlightning_aio.batch import BatchedData, Origin, ResultColumns
 from rlightning_aio.protocol.columns import Rows, gather, mapped
-from rlightning_aio.protocol.slab import Slab
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from rlightning_aio.group.core import Core
+    from rlightning_aio.protocol.slab import Slab
 
 __all__ = ["collected"]
+
 
 def collected(core: Core, slots: NDArray[np.intp], rests: dict[int, Any]) -> BatchedData:
     """A batch of the results of `slots`, which lie in their rows, in the order of `slots`."""

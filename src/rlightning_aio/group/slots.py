@@ -6,16 +6,20 @@ costs a few vector operations; nothing here walks envs one by one.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rlightning_aio.config import EnvConfig
 from rlightning_aio.errors import UnknownEnv
-from rlightning_aio.protocol.info import InfoSchema
 from rlightning_aio.protocol.rings import NUMBER_SHIFT, OP_BITS
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from rlightning_aio.config import EnvConfig
+    from rlightning_aio.protocol.info import InfoSchema
 
 __all__ = ["BUSY", "IDLE", "READY", "Slots"]
 
@@ -39,7 +43,7 @@ class Slots:
         slab, row: where its results lie.
         by_frame: actions may not fit the row; reads_extras: responses' extras are read there;
             letters: either is true of any env.
-        seed_offset: sub-environments before it.
+        seed_offset: sub-environments before it; resets_itself: it needs no reset after an end.
         schemas: of its worker.
     """
 
@@ -61,6 +65,7 @@ class Slots:
         self.reads_extras = np.zeros(size, np.bool_)
         self.letters = False
         self.seed_offset = np.zeros(size, np.int64)
+        self.resets_itself = np.zeros(size, np.bool_)
         self.schemas: list[dict[int, InfoSchema]] = [{} for _ in range(size)]
 
     def __len__(self) -> int:

@@ -9,13 +9,15 @@ from __future__ import annotations
 import time
 from collections import deque
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rlightning_aio.batch import BatchedData
-from rlightning_aio.group.slots import Slots
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from rlightning_aio.batch import BatchedData
+    from rlightning_aio.group.slots import Slots
 
 __all__ = ["Stats"]
 
@@ -55,7 +57,11 @@ class Stats:
             slots = part.slots
             self._samples.append(
                 _Sample(
-                    now, slots, self._table.sent_ns[slots], part.done_ns, part.busy_ns,
+                    now,
+                    slots,
+                    self._table.sent_ns[slots],
+                    part.done_ns,
+                    part.busy_ns,
                     synchronous,
                 )
             )
@@ -95,7 +101,9 @@ class Stats:
             "steps_per_second": sum(len(s.slots) for s in counted) / seconds,
             "entries": self._by_entry(counted, seconds),
             "batch_size": {
-                "mean": float(sizes.mean()), "min": int(sizes.min()), "max": int(sizes.max())
+                "mean": float(sizes.mean()),
+                "min": int(sizes.min()),
+                "max": int(sizes.max()),
             },
             "latency_us": self._latencies(samples),
         }
@@ -148,7 +156,11 @@ class Stats:
     def reset_envs(self) -> None:
         """Start the sums over episodes anew."""
         for sums in (
-            self._episodes, self._returns, self._lengths, self._last_length, self._env_steps,
+            self._episodes,
+            self._returns,
+            self._lengths,
+            self._last_length,
+            self._env_steps,
         ):
             sums[:] = 0
         self._last_return[:] = np.nan

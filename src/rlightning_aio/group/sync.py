@@ -8,16 +8,19 @@ from __future__ import annotations
 
 import select
 import time
-from collections.abc import Mapping, Sequence
-from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
-from rlightning_aio.batch import BatchedData
 from rlightning_aio.group.build import PreprocessFn, plan_group
 from rlightning_aio.group.facade import AutoResetContext, Facade, sole, steps_of
-from rlightning_aio.group.wait import Operation
-from rlightning_aio.hosts.base import Source
-from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from types import TracebackType
+
+    from rlightning_aio.batch import BatchedData
+    from rlightning_aio.group.wait import Operation
+    from rlightning_aio.hosts.base import Source
+    from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
 
 __all__ = ["EnvGroup", "EnvHandle", "SyncDriver"]
 

@@ -8,13 +8,14 @@ to watch their descriptors through a `Watcher`; neither side ever waits here.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
-from rlightning_aio.hosts.worker import AttachOrder, ErrorText, Started
-from rlightning_aio.protocol.info import InfoSchema
+    from rlightning_aio.hosts.worker import AttachOrder, ErrorText, Started
+    from rlightning_aio.protocol.info import InfoSchema
 
 __all__ = ["Death", "Host", "Inbox", "Source", "Watcher"]
 

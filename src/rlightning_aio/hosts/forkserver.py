@@ -23,9 +23,11 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 __all__ = ["BOOTSTRAP", "DUMP_SIGNAL", "Exited", "Fork", "Forked", "Hello", "Kill", "Ready", "main"]
 
@@ -289,9 +291,7 @@ def _run_worker(
         from rlightning_aio.hosts import worker
 
         channel = socket.socket(fileno=descriptors[0])
-        worker.main(
-            channel, descriptors[1], order.rings_offset, order.first_slot, order.rows
-        )
+        worker.main(channel, descriptors[1], order.rings_offset, order.first_slot, order.rows)
         code = 0
     except BaseException:
         traceback.print_exc()

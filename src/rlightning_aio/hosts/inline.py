@@ -8,25 +8,29 @@ while it steps; nothing protects the trainer from an env that crashes.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rlightning_aio.hosts.arena import Arena, map_shared
-from rlightning_aio.hosts.base import Inbox
 from rlightning_aio.hosts.runner import EnvRunner, Rest
 from rlightning_aio.hosts.worker import (
     AttachOrder,
     ErrorText,
-    StartOrder,
     Started,
+    StartOrder,
     build_env,
 )
 from rlightning_aio.protocol import rings as ring_entries
 from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
 from rlightning_aio.protocol.slab import Slab
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from rlightning_aio.hosts.base import Inbox
 
 __all__ = ["InlineHost"]
 
@@ -77,9 +81,7 @@ class InlineHost:
     def attach(self, order: AttachOrder) -> None:
         """See `base.Host.attach`."""
         slabs = [
-            Slab(
-                layout, map_shared(self._arena.descriptor, offset, layout.size(rows)), rows
-            )
+            Slab(layout, map_shared(self._arena.descriptor, offset, layout.size(rows)), rows)
             for layout, rows, offset in order.slabs
         ]
         for runner, (slab_index, row) in zip(self._runners, order.rows, strict=True):

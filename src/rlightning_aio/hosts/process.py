@@ -16,19 +16,22 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cloudpickle
-import numpy as np
-from numpy.typing import NDArray
 
 import rlightning_aio
 from rlightning_aio.hosts.arena import Arena, map_shared
 from rlightning_aio.hosts.base import Death, Inbox, Watcher
 from rlightning_aio.hosts.forkserver import BOOTSTRAP, Exited, Fork, Forked, Hello, Kill, Ready
-from rlightning_aio.hosts.worker import AttachOrder, ErrorText, StartOrder
 from rlightning_aio.protocol.frames import BELL, Frame, FrameKind, FrameReader, encode
 from rlightning_aio.protocol.rings import TrainerRings, rings_size
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from rlightning_aio.hosts.worker import AttachOrder, ErrorText, StartOrder
 
 __all__ = ["ForkServer", "ProcessHost"]
 
@@ -84,9 +87,7 @@ class ForkServer:
             self._launch()
         assert self._socket is not None
         self._hosts[order.host_id] = host
-        socket.send_fds(
-            self._socket, [pickle.dumps(order)], [channel.fileno(), arena.descriptor]
-        )
+        socket.send_fds(self._socket, [pickle.dumps(order)], [channel.fileno(), arena.descriptor])
 
     def kill(self, host: ProcessHost, *, dump: bool) -> None:
         """Kill the worker of `host`, if it is still there."""
@@ -186,9 +187,7 @@ class ProcessHost:
         self._inbox = inbox
         self._watcher = watcher
         self._rings_offset = arena.append(rings_size(self.rows))
-        self._rings_memory = map_shared(
-            arena.descriptor, self._rings_offset, rings_size(self.rows)
-        )
+        self._rings_memory = map_shared(arena.descriptor, self._rings_offset, rings_size(self.rows))
         self._socket: socket.socket | None = None
         self._alive = False
 
@@ -291,9 +290,7 @@ class ProcessHost:
         self.in_flight += 1
         self._send(FrameKind.CALL, row, number, cloudpickle.dumps((name, args, kwargs)))
 
-    def _send(
-        self, kind: FrameKind, row: int = 0, number: int = 0, payload: bytes = b""
-    ) -> None:
+    def _send(self, kind: FrameKind, row: int = 0, number: int = 0, payload: bytes = b"") -> None:
         self._frames_outgoing += 1
         self._write(encode(kind, row, number, payload))
 

@@ -8,8 +8,7 @@ returned as a dict, the *rest*; None means that the row holds everything.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,6 +18,9 @@ from rlightning_aio.protocol.columns import row_reader, row_writer
 from rlightning_aio.protocol.info import NO_INFO, PICKLED, InfoSchema, InfoWriter
 from rlightning_aio.protocol.slab import NO_SEED, RowLayout, Slab
 from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 __all__ = ["EnvRunner", "Rest"]
 
@@ -68,8 +70,7 @@ class EnvRunner:
     def transforms_actions(self) -> bool:
         """Whether an action may have any shape and type."""
         return (
-            self.env.transforms_actions
-            or self.env._preprocess_fn is not default_env_preprocess_fn  # pyright: ignore[reportPrivateUsage]
+            self.env.transforms_actions or self.env._preprocess_fn is not default_env_preprocess_fn  # pyright: ignore[reportPrivateUsage]
         )
 
     def attach(self, slab: Slab, row: int, announce: Callable[[InfoSchema], int]) -> None:
@@ -118,7 +119,11 @@ class EnvRunner:
         if bare is None or self._write_observation is None or not plain:
             return lambda: self.step_with(read_action(), {})
         self.reset_episode, step = _bare_stepper(
-            bare, read_action, self._write_observation, self._info_writer.write, self._slab,
+            bare,
+            read_action,
+            self._write_observation,
+            self._info_writer.write,
+            self._slab,
             self._row,
         )
         return step

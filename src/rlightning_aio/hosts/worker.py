@@ -16,14 +16,11 @@ import pickle
 import socket
 import time
 import traceback
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import cloudpickle
 
-from rlightning_aio.config import EnvConfig
-from rlightning_aio.envs.base import BaseEnv
 from rlightning_aio.hosts.arena import map_shared
 from rlightning_aio.hosts.runner import EnvRunner, Rest
 from rlightning_aio.protocol.frames import BELL, Frame, FrameKind, FrameReader, encode
@@ -40,7 +37,13 @@ from rlightning_aio.protocol.rings import (
 )
 from rlightning_aio.protocol.slab import RowLayout, Slab
 from rlightning_aio.registry import ENVS
-from rlightning_aio.types import EnvMeta
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rlightning_aio.config import EnvConfig
+    from rlightning_aio.envs.base import BaseEnv
+    from rlightning_aio.types import EnvMeta
 
 __all__ = ["NO_ACTION", "AttachOrder", "ErrorText", "StartOrder", "Started", "Worker", "main"]
 
@@ -258,9 +261,7 @@ class Worker:
 
     def _handle(self, frame: Frame) -> None:
         """Execute one frame and answer it."""
-        self._rings.begin(
-            entry(frame.number, self._first_slot + frame.row, 0), time.monotonic_ns()
-        )
+        self._rings.begin(entry(frame.number, self._first_slot + frame.row, 0), time.monotonic_ns())
         try:
             self._handlers[frame.kind](self, frame)
         except (TrainerGone, BrokenPipeError, ConnectionResetError):
@@ -378,9 +379,7 @@ def _dumped(value: Any, what: str) -> bytes:
             raise TypeError(f"{what} can't be pickled: {error}") from error
 
 
-def main(
-    channel: socket.socket, arena: int, rings_offset: int, first_slot: int, rows: int
-) -> None:
+def main(channel: socket.socket, arena: int, rings_offset: int, first_slot: int, rows: int) -> None:
     """Run a worker in this process; returns when it has closed."""
     rings_memory = map_shared(arena, rings_offset, rings_size(rows))
     Worker(channel, arena, rings_memory, first_slot, rows).serve()

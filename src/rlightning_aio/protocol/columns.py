@@ -9,14 +9,17 @@ travel pickled.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from numpy.typing import NDArray
 
 __all__ = [
     "Leaf",
@@ -155,9 +158,7 @@ def row_writer(
     return write
 
 
-def _number_writer(
-    column: NDArray[Any], row: int, leaf: Leaf, what: str
-) -> Callable[[Any], None]:
+def _number_writer(column: NDArray[Any], row: int, leaf: Leaf, what: str) -> Callable[[Any], None]:
     def write(value: Any) -> None:
         column[row] = _fitted(value, leaf, what)
 

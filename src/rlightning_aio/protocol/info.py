@@ -9,11 +9,13 @@ Types survive: a NumPy scalar comes back as the NumPy scalar it was.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 __all__ = ["INFO_BYTES", "NO_INFO", "PICKLED", "InfoSchema", "InfoWriter"]
 

@@ -9,17 +9,20 @@ worker writes it only while it has one.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from math import prod
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
 from rlightning_aio.protocol.columns import Leaf, Tree, assemble, leaves
 from rlightning_aio.protocol.info import INFO_BYTES
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    import gymnasium as gym
+    from numpy.typing import NDArray
 
 __all__ = ["NO_SEED", "RowLayout", "Slab"]
 
@@ -69,9 +72,7 @@ class RowLayout:
 
     def size(self, rows: int) -> int:
         """Bytes of a slab with `rows` rows."""
-        return sum(
-            _aligned(rows * prod(shape) * dtype.itemsize) for shape, dtype in self._arrays()
-        )
+        return sum(_aligned(rows * prod(shape) * dtype.itemsize) for shape, dtype in self._arrays())
 
     def arrays(self, buffer: memoryview, rows: int) -> Iterator[NDArray[Any]]:
         """The columns over `buffer`, in a fixed order."""
