@@ -1,0 +1,90 @@
+"""What the README promises, executed."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text()
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+
+
+def commands() -> list[str]:
+    return [line for block in blocks("sh") for line in block.splitlines() if line.strip()]
+
+
+@pytest.mark.parametrize("program", blocks("python"), ids=range(len(blocks("python"))))
+def test_every_example_runs(program: str, tmp_path: Path) -> None:
+    """A Python block of the README is a whole program that ends well."""
+    script = tmp_path / "example.py"
+    script.write_text(program)
+    done = subprocess.run(
+        [sys.executable, script], cwd=ROOT, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("command", [c for c in commands() if c.startswith("rlightning-aio")])
+def test_every_command_runs(command: str) -> None:
+    """A command of the README ends with exit code 0."""
+    words = [sys.executable, "-c", "from rlightning_aio.cli import main; main()"]
+    done = subprocess.run(
+        [*words, *shlex.split(command)[1:]],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("command", [c for c in commands() if c.startswith("make")])
+def test_every_make_target_exists(command: str) -> None:
+    """Make knows what to do for each target that the README names."""
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("MAKE")}
+    done = subprocess.run(
+        [*shlex.split(command), "--dry-run"],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_configuration_block_loads(tmp_path: Path) -> None:
+    """The YAML block is a configuration."""
+    from rlightning_aio import load_config
+
+    path = tmp_path / "file.yaml"
+    path.write_text(blocks("yaml")[0])
+    configs = load_config(path, ["envs.0.num_workers=16"])
+    assert [config.num_workers for config in configs] == [16, 8]
+
+
+def test_the_configuration_table_names_every_field() -> None:
+    """Each field of `EnvConfig` has its row, and no row names another."""
+    from rlightning_aio import EnvConfig
+
+    rows = re.findall(r"^\| ((?:`\w+`(?:, )?)+) \|", README, re.MULTILINE)
+    named = {name for row in rows for name in re.findall(r"`(\w+)`", row)}
+    assert named == set(EnvConfig.model_fields)
+
+
+def test_every_linked_file_exists() -> None:
+    """No relative link of the README leads nowhere."""
+    targets = re.findall(r"\]\((?!http)([^)#]+)\)", README)
+    assert [target for target in targets if not (ROOT / target).exists()] == []
