@@ -1,0 +1,470 @@
+"""Alternating rounds of contenders in one run, and what is told of them.
+
+Rule: contenders take turns (A B C A B C …), each in a process of its own that sleeps
+while others have theirs, and a ratio is the median over pairs of the same round. So a
+machine that slows down for a while slows all of them down.
+Absent on purpose: any work to measure; that is in the scripts, one question each.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.metadata
+import importlib.util
+import json
+import multiprocessing as mp
+import os
+import platform
+import statistics
+import sys
+import tempfile
+import time
+import traceback
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from multiprocessing.connection import Connection
+
+# One math thread for everybody: none of the contenders gains by more, and some would
+# start one for each core in each of their processes.
+ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+PACKAGES = (
+    "rlightning-aio", "gymnasium", "mujoco", "numpy", "uvloop", "stable_baselines3", "tianshou",
+    "envpool", "ale-py", "torch",
+)  # fmt: skip
+NAME_WIDTH = 34
+
+
+class Contender:
+    """One way to do the work; subclasses are dataclasses that pickle.
+
+    Everything but the constructor runs in the contender's own process.
+    """
+
+    name: str
+
+    @property
+    def requires(self) -> tuple[str, ...]:
+        """Modules without which it is left out."""
+        return ()
+
+    def setup(self) -> None:
+        """Called once, before the first round; not measured."""
+
+    def round(self, seconds: float) -> float:
+        """One round of about that length; the figure that was measured."""
+        raise NotImplementedError
+
+    def teardown(self) -> None:
+        """Called once, after the last round, also if a round has failed."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """What is asked of `subject` in comparison to `reference`, both contenders' names.
+
+    Attributes:
+        bound: of the ratio (or difference) of their figures in the same round.
+        at_most: the bound is an upper one.
+        difference: compare by difference, not by ratio.
+    """
+
+    subject: str
+    reference: str
+    bound: float
+    at_most: bool = False
+    difference: bool = False
+
+    def compare(self, subject: float, reference: float) -> float:
+        return subject - reference if self.difference else subject / reference
+
+    def is_met(self, value: float) -> bool:
+        return value <= self.bound if self.at_most else value >= self.bound
+
+
+@dataclass(frozen=True)
+class Question:
+    """What a script asks.
+
+    Attributes:
+        name: of the result files.
+        title: one line, with the workload.
+        unit: of the contenders' figures.
+        seconds: length of a round; None where the work itself gives the length.
+        counts_steps: the figures are env steps per second, so that processor time can be
+            told by env step as well.
+    """
+
+    name: str
+    title: str
+    unit: str
+    contenders: Sequence[Contender]
+    targets: Sequence[Target] = ()
+    rounds: int = 7
+    seconds: float | None = 1.5
+    counts_steps: bool = True
+
+
+@dataclass
+class Figures:
+    """What was measured: one value for each round, in order.
+
+    Attributes:
+        cores: processors that the contender kept busy, all its processes together. Well
+            below what it could use, it was kept waiting, by others or by itself.
+    """
+
+    values: list[float] = field(default_factory=list)
+    cores: list[float] = field(default_factory=list)
+
+    @property
+    def median(self) -> float:
+        return statistics.median(self.values)
+
+    def as_json(self) -> dict[str, Any]:
+        return {
+            "median": self.median,
+            "low": min(self.values),
+            "high": max(self.values),
+            "values": self.values,
+        }
+
+    def processor_time(self) -> dict[str, float]:
+        """What a step costs all processes together, and how many processors were busy."""
+        pairs = zip(self.cores, self.values, strict=True)
+        return {
+            "cpu_us_per_step": statistics.median(1e6 * cores / rate for cores, rate in pairs),
+            "cores_used": statistics.median(self.cores),
+        }
+
+
+def throughput(step: Callable[[], int], seconds: float) -> float:
+    """Results per second of `step`, which returns how many one call has brought.
+
+    The first tenth of the time is not counted: caches that other contenders have used
+    meanwhile fill, and work that the last round left behind is used up.
+    """
+    clock = time.perf_counter
+    until = clock() + 0.1 * seconds
+    while clock() < until:
+        step()
+    count = 0
+    began = now = clock()
+    until = began + 0.9 * seconds
+    while now < until:
+        count += step()
+        now = clock()
+    return count / (now - began)
+
+
+class Stage:
+    """A contender's process."""
+
+    def __init__(self, contender: Contender) -> None:
+        self.contender = contender
+
+    def __enter__(self) -> Self:
+        context = mp.get_context("spawn")
+        self._connection, theirs = context.Pipe()
+        self._process = context.Process(target=_perform, args=(theirs, self.contender))
+        self._process.start()
+        theirs.close()
+        self._answer()
+        return self
+
+    def round(self, seconds: float) -> tuple[float, float]:
+        """The figure of one round, and how many processors it kept busy."""
+        busy, began = self._busy_seconds(), time.perf_counter()
+        self._connection.send(seconds)
+        value = self._answer()
+        wall = time.perf_counter() - began
+        return value, (self._busy_seconds() - busy) / wall
+
+    def _busy_seconds(self) -> float:
+        """Processor time of the contender's processes so far."""
+        assert self._process.pid is not None
+        return sum(_busy_ns(thread) for pid in family(self._process.pid) for thread in pid) / 1e9
+
+    def _answer(self) -> float:
+        try:
+            value, trouble = self._connection.recv()
+        except EOFError:
+            self._process.join()
+            raise ContenderFailed(f"its process ended with {self._process.exitcode}") from None
+        if trouble:
+            raise ContenderFailed(trouble)
+        return value
+
+    def __exit__(self, *error: object) -> None:
+        self._connection.close()
+        self._process.join(30)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+
+
+def family(pid: int) -> Iterator[list[Path]]:
+    """A process and all that come from it: the threads of each."""
+    try:
+        threads = list(Path(f"/proc/{pid}/task").iterdir())
+        children = [thread.joinpath("children").read_text().split() for thread in threads]
+    except FileNotFoundError:
+        return  # It has just ended.
+    yield threads
+    for child in chain.from_iterable(children):
+        yield from family(int(child))
+
+
+def _busy_ns(thread: Path) -> int:
+    try:
+        return int(thread.joinpath("schedstat").read_text().split()[0])
+    except FileNotFoundError:
+        return 0
+
+
+class ContenderFailed(Exception):
+    """A contender raised or died; the text says how."""
+
+
+def _perform(connection: Connection, contender: Contender) -> None:
+    """Run in the contender's process: rounds as they are asked for, until the pipe ends."""
+    with tempfile.TemporaryDirectory() as folder, (Path(folder) / "output").open("w+b") as output:
+        # Simulators print, and MuJoCo writes a log into the working directory.
+        os.chdir(folder)
+        for descriptor in (1, 2):
+            os.dup2(output.fileno(), descriptor)
+        try:
+            contender.setup()
+            connection.send((0.0, ""))
+            while True:
+                connection.send((contender.round(connection.recv()), ""))
+        except (EOFError, BrokenPipeError):
+            pass
+        except Exception:  # noqa: BLE001  Whatever it is, the run goes on without it.
+            output.seek(0)
+            printed = output.read().decode(errors="replace")[-2000:]
+            connection.send((0.0, f"{traceback.format_exc()}{printed}"))
+        finally:
+            contender.teardown()
+            os.chdir("/")
+
+
+def missing(contender: Contender) -> list[str]:
+    """Modules that the contender needs and that aren't installed."""
+    return [name for name in contender.requires if importlib.util.find_spec(name) is None]
+
+
+def measure(question: Question, rounds: int, seconds: float, only: Sequence[str]) -> dict[str, Any]:
+    """Run a question; its report as plain data."""
+    figures: dict[str, Figures] = {}
+    skipped: dict[str, str] = {}
+    machine = machine_facts()
+    with ExitStack() as stack:
+        stages = _stages(question, only, stack, skipped)
+        for number in range(rounds):
+            for stage in list(stages):
+                name = stage.contender.name
+                try:
+                    value, cores = stage.round(seconds)
+                except ContenderFailed as error:
+                    stages.remove(stage)
+                    figures.pop(name, None)
+                    skipped[name] = _last_line(name, error)
+                    continue
+                found = figures.setdefault(name, Figures())
+                found.values.append(value)
+                found.cores.append(cores)
+                say(f"  round {number + 1}/{rounds}  {name:{NAME_WIDTH}} {number_text(value)}")
+    return {
+        "name": question.name,
+        "title": question.title,
+        "unit": question.unit,
+        "rounds": rounds,
+        "seconds": question.seconds and seconds,
+        "machine": machine,
+        "results": {
+            name: found.as_json() | (found.processor_time() if question.counts_steps else {})
+            for name, found in figures.items()
+        },
+        "targets": [
+            _judged(target, figures)
+            for target in question.targets
+            if {target.subject, target.reference} <= figures.keys()
+        ],
+        "skipped": skipped,
+    }
+
+
+def _stages(
+    question: Question, only: Sequence[str], stack: ExitStack, skipped: dict[str, str]
+) -> list[Stage]:
+    stages: list[Stage] = []
+    for contender in question.contenders:
+        if only and not any(part in contender.name for part in only):
+            continue
+        if lacking := missing(contender):
+            skipped[contender.name] = f"needs {', '.join(lacking)}"
+            continue
+        try:
+            stages.append(stack.enter_context(Stage(contender)))
+        except ContenderFailed as error:
+            skipped[contender.name] = _last_line(contender.name, error)
+    return stages
+
+
+def _last_line(name: str, error: ContenderFailed) -> str:
+    say(f"{name} failed:\n{error}")
+    lines = [line for line in str(error).splitlines() if line.strip()]
+    return f"failed: {lines[-1].strip()}" if lines else "failed"
+
+
+def _judged(target: Target, figures: dict[str, Figures]) -> dict[str, Any]:
+    pairs = zip(figures[target.subject].values, figures[target.reference].values, strict=True)
+    found = Figures([target.compare(*pair) for pair in pairs])
+    return {**asdict(target), **found.as_json(), "met": target.is_met(found.median)}
+
+
+def machine_facts() -> dict[str, Any]:
+    """What the figures depend on beside the code."""
+    versions: dict[str, str] = {}
+    for package in PACKAGES:
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return {
+        "cores": len(os.sched_getaffinity(0)),
+        "cpu": _cpu_model(),
+        "memory_gib": round(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30),
+        "system": platform.system(),
+        "python": platform.python_version(),
+        "versions": versions,
+        # What others did on the machine when the run began.
+        "load_average": round(os.getloadavg()[0], 2),
+    }
+
+
+def _cpu_model() -> str:
+    for line in Path("/proc/cpuinfo").read_text().splitlines():
+        if line.startswith("model name"):
+            return line.partition(":")[2].strip()
+    return platform.machine()
+
+
+# ---- telling
+
+
+def say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def number_text(value: float) -> str:
+    """Three significant digits, thousands apart."""
+    if abs(value) >= 1000:
+        digits = len(str(int(abs(value)))) - 3
+        return f"{round(value, -digits):,.0f}"
+    return f"{value:.3g}"
+
+
+def tables(report: dict[str, Any]) -> str:
+    """The report as Markdown."""
+    results = report["results"]
+    counts_steps = any("cores_used" in found for found in results.values())
+    lines = [
+        f"| {report['title']} | median, {report['unit']} | lowest to highest |"
+        + (" CPU time, µs/step | cores used |" if counts_steps else ""),
+        "|---|---:|---:|" + ("---:|---:|" if counts_steps else ""),
+    ]
+    for name, found in results.items():
+        spread = f"{number_text(found['low'])} to {number_text(found['high'])}"
+        row = f"| {name} | {number_text(found['median'])} | {spread} |"
+        if counts_steps:
+            row += f" {number_text(found['cpu_us_per_step'])} | {found['cores_used']:.2f} |"
+        lines.append(row)
+    if report["targets"]:
+        lines += [
+            "",
+            "| compared | median | lowest to highest | target | |",
+            "|---|---:|---:|---:|---|",
+        ]
+        lines += [_target_row(target, report["unit"]) for target in report["targets"]]
+    lines += [f"\n{name}: {why}" for name, why in report["skipped"].items()]
+    return "\n".join(lines)
+
+
+def _target_row(target: dict[str, Any], unit: str) -> str:
+    sign, suffix = ("minus", f" {unit}") if target["difference"] else ("/", "")
+    bound = f"{'≤' if target['at_most'] else '≥'} {target['bound']:g}{suffix}"
+    spread = f"{target['low']:.2f} to {target['high']:.2f}"
+    met = "met" if target["met"] else "missed"
+    compared = f"{target['subject']} {sign} {target['reference']}"
+    return f"| {compared} | {target['median']:.2f} | {spread} | {bound} | {met} |"
+
+
+def machine_text(machine: dict[str, Any]) -> str:
+    """The machine in one sentence."""
+    versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
+    return (
+        f"{machine['cores']} cores ({machine['cpu']}), {machine['memory_gib']} GiB, "
+        f"{machine['system']}, Python {machine['python']}; {versions}."
+    )
+
+
+def plot(report: dict[str, Any], path: Path) -> None:
+    """A bar for each contender's median, a dot for each round."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    results = report["results"]
+    figure, axes = plt.subplots(figsize=(7.5, 0.9 + 0.38 * len(results)), layout="constrained")
+    for place, (name, found) in enumerate(results.items()):
+        color = "tab:blue" if name.startswith("rlightning") else "tab:gray"
+        axes.barh(place, found["median"], color=color, alpha=0.6)
+        axes.plot(found["values"], [place] * len(found["values"]), ".", color="black", markersize=4)
+    axes.set_yticks(range(len(results)), list(results))
+    axes.invert_yaxis()
+    axes.set_xlim(left=0)
+    axes.set_xlabel(report["unit"])
+    axes.set_title(report["title"], fontsize=10, loc="left")
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, dpi=80)
+    plt.close(figure)
+
+
+# ---- the command line of every script
+
+
+def main(question: Question, description: str | None) -> None:
+    """Parse the arguments, run the question, tell the outcome."""
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--rounds", type=int, default=question.rounds, help="default: %(default)s")
+    if question.seconds is not None:
+        parser.add_argument(
+            "--seconds", type=float, default=question.seconds,
+            help="length of one contender's round (default: %(default)s)",
+        )  # fmt: skip
+    parser.add_argument(
+        "--only", action="append", default=[], metavar="PART",
+        help="run contenders whose name holds PART; may be given more than once",
+    )  # fmt: skip
+    parser.add_argument("--json", type=Path, help="write the report here")
+    parser.add_argument("--plot", type=Path, help="draw the report here (needs matplotlib)")
+    given = parser.parse_args()
+    if given.plot and importlib.util.find_spec("matplotlib") is None:
+        parser.error("--plot needs matplotlib: pip install matplotlib")
+    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
+    report = measure(question, given.rounds, getattr(given, "seconds", 0.0), given.only)
+    print(f"{tables(report)}\n\n{machine_text(report['machine'])}")
+    if given.json:
+        given.json.write_text(json.dumps(report, indent=1) + "\n")
+    if given.plot:
+        plot(report, given.plot)

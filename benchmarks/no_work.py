@@ -1,0 +1,69 @@
+"""Environments that do nothing, so that what is left to measure is the runtime around them.
+
+Workers import this module through a config entry's ``imports``.
+"""
+
+from __future__ import annotations
+
+import time
+from statistics import NormalDist
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.spaces import Box
+
+NO_WORK = "benchmarks/NoWork-v0"
+SLEEPS = "benchmarks/Sleeps-v0"
+
+
+class NoWork(gym.Env[Any, Any]):
+    """Returns the same four numbers for ever."""
+
+    observation_space = Box(-1.0, 1.0, (4,), np.float32)
+    action_space = Box(-1.0, 1.0, (2,), np.float32)
+
+    def __init__(self) -> None:
+        self._observation = np.zeros(4, np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed, options=options)
+        return self._observation, {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        del action
+        return self._observation, 0.0, False, False, {}
+
+
+class Sleeps(NoWork):
+    """Sleeps in each step for a log-normal time: median 2 ms, sigma 1.5.
+
+    The times are quantiles of the distribution in an order of the seed's, over and over:
+    every 256 steps take the same time in all, so that rounds of a second can be compared.
+    """
+
+    MEDIAN, SIGMA, TIMES = 2e-3, 1.5, 256
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        found = super().reset(seed=seed, options=options)
+        normal = NormalDist(0.0, self.SIGMA)
+        times = [
+            self.MEDIAN * float(np.exp(normal.inv_cdf((k + 0.5) / self.TIMES)))
+            for k in range(self.TIMES)
+        ]
+        self._times = self.np_random.permutation(times).tolist()
+        self._next = 0
+        return found
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self._next = (self._next + 1) % self.TIMES
+        time.sleep(self._times[self._next])
+        return super().step(action)
+
+
+for _id, _entry_point in ((NO_WORK, NoWork), (SLEEPS, Sleeps)):
+    gym.register(_id, _entry_point, disable_env_checker=True, order_enforce=False)
