@@ -1,0 +1,27 @@
+"""The command line: it parses, calls the library, and prints.
+
+Rule: figures and tables go to stdout, everything said on the way to stderr; exit code 0
+is success, 1 a failed env, 2 a wrong configuration or command line, 130 Ctrl-C.
+Absent on purpose: rules of environments, and anything a program couldn't call itself.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+
+__all__ = ["main"]
+
+
+def main() -> None:
+    """Run the command that `sys.argv` names; the entry point of ``rlightning-aio``."""
+    try:
+        # Imported here, so that Ctrl-C ends the imports as quietly as anything else.
+        from rlightning_aio.cli.app import app  # noqa: PLC0415
+
+        app()
+    except KeyboardInterrupt:
+        sys.exit(130)
+    finally:
+        # All is said; what the interpreter still does to end is not worth a traceback.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)

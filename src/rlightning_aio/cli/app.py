@@ -1,0 +1,57 @@
+"""The Typer application: which commands there are."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import rlightning_aio
+from rlightning_aio.cli.backends import backends
+from rlightning_aio.cli.rollout import rollout
+from rlightning_aio.cli.terminal import guarded
+
+__all__ = ["app"]
+
+app = typer.Typer(
+    rich_markup_mode="markdown",
+    name="rlightning-aio",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(rlightning_aio.__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def prepare(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print it.")
+    ] = False,
+) -> None:
+    """Many reinforcement-learning environments in worker processes, used as one.
+
+    A config is a YAML file with one entry for each kind of env; `key=value` arguments
+    after it override it (envs.0.num_workers=8).
+
+    Start here:
+
+        rlightning-aio backends
+        rlightning-aio rollout configs/cartpole.yaml
+    """
+    del version  # Its callback has done the work.
+    # Policies and `imports:` of a project are found where the command is run, as they are
+    # by `python -m`; what is installed comes first.
+    if (here := str(Path.cwd())) not in sys.path:
+        sys.path.append(here)
+
+
+for command in (rollout, backends):
+    app.command()(guarded(command))

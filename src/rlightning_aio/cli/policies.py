@@ -1,0 +1,182 @@
+"""Where a rollout's actions come from: at random, or from a callable that the user names.
+
+A policy is a callable that takes a `BatchedData` of results and returns actions
+(``[n, *action]``, one row for each result, in order), or a batch of responses made with
+`BatchedData.respond`. Sampling works on whole columns: it costs a batch, not an env.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
+
+import gymnasium as gym
+import numpy as np
+
+from rlightning_aio.batch import BatchedData
+from rlightning_aio.errors import ConfigError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+__all__ = ["Policy", "RandomPolicy", "Responder", "load_policy"]
+
+Policy: TypeAlias = Callable[[BatchedData], Any]
+Sampler: TypeAlias = Callable[[int], Any]
+
+_UNBOUNDED_SCALE = 0.1
+"""Standard deviation where a space has no bounds: simulators take such actions in units of
+a joint's range, and larger ones throw a robot about."""
+
+
+def load_policy(name: str) -> Policy:
+    """The callable that ``module:callable`` names; the working folder is on the path.
+
+    Raises:
+        ConfigError: it can't be imported, or is not callable.
+    """
+    module_name, colon, path = name.partition(":")
+    if not (module_name and colon and path):
+        raise ConfigError(f"--policy {name!r}: should read like my_policies:greedy")
+    try:
+        found: Any = importlib.import_module(module_name)
+    except Exception as error:
+        raise ConfigError(
+            f"--policy {name!r}: importing {module_name} raised {type(error).__name__}: {error}"
+        ) from error
+    for part in path.split("."):
+        if not hasattr(found, part):
+            raise ConfigError(f"--policy {name!r}: {module_name} has no {path!r}")
+        found = getattr(found, part)
+    if not callable(found):
+        raise ConfigError(f"--policy {name!r}: is a {type(found).__name__}, not a callable")
+    return found
+
+
+class Responder:
+    """Makes the responses to a batch, with one call of the policy if its results stack.
+
+    Args:
+        policy: see the module's text.
+        separate: call it once for each config entry, as their spaces differ.
+    """
+
+    def __init__(self, policy: Policy, *, separate: bool) -> None:
+        self._policy = policy
+        self._separate = separate
+
+    def __call__(self, batch: BatchedData) -> list[BatchedData]:
+        """Batches of responses, which together answer `batch`."""
+        parts = list(batch.by_name().values()) if self._separate else [batch]
+        return [self._respond(part) for part in parts]
+
+    def _respond(self, batch: BatchedData) -> BatchedData:
+        answer = self._policy(batch)
+        return answer if isinstance(answer, BatchedData) else batch.respond(action=answer)
+
+
+class RandomPolicy:
+    """Samples actions from the envs' spaces.
+
+    Bounded numbers are uniform. Where a space has no bounds they are normal, with a small
+    spread. One generator serves all envs in the order in which results arrive.
+
+    Args:
+        env_ids: of the group, in order.
+        action_spaces: one for each of them.
+        seed: of the generator; None draws one.
+    """
+
+    def __init__(
+        self,
+        env_ids: Sequence[str],
+        action_spaces: Sequence[gym.Space[Any] | None],
+        seed: int | None,
+    ) -> None:
+        rng = np.random.default_rng(seed)
+        known: list[tuple[gym.Space[Any] | None, Sampler]] = []
+        self._samplers: dict[str, Sampler] = {}
+        for env_id, space in zip(env_ids, action_spaces, strict=True):
+            sampler = next((sampler for other, sampler in known if other == space), None)
+            if sampler is None:
+                sampler = _sampler(space, rng)
+                known.append((space, sampler))
+            self._samplers[env_id] = sampler
+
+    def __call__(self, batch: BatchedData) -> Any:
+        """Actions for a batch of envs that share one action space."""
+        return self._samplers[batch.ids()[0]](len(batch))
+
+
+def _sampler(space: gym.Space[Any] | None, rng: np.random.Generator) -> Sampler:
+    """A function that makes n actions of `space`, as columns."""
+    if space is None:
+        raise ConfigError("an env reports no action space; give a --policy")
+    columns = _columns(space, rng)
+    if columns is not None:
+        return columns
+    space.seed(int(rng.integers(2**31)))
+    return lambda n: [space.sample() for _ in range(n)]
+
+
+def _columns(space: gym.Space[Any], rng: np.random.Generator) -> Sampler | None:
+    """A function that makes whole columns; None for spaces whose values don't stack."""
+    # Gymnasium's spaces are generic over dtypes that nobody states.
+    spaces: Any = gym.spaces
+    known = cast("Any", space)
+    if isinstance(space, spaces.Box):
+        return _box(known, rng)
+    if isinstance(space, spaces.Discrete):
+        return _integers(known.start, known.start + known.n - 1, known, rng)
+    if isinstance(space, spaces.MultiDiscrete):
+        return _integers(known.start, known.start + known.nvec - 1, known, rng)
+    if isinstance(space, spaces.MultiBinary):
+        return _integers(0, 1, known, rng)
+    if isinstance(space, spaces.Dict):
+        return _mapping({key: _columns(inner, rng) for key, inner in known.spaces.items()})
+    if isinstance(space, spaces.Tuple):
+        parts = _mapping(dict(enumerate(_columns(inner, rng) for inner in known.spaces)))
+        return parts and (lambda n: tuple(parts(n).values()))
+    return None
+
+
+def _mapping(samplers: dict[Any, Sampler | None]) -> Sampler | None:
+    found = {key: sampler for key, sampler in samplers.items() if sampler is not None}
+    if len(found) < len(samplers):
+        return None
+    return lambda n: {key: sampler(n) for key, sampler in found.items()}
+
+
+def _integers(low: Any, high: Any, space: gym.Space[Any], rng: np.random.Generator) -> Sampler:
+    """Whole numbers from `low` to `high`, both included."""
+    shape, dtype = space.shape or (), space.dtype
+    return lambda n: rng.integers(low, high, (n, *shape), dtype=dtype, endpoint=True)
+
+
+def _box(space: Any, rng: np.random.Generator) -> Sampler:
+    if np.issubdtype(space.dtype, np.integer):
+        return _integers(space.low, space.high, space, rng)
+    low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+    shape, dtype = space.shape, space.dtype
+    with np.errstate(over="ignore"):
+        span = high - low
+    if np.isfinite(span).all():
+        return lambda n: (low + span * rng.random((n, *shape))).astype(dtype)
+    return lambda n: _partly_bounded(low, high, span, rng, (n, *shape)).astype(dtype)
+
+
+def _partly_bounded(
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+    span: NDArray[np.float64],
+    rng: np.random.Generator,
+    shape: tuple[int, ...],
+) -> NDArray[np.float64]:
+    """Uniform where there are two bounds, normal around 0 or away from the only one."""
+    both = np.isfinite(span)
+    uniform = np.where(both, low, 0.0) + np.where(both, span, 0.0) * rng.random(shape)
+    normal = rng.normal(0.0, _UNBOUNDED_SCALE, shape)
+    normal = np.where(np.isfinite(low), low + abs(normal), normal)
+    normal = np.where(~np.isfinite(low) & np.isfinite(high), high - abs(normal), normal)
+    return np.where(both, uniform, normal)

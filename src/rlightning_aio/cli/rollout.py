@@ -1,0 +1,303 @@
+"""``rlightning-aio rollout``: collect steps asynchronously, and say how it went."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+import warnings
+from dataclasses import asdict, dataclass
+from pathlib import Path  # noqa: TC003 (Typer reads annotations)
+from typing import TYPE_CHECKING, Annotated, Any, Final, Self
+
+import typer
+from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn
+
+import rlightning_aio
+from rlightning_aio.cli.policies import Policy, RandomPolicy, Responder, load_policy
+from rlightning_aio.cli.tally import EntryFigures, Tally
+from rlightning_aio.cli.terminal import (
+    INTERRUPTED,
+    count,
+    duration,
+    err,
+    named_columns,
+    number,
+    out,
+    print_json,
+)
+from rlightning_aio.config import EnvConfig, load_config
+
+if TYPE_CHECKING:
+    from collections.abc import Generator, Sequence
+
+    import gymnasium as gym
+
+    from rlightning_aio.batch import BatchedData
+    from rlightning_aio.group.aio import EnvGroup
+
+__all__ = ["resetting", "respond_to_all", "rollout"]
+
+_REFRESH_SECONDS: Final = 0.2
+_NO_LIMIT: Final = 2**62
+
+
+@dataclass(frozen=True)
+class _Order:
+    """What to collect, and how."""
+
+    steps: int
+    min_results: int
+    seed: int | None
+    policy: Policy | None
+
+
+def rollout(
+    config: Annotated[Path, typer.Argument(help="YAML file with envs:", show_default=False)],
+    overrides: Annotated[
+        list[str] | None,
+        typer.Argument(help="Dotted overrides, such as envs.0.num_workers=8", show_default=False),
+    ] = None,
+    steps: Annotated[int, typer.Option(min=1, help="Env steps to collect.")] = 10_000,
+    policy: Annotated[
+        str | None,
+        typer.Option(metavar="MODULE:CALLABLE", help="Takes a batch, returns actions."),
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Of the envs' first reset and the random actions.")
+    ] = None,
+    min_results: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="Results to wait for in each collect.", show_default="half of the envs"
+        ),
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON document in place of the table.")
+    ] = False,
+) -> None:
+    """Collect steps from a config's envs and print a table of what came.
+
+    Actions are sampled at random from the envs' action spaces, or made by the callable that
+    --policy names. It gets a BatchedData (one for each entry, where their spaces differ) and
+    returns actions, one row for each result, or a batch made with its respond() method.
+    Ctrl-C ends the collecting early and prints the table of what there is.
+
+    Examples:
+
+        rlightning-aio rollout configs/halfcheetah.yaml --steps 100000
+        rlightning-aio rollout configs/cartpole.yaml envs.0.num_workers=128 --seed 0
+        rlightning-aio rollout configs/hopper.yaml --policy my_policies:greedy
+        rlightning-aio rollout configs/multi_task.yaml --json > rollout.json
+    """
+    configs = load_config(config, overrides or ())
+    num_envs = sum(entry.num_workers for entry in configs)
+    order = _Order(
+        steps=steps,
+        min_results=min(min_results or max(1, num_envs // 2), num_envs),
+        seed=seed,
+        policy=load_policy(policy) if policy else None,
+    )
+    tally = Tally(configs)
+    group = rlightning_aio.build_env_group(configs, mixed_actions=True)
+    interrupted = False
+    try:
+        with _Display(group, tally, steps) as display:
+            rlightning_aio.run(_collect(group, configs, order, tally, display))
+    except KeyboardInterrupt:
+        interrupted = True
+        raise typer.Exit(INTERRUPTED) from None
+    finally:
+        # Also after an error: what was collected until then is worth knowing.
+        if interrupted or tally.began:
+            _report(config, group, tally, interrupted=interrupted, as_json=as_json)
+
+
+async def _collect(
+    group: EnvGroup, configs: Sequence[EnvConfig], order: _Order, tally: Tally, display: _Display
+) -> None:
+    async with group:
+        respond = _responder(group, order)
+        batch, _ = await group.reset(seed=order.seed)
+        sub_envs = max(config.num_envs for config in configs)
+        display.ready()
+        tally.begin()
+        with resetting(group, configs):
+            respond_to_all(group, respond, batch)
+            while (left := order.steps - tally.steps) > 0:
+                most = -(-left // sub_envs)
+                batch, flags = await group.collect_async(
+                    min_results=min(order.min_results, most), max_results=most
+                )
+                tally.add(batch, flags)
+                respond_to_all(group, respond, batch)
+                if display.due():
+                    display.show()
+                    # Where results never keep us waiting, nothing else would let Ctrl-C in.
+                    await asyncio.sleep(0)
+
+
+def _responder(group: EnvGroup, order: _Order) -> Responder:
+    actions = group.get_action_spaces()
+    if order.policy is None:
+        policy = RandomPolicy(group.env_ids, actions, order.seed)
+        return Responder(policy, separate=_differ(actions))
+    return Responder(
+        order.policy, separate=_differ(actions) or _differ(group.get_observation_spaces())
+    )
+
+
+def _differ(spaces: Sequence[gym.Space[Any] | None]) -> bool:
+    return any(space != spaces[0] for space in spaces[1:])
+
+
+def respond_to_all(group: EnvGroup, respond: Responder, batch: BatchedData) -> None:
+    """Have every env of `batch` go on."""
+    for response in respond(batch):
+        group.step_async(response)
+
+
+@contextlib.contextmanager
+def resetting(group: EnvGroup, configs: Sequence[EnvConfig]) -> Generator[None]:
+    """Have finished episodes reset, at the configured step limits or at the simulator's own.
+
+    `auto_reset` wants a limit of every entry. Where one has none, episodes of all entries
+    end where their simulators end them, which know the limits that are configured.
+    """
+    limit = None if all(config.max_episode_steps for config in configs) else _NO_LIMIT
+    with contextlib.ExitStack() as stack:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="auto_reset.*overrides")
+            stack.enter_context(group.auto_reset(limit))
+        yield
+
+
+class _Display:
+    """The live line on stderr; on anything but a terminal, plain lines at the start."""
+
+    def __init__(self, group: EnvGroup, tally: Tally, steps: int) -> None:
+        self._group = group
+        self._tally = tally
+        self._console = err()
+        self._progress = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=28),
+            TextColumn("{task.fields[figures]}"),
+            console=self._console,
+            auto_refresh=False,
+            transient=True,
+        )
+        self._task: TaskID = self._progress.add_task(
+            f"starting {len(group)} envs", total=steps, figures=""
+        )
+        self._next_at = 0.0
+        self._last = (0.0, 0)
+
+    def __enter__(self) -> Self:
+        if self._console.is_terminal:
+            self._progress.start()
+            self._progress.refresh()
+        else:
+            self._console.print(f"starting {len(self._group)} envs")
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._progress.stop()
+
+    def ready(self) -> None:
+        """All envs have had their first reset."""
+        if self._console.is_terminal:
+            self._progress.update(self._task, description="collecting")
+        else:
+            self._console.print(f"collecting {count(self._progress.tasks[0].total or 0)} steps")
+
+    def due(self) -> bool:
+        """Whether it is time to show something new."""
+        return time.monotonic() >= self._next_at
+
+    def show(self) -> None:
+        """Draw the figures as they are now."""
+        now = time.monotonic()
+        self._next_at = now + _REFRESH_SECONDS
+        if not self._console.is_terminal:
+            return
+        then, steps = self._last
+        self._last = now, self._tally.steps
+        rate = (self._tally.steps - steps) / (now - then)
+        entries = self._tally.by_entry(self._group.get_env_stats())
+        self._progress.update(
+            self._task, completed=self._tally.steps, figures=_figures(entries, rate)
+        )
+        self._progress.refresh()
+
+
+def _figures(entries: Sequence[EntryFigures], rate: float) -> str:
+    steps = sum(entry.steps for entry in entries)
+    episodes = sum(entry.episodes for entry in entries)
+    total = sum((entry.mean_return or 0.0) * entry.episodes for entry in entries)
+    mean = number(total / episodes if episodes else None)
+    return (
+        f"{count(steps)} steps  {count(rate)} steps/s  {count(episodes)} episodes  "
+        f"mean return {mean}"
+    )
+
+
+def _report(
+    config: Path, group: EnvGroup, tally: Tally, *, interrupted: bool, as_json: bool
+) -> None:
+    entries = tally.by_entry(group.get_env_stats())
+    stats = group.get_stats()
+    if as_json:
+        print_json(
+            {
+                "config": str(config),
+                "interrupted": interrupted,
+                "seconds": tally.seconds,
+                "steps": tally.steps,
+                "steps_per_second": tally.steps_per_second,
+                "entries": [asdict(entry) for entry in entries],
+                "batch_size": stats["batch_size"],
+                "latency_us": stats["latency_us"],
+            }
+        )
+        return
+    title = (
+        f"{'Interrupted after ' if interrupted else ''}{count(tally.steps)} steps in "
+        f"{tally.seconds:.1f} s: {count(tally.steps_per_second)} steps/s"
+    )
+    _print_table(title, entries, stats["latency_us"])
+
+
+def _print_table(
+    title: str, entries: Sequence[EntryFigures], latency: dict[str, dict[str, float]]
+) -> None:
+    table = named_columns(
+        title,
+        "entry", "envs", "steps", "steps/s", "episodes", "mean return", "mean length",
+        "step p50", "p99",
+    )  # fmt: skip
+    for entry in entries:
+        step = entry.step_us or {}
+        table.add_row(
+            entry.name,
+            count(entry.envs),
+            count(entry.steps),
+            count(entry.steps_per_second),
+            count(entry.episodes),
+            number(entry.mean_return),
+            number(entry.mean_length),
+            duration(step.get("p50")),
+            duration(step.get("p99")),
+        )
+    console = out()
+    console.print(table)
+    if latency:
+        shares = (("step", "in the env"), ("wait", "before it"), ("transfer", "after it"))
+        console.print(
+            "a step's way, median and p99: "
+            + ", ".join(
+                f"{duration(latency[kind]['p50'])} ({duration(latency[kind]['p99'])}) {words}"
+                for kind, words in shares
+            )
+        )

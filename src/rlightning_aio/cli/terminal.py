@@ -1,0 +1,112 @@
+"""What every command shares: the two output streams, how errors end it, how figures look.
+
+Rule: an error of the library is one message on stderr and an exit code, never a traceback;
+only an error in the user's own code (a policy) shows where it happened, in full.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import re
+import sys
+from typing import TYPE_CHECKING, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from rlightning_aio.errors import ConfigError, EnvFault, RemoteTraceback, RLightningError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+__all__ = [
+    "INTERRUPTED",
+    "count",
+    "duration",
+    "err",
+    "guarded",
+    "named_columns",
+    "number",
+    "out",
+    "print_json",
+]
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
+
+_WIDE = 160
+"""Columns of a table that goes to a file: what reads it wraps lines itself."""
+
+
+def out() -> Console:
+    """The console for results."""
+    return Console(highlight=False, width=None if sys.stdout.isatty() else _WIDE)
+
+
+def err() -> Console:
+    """The console for what is said on the way."""
+    return Console(stderr=True, highlight=False, width=None if sys.stderr.isatty() else _WIDE)
+
+
+def print_json(value: Any) -> None:
+    """Print `value` as the one JSON document on stdout."""
+    typer.echo(json.dumps(value, indent=2, allow_nan=False))
+
+
+def guarded(command: Callable[..., None]) -> Callable[..., None]:
+    """`command`, with errors of the library turned into messages and exit codes."""
+
+    @functools.wraps(command)
+    def run(*args: Any, **kwargs: Any) -> None:
+        try:
+            command(*args, **kwargs)
+        except RLightningError as error:
+            typer.echo(f"error: {_in_words(error)}", err=True)
+            raise typer.Exit(2 if isinstance(error, ConfigError) else 1) from None
+        except KeyboardInterrupt:
+            raise typer.Exit(INTERRUPTED) from None
+
+    return run
+
+
+def _in_words(error: RLightningError) -> str:
+    """The message, with the place in the env's code in place of a traceback."""
+    text = str(error)
+    if isinstance(error.__cause__, RemoteTraceback):
+        places = re.findall(r'^  File (".*", line \d+, in .*)$', error.__cause__.text, re.MULTILINE)
+        where = f"it happened in {places[-1]}" if places else "its traceback is lost"
+        text = text.replace("the remote traceback is above", where)
+    if isinstance(error, EnvFault) and error.others:
+        text += f"\n(and {len(error.others)} more envs of the same call)"
+    return text
+
+
+def named_columns(title: str, *names: str) -> Table:
+    """An empty table: the first column is text, all others are figures."""
+    table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False)
+    for position, name in enumerate(names):
+        table.add_column(name, justify="right" if position else "left", no_wrap=True)
+    return table
+
+
+def count(value: float) -> str:
+    """A count, or a rate of counts."""
+    return f"{value:,.0f}"
+
+
+def number(value: float | None) -> str:
+    """Any other figure; a dash where there is none."""
+    return "-" if value is None else f"{value:,.2f}"
+
+
+def duration(microseconds: float | None) -> str:
+    """A time in the unit that suits its size."""
+    if microseconds is None:
+        return "-"
+    if microseconds < 1e3:
+        return f"{microseconds:.0f} µs"
+    if microseconds < 1e6:
+        return f"{microseconds / 1e3:.1f} ms"
+    return f"{microseconds / 1e6:.1f} s"
