@@ -45,6 +45,9 @@ _COPIED_BYTES: Final = 4096
 _ROUTES_REMEMBERED: Final = 4096
 _SECONDS_BETWEEN_WARNINGS: Final = 10.0
 
+_EVENTS: Final = int(zmq.EVENTS)
+_POLLIN: Final = int(zmq.POLLIN)
+
 _log = logging.getLogger(__name__)
 
 
@@ -227,6 +230,8 @@ class RemoteHost:
             if not _is_readable(self._router):
                 break
             self._receive(now)
+        else:
+            self._call_back()
         self._sessions.tick(now)
         self._flush(now)
 
@@ -252,8 +257,10 @@ class RemoteHost:
         return self._users[route]
 
     def _flush(self, now: float) -> None:
-        """Send what is due, and see to it that nothing is left that nobody is woken for."""
+        """Send what is due, and see to it that nothing is left that wakes nobody."""
         outbox = self._sessions.outbox
+        if not outbox:
+            return
         while outbox:
             route, parts = outbox.popleft()
             try:
@@ -266,8 +273,12 @@ class RemoteHost:
                     raise
                 self._sessions.unreachable(route, now)
         # Sending takes in what ZMQ has to tell, so its descriptor may have fallen silent.
-        more = self._sessions.has_results or _is_readable(self._router)
-        if more and not self._has_more:
+        if _is_readable(self._router):
+            self._call_back()
+
+    def _call_back(self) -> None:
+        """Make the driver pump once more, though nothing new will wake it."""
+        if not self._has_more:
             self._has_more = True
             os.eventfd_write(self._more, 1)
 
@@ -277,6 +288,8 @@ class RemoteHost:
         """Ask a client to step; see `ServerSessions.submit`."""
         will_answer = self._sessions.submit(client, number, action, extras, now)
         self._flush(now)
+        if self._sessions.has_results:
+            self._call_back()
         return will_answer
 
     def submit_reset(
@@ -290,6 +303,8 @@ class RemoteHost:
         """Ask a client to reset; see `ServerSessions.submit_reset`."""
         will_answer = self._sessions.submit_reset(client, number, seed, options, now)
         self._flush(now)
+        if self._sessions.has_results:
+            self._call_back()
         return will_answer
 
     def take(self) -> list[RemoteResult]:
@@ -314,7 +329,8 @@ def _descriptor(socket: zmq.Socket[bytes]) -> int:
 
 
 def _is_readable(socket: zmq.Socket[bytes]) -> bool:
-    return bool(cast("int", socket.get(zmq.EVENTS)) & zmq.POLLIN)
+    # Plain ints: an operation on an enum costs as much as the call itself.
+    return cast("int", socket.get(_EVENTS)) & _POLLIN != 0
 
 
 class _Gate:

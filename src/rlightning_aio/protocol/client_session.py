@@ -223,10 +223,8 @@ class ClientSession:
         """
         try:
             message, frames = self._reader.read(parts)
-            if isinstance(message, Welcome):
-                return self._on_welcome(message)
-            if isinstance(message, Refusal):
-                return self._on_refusal(message, now)
+            if isinstance(message, Welcome | Refusal):
+                return self._on_answer(message, now)
             if message.session != self._session:
                 self._on_stranger(message)
                 return None
@@ -249,10 +247,11 @@ class ClientSession:
             self._greet_at(now + self._pause)
             return self._end(f"the server closed: {message.reason[:1000]}")
         self.phase, self._ask_at = Phase.SERVING, None
+        if isinstance(message, Step | Reset):
+            return self._on_request(message, frames, now)
         if isinstance(message, Ping):
             self._send(Pong(session=message.session, number=message.number))
-            return None
-        return None if isinstance(message, Pong) else self._on_request(message, frames, now)
+        return None
 
     def _on_request(
         self, message: Step | Reset, frames: Sequence[Part], now: float
@@ -286,6 +285,11 @@ class ClientSession:
                 traceback="",
             )
         )
+
+    def _on_answer(self, message: Welcome | Refusal, now: float) -> Event | None:
+        if isinstance(message, Welcome):
+            return self._on_welcome(message)
+        return self._on_refusal(message, now)
 
     def _on_welcome(self, welcome: Welcome) -> Event | None:
         if welcome.session == self._session:
@@ -357,17 +361,17 @@ class ClientSession:
 
     def _written(self, result: Result, frames: list[bytes]) -> list[bytes]:
         try:
-            return self._writer.write(result, frames.copy())
+            return self._writer.write(result, [*frames])
         except Untransferable:
             lost: list[str] = []
             result.info = portable(result.info, lost)
             result.extra = portable(result.extra, lost)
         try:
-            parts = self._writer.write(result, frames.copy())
+            parts = self._writer.write(result, [*frames])
         except Untransferable as error:
             lost.append(f"everything ({error})")
             result.info, result.extra = {}, {}
-            parts = self._writer.write(result, frames.copy())
+            parts = self._writer.write(result, [*frames])
         if new := sorted({*lost} - self._lost_keys):
             self._lost_keys.update(new)
             _log.warning(

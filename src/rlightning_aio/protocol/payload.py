@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium import spaces
 
 from rlightning_aio.protocol.columns import Misfit
-from rlightning_aio.protocol.wire import DTYPES, Part, WireError, as_array, read_array
+from rlightning_aio.protocol.wire import DTYPES, ArrayForm, Part, WireError, as_array
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -54,6 +54,7 @@ class SpaceLayout:
 
     def __init__(self, space: gym.Space[Any], what: str) -> None:
         self._node = _node_of(space, what)
+        self._only = self._node.form if type(self._node) is _Array else None
         self.num_frames = self._node.num_frames
         self.num_texts = self._node.num_texts
 
@@ -76,6 +77,8 @@ class SpaceLayout:
                 f"{len(frames)} frames and {len(texts)} texts can't hold a value of "
                 f"{self.num_frames} and {self.num_texts}"
             )
+        if self._only is not None:
+            return self._only.read(frames[0])
         return self._node.unpack(_Arriving(iter(frames), iter(texts)))
 
 
@@ -94,26 +97,27 @@ class _Array(_Node):
     num_frames = 1
 
     def __init__(self, space: gym.Space[Any], what: str) -> None:
-        self._dtype = DTYPES[np.dtype(space.dtype).name]
-        self._shape = tuple(cast("tuple[int, ...]", space.shape))
+        shape = tuple(cast("tuple[int, ...]", space.shape))
+        self.form = ArrayForm(DTYPES[np.dtype(space.dtype).name], shape)
         self._what = what
 
     def pack(self, value: Any, packed: Packed) -> None:
         array = as_array(value)
-        if array.dtype != self._dtype or array.shape != self._shape:
+        form = self.form
+        if array.dtype != form.dtype or array.shape != form.shape:
             array = self._fitted(array)
         packed.frames.append(array.tobytes())
 
     def _fitted(self, array: NDArray[Any]) -> NDArray[Any]:
-        if array.shape != self._shape or not np.can_cast(array.dtype, self._dtype, "same_kind"):
+        if array.shape != self.form.shape or not np.can_cast(array.dtype, self.form.dtype, "same_kind"):
             raise Misfit(
-                f"{self._what} doesn't fit its space: expected shape {self._shape} and dtype "
-                f"{self._dtype}, found shape {array.shape} and dtype {array.dtype}"
+                f"{self._what} doesn't fit its space: expected shape {self.form.shape} and dtype "
+                f"{self.form.dtype}, found shape {array.shape} and dtype {array.dtype}"
             )
-        return array.astype(self._dtype)
+        return array.astype(self.form.dtype)
 
     def unpack(self, arriving: _Arriving) -> Any:
-        return read_array(next(arriving.frames), self._dtype, self._shape)
+        return self.form.read(next(arriving.frames))
 
 
 class _Number(_Array):
@@ -231,6 +235,7 @@ class ResultLayout:
         self._agents = tuple(agents)
         self._each = (num_envs,) if num_envs > 1 else ()
         self.head = (len(agents), *self._each) if agents else self._each
+        self._columns = [ArrayForm(DTYPES[name], self.head) for name in ("float64", "bool", "bool")]
         if prod(self.head) > MAX_HEAD:
             raise WireError(f"{prod(self.head)} rewards in one result; {MAX_HEAD} are allowed")
 
@@ -242,7 +247,7 @@ class ResultLayout:
         """
         self._observation.pack(outcome.observation, packed)
         if not self.head:
-            reward, terminated, truncated = (_scalar(value) for value in outcome[1:])
+            _, reward, terminated, truncated = outcome
             return Outcome(None, float(reward), bool(terminated), bool(truncated))
         for name, dtype in (("reward", "float64"), ("terminated", "bool"), ("truncated", "bool")):
             column = self._column(getattr(outcome, name), name)
@@ -274,10 +279,7 @@ class ResultLayout:
         rest = frames[self._observation.num_frames :]
         if len(rest) < 3:
             raise WireError("a result lacks the frames of its rewards and flags")
-        columns = (
-            read_array(part, DTYPES[dtype], self.head)
-            for part, dtype in zip(rest, ("float64", "bool", "bool"), strict=False)
-        )
+        columns = (form.read(part) for form, part in zip(self._columns, rest, strict=False))
         return Outcome(observation, *map(self._by_agent, columns))
 
     def _by_agent(self, column: NDArray[Any]) -> Any:
@@ -289,7 +291,3 @@ class ResultLayout:
             return Outcome(observation, 0.0, False, True)
         reward, flags = np.zeros(self.head), np.zeros(self.head, bool)
         return Outcome(observation, *map(self._by_agent, (reward, flags, ~flags)))
-
-
-def _scalar(value: Any) -> Any:
-    return value if isinstance(value, int | float) else as_array(value).item()

@@ -28,6 +28,7 @@ __all__ = [
     "MAX_NAME_LENGTH",
     "MAX_PARTS",
     "VERSION",
+    "ArrayForm",
     "Bye",
     "Failure",
     "FromClient",
@@ -48,7 +49,6 @@ __all__ = [
     "Writer",
     "as_array",
     "portable",
-    "read_array",
 ]
 
 VERSION: Final = 1
@@ -196,26 +196,38 @@ FromServer: TypeAlias = Welcome | Refusal | Step | Reset | Ping | Pong | Gone | 
 Message = TypeVar("Message")
 
 
-def read_array(part: Part, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """`part` as an array: a read-only view of it.
+class ArrayForm:
+    """What a frame must be to hold an array of one dtype and shape."""
 
-    Raises:
-        WireError: it has another size, or is no array of bools.
-    """
-    size = prod(shape) * dtype.itemsize
-    if len(part) != size:
-        raise WireError(f"a frame for {dtype}{list(shape)} has {len(part)} bytes, not {size}")
-    if not size:
-        return np.zeros(shape, dtype)
-    array = np.frombuffer(part, dtype).reshape(shape)
-    # Any other byte would make a bool that equals neither True nor False.
-    if dtype.kind == "b" and array.view(np.uint8).max() > 1:
-        raise WireError("a frame of bools holds bytes other than 0 and 1")
-    return array
+    def __init__(self, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
+        self.dtype = dtype
+        self.shape = shape
+        self.size = prod(shape) * dtype.itemsize
+        self._is_bool = dtype.kind == "b"
+
+    def read(self, part: Part) -> NDArray[Any]:
+        """`part` as an array: a read-only view of it.
+
+        Raises:
+            WireError: it has another size, or is no array of bools.
+        """
+        if len(part) != self.size:
+            raise WireError(
+                f"a frame for {self.dtype}{[*self.shape]} has {len(part)} bytes, not {self.size}"
+            )
+        if not self.size:
+            return np.zeros(self.shape, self.dtype)
+        array = np.frombuffer(part, self.dtype).reshape(self.shape)
+        # Any other byte would make a bool that equals neither True nor False.
+        if self._is_bool and array.view(np.uint8).max() > 1:
+            raise WireError("a frame of bools holds bytes other than 0 and 1")
+        return array
 
 
 def as_array(value: Any) -> NDArray[Any]:
     """`value` as NumPy; tensors come from their device to the CPU."""
+    if type(value) is np.ndarray:
+        return cast("NDArray[Any]", value)
     if hasattr(value, "detach"):
         value = value.detach().cpu()
     return np.asarray(value)
@@ -228,7 +240,8 @@ class Reader(Generic[Message]):
         decoder = msgspec.msgpack.Decoder(kinds, ext_hook=self._array)
         self._decode = cast("Callable[[Part], Message]", decoder.decode)
         self._reference = msgspec.msgpack.Decoder(tuple[str, list[Count], Count])
-        self._unread: dict[int, Part] = {}
+        self._frames: Sequence[Part] = ()
+        self._named: set[int] = set()
 
     def read(self, parts: Sequence[Part]) -> tuple[Message, Sequence[Part]]:
         """The message that `parts` is, and its frames.
@@ -241,8 +254,8 @@ class Reader(Generic[Message]):
         header, frames = parts[0], parts[1:]
         if len(header) > MAX_HEADER_BYTES:
             raise WireError(f"a header has {len(header)} bytes; {MAX_HEADER_BYTES} are allowed")
-        # Each frame may be named once, or a small message could unfold to any size.
-        self._unread = dict(enumerate(frames))
+        self._frames = frames
+        self._named.clear()
         try:
             return self._decode(header), frames
         except WireError:
@@ -256,10 +269,12 @@ class Reader(Generic[Message]):
             raise WireError(f"a header uses the unknown extension {code}")
         dtype_name, shape, position = self._reference.decode(data)
         dtype = DTYPES.get(dtype_name)
-        part = self._unread.pop(position, None)
-        if dtype is None or part is None or len(shape) > _MAX_NESTING:
+        # Each frame may be named once, or a small message could unfold to any size.
+        is_there = position < len(self._frames) and position not in self._named
+        if dtype is None or not is_there or len(shape) > _MAX_NESTING:
             raise WireError(f"a header names an array {dtype_name!r}{shape} that is not there")
-        return read_array(part, dtype, tuple(shape)).copy()
+        self._named.add(position)
+        return ArrayForm(dtype, tuple(shape)).read(self._frames[position]).copy()
 
 
 class Writer:
