@@ -10,7 +10,7 @@ travel pickled.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard
 
 import gymnasium as gym
 import numpy as np
@@ -29,6 +29,8 @@ __all__ = [
     "assemble",
     "gather",
     "index",
+    "is_dict",
+    "is_tuple",
     "leaf_of",
     "leaves",
     "mapped",
@@ -38,6 +40,7 @@ __all__ = [
 
 Tree: TypeAlias = Any
 """An array, or a dict or tuple of trees."""
+_Node: TypeAlias = "NDArray[Any] | dict[str, Tree] | tuple[Tree, ...]"
 Rows: TypeAlias = "slice | NDArray[np.intp]"
 """Which rows: a slice for a contiguous range, else an index array."""
 
@@ -65,23 +68,38 @@ def leaves(space: gym.Space[Any]) -> tuple[Leaf, ...] | None:
 
 
 def _walk(space: gym.Space[Any], path: tuple[str | int, ...]) -> Iterator[Leaf | None]:
-    if isinstance(space, _FIXED) and space.dtype is not None and space.dtype != object:
-        yield Leaf(path, tuple(space.shape), np.dtype(space.dtype))
-    elif isinstance(space, spaces.Dict):
+    if is_dict(space):
         for key, inner in space.spaces.items():
             yield from _walk(inner, (*path, key))
-    elif isinstance(space, spaces.Tuple):
+    elif is_tuple(space):
         for position, inner in enumerate(space.spaces):
             yield from _walk(inner, (*path, position))
+    elif _is_array(space) and space.dtype != object:
+        yield Leaf(path, space.shape, space.dtype)
     else:
         yield None
 
 
+def is_dict(space: object) -> TypeGuard[spaces.Dict[Any]]:
+    """Whether `space` is a Dict; an `isinstance` would lose what its parts are."""
+    return isinstance(space, spaces.Dict)
+
+
+def is_tuple(space: object) -> TypeGuard[spaces.Tuple[Any]]:
+    """Whether `space` is a Tuple; an `isinstance` would lose what its parts are."""
+    return isinstance(space, spaces.Tuple)
+
+
+def _is_array(space: gym.Space[Any]) -> TypeGuard[spaces.Box[Any]]:
+    """Whether values of `space` are arrays of one shape and dtype, as a Box's are."""
+    return isinstance(space, _FIXED)
+
+
 def assemble(space: gym.Space[Any], arrays: Iterator[NDArray[Any]]) -> Tree:
     """Arrange `arrays`, given in the order of `leaves`, in the shape of `space`."""
-    if isinstance(space, spaces.Dict):
+    if is_dict(space):
         return {key: assemble(inner, arrays) for key, inner in space.spaces.items()}
-    if isinstance(space, spaces.Tuple):
+    if is_tuple(space):
         return tuple(assemble(inner, arrays) for inner in space.spaces)
     return next(arrays)
 
@@ -95,7 +113,7 @@ def leaf_of(space_leaves: Sequence[Leaf], tree: Tree) -> Iterator[tuple[Leaf, ND
         yield leaf, array
 
 
-def mapped(function: Callable[[NDArray[Any]], Any], tree: Tree) -> Tree:
+def mapped(function: Callable[[NDArray[Any]], Any], tree: _Node) -> Tree:
     """`tree` with `function` applied to each array."""
     if isinstance(tree, dict):
         return {key: mapped(function, inner) for key, inner in tree.items()}
@@ -104,14 +122,14 @@ def mapped(function: Callable[[NDArray[Any]], Any], tree: Tree) -> Tree:
     return function(tree)
 
 
-def gather(tree: Tree, rows: Rows) -> Tree:
+def gather(tree: _Node, rows: Rows) -> Any:
     """A fresh copy of `rows` of each array."""
     if isinstance(tree, np.ndarray):
         return tree[rows].copy() if isinstance(rows, slice) else tree.take(rows, axis=0)
     return mapped(lambda array: gather(array, rows), tree)
 
 
-def index(tree: Tree, position: int) -> Tree:
+def index(tree: _Node, position: int) -> Tree:
     """Row `position` of each array: a view, or a NumPy scalar where a row is one number."""
     return tree[position] if isinstance(tree, np.ndarray) else mapped(lambda a: a[position], tree)
 
@@ -130,6 +148,12 @@ def _fitted(value: Any, leaf: Leaf, what: str) -> NDArray[Any]:
     return array
 
 
+def _misplaced(what: str, path: tuple[str | int, ...], expected: str, value: Any) -> Misfit:
+    place = Leaf(path, (), np.dtype(bool)).name
+    found = f"keys {sorted(map(str, value))}" if hasattr(value, "keys") else type(value).__name__
+    return Misfit(f"{what}{place} doesn't fit its space: expected {expected}, found {found}")
+
+
 def row_writer(
     space: gym.Space[Any], tree: Tree, row: int, what: str, path: tuple[str | int, ...] = ()
 ) -> Callable[[Any], None]:
@@ -141,9 +165,9 @@ def row_writer(
         Misfit: the value has another shape, structure, or kind of dtype; the row may hold
             a part of it.
     """
-    if isinstance(space, spaces.Dict):
+    if is_dict(space):
         return _dict_writer(space, tree, row, what, path)
-    if isinstance(space, spaces.Tuple):
+    if is_tuple(space):
         return _tuple_writer(space, tree, row, what, path)
     leaf = Leaf(path, tree.shape[1:], tree.dtype)
     if not leaf.shape:
@@ -166,7 +190,7 @@ def _number_writer(column: NDArray[Any], row: int, leaf: Leaf, what: str) -> Cal
 
 
 def _dict_writer(
-    space: spaces.Dict, tree: Tree, row: int, what: str, path: tuple[str | int, ...]
+    space: spaces.Dict[Any], tree: Tree, row: int, what: str, path: tuple[str | int, ...]
 ) -> Callable[[Any], None]:
     writers = {
         key: row_writer(inner, tree[key], row, what, (*path, key))
@@ -175,11 +199,7 @@ def _dict_writer(
 
     def write(value: Any) -> None:
         if not hasattr(value, "keys") or value.keys() != writers.keys():
-            found = sorted(map(str, value.keys())) if hasattr(value, "keys") else type(value)
-            raise Misfit(
-                f"{what}{Leaf(path, (), np.dtype(bool)).name} doesn't fit its space: expected a "
-                f"dict with keys {sorted(map(str, writers))}, found {found}"
-            )
+            raise _misplaced(what, path, f"a dict with keys {sorted(map(str, writers))}", value)
         for key, writer in writers.items():
             writer(value[key])
 
@@ -187,19 +207,16 @@ def _dict_writer(
 
 
 def _tuple_writer(
-    space: spaces.Tuple, tree: Tree, row: int, what: str, path: tuple[str | int, ...]
+    space: spaces.Tuple[Any], tree: Tree, row: int, what: str, path: tuple[str | int, ...]
 ) -> Callable[[Any], None]:
     writers = [
         row_writer(inner, part, row, what, (*path, position))
         for position, (inner, part) in enumerate(zip(space.spaces, tree, strict=True))
     ]
 
-    def write(value: Any) -> None:
+    def write(value: tuple[Any, ...] | list[Any] | NDArray[Any]) -> None:
         if not isinstance(value, tuple | list) or len(value) != len(writers):
-            raise Misfit(
-                f"{what}{Leaf(path, (), np.dtype(bool)).name} doesn't fit its space: expected a "
-                f"tuple of {len(writers)}, found {type(value).__name__}"
-            )
+            raise _misplaced(what, path, f"a tuple of {len(writers)}", value)
         for writer, part in zip(writers, value, strict=True):
             writer(part)
 
@@ -211,10 +228,10 @@ def row_reader(space: gym.Space[Any], tree: Tree, row: int) -> Callable[[], Any]
 
     The caller owns the value: nothing that is written to the row later changes it.
     """
-    if isinstance(space, spaces.Dict):
+    if is_dict(space):
         readers = {k: row_reader(inner, tree[k], row) for k, inner in space.spaces.items()}
         return lambda: {key: reader() for key, reader in readers.items()}
-    if isinstance(space, spaces.Tuple):
+    if is_tuple(space):
         parts = [row_reader(s, t, row) for s, t in zip(space.spaces, tree, strict=True)]
         return lambda: tuple(reader() for reader in parts)
     if tree.ndim == 1:

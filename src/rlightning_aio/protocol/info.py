@@ -59,20 +59,21 @@ class InfoSchema:
         """The schema of `info`, or None if it can't travel in a row."""
         arrays: list[tuple[tuple[int, ...], str] | None] = []
         codes = "="
-        for key, value in info.items():
+        kinds = tuple(map(type, info.values()))
+        for (key, value), kind in zip(info.items(), kinds, strict=True):
             if type(key) is not str:
                 return None
-            if type(value) is np.ndarray and not value.dtype.hasobject:
-                arrays.append((value.shape, value.dtype.str))
-                codes += f"{value.nbytes}s"
-            elif (code := _SCALARS.get(type(value))) is not None:
+            if (code := _SCALARS.get(kind)) is not None:
                 arrays.append(None)
                 codes += code
+            elif kind is np.ndarray and not value.dtype.hasobject:
+                arrays.append((value.shape, value.dtype.str))
+                codes += f"{value.nbytes}s"
             else:
                 return None
         if struct.calcsize(codes) > INFO_BYTES:
             return None
-        return cls(tuple(info), tuple(map(type, info.values())), tuple(arrays), codes)
+        return cls(tuple(info), kinds, tuple(arrays), codes)
 
     @property
     def size(self) -> int:

@@ -16,6 +16,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from rlightning_aio.protocol.columns import is_dict, is_tuple
 from rlightning_aio.protocol.wire import DTYPES, MAX_FRAME_BYTES, WireError
 
 if TYPE_CHECKING:
@@ -48,10 +49,10 @@ def describe(space: gym.Space[Any] | None, what: str) -> Description:
     Raises:
         UnsupportedSpace: it, or a space within, is none of those that can travel.
     """
-    if isinstance(space, spaces.Dict):
-        return _describe_dict(cast("spaces.Dict[Any]", space), what)
-    if isinstance(space, spaces.Tuple):
-        parts = enumerate(cast("spaces.Tuple[Any]", space).spaces)
+    if is_dict(space):
+        return _describe_dict(space, what)
+    if is_tuple(space):
+        parts = enumerate(space.spaces)
         return {"type": "tuple", "spaces": [describe(s, f"{what}[{k}]") for k, s in parts]}
     if isinstance(space, spaces.Text):
         return {
