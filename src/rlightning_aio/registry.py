@@ -42,6 +42,7 @@ class Backend:
         cpu_bound: one core's worth of plain computing for each step, so that several
             envs may share a worker (``envs_per_process: auto``).
         vectorized: whether ``num_envs`` above 1 is supported.
+        own_command: installs the simulator, where no extra of this package does.
         preload: modules that are safe to import before workers are forked and slow to
             import after: no threads, no devices.
     """
@@ -53,13 +54,14 @@ class Backend:
     extra: str = ""
     cpu_bound: bool = False
     vectorized: bool = False
+    own_command: str = ""
     preload: tuple[str, ...] = ()
 
     @property
     def install_command(self) -> str:
         """The one command that installs the simulator."""
         package = f"'rlightning-aio[{self.extra}]'" if self.extra else "rlightning-aio"
-        return f"pip install {package}"
+        return self.own_command or f"pip install {package}"
 
     def installed_version(self) -> str | None:
         """Version of the simulator in this interpreter, or None if it isn't installed."""
@@ -70,6 +72,9 @@ class Backend:
         except importlib.metadata.PackageNotFoundError:
             return "unknown"
 
+
+# Python 3.12 alone, and best in an environment of its own; docs/backends.md has the rest.
+ISAAC_LAB = "pip install isaaclab==3.0.0 rlightning-aio"
 
 # One row for one backend.
 # fmt: off
@@ -90,9 +95,9 @@ BACKENDS: dict[str, Backend] = {
         Backend("maniskill", "rlightning_aio.envs.maniskill:ManiskillEnv", "mani_skill",
                 "mani-skill", extra="maniskill", vectorized=True),
         Backend("isaac_manager_based", "rlightning_aio.envs.isaac:IsaacManagerBasedEnv",
-                "isaaclab", "isaaclab", extra="isaac", vectorized=True),
+                "isaaclab", "isaaclab", extra="isaac", vectorized=True, own_command=ISAAC_LAB),
         Backend("isaac_marl", "rlightning_aio.envs.isaac:IsaacMarlEnv",
-                "isaaclab", "isaaclab", extra="isaac", vectorized=True),
+                "isaaclab", "isaaclab", extra="isaac", vectorized=True, own_command=ISAAC_LAB),
         Backend("piper", "rlightning_aio.envs.piper:PiperEnv", "piper_sdk", "piper-sdk",
                 extra="piper"),
     )

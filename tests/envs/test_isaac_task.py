@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import importlib.util
 import math
 import sys
 import threading
+from importlib.machinery import ModuleSpec
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -49,8 +51,10 @@ def events(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     package = ModuleType("stub_package")
     package.Cfg = Cfg  # type: ignore[attr-defined]
     package.Env = lambda cfg: cfg  # type: ignore[attr-defined]
+    package_root = ModuleType("isaaclab")
+    package_root.__spec__ = ModuleSpec("isaaclab", None)
     for name, module in {
-        "isaaclab": ModuleType("isaaclab"),
+        "isaaclab": package_root,
         "isaaclab.app": app,
         "isaaclab_tasks": Watched("isaaclab_tasks"),
         "isaaclab_tasks.utils": Watched("isaaclab_tasks.utils"),
@@ -95,3 +99,11 @@ def test_the_step_limit_survives_the_simulators_rounding(events: list[Any], step
     config = CONFIG.model_copy(update={"max_episode_steps": steps})
     cfg = isaac_task.make_simulator("isaac-0", config, "stub_package::Env")
     assert math.ceil(cfg.episode_length_s / (cfg.decimation * cfg.sim.dt)) == steps
+
+
+def test_a_python_without_isaac_lab_is_named() -> None:
+    """The message says which Python was asked, and how an entry gets another one."""
+    if importlib.util.find_spec("isaaclab"):
+        pytest.skip("Isaac Lab is here")
+    with pytest.raises(ConfigError, match=rf"isaac-0: {sys.executable} has no Isaac Lab"):
+        isaac_task.make_simulator("isaac-0", CONFIG, None)

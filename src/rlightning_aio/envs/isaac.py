@@ -37,6 +37,7 @@ class _IsaacEnv(BaseEnv):
     episodes that ended in that step.
     """
 
+    autoreset = "same_step"
     default_env_class: ClassVar[str | None] = None
     live_env_id: ClassVar[str | None] = None
 
@@ -48,7 +49,6 @@ class _IsaacEnv(BaseEnv):
         **kwargs: Any,
     ) -> None:
         super().__init__(config, worker_index, preprocess_fn, **kwargs)
-        self._torch: Any = importlib.import_module("torch")
         self._fresh = True
         self._claim_process()
         try:
@@ -56,6 +56,7 @@ class _IsaacEnv(BaseEnv):
         except BaseException:
             _IsaacEnv.live_env_id = None
             raise
+        self._torch: Any = importlib.import_module("torch")
         self.max_episode_steps = int(self.env.max_episode_length)
 
     def _claim_process(self) -> None:

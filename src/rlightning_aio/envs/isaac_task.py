@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import importlib.util
+import sys
 import threading
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, cast
@@ -56,9 +58,14 @@ def make_simulator(env_id: str, config: EnvConfig, default_env_class: str | None
             ``env_kwargs.env_class`` names none.
 
     Raises:
-        ConfigError: an option, an override or the task doesn't exist; or, for Isaac Lab
-            2.3, this isn't the main thread.
+        ConfigError: there is no Isaac Lab; an option, an override or the task doesn't
+            exist; or, for Isaac Lab 2.3, this isn't the main thread.
     """
+    if importlib.util.find_spec("isaaclab") is None:
+        raise ConfigError(
+            f"{env_id}: {sys.executable} has no Isaac Lab; let the entry's interpreter name a "
+            "Python that has (docs/backends.md tells how to install it)"
+        )
     options = read_options(IsaacOptions, env_id, config.env_kwargs)
     device = options.device or _default_device()
     app: Any = importlib.import_module("isaaclab.app")
