@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from envs.isaac_bare import bare_simulator, by_agent
 
+from rlightning_aio import BatchedData, sync
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
@@ -76,19 +78,6 @@ def actions(num_steps: int, num_envs: int) -> np.ndarray:
 
 def respond(action: Any) -> PolicyResponse:
     return PolicyResponse("isaac-0", action=action)
-
-
-def bare_simulator(task: str, num_envs: int, max_episode_length: int) -> Any:
-    """The simulator with nothing of this package around it."""
-    import gymnasium as gym
-    from isaaclab.app import launch_simulation
-    from isaaclab_tasks.utils import parse_env_cfg
-
-    cfg = parse_env_cfg(task, device="cpu", num_envs=num_envs)
-    cfg.compute_final_obs = True
-    cfg.episode_length_s = (max_episode_length - 0.5) * cfg.decimation * cfg.sim.dt
-    with launch_simulation(cfg):
-        return gym.make(task, cfg=cfg).unwrapped
 
 
 def test_spaces_are_batched_and_hold_what_comes_out(make: Any) -> None:
@@ -164,7 +153,7 @@ def test_marl_steps_equal_the_bare_simulators(make: Any) -> None:
     env = make(MARL, "isaac_marl", num_envs=3, max_episode_steps=40)
     steps = actions(200, 3)
     ours = [env.reset(seed=1)]
-    ours += [env.step(respond({"cart": a, "pendulum": -a})) for a in steps]
+    ours += [env.step(respond(by_agent(a))) for a in steps]
     env.close()
     bare = bare_simulator(MARL, 3, 40)
     try:
@@ -173,8 +162,9 @@ def test_marl_steps_equal_the_bare_simulators(make: Any) -> None:
         assert all(torch.equal(ours[0].observation[k], observation[k]) for k in observation)
         num_ended = 0
         for ret, action in zip(ours[1:], steps, strict=True):
-            by_agent = {"cart": torch.tensor(action), "pendulum": -torch.tensor(action)}
-            observation, reward, terminated, truncated, extras = bare.step(by_agent)
+            observation, reward, terminated, truncated, extras = bare.step(
+                by_agent(torch.tensor(action))
+            )
             for agent in ("cart", "pendulum"):
                 assert torch.equal(ret.observation[agent], observation[agent])
                 assert torch.equal(ret.last_reward[agent], reward[agent])
@@ -293,3 +283,31 @@ def test_faults_of_the_config_are_named(make: Any, fields: Any, message: str) ->
     with pytest.raises(ConfigError, match=message):
         make(**fields)
     make(num_envs=1)
+
+
+@pytest.mark.parametrize("placement", ["inline", "process"])
+def test_tensors_stay_tensors_inline_and_are_arrays_from_a_process(placement: str) -> None:
+    """In this process results are torch tensors; from a worker they are equal NumPy arrays."""
+    entry = {
+        "name": "isaac",
+        "backend": "isaac_manager_based",
+        "task": MANAGER_BASED,
+        "num_envs": 2,
+        "placement": placement,
+        "start_timeout": 300.0,
+        "env_kwargs": {"device": "cpu"},
+    }
+    action = actions(1, 2)[0]
+    with sync.build_env_group(entry) as group:
+        group.reset(seed=0)
+        outcomes = []
+        for given in (torch.tensor(action), action):
+            group.reset(seed=0)
+            batch, _ = group.step(BatchedData(["isaac-0"], [respond(given)]))
+            outcomes.append(batch["isaac-0"])
+        kind = torch.Tensor if placement == "inline" else np.ndarray
+        for ret in outcomes:
+            assert isinstance(ret.observation["policy"], kind)
+            assert isinstance(ret.last_reward, kind)
+        first, second = (np.asarray(ret.observation["policy"]) for ret in outcomes)
+        np.testing.assert_array_equal(first, second)
