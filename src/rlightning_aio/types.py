@@ -80,6 +80,9 @@ class EnvRet(_Ret):
     last_terminated: Any = False
     last_truncated: Any = False
 
+    # Said again, because type checkers make one up that knows no `_extra`.
+    __init__ = _Ret.__init__
+
 
 class MultiAgentEnvRet(_Ret):
     """One multi-agent env's result: every field but the info is a dict by agent."""
@@ -88,6 +91,8 @@ class MultiAgentEnvRet(_Ret):
     last_reward: dict[str, Any] = Field(default_factory=dict)
     last_terminated: dict[str, Any] = Field(default_factory=dict)
     last_truncated: dict[str, Any] = Field(default_factory=dict)
+
+    __init__ = _Ret.__init__
 
 
 class EnvMeta(BaseModel):
