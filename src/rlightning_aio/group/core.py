@@ -44,16 +44,19 @@ if TYPE_CHECKING:
 __all__ = ["Core"]
 
 CALL: Final = 3
+NOBODY: Final = -1
+"""Owner of a call that was given up."""
 Flags: TypeAlias = "list[bool]"
 
 
 @dataclass(slots=True)
 class Ticket:
-    """A call that waits for requests of its own, beside `collect_async`."""
+    """What waits for requests of its own, beside `collect_async`; `calls` are of methods."""
 
     owner: int
     slots: NDArray[np.intp]
     remaining: int
+    calls: bool = False
     faults: list[EnvFault] = field(default_factory=list[EnvFault])
     value: Any = None
 
@@ -81,6 +84,7 @@ class Core:
         self._rests: dict[int, Any] = {}
         self._reports: list[NDArray[np.int64]] = []
         self._collecting = False
+        self._wanted: list[int] = []
         self.info_width = 0
         fleet.deliver_to(self)
 
@@ -90,9 +94,14 @@ class Core:
         """Slots of a batch's envs; free for a batch that answers one of ours."""
         slots = batch.slots_in(self)
         if slots is None:
-            slots = self.slots.find(batch.env_ids())
-            if len(slots) > 1 and len(set(batch.env_ids())) < len(slots):
-                raise EnvBusy(f"{_first_double(batch.env_ids())!r} comes twice in one batch")
+            slots = self._distinct(batch.env_ids())
+        return slots
+
+    def _distinct(self, env_ids: Sequence[str]) -> NDArray[np.intp]:
+        """Slots of `env_ids`, each of which may come once."""
+        slots = self.slots.find(env_ids)
+        if slots is not self.slots.all and len(set(env_ids)) < len(slots):
+            raise EnvBusy(f"{_first_double(env_ids)!r} comes twice in one call; nothing was sent")
         return slots
 
     def _check_sendable(self, slots: NDArray[np.intp], what: str) -> None:
@@ -144,6 +153,8 @@ class Core:
 
     def _post(self, slots: NDArray[np.intp], entries: NDArray[np.int64]) -> None:
         """Hand entries to their hosts, with one call for each run of slots of one host."""
+        if not len(slots):
+            return
         hosts = self.slots.host[slots]
         hosts_of = self.fleet.hosts
         cuts = np.flatnonzero(hosts[1:] != hosts[:-1])
@@ -217,7 +228,11 @@ class Core:
         slot = host.first_slot + row
         if self._is_current(slot, number):
             self.slots.state[slot] = IDLE
-            ticket = self._tickets[int(self.slots.owner[slot])]
+            owner = int(self.slots.owner[slot])
+            if owner == NOBODY:
+                self.slots.owner[slot] = 0
+                return
+            ticket = self._tickets[owner]
             ticket.value = value
             ticket.remaining -= 1
 
@@ -279,7 +294,9 @@ class Core:
         for owner in owners:
             mine = [slot for slot in slots if table.owner[slot] == owner]
             table.state[mine] = IDLE
-            if owner:
+            if owner == NOBODY:
+                table.owner[mine] = 0
+            elif owner:
                 ticket = self._tickets[owner]
                 ticket.remaining -= len(mine)
                 ticket.faults.append(fault)
@@ -300,6 +317,7 @@ class Core:
         deadline: float | None,
     ) -> Operation[tuple[BatchedData, Flags]]:
         """See `EnvGroup.collect_async`."""
+        self.check_open()
         if self._collecting:
             raise RLightningError(
                 "another collect_async is already waiting on this group; one collector at a time"
@@ -308,6 +326,8 @@ class Core:
         try:
             end = None if deadline is None else now + deadline
             window = None
+            if wait_all:
+                timeout = None
             while True:
                 self.fleet.sweep()
                 if self._faults:
@@ -333,7 +353,7 @@ class Core:
                     wanted = most - ready
                 else:
                     wanted = 1 if timeout is not None else max(need - ready, 1)
-                until = earliest(end, window if ready >= need else None)
+                until = earliest(end, window if open_window else None)
                 now = yield from self._wait(wanted, until)
         finally:
             self._collecting = False
@@ -341,9 +361,14 @@ class Core:
 
     def _wait(self, wanted: int, until: float | None) -> Operation[float]:
         """One turn of waiting for `wanted` more replies; the time after it."""
-        if self.fleet.run_inline(wanted) or self.fleet.order(wanted):
-            return (yield Wait(0.0))
-        now = yield Wait(earliest(until, self.fleet.next_check()))
+        self._wanted.append(wanted)
+        try:
+            # Whoever else waits meanwhile must be woken as early as it asked for.
+            if self.fleet.run_inline(wanted) or self.fleet.order(min(self._wanted)):
+                return (yield Wait(0.0))
+            now = yield Wait(earliest(until, self.fleet.next_check()))
+        finally:
+            self._wanted.remove(wanted)
         self.fleet.check(now)
         return now
 
@@ -371,8 +396,8 @@ class Core:
 
     # -- calls that wait for their own replies ------------------------------------
 
-    def _new_ticket(self, slots: NDArray[np.intp]) -> Ticket:
-        ticket = Ticket(self._next_owner, slots, len(slots))
+    def _new_ticket(self, slots: NDArray[np.intp], *, calls: bool = False) -> Ticket:
+        ticket = Ticket(self._next_owner, slots, len(slots), calls)
         self._next_owner += 1
         self._tickets[ticket.owner] = ticket
         return ticket
@@ -383,21 +408,27 @@ class Core:
             while True:
                 self.fleet.sweep()
                 if ticket.remaining <= 0:
-                    return
+                    break
                 yield from self._wait(ticket.remaining, None)
-        finally:
-            del self._tickets[ticket.owner]
-            # Invariant: the owner of an idle slot is 0.
-            self.slots.owner[ticket.slots] = 0
-            if ticket.remaining > 0:
-                self._disown(ticket)
+        except BaseException:
+            self._disown(ticket)
+            raise
+        del self._tickets[ticket.owner]
+        # Invariant: the owner of an idle slot is 0.
+        self.slots.owner[ticket.slots] = 0
 
     def _disown(self, ticket: Ticket) -> None:
-        """The caller has given up: `collect_async` gets what is still to come."""
-        states = self.slots.state[ticket.slots]
+        """The caller has given up: `collect_async` gets what was stepped and reset for it."""
+        del self._tickets[ticket.owner]
+        table, slots = self.slots, ticket.slots
+        table.owner[slots] = 0
+        if ticket.calls:
+            table.owner[slots[table.state[slots] == BUSY]] = NOBODY
+            return
+        states = table.state[slots]
         self._in_flight += int(np.count_nonzero(states))
         self._faults.extend(ticket.faults)
-        ready = ticket.slots[states == READY]
+        ready = slots[states == READY]
         if len(ready):
             self._queue(ready)
 
@@ -424,7 +455,7 @@ class Core:
     ) -> Operation[tuple[BatchedData, Flags]]:
         """See `EnvGroup.reset`."""
         table = self.slots
-        slots = table.all if env_ids is None else table.find(env_ids)
+        slots = table.all if env_ids is None else self._distinct(env_ids)
         seeds = self._seeds(seed, slots)
         self._check_sendable(slots, "reset")
         self.fleet.forget_lost(slots)
@@ -453,19 +484,14 @@ class Core:
         if seed is None:
             return np.full(len(slots), NO_SEED)
         if isinstance(seed, Mapping):
-            given = {table.find_one(env_id): value for env_id, value in seed.items()}
+            given = {table.find_one(env_id): _checked(one) for env_id, one in seed.items()}
             chosen = [given.get(slot, NO_SEED) for slot in slots.tolist()]
-        elif isinstance(seed, Sequence | np.ndarray):
+        elif isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str):
             if len(seed) != len(slots):
                 raise ValueError(f"{len(seed)} seeds for {len(slots)} envs; give one for each")
-            chosen = list(seed)
+            chosen = [_checked(one) for one in seed]
         else:
-            if seed < 0:
-                raise ValueError(f"seed must be at least 0, not {seed}")
-            return table.seed_offset[slots] + int(seed)
-        for value in chosen:
-            if value != NO_SEED and value < 0:
-                raise ValueError(f"seeds must be at least 0, not {value}")
+            return table.seed_offset[slots] + _checked(seed)
         return np.array(chosen, np.int64)
 
     def _settled(self, ticket: Ticket, slots: NDArray[np.intp]) -> tuple[BatchedData, Flags]:
@@ -489,7 +515,7 @@ class Core:
         """Call a method of one env; its value."""
         slots = np.array([slot], np.intp)
         self._check_sendable(slots, f"call {name} of")
-        ticket = self._new_ticket(slots)
+        ticket = self._new_ticket(slots, calls=True)
         self._mark_sent(slots, CALL, ticket.owner, now)
         host = self.fleet.hosts[self.slots.host[slot]]
         host.request_call(slot - host.first_slot, self.slots.number(slot), name, args, kwargs)
@@ -502,7 +528,7 @@ class Core:
         """Call a method of every env, all at once."""
         slots = self.slots.all
         self._check_sendable(slots, f"call {name} of")
-        ticket = self._new_ticket(slots)
+        ticket = self._new_ticket(slots, calls=True)
         self._mark_sent(slots, CALL, ticket.owner, now)
         for slot in slots.tolist():
             host = self.fleet.hosts[self.slots.host[slot]]
@@ -524,6 +550,14 @@ class Core:
                 else "this group has not been initialised; call init() first, or use it in a "
                 "with block"
             )
+
+
+def _checked(seed: Any) -> int:
+    """`seed` as an int that every env can count on from."""
+    whole = isinstance(seed, int | np.integer) and not isinstance(seed, bool)
+    if not whole or not 0 <= seed < 1 << 62:
+        raise ValueError(f"a seed must be an int from 0 to 2**62 - 1, not {seed!r}")
+    return int(seed)
 
 
 def _first_double(ids: Sequence[str]) -> str:

@@ -1,0 +1,187 @@
+"""Rules of the core that need a certain order of events, on hosts without processes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from group.fake_host import PLAIN, RAISES, FakeGroup
+
+from rlightning_aio.batch import BatchedData
+from rlightning_aio.errors import EnvBusy, EnvRaised, GroupClosed, NothingPending
+from rlightning_aio.types import PolicyResponse
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from group.fake_host import Running
+
+    NewGroup = Callable[..., FakeGroup]
+
+
+@pytest.fixture
+def new_group() -> Iterator[NewGroup]:
+    groups: list[FakeGroup] = []
+
+    def new_group(*rows: int, **kwargs: Any) -> FakeGroup:
+        groups.append(FakeGroup(rows, **kwargs))
+        return groups[-1]
+
+    yield new_group
+    while groups:
+        groups.pop().close()
+
+
+def steps(*slots: int, action: int = PLAIN) -> BatchedData:
+    ids = [f"fake-{slot}" for slot in slots]
+    return BatchedData(ids, [PolicyResponse(id_, action) for id_ in ids])
+
+
+def collect(group: FakeGroup, **rules: Any) -> Running:
+    defaults: dict[str, Any] = {
+        "timeout": None,
+        "wait_all": False,
+        "min_results": 1,
+        "max_results": None,
+        "deadline": None,
+    }
+    return group.begin(group.core.collect(group.now, **{**defaults, **rules}))
+
+
+def ids_of(running: Running) -> list[str]:
+    return running.result()[0].ids()
+
+
+def test_the_window_ends_for_results_that_joined_unnoticed(new_group: NewGroup) -> None:
+    """Past the window a collect returns as soon as the minimum is there, though not all came."""
+    group = new_group(8)
+    group.core.step_async(steps(*range(8)), group.now)
+    running = collect(group, timeout=1.0, min_results=3)
+    group.finish(0)
+    group.pass_time(0.5)
+    group.finish(1)
+    group.finish(2)
+    assert not running.done
+    group.pass_time(0.5)
+    assert ids_of(running) == ["fake-0", "fake-1", "fake-2"]
+
+
+def test_one_callers_slow_env_does_not_hold_up_another_caller(new_group: NewGroup) -> None:
+    """Two calls at once, on envs of one worker: each returns when its own envs have replied."""
+    group = new_group(3)
+    quick = group.begin(group.core.step(steps(0), group.now))
+    slow = group.begin(group.core.step(steps(1, 2), group.now))
+    group.finish(0)
+    assert ids_of(quick) == ["fake-0"]
+    assert not slow.done
+    group.finish(2)
+    group.finish(1)
+    assert ids_of(slow) == ["fake-1", "fake-2"]
+
+
+def test_a_step_given_up_after_its_last_reply_loses_nothing(new_group: NewGroup) -> None:
+    """The replies are there, the caller is not: the next collect gets them."""
+    group = new_group(2)
+    running = group.begin(group.core.step(steps(0, 1), group.now))
+    host = group.hosts[0]
+    host.finish()
+    host.finish()
+    host.on_readable()
+    group.core.absorb()
+    group.cancel(running)
+    assert ids_of(collect(group)) == ["fake-0", "fake-1"]
+
+
+def test_what_a_step_given_up_raised_reaches_the_collector(new_group: NewGroup) -> None:
+    """An error is an answer too."""
+    group = new_group(2)
+    running = group.begin(group.core.step(steps(0, 1, action=RAISES), group.now))
+    group.finish(1)
+    group.cancel(running)
+    with pytest.raises(EnvRaised, match="fake-1"):
+        collect(group).result()
+    waiting = collect(group)
+    group.finish(0)
+    with pytest.raises(EnvRaised, match="fake-0"):
+        waiting.result()
+    with pytest.raises(NothingPending):
+        collect(group).result()
+
+
+@pytest.mark.parametrize("name", ["who", "raise"])
+def test_the_value_of_a_call_given_up_is_dropped(new_group: NewGroup, name: str) -> None:
+    """Nobody collects it, and the env can be stepped once it has replied."""
+    group = new_group(1)
+    running = group.begin(group.core.call(group.now, 0, name, (), {}))
+    group.cancel(running)
+    with pytest.raises(NothingPending):
+        collect(group).result()
+    with pytest.raises(EnvBusy):
+        group.core.step_async(steps(0), group.now)
+    group.hosts[0].finish()
+    group.hosts[0].on_readable()
+    stepped = group.begin(group.core.step(steps(0), group.now))
+    group.finish(0)
+    assert ids_of(stepped) == ["fake-0"]
+
+
+def test_an_env_is_reset_once_in_one_call(new_group: NewGroup) -> None:
+    """Naming an env twice is refused as a whole, as in a batch of steps."""
+    group = new_group(2)
+    ids = ["fake-1", "fake-0", "fake-1"]
+    with pytest.raises(EnvBusy, match="'fake-1' comes twice"):
+        group.begin(group.core.reset(group.now, None, None, ids)).result()
+    assert not group.hosts[0].waiting
+
+
+def test_empty_batches_do_nothing(new_group: NewGroup) -> None:
+    """A loop may have nothing to step; only a collect of nothing is refused."""
+    group = new_group(2)
+    group.core.step_async(BatchedData(), group.now)
+    batch, flags = group.begin(group.core.step(BatchedData(), group.now)).result()
+    assert (len(batch), batch.values(), flags) == (0, [], None)
+    batch, flags = group.begin(group.core.reset(group.now, 0, None, [])).result()
+    assert (len(batch), flags) == (0, [])
+    with pytest.raises(NothingPending):
+        collect(group).result()
+
+
+@pytest.mark.parametrize(
+    "seed",
+    [-1, [0, -1], {"fake-0": -1}, 1.5, [0.5, 1], True, "01", [None, 1], 2**63, {"fake-1": "x"}],
+)
+def test_a_bad_seed_is_refused_before_anything_is_sent(new_group: NewGroup, seed: Any) -> None:
+    """Seeds are ints from 0 on that fit 63 bits; what else came in is named."""
+    group = new_group(2)
+    with pytest.raises(ValueError, match="seed"):
+        group.begin(group.core.reset(group.now, seed, None, None)).result()
+    assert not group.hosts[0].waiting
+
+
+def test_seeds_are_counted_for_each_env(new_group: NewGroup) -> None:
+    """A sequence holds one seed for each env that is reset."""
+    group = new_group(2)
+    with pytest.raises(ValueError, match="3 seeds for 2 envs"):
+        group.begin(group.core.reset(group.now, [1, 2, 3], None, None)).result()
+
+
+@pytest.mark.parametrize("moment", ["before init", "after close"])
+def test_a_group_that_is_not_open_says_so(moment: str) -> None:
+    """Whatever is asked of it; nothing is confused with an idle group."""
+    group = FakeGroup([1])
+    if moment == "before init":
+        group.fleet.open = False
+    else:
+        group.core.step_async(steps(0), group.now)
+        group.finish(0)
+        group.close()
+    hint = "init" if moment == "before init" else "build a new one"
+    with pytest.raises(GroupClosed, match=hint):
+        collect(group).result()
+    with pytest.raises(GroupClosed, match=hint):
+        group.core.step_async(steps(0), group.now)
+    with pytest.raises(GroupClosed, match=hint):
+        group.begin(group.core.reset(group.now, None, None, None)).result()
+    with pytest.raises(GroupClosed, match=hint):
+        group.begin(group.core.call(group.now, 0, "who", (), {})).result()
+    group.close()
