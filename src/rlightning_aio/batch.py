@@ -318,6 +318,11 @@ class BatchedData:
         return _stacked([getattr(value, attribute) for value in self.values()])
 
     @property
+    def any_ended(self) -> bool:
+        """Whether any episode has ended, of a sub-environment or agent included."""
+        return any(part.episode_return is not None for part in self._parts)
+
+    @property
     def ended(self) -> NDArray[np.bool_]:
         """Which envs' episodes have ended: ``[n]`` bool, all sub-environments and agents of it."""
         whole = np.empty(len(self), np.bool_)

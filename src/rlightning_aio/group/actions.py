@@ -13,7 +13,7 @@ import numpy as np
 
 from rlightning_aio.errors import BadAction
 from rlightning_aio.hosts.worker import NO_ACTION
-from rlightning_aio.protocol.columns import Leaf, Tree, index, leaf_of
+from rlightning_aio.protocol.columns import Leaf, Tree, index
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -59,8 +59,8 @@ def write_actions(
 
 def _write_column(action: Any, slab: Slab, slots: NDArray[np.intp], table: Slots) -> None:
     """Write the actions of a whole batch with one copy for each array."""
-    rows = slots if len(slots) != slab.rows or slots is not table.all else slice(None)
-    for leaf, target in leaf_of(slab.layout.action_leaves or (), slab.action):
+    rows = slice(None) if slots is table.all else slots
+    for leaf, target in slab.action_columns:
         source = _as_array(_at(action, leaf))
         if source.shape != (len(slots), *leaf.shape) or not _castable(source, leaf):
             raise BadAction(_misfit(f"the batch's action{leaf.name}", source, leaf, len(slots)))
@@ -84,7 +84,7 @@ def _write_one_by_one(
     for slab_index, positions in by_slab.items():
         slab = slabs[slab_index]
         rows = table.row[slots[positions]]
-        for leaf, target in leaf_of(slab.layout.action_leaves or (), slab.action):
+        for leaf, target in slab.action_columns:
             sources = [_as_array(_at(actions[k], leaf)) for k in positions]
             for k, source in zip(positions, sources, strict=True):
                 if source.shape != leaf.shape or not _castable(source, leaf):
@@ -152,14 +152,14 @@ def _fits(action: Any, slab: Slab) -> bool:
     try:
         return all(
             (array := _as_array(_at(action, leaf))).shape == leaf.shape and _castable(array, leaf)
-            for leaf in slab.layout.action_leaves or ()
+            for leaf, _ in slab.action_columns
         )
     except (BadAction, ValueError):
         return False
 
 
 def _write_one(action: Any, slab: Slab, row: int) -> None:
-    for leaf, target in leaf_of(slab.layout.action_leaves or (), slab.action):
+    for leaf, target in slab.action_columns:
         target[row] = _as_array(_at(action, leaf))
 
 

@@ -25,6 +25,10 @@ __all__ = ["NO_RESETS", "AutoReset"]
 NO_RESETS: Final[NDArray[np.bool_]] = np.zeros(1, np.bool_)
 """No env is due; broadcasts to any number of slots."""
 
+# 0-d arrays: NumPy takes twice as long over a Python int.
+_ONE: Final = np.array(1)
+_STEP: Final = np.array(STEP, np.int8)
+
 
 class AutoReset:
     """Counters of completed steps, and what follows from them while it is active."""
@@ -84,13 +88,14 @@ class AutoReset:
 
     def account(self, slots: NDArray[np.intp], batch: BatchedData) -> list[bool]:
         """Count results as they are handed out; the flags that go with them."""
-        stepped = self._slots.op[slots] == STEP
-        counts = (self._counts[slots] + 1) * stepped
+        stepped = self._slots.op[slots] == _STEP
+        counts = (self._counts[slots] + _ONE) * stepped
         self._counts[slots] = counts
         if self._limits is None:
             return [False] * len(slots)
-        reached = due = counts >= self._limits[slots]
-        if self._on_done:
-            due = reached | (batch.ended & stepped & ~self._slots.resets_itself[slots])
+        reached = counts >= self._limits[slots]
+        due = reached
+        if self._on_done and batch.any_ended:
+            due = reached | (batch.ended & stepped)
         self._due[slots] = due
         return reached.tolist()

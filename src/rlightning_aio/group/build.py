@@ -19,6 +19,7 @@ from rlightning_aio.group.slots import Slots
 from rlightning_aio.hosts.arena import Arena
 from rlightning_aio.hosts.inline import InlineHost
 from rlightning_aio.hosts.process import ForkServer, ProcessHost
+from rlightning_aio.hosts.spinner import Spinner
 from rlightning_aio.hosts.worker import StartOrder
 from rlightning_aio.registry import BACKENDS, ENVS
 from rlightning_aio.types import PolicyResponse
@@ -154,6 +155,8 @@ def build_fleet(plan: Plan, watcher: Watcher) -> Fleet:
         fleet.add(host, config)
         first_slot += len(shares)
     fleet.servers = list(servers.values())
+    # A trainer that spins needs a core that no worker needs.
+    fleet.spinner = Spinner(enabled=0 < num_processes < len(cores))
     return fleet
 
 

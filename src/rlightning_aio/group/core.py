@@ -46,6 +46,12 @@ __all__ = ["Core"]
 CALL: Final = 3
 NOBODY: Final = -1
 """Owner of a call that was given up."""
+
+# 0-d arrays: NumPy takes twice as long over a Python int.
+_WITHOUT_OP: Final = np.array(~OP_MASK)
+_OP_BITS: Final = np.array(OP_BITS)
+_SLOT_MASK: Final = np.array(SLOT_MASK)
+_OPS: Final = {STEP: np.array(STEP), RESET: np.array(RESET)}
 Flags: TypeAlias = "list[bool]"
 
 
@@ -145,7 +151,7 @@ class Core:
         self, slots: NDArray[np.intp], resets: NDArray[np.bool_], owner: int, now: float
     ) -> None:
         """Send steps, and resets in place of some, whose arguments lie in the rows."""
-        op = STEP
+        op = _OPS[STEP]
         if resets is not NO_RESETS and np.count_nonzero(resets):
             op = STEP + resets  # RESET == STEP + 1
             self.fleet.write_seeds(slots[resets], np.full(np.count_nonzero(resets), NO_SEED))
@@ -157,7 +163,10 @@ class Core:
             return
         hosts = self.slots.host[slots]
         hosts_of = self.fleet.hosts
-        cuts = np.flatnonzero(hosts[1:] != hosts[:-1])
+        if hosts[0] == hosts[-1] and len(hosts_of) == 1:
+            hosts_of[0].request(entries)
+            return
+        cuts = (hosts[1:] != hosts[:-1]).nonzero()[0]
         start = 0
         for end in (*(cuts + 1).tolist(), len(slots)):
             hosts_of[hosts[start]].request(entries[start:end])
@@ -207,9 +216,9 @@ class Core:
         reports = self._reports
         if not reports:
             return
-        entries = (reports[0] if len(reports) == 1 else np.concatenate(reports)) & ~OP_MASK
+        entries = (reports[0] if len(reports) == 1 else np.concatenate(reports)) & _WITHOUT_OP
         reports.clear()
-        slots = (entries >> OP_BITS) & SLOT_MASK
+        slots = (entries >> _OP_BITS) & _SLOT_MASK
         current = self.slots.entry[slots] == entries
         if np.count_nonzero(current) < len(slots):
             slots = slots[current]  # Late replies to requests that were given up.
@@ -273,7 +282,7 @@ class Core:
             self.fleet.note_restarted(slots, self._rests)
         if self._tickets:
             owners = table.owner[slots]
-            for owner in np.unique(owners).tolist():
+            for owner in set(owners.tolist()):
                 mine = owners == owner
                 if owner:
                     self._tickets[owner].remaining -= int(np.count_nonzero(mine))
@@ -364,12 +373,14 @@ class Core:
         self._wanted.append(wanted)
         try:
             # Whoever else waits meanwhile must be woken as early as it asked for.
-            if self.fleet.run_inline(wanted) or self.fleet.order(min(self._wanted)):
+            fleet, first = self.fleet, min(self._wanted)
+            if fleet.run_inline(wanted) or fleet.spin() or fleet.order(first):
                 return (yield Wait(0.0))
-            now = yield Wait(earliest(until, self.fleet.next_check()))
+            now = yield Wait(earliest(until, fleet.next_check()))
+            fleet.slept()
         finally:
             self._wanted.remove(wanted)
-        self.fleet.check(now)
+        fleet.check(now)
         return now
 
     def _take(self, most: int) -> tuple[BatchedData, Flags]:
@@ -391,7 +402,7 @@ class Core:
         self.slots.state[slots] = IDLE
         batch = collected(self, slots, self._rests)
         flags = self.auto.account(slots, batch)
-        self.stats.account(batch, synchronous=synchronous)
+        self.stats.account(batch.parts, synchronous=synchronous)
         return batch, flags
 
     # -- calls that wait for their own replies ------------------------------------
@@ -462,7 +473,7 @@ class Core:
         ticket = self._new_ticket(slots)
         if options is None:
             self.fleet.write_seeds(slots, seeds)
-            self._post(slots, self._mark_sent(slots, RESET, ticket.owner, now) + RESET)
+            self._post(slots, self._mark_sent(slots, RESET, ticket.owner, now) + _OPS[RESET])
         else:
             self._mark_sent(slots, RESET, ticket.owner, now)
             for slot, one in zip(slots.tolist(), seeds.tolist(), strict=True):

@@ -160,7 +160,7 @@ class Facade:
         return self._core.stats.summary()
 
     def get_env_stats(self, reset: bool = False) -> dict[str, dict[str, Any]]:
-        """By env id: results, episodes ended, mean and last return and length.
+        """By env id: requests sent, episodes ended, mean and last return and length.
 
         Args:
             reset: start the sums anew after this call.

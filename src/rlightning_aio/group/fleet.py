@@ -29,6 +29,7 @@ from rlightning_aio.group.slots import BUSY, Slots
 from rlightning_aio.group.wait import Operation, Wait, earliest
 from rlightning_aio.hosts.arena import Arena, map_shared
 from rlightning_aio.hosts.base import Death, Host
+from rlightning_aio.hosts.spinner import Spinner
 from rlightning_aio.hosts.worker import AttachOrder, ErrorText, Started
 from rlightning_aio.protocol.columns import leaves
 from rlightning_aio.protocol.info import NO_INFO, PICKLED
@@ -104,6 +105,7 @@ class Fleet:
         self.metas: list[EnvMeta] = []
         self.close_errors: list[tuple[str, ErrorText]] = []
         self.servers: list[ForkServer] = []
+        self.spinner = Spinner(enabled=False)
         self._arena = arena
         self._mixed_actions = mixed_actions
         self._members: list[_Member] = []
@@ -328,6 +330,17 @@ class Fleet:
         if self.lost:
             for slot in slots.tolist():
                 self.lost.pop(slot, None)
+
+    def spin(self) -> bool:
+        """Whether a worker has reported something within a moment of looking for it."""
+        return self.spinner.spin(self._has_news)
+
+    def slept(self) -> None:
+        """A wait that was no spin is over."""
+        self.spinner.slept()
+
+    def _has_news(self) -> bool:
+        return any(host.has_news() for host in self.hosts)
 
     def order(self, wanted: int) -> bool:
         """Ask hosts to wake us when `wanted` results may be ready; True if some are already.

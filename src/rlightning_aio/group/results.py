@@ -44,7 +44,7 @@ def _part(
     rows: Rows = table.row[slots]
     if slots is table.all:
         rows = slice(0, slab.rows)
-    terminated, truncated = gather(slab.terminated, rows), gather(slab.truncated, rows)
+    terminated, truncated = _copy(slab.terminated, rows), _copy(slab.truncated, rows)
     ended = terminated | truncated
     any_ended = np.count_nonzero(ended) > 0
     return ResultColumns(
@@ -52,20 +52,25 @@ def _part(
         table=table,
         positions=positions,
         observation=_observations(core, slab, rows),
-        reward=gather(slab.reward, rows),
+        reward=_copy(slab.reward, rows),
         terminated=terminated,
         truncated=truncated,
-        info_marks=gather(slab.info_mark, rows),
-        info=gather(slab.info[:, : core.info_width], rows) if core.info_width else None,
+        info_marks=_copy(slab.info_mark, rows),
+        info=_copy(slab.info[:, : core.info_width], rows) if core.info_width else None,
         schemas=table.schemas,
         rests=_rests(slots, rests) if rests else {},
         ended=ended,
-        episode_return=gather(slab.episode_return, rows) if any_ended else None,
-        episode_length=gather(slab.episode_length, rows) if any_ended else None,
-        done_ns=gather(slab.done_ns, rows),
-        busy_ns=gather(slab.busy_ns, rows),
+        episode_return=_copy(slab.episode_return, rows) if any_ended else None,
+        episode_length=_copy(slab.episode_length, rows) if any_ended else None,
+        done_ns=_copy(slab.done_ns, rows),
+        busy_ns=_copy(slab.busy_ns, rows),
         agents=slab.layout.agents,
     )
+
+
+def _copy(column: NDArray[Any], rows: Rows) -> NDArray[Any]:
+    """Rows of a narrow column: for those, indexing is the quickest copy."""
+    return column[rows].copy() if type(rows) is slice else column[rows]
 
 
 def _observations(core: Core, slab: Slab, rows: Rows) -> Any:

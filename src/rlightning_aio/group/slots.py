@@ -30,6 +30,10 @@ BUSY: Final = 1
 READY: Final = 2
 
 
+# A 0-d array: NumPy takes twice as long over a Python int.
+_NEXT_NUMBER: Final = np.array(1 << NUMBER_SHIFT)
+
+
 class Slots:
     """Arrays over the envs of a group.
 
@@ -77,7 +81,7 @@ class Slots:
 
     def renumber(self, slots: NDArray[np.intp]) -> NDArray[np.int64]:
         """Give the next request of each of `slots` its number; the new entries."""
-        entries = self.entry[slots] + (1 << NUMBER_SHIFT)
+        entries = self.entry[slots] + _NEXT_NUMBER
         self.entry[slots] = entries
         return entries
 

@@ -14,9 +14,11 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
-    from rlightning_aio.batch import BatchedData
+    from rlightning_aio.batch import ResultColumns
     from rlightning_aio.group.slots import Slots
 
 __all__ = ["Stats"]
@@ -48,28 +50,19 @@ class Stats:
         self._lengths = np.zeros(len(slots), np.int64)
         self._last_return = np.full(len(slots), np.nan)
         self._last_length = np.zeros(len(slots), np.int64)
-        self._env_steps = np.zeros(len(slots), np.int64)
+        self._requests_before = np.zeros(len(slots), np.int64)
 
-    def account(self, batch: BatchedData, *, synchronous: bool) -> None:
-        """Take note of a batch that is handed out."""
+    def account(self, parts: Sequence[ResultColumns], *, synchronous: bool) -> None:
+        """Take note of results that are handed out."""
         now = time.monotonic_ns()
-        for part in batch.parts:
+        sent_ns = self._table.sent_ns
+        for part in parts:
             slots = part.slots
             self._samples.append(
-                _Sample(
-                    now,
-                    slots,
-                    self._table.sent_ns[slots],
-                    part.done_ns,
-                    part.busy_ns,
-                    synchronous,
-                )
+                _Sample(now, slots, sent_ns[slots], part.done_ns, part.busy_ns, synchronous)
             )
-            self._env_steps[slots] += 1
             if part.episode_return is not None and part.episode_length is not None:
-                self._note_episodes(
-                    part.slots, part.ended, part.episode_return, part.episode_length
-                )
+                self._note_episodes(slots, part.ended, part.episode_return, part.episode_length)
 
     def _note_episodes(
         self,
@@ -144,7 +137,7 @@ class Stats:
         for slot, env_id in enumerate(self._table.env_ids):
             episodes = int(self._episodes[slot])
             found[env_id] = {
-                "results": int(self._env_steps[slot]),
+                "requests": self._table.number(slot) - int(self._requests_before[slot]),
                 "episodes": episodes,
                 "mean_return": self._returns[slot] / episodes if episodes else None,
                 "mean_length": self._lengths[slot] / episodes if episodes else None,
@@ -160,7 +153,7 @@ class Stats:
             self._returns,
             self._lengths,
             self._last_length,
-            self._env_steps,
         ):
             sums[:] = 0
         self._last_return[:] = np.nan
+        self._requests_before[:] = [self._table.number(slot) for slot in range(len(self._table))]

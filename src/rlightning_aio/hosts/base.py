@@ -120,6 +120,10 @@ class Host(Source, Protocol):
         """Ask to be woken when `count` results are ready; True if they already are."""
         ...
 
+    def has_news(self) -> bool:
+        """Whether results wait to be swept; costs a look into memory."""
+        ...
+
     def sweep(self) -> None:
         """Tell the inbox of results that came without a wake-up."""
         ...

@@ -146,6 +146,10 @@ class InlineHost:
         """Nothing gets ready by itself here."""
         return False
 
+    def has_news(self) -> bool:
+        """Nothing gets ready by itself here."""
+        return False
+
     def sweep(self) -> None:
         """Nothing gets ready by itself here."""
 

@@ -352,6 +352,10 @@ class ProcessHost:
         self._read_channel()
         self.sweep()
 
+    def has_news(self) -> bool:
+        """See `base.Host.has_news`."""
+        return self._alive and self._rings.unread() > 0
+
     def sweep(self) -> None:
         """See `base.Host.sweep`."""
         if not self._rings.unread():

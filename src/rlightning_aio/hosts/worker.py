@@ -2,8 +2,7 @@
 
 Rule: one thread, no asyncio; requests are executed in the order in which they were
 sent, and every request gets exactly one reply under its own number. When there is
-nothing to do the worker spins for a moment (where that has paid lately), then sleeps
-on its channel.
+nothing to do the worker spins for a moment (see `spinner`), then sleeps on its channel.
 """
 
 from __future__ import annotations
@@ -23,6 +22,7 @@ import cloudpickle
 
 from rlightning_aio.hosts.arena import map_shared
 from rlightning_aio.hosts.runner import EnvRunner, Rest
+from rlightning_aio.hosts.spinner import Spinner
 from rlightning_aio.protocol.frames import BELL, Frame, FrameKind, FrameReader, encode
 from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
 from rlightning_aio.protocol.rings import (
@@ -48,7 +48,6 @@ if TYPE_CHECKING:
 __all__ = ["NO_ACTION", "AttachOrder", "ErrorText", "StartOrder", "Started", "Worker", "main"]
 
 NO_ACTION = "the action is in the row"
-_SPIN_SECONDS = 60e-6
 
 
 @dataclass(frozen=True)
@@ -166,8 +165,7 @@ class Worker:
         self._runners: list[EnvRunner] = []
         self._schemas = InfoSchemas(self._send_schema)
         self._timed = False
-        self._spin_seconds = 0.0
-        self._failed_spins = 0
+        self._spinner = Spinner(enabled=False)
         self._attached = False
         self._closing = False
 
@@ -223,30 +221,12 @@ class Worker:
 
     def _wait(self) -> None:
         """Return when there may be something to do."""
-        if self._closing or (self._spin_seconds and self._spun()):
+        if self._closing or self._spinner.spin(self._rings.has_news):
             return
         if self._rings.fall_asleep():
             self._receive(0)
             self._rings.wake_up()
-
-    def _spun(self) -> bool:
-        """Look for work for a few microseconds without sleeping; whether some came.
-
-        A sleeping process takes tens of microseconds to wake. Spinning yields the core to
-        whoever wants it, and pauses for a while after it was in vain a few times.
-        """
-        if self._failed_spins > 8:
-            self._failed_spins = (self._failed_spins + 1) % 64
-            return False
-        has_request, has_frame = self._rings.has_request, self._rings.has_frame
-        until = time.monotonic() + self._spin_seconds
-        while time.monotonic() < until:
-            if has_request() or has_frame():
-                self._failed_spins = 0
-                return True
-            os.sched_yield()
-        self._failed_spins += 1
-        return False
+            self._spinner.slept()
 
     def _receive(self, flags: int) -> None:
         try:
@@ -274,7 +254,7 @@ class Worker:
         order: StartOrder = cloudpickle.loads(frame.payload)
         if order.core is not None:
             os.sched_setaffinity(0, {order.core})
-        self._spin_seconds = _SPIN_SECONDS if order.spins else 0.0
+        self._spinner = Spinner(enabled=order.spins)
         self._timed = (order.config.step_timeout or order.config.reset_timeout) is not None
         for row, (index, fn) in enumerate(
             zip(order.worker_indices, order.preprocess_fns, strict=True)

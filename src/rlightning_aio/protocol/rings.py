@@ -211,10 +211,6 @@ class WorkerRings:
         self._frames_sent = 0
         self._frames_seen = 0
 
-    def has_request(self) -> bool:
-        """Whether an entry waits in the ring."""
-        return self._words[_REQUESTS_SENT] != self._read
-
     def requests(self) -> list[int]:
         """Read all entries that wait, in order."""
         sent = self._words[_REQUESTS_SENT]
@@ -265,11 +261,16 @@ class WorkerRings:
         self._frames_sent += 1
         self._words[_FRAMES_TO_TRAINER] = self._frames_sent
 
+    def has_news(self) -> bool:
+        """Whether an entry or a frame waits."""
+        words = self._words
+        return words[_REQUESTS_SENT] != self._read or words[_FRAMES_TO_WORKER] != self._frames_seen
+
     def fall_asleep(self) -> bool:
         """Say that this worker sleeps; False if something came meanwhile."""
         self._words[_WORKER_ASLEEP] = 1
         fence()
-        if self.has_request() or self.has_frame():
+        if self.has_news():
             self._words[_WORKER_ASLEEP] = 0
             return False
         return True

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from rlightning_aio.protocol.columns import Leaf, Tree, assemble, leaves
+from rlightning_aio.protocol.columns import Leaf, Tree, assemble, leaf_of, leaves
 from rlightning_aio.protocol.info import INFO_BYTES
 
 if TYPE_CHECKING:
@@ -92,6 +92,7 @@ class Slab:
 
     Attributes:
         observation, action: trees of ``[rows, ...]``; None where they travel pickled.
+        action_columns: the arrays of `action`, each with its leaf.
         reward: ``[rows, *head]`` float64; terminated, truncated: ``[rows, *head]`` bool.
         episode_return: ``[rows, *head]`` float64, episode_length: ``[rows, *head]`` int64;
             valid where an episode has just ended.
@@ -109,8 +110,10 @@ class Slab:
         if layout.observation_leaves is not None:
             self.observation = assemble(layout.observation_space, arrays)
         self.action: Tree | None = None
-        if layout.action_leaves is not None:
+        self.action_columns: list[tuple[Leaf, NDArray[Any]]] = []
+        if (action_leaves := layout.action_leaves) is not None:
             self.action = assemble(layout.action_space, arrays)
+            self.action_columns = list(leaf_of(action_leaves, self.action))
         self.reward = next(arrays)
         self.terminated = next(arrays)
         self.truncated = next(arrays)
