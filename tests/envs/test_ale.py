@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from envs.bare import gymnasium_outcomes
+from envs.group_contract import GroupContract
 
 from rlightning_aio.config import EnvConfig
-from rlightning_aio.envs.contract import EnvContract, Outcome, outcome_of, same
+from rlightning_aio.envs.contract import Outcome, outcome_of, same
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.types import PolicyResponse
 
@@ -35,14 +36,14 @@ def make(config: EnvConfig) -> ALEEnv:
     return ALEEnv(config)
 
 
-class TestRawFrames(EnvContract):
+class TestRawFrames(GroupContract):
     config = entry()
 
     def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:
         return gymnasium_outcomes(gym.make("ALE/Pong-v5"), self.seed, actions)
 
 
-class TestPreprocessedStack(EnvContract):
+class TestPreprocessedStack(GroupContract):
     config = entry(
         "ALE/Breakout-v5",
         env_kwargs={
@@ -57,7 +58,7 @@ class TestPreprocessedStack(EnvContract):
         return gymnasium_outcomes(FrameStackObservation(frames, 4), self.seed, actions)
 
 
-class TestStepLimit(EnvContract):
+class TestStepLimit(GroupContract):
     config = entry(max_episode_steps=30, env_kwargs={"preprocessing": True})
 
     def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:
@@ -65,9 +66,8 @@ class TestStepLimit(EnvContract):
         return gymnasium_outcomes(TimeLimit(frames, 30), self.seed, actions)
 
 
-class TestVectorOfRawFrames(EnvContract):
+class TestVectorOfRawFrames(GroupContract):
     config = entry("ALE/Breakout-v5", 3)
-    resets_itself = True
 
     def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:
         games = gym.make_vec(
@@ -89,11 +89,10 @@ class TestVectorOfRawFrames(EnvContract):
             yield stacked[:, 0], *rest
 
 
-class TestVectorOfPreprocessedStacks(EnvContract):
+class TestVectorOfPreprocessedStacks(GroupContract):
     config = entry(
         "ALE/Breakout-v5", 3, env_kwargs={"preprocessing": {"noop_max": 12}, "frame_stack": 4}
     )
-    resets_itself = True
 
     def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:
         games = gym.make_vec(

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from envs.bare import gymnasium_outcomes
+from envs.group_contract import GroupContract
 
 from rlightning_aio.config import EnvConfig
-from rlightning_aio.envs.contract import EnvContract, Outcome, outcome_of, same
+from rlightning_aio.envs.contract import Outcome, outcome_of, same
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.types import PolicyResponse
 
@@ -36,9 +37,7 @@ def make(*args: Any, **fields: Any) -> EnvPoolEnv:
     return EnvPoolEnv(entry(*args, **fields))
 
 
-class PoolContract(EnvContract):
-    resets_itself = True
-
+class PoolContract(GroupContract):
     def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:
         limit = self.config.max_episode_steps
         pool = envpool.make(
@@ -63,9 +62,8 @@ class TestAtari(PoolContract):
     config = entry("Pong-v5", 2)
 
 
-class TestPoolOfOne(EnvContract):
+class TestPoolOfOne(GroupContract):
     config = entry(num_envs=1)
-    resets_itself = True
 
     def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:
         pool = envpool.make("CartPole-v1", env_type="gymnasium", num_envs=1, seed=self.seed)

@@ -8,17 +8,19 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from envs.bare import gymnasium_outcomes
+from envs.group_contract import GroupContract
 
 from rlightning_aio.config import EnvConfig
-from rlightning_aio.envs.contract import EnvContract, Outcome
 from rlightning_aio.envs.gymnasium import GymnasiumEnv
 from rlightning_aio.types import PolicyResponse
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from rlightning_aio.envs.contract import Outcome
 
-class GymnasiumContract(EnvContract):
+
+class GymnasiumContract(GroupContract):
     num_steps = 300
 
     def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:

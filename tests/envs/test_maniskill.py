@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from envs.group_contract import GroupContract
 
 from rlightning_aio.config import EnvConfig
-from rlightning_aio.envs.contract import EnvContract, Outcome, same
+from rlightning_aio.envs.contract import Outcome, same
 from rlightning_aio.envs.vulkan import render_device_is_usable
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.types import PolicyResponse
@@ -60,7 +61,7 @@ def step(env: ManiskillEnv, action: Any = None) -> EnvRet:
     return env.step(PolicyResponse(env.env_id, action))
 
 
-class ManiskillContract(EnvContract):
+class ManiskillContract(GroupContract):
     num_steps = 70  # Episodes have 50.
 
     def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:
@@ -103,7 +104,7 @@ class TestStateDict(ManiskillContract):
 @needs_vulkan
 class TestRgb(ManiskillContract):
     config = entry(env_kwargs={"obs_mode": "rgb", "sensor_configs": {"width": 64, "height": 48}})
-    num_steps = 15
+    num_steps = 6
 
     def test_images_are_bytes_of_the_size_asked_for(self) -> None:
         """Cameras give uint8 images that show something."""
@@ -115,7 +116,7 @@ class TestRgb(ManiskillContract):
 
 
 @needs_gpu
-class TestBatchOnAGpu(EnvContract):
+class TestBatchOnAGpu(GroupContract):
     config = entry(num_envs=4)
     num_steps = 40
 

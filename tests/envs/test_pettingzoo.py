@@ -6,16 +6,17 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import pytest
+from envs.group_contract import GroupContract
 from gymnasium.spaces import Box, Dict, Discrete, Tuple
 
 from rlightning_aio.config import EnvConfig
-from rlightning_aio.envs.contract import EnvContract, Outcome
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.types import PolicyResponse
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from rlightning_aio.envs.contract import Outcome
     from rlightning_aio.envs.pettingzoo import PettingZooEnv
     from rlightning_aio.types import MultiAgentEnvRet
 
@@ -57,7 +58,7 @@ def parallel_outcomes(env: Any, seed: int, actions: Sequence[Any]) -> Iterator[O
     env.close()
 
 
-class TestSimpleSpread(EnvContract):
+class TestSimpleSpread(GroupContract):
     config = entry("mpe2.simple_spread_v3", env_kwargs={"N": 4, "continuous_actions": True})
 
     def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:
@@ -65,7 +66,7 @@ class TestSimpleSpread(EnvContract):
         return parallel_outcomes(env, self.seed, actions)
 
 
-class TestAgentsWithDifferentSpaces(EnvContract):
+class TestAgentsWithDifferentSpaces(GroupContract):
     config = entry("mpe2.simple_tag_v3")
 
     def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:

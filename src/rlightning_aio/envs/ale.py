@@ -116,12 +116,13 @@ class ALEEnv(GymnasiumEnv):
             vector_kwargs["max_num_frames_per_episode"] = (
                 self.config.max_episode_steps * frames_per_step
             )
-        games: Any = gym.make_vec(
+        games = gym.make_vec(
             self.config.task,
             num_envs=self.num_envs,
             vectorization_mode="vector_entry_point",
             **vector_kwargs,
         )
+        self.autoreset = games.metadata["autoreset_mode"].name.lower()
         return games if frame_stack > 1 else _without_stack_axis(games)
 
     def _raw_frames(self) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import gymnasium as gym
 
 from rlightning_aio.config import EnvConfig
-from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
+from rlightning_aio.types import Autoreset, EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
 
 __all__ = ["BareStep", "BaseEnv", "PreprocessFn", "Result", "default_env_preprocess_fn"]
 
@@ -46,12 +46,16 @@ class BaseEnv(abc.ABC):
         transforms_actions: set it on a subclass whose `step` takes actions that need not
             fit the action space (chunks, logits, dicts).
         agents: agent names of a multi-agent env, in order; empty otherwise.
+        num_envs: sub-environments in each result. Where it is below the config's, results
+            come from some of them at a time, and ``info["env_id"]`` says from which.
+        autoreset: what sub-environments do after their episode's end; see `EnvMeta`.
     """
 
     transforms_actions: ClassVar[bool] = False
 
     env: Any = None
     agents: tuple[str, ...] = ()
+    autoreset: Autoreset = "disabled"
 
     def __init__(
         self,
@@ -104,6 +108,7 @@ class BaseEnv(abc.ABC):
             num_envs=self.num_envs,
             agents=self.agents,
             max_episode_steps=self.max_episode_steps,
+            autoreset=self.autoreset,
         )
 
     def get_observation_space(self) -> gym.Space[Any]:

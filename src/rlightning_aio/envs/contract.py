@@ -41,13 +41,11 @@ class EnvContract:
 
     Attributes:
         config: the config entry that the env is made from.
-        resets_itself: sub-environments that ended start over in the next step, unasked.
         num_steps: how many steps the trajectories have.
         seed: what they start from.
     """
 
     config: ClassVar[EnvConfig]
-    resets_itself: ClassVar[bool] = False
     num_steps: ClassVar[int] = 200
     seed: ClassVar[int] = 3
 
@@ -97,7 +95,7 @@ class EnvContract:
         ended = False
         for action in actions:
             outcome = outcome_of(env.reset()) if ended else step(action)
-            ended = not self.resets_itself and _has_ended(outcome)
+            ended = _awaits_reset(env, outcome)
             yield outcome
 
     def test_metadata_is_what_the_env_was_configured_to_be(self) -> None:
@@ -122,7 +120,7 @@ class EnvContract:
                 _check_membership(outcome[0], env.get_observation_space())
                 if not ended:
                     _check_columns(outcome, meta.agents, shape)
-                ended = not self.resets_itself and _has_ended(outcome)
+                ended = _awaits_reset(env, outcome)
 
     def test_a_reset_gives_no_reward_and_ends_nothing(self) -> None:
         """After a reset nobody has been rewarded; whoever takes part has not ended."""
@@ -158,7 +156,7 @@ class EnvContract:
                 result = _step(env, action)
                 kept = _copied(outcome_of(result))
                 assert same(outcome_of(result_before), kept_before)
-                if not self.resets_itself and _has_ended(kept):
+                if _awaits_reset(env, kept):
                     break
 
     def test_bare_steps_are_steps(self) -> None:
@@ -173,7 +171,7 @@ class EnvContract:
             for action in self.actions(env):
                 outcome = outcome_of(_step(env, action))
                 assert same(outcome, tuple(map(as_numpy, bare(action)[:4])))
-                if not self.resets_itself and _has_ended(outcome):
+                if _awaits_reset(env, outcome):
                     break
 
     def _has_bare_step(self) -> bool:
@@ -266,8 +264,10 @@ def _entries(value: Any, agents: Sequence[str]) -> list[Any]:
     return list(by_agent.values())
 
 
-def _has_ended(outcome: Outcome) -> bool:
-    """Whether nobody is left in the episode."""
+def _awaits_reset(env: BaseEnv, outcome: Outcome) -> bool:
+    """Whether nobody is left in the episode, and nobody comes back unasked."""
+    if env.autoreset != "disabled":
+        return False
     _, _, terminated, truncated = outcome
     flags = zip(_entries(terminated, ()), _entries(truncated, ()), strict=True)
     return all(bool(np.all(np.logical_or(one, other))) for one, other in flags)

@@ -44,6 +44,8 @@ class EnvPoolEnv(BaseEnv):
     and returns reward 0; the result before it holds the final observation.
     """
 
+    autoreset = "next_step"
+
     def __init__(
         self,
         config: EnvConfig,

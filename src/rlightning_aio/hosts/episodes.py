@@ -1,0 +1,66 @@
+"""`EpisodeSums`: return and length of the episodes that are under way in one env.
+
+Rule: one sum for each agent and sub-environment, over the steps between a reset and an
+end. The step in which a sub-environment resets itself belongs to no episode, nor does
+what comes after an end that nobody has reset yet.
+"""
+
+from __future__ import annotations
+
+from types import EllipsisType
+from typing import Any, TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+if TYPE_CHECKING:
+    from rlightning_aio.types import Autoreset
+
+__all__ = ["EpisodeSums"]
+
+Which = EllipsisType | NDArray[np.integer[Any]]
+
+
+class EpisodeSums:
+    """See the module.
+
+    Args:
+        shape: of the sums: agents, then sub-environments, where there are any.
+        autoreset: what sub-environments do after an end; see `EnvMeta`.
+    """
+
+    def __init__(self, shape: tuple[int, ...], autoreset: Autoreset) -> None:
+        self._autoreset = autoreset
+        self._returns = np.zeros(shape)
+        self._lengths = np.zeros(shape, np.int64)
+        self._over = np.zeros(shape, np.bool_)
+
+    def forget(self) -> None:
+        """All episodes begin anew."""
+        self._returns[...] = 0.0
+        self._lengths[...] = 0
+        self._over[...] = False
+
+    def add(
+        self, reward: NDArray[np.float64], ended: NDArray[np.bool_], which: Which = ...
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Count one step of all sub-environments, or of those that `which` names.
+
+        Returns:
+            Returns and lengths of the episodes that ended in this step, in the shape of
+            `ended`; elsewhere the length is 0.
+        """
+        over = self._over[which]
+        self._returns[which] += np.where(over, 0.0, reward)
+        self._lengths[which] += ~over
+        ended_now = ended & ~over
+        returns = self._returns[which].copy()
+        lengths = np.where(ended_now, self._lengths[which], 0)
+        self._returns[which] = np.where(ended_now, 0.0, returns)
+        self._lengths[which] *= ~ended_now
+        if self._autoreset == "next_step":
+            self._over[which] = ended_now
+        elif self._autoreset == "disabled":
+            self._over[which] = over | ended
+        return returns, lengths

@@ -1,0 +1,106 @@
+"""`GroupContract`: an env is in a group what it is alone, wherever it lives."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from rlightning_aio import BatchedData, PolicyResponse, sync
+from rlightning_aio.envs.contract import EnvContract, Outcome, outcome_of, same
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+
+    from rlightning_aio import EnvMeta
+
+NO_LIMIT = 10**6
+
+
+# Episodes end by the envs' own limits here.
+@pytest.mark.filterwarnings("ignore:.*overrides the limits")
+class GroupContract(EnvContract):
+    """The tests of `EnvContract`, and the same env in worker processes and inline."""
+
+    @pytest.mark.parametrize("placement", ["process", "inline"])
+    def test_in_a_group_it_goes_its_own_way(self, placement: str) -> None:
+        """Each env of a group goes, bit for bit, as it goes alone with its seed."""
+        with self.opened() as env:
+            actions = self.actions(env)
+            seeds = self.seed, self.seed + self.config.num_envs
+            alone = [list(self.outcomes(env, actions, seed=seed)) for seed in seeds]
+        config = self.config.model_copy(update={"placement": placement, "num_workers": 2})
+        with sync.build_env_group(config) as group:
+            together = list(batches(group, self.seed, actions))
+        for index, batch in enumerate(together):
+            for k, result in enumerate(batch.values()):
+                assert same_outcome(outcome_of(result), alone[k][index]), (
+                    f"env {k}, outcome {index}: {result} is not {alone[k][index]}"
+                )
+
+    def test_a_group_knows_the_envs_spaces(self) -> None:
+        """They cross processes unchanged."""
+        with self.opened() as env, sync.build_env_group(self.config) as group:
+            assert group.get_observation_spaces() == [env.get_observation_space()]
+            assert group.get_action_spaces() == [env.get_action_space()]
+
+    def test_a_group_counts_episodes(self) -> None:
+        """Returns and lengths are sums over the steps between a start and an end."""
+        with self.opened() as env:
+            actions = self.actions(env)
+            meta = env.get_metadata()
+            expected = list(episodes(meta, self.outcomes(env, actions)))
+        with sync.build_env_group(self.config) as group:
+            for _ in batches(group, self.seed, actions):
+                pass
+            stats = group.get_env_stats()[meta.env_id]
+        assert stats["episodes"] == len(expected)
+        if expected:
+            returns, lengths = np.array(expected).T
+            assert stats["mean_return"] == pytest.approx(returns.mean())
+            assert stats["mean_length"] == pytest.approx(lengths.mean())
+
+
+def batches(group: sync.EnvGroup, seed: int, actions: Sequence[Any]) -> Iterator[BatchedData]:
+    """What a group gives for a seeded reset and for one step with each action, in all envs."""
+    yield group.reset(seed=seed)[0]
+    with group.auto_reset(max_episode_steps=NO_LIMIT):
+        for action in actions:
+            responses = [PolicyResponse(env_id, action) for env_id in group.env_ids]
+            yield group.step(BatchedData(group.env_ids, responses))[0]
+
+
+def same_outcome(one: Outcome, other: Outcome) -> bool:
+    """Whether two outcomes are the same; what nobody has told stands for all that are."""
+    return same(one[0], other[0]) and all(map(_same_column, one[1:], other[1:]))
+
+
+def _same_column(one: Any, other: Any) -> bool:
+    if isinstance(one, dict):
+        return same(one, other)
+    return np.array_equal(*np.broadcast_arrays(one, other))
+
+
+def episodes(meta: EnvMeta, outcomes: Iterable[Outcome]) -> Iterator[tuple[float, int]]:
+    """Return and length of each finished episode, by agent and sub-environment."""
+    streams: dict[Any, list[tuple[float, bool]]] = {}
+    for _, *columns in outcomes:
+        for agent in meta.agents or (None,):
+            of_agent = [column if agent is None else column[agent] for column in columns]
+            table = np.broadcast_arrays(*of_agent, np.zeros(meta.num_envs))[:3]
+            for k, (reward, terminated, truncated) in enumerate(zip(*table, strict=True)):
+                streams.setdefault((agent, k), []).append((reward, terminated or truncated))
+    for stream in streams.values():
+        # A stream begins with a reset; after an end the next outcome is one again, and an
+        # agent that has ended stays so until then.
+        total, length, over = 0.0, -1, False
+        for reward, ended in stream:
+            if over:
+                over = ended
+                total, length = 0.0, 0
+                continue
+            total, length = total + reward, length + 1
+            if ended:
+                yield total, length
+                over = True
