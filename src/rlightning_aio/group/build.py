@@ -10,14 +10,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import cloudpickle
-
 from rlightning_aio.config import EnvConfig, check_installed, parse_configs
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.group.fleet import Fleet
 from rlightning_aio.group.slots import Slots
 from rlightning_aio.hosts.arena import Arena
 from rlightning_aio.hosts.inline import InlineHost
+from rlightning_aio.hosts.pickling import dumped_with_code
 from rlightning_aio.hosts.process import ForkServer, ProcessHost
 from rlightning_aio.hosts.spinner import Spinner
 from rlightning_aio.hosts.worker import StartOrder
@@ -96,7 +95,7 @@ def _check_preprocess(config: EnvConfig, fn: Any) -> None:
     if config.placement == "inline":
         return
     try:
-        cloudpickle.dumps(fn)
+        dumped_with_code(fn)
     except Exception as error:
         name = getattr(fn, "__qualname__", repr(fn))
         raise ConfigError(
@@ -114,7 +113,7 @@ def _culprit(fn: Any) -> str:
     )
     for name, cell in cells:
         try:
-            cloudpickle.dumps(cell.cell_contents)
+            dumped_with_code(cell.cell_contents)
         except Exception:
             return f"; it captures {name!r}, which can't be pickled"
     return ""

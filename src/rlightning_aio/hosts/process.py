@@ -18,12 +18,11 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import cloudpickle
-
 import rlightning_aio
 from rlightning_aio.hosts.arena import Arena, map_shared
 from rlightning_aio.hosts.base import Death, Inbox, Watcher
 from rlightning_aio.hosts.forkserver import BOOTSTRAP, Exited, Fork, Forked, Hello, Kill, Ready
+from rlightning_aio.hosts.pickling import dumped, dumped_with_code
 from rlightning_aio.protocol.frames import BELL, Frame, FrameKind, FrameReader, encode
 from rlightning_aio.protocol.rings import TrainerRings, rings_size
 
@@ -181,7 +180,7 @@ class ProcessHost:
         self.ordered = 0
         self.inline = False
         self.pid: int | None = None
-        self._start_payload = cloudpickle.dumps(order)
+        self._start_payload = dumped_with_code(order)
         self._fork_server = fork_server
         self._arena = arena
         self._inbox = inbox
@@ -273,22 +272,25 @@ class ProcessHost:
 
     def request_step(self, row: int, number: int, action: Any, extras: dict[str, Any]) -> None:
         """See `base.Host.request_step`."""
+        payload = dumped((action, extras), "the response")
         self.in_flight += 1
-        self._send(FrameKind.STEP, row, number, _dumped((action, extras)))
+        self._send(FrameKind.STEP, row, number, payload)
 
     def request_reset(
         self, row: int, number: int, seed: int | None, options: dict[str, Any] | None
     ) -> None:
         """See `base.Host.request_reset`."""
+        payload = dumped((seed, options), "the reset's options")
         self.in_flight += 1
-        self._send(FrameKind.RESET, row, number, _dumped((seed, options)))
+        self._send(FrameKind.RESET, row, number, payload)
 
     def request_call(
         self, row: int, number: int, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]
     ) -> None:
         """See `base.Host.request_call`."""
+        payload = dumped_with_code((name, args, kwargs))
         self.in_flight += 1
-        self._send(FrameKind.CALL, row, number, cloudpickle.dumps((name, args, kwargs)))
+        self._send(FrameKind.CALL, row, number, payload)
 
     def _send(self, kind: FrameKind, row: int = 0, number: int = 0, payload: bytes = b"") -> None:
         self._frames_outgoing += 1
@@ -420,13 +422,6 @@ class ProcessHost:
     def run_one(self) -> bool:
         """Nothing runs here."""
         return False
-
-
-def _dumped(value: Any) -> bytes:
-    try:
-        return pickle.dumps(value, pickle.HIGHEST_PROTOCOL)
-    except Exception:
-        return cloudpickle.dumps(value)
 
 
 def _ending(exit_code: int) -> str:

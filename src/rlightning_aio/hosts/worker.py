@@ -18,9 +18,8 @@ import traceback
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import cloudpickle
-
 from rlightning_aio.hosts.arena import map_shared
+from rlightning_aio.hosts.pickling import dumped, dumped_with_code
 from rlightning_aio.hosts.runner import EnvRunner, Rest
 from rlightning_aio.hosts.spinner import Spinner
 from rlightning_aio.protocol.frames import BELL, Frame, FrameKind, FrameReader, encode
@@ -251,7 +250,7 @@ class Worker:
         self._rings.idle()
 
     def _start(self, frame: Frame) -> None:
-        order: StartOrder = cloudpickle.loads(frame.payload)
+        order: StartOrder = pickle.loads(frame.payload)
         if order.core is not None:
             os.sched_setaffinity(0, {order.core})
         self._spinner = Spinner(enabled=order.spins)
@@ -269,7 +268,7 @@ class Worker:
         # What was built stays: sparing the collector from walking it saves time and pages.
         gc.collect()
         gc.freeze()
-        self._send(FrameKind.STARTED, frame, cloudpickle.dumps(started))
+        self._send(FrameKind.STARTED, frame, dumped_with_code(started))
 
     def _attach(self, frame: Frame) -> None:
         """Map the slabs; the arena's descriptor was inherited for this."""
@@ -297,9 +296,9 @@ class Worker:
         self._send_rest(frame.row, frame.number, rest or {})
 
     def _call(self, frame: Frame) -> None:
-        name, args, kwargs = cloudpickle.loads(frame.payload)
+        name, args, kwargs = pickle.loads(frame.payload)
         value = self._runners[frame.row].call(name, args, kwargs)
-        self._send(FrameKind.VALUE, frame, _dumped(value, f"what {name}() returned"))
+        self._send(FrameKind.VALUE, frame, dumped(value, f"what {name}() returned"))
 
     def _close(self, frame: Frame) -> None:
         self._closing = True
@@ -331,7 +330,7 @@ class Worker:
 
     def _send_rest(self, row: int, number: int, rest: Rest) -> None:
         try:
-            payload = _dumped(rest, "the result")
+            payload = dumped(rest, "the result")
         except BaseException as error:
             self._send_error(row, number, error)
             return
@@ -347,16 +346,6 @@ class Worker:
         payload = pickle.dumps(schema)
         self._channel.sendall(encode(FrameKind.INFO_SCHEMA, 0, number, payload))
         self._rings.count_frame()
-
-
-def _dumped(value: Any, what: str) -> bytes:
-    try:
-        return pickle.dumps(value, pickle.HIGHEST_PROTOCOL)
-    except Exception:
-        try:
-            return cloudpickle.dumps(value)
-        except Exception as error:
-            raise TypeError(f"{what} can't be pickled: {error}") from error
 
 
 def main(channel: socket.socket, arena: int, rings_offset: int, first_slot: int, rows: int) -> None:
