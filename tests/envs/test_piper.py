@@ -23,8 +23,10 @@ if TYPE_CHECKING:
 pytest.importorskip("piper_sdk")
 pytest.importorskip("serial")
 
+from envs.watched_arm import WatchedArm
+
 from rlightning_aio.envs.piper import PiperEnv
-from rlightning_aio.envs.piper_arm import Frame, SimulatedArm
+from rlightning_aio.envs.piper_arm import Frame
 from rlightning_aio.envs.piper_sim import SlcanPort, running
 
 pytestmark = [
@@ -35,32 +37,6 @@ pytestmark = [
 
 READY = [0.0, 0.5, -0.5, 0.0, 0.0, 0.0]
 STOP_COMMAND = Frame(0x150, bytes([1, 0, 0, 0, 0, 0, 0, 0]))
-
-
-class WatchedArm(SimulatedArm):
-    """Remembers every command, and can be made deaf to some or fall silent."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.commands: list[Frame] = []
-        self.deaf_to: set[int] = set()
-        self.silent = False
-        self._changed = threading.Condition()
-
-    def receive(self, frame: Frame) -> list[Frame]:
-        with self._changed:
-            self.commands.append(frame)
-            answers = [] if frame.can_id in self.deaf_to else super().receive(frame)
-            self._changed.notify_all()
-        return answers
-
-    def feedback(self) -> list[Frame]:
-        return [] if self.silent else super().feedback()
-
-    def wait_for(self, predicate: Callable[[], Any]) -> bool:
-        """Whether `predicate` is true after some command, within 5 seconds."""
-        with self._changed:
-            return self._changed.wait_for(predicate, 5)
 
 
 @pytest.fixture

@@ -1,0 +1,37 @@
+"""`WatchedArm`: a simulated arm that a test can listen in on, and hinder."""
+
+from __future__ import annotations
+
+import threading
+from typing import TYPE_CHECKING, Any
+
+from rlightning_aio.envs.piper_arm import Frame, SimulatedArm
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+class WatchedArm(SimulatedArm):
+    """Remembers every command, and can be made deaf to some or fall silent."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.commands: list[Frame] = []
+        self.deaf_to: set[int] = set()
+        self.silent = False
+        self._changed = threading.Condition()
+
+    def receive(self, frame: Frame) -> list[Frame]:
+        with self._changed:
+            self.commands.append(frame)
+            answers = [] if frame.can_id in self.deaf_to else super().receive(frame)
+            self._changed.notify_all()
+        return answers
+
+    def feedback(self) -> list[Frame]:
+        return [] if self.silent else super().feedback()
+
+    def wait_for(self, predicate: Callable[[], Any], seconds: float = 5) -> bool:
+        """Whether `predicate` becomes true after some command, within that time."""
+        with self._changed:
+            return bool(self._changed.wait_for(predicate, seconds))
