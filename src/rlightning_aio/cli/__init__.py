@@ -7,6 +7,7 @@ Absent on purpose: rules of environments, and anything a program couldn't call i
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 
@@ -15,10 +16,12 @@ __all__ = ["main"]
 
 def main() -> None:
     """Run the command that `sys.argv` names; the entry point of ``rlightning-aio``."""
-    try:
-        # Imported here, so that Ctrl-C ends the imports as quietly as anything else.
-        from rlightning_aio.cli.app import app  # noqa: PLC0415
+    # Until a command begins there is nothing to clean up, and an exception could get lost
+    # among those of the imports.
+    signal.signal(signal.SIGINT, lambda *_: os._exit(130))
+    from rlightning_aio.cli.app import app  # noqa: PLC0415
 
+    try:
         app()
     except KeyboardInterrupt:
         sys.exit(130)

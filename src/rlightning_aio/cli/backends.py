@@ -34,7 +34,7 @@ def backends(
     after the built-in ones. Simulators that exclude each other live in environments of
     their own; run this command there, and name that Python in an entry's `interpreter`.
 
-    Examples:
+    For example:
 
         rlightning-aio backends
         rlightning-aio backends --json

@@ -83,7 +83,7 @@ def rollout(
     returns actions, one row for each result, or a batch made with its respond() method.
     Ctrl-C ends the collecting early and prints the table of what there is.
 
-    Examples:
+    For example:
 
         rlightning-aio rollout configs/halfcheetah.yaml --steps 100000
         rlightning-aio rollout configs/cartpole.yaml envs.0.num_workers=128 --seed 0
@@ -102,8 +102,11 @@ def rollout(
     group = rlightning_aio.build_env_group(configs, mixed_actions=True)
     interrupted = False
     try:
-        with _Display(group, tally, steps) as display:
-            rlightning_aio.run(_collect(group, configs, order, tally, display))
+        with (
+            _Display(group, tally, steps) as display,
+            contextlib.closing(_collect(group, configs, order, tally, display)) as collecting,
+        ):
+            rlightning_aio.run(collecting)
     except KeyboardInterrupt:
         interrupted = True
         raise typer.Exit(INTERRUPTED) from None
