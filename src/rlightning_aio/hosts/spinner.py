@@ -48,16 +48,17 @@ class Spinner:
         if self._mean > _LIMIT_SECONDS:
             return False
         until = now + _LIMIT_SECONDS
-        while now < until:
-            if ready():
-                self._note(now - self._began)
-                return True
+        while not ready():
+            if now >= until:
+                return False
             os.sched_yield()
             before, now = now, clock()
-            if now - before > _YIELD_SECONDS:
+            # The one we wait for may have had the core meanwhile: then it was no loss.
+            if now - before > _YIELD_SECONDS and not ready():
                 self._skip = _SKIPPED_AFTER_CONTENTION
                 return False
-        return False
+        self._note(now - self._began)
+        return True
 
     def slept(self) -> None:
         """What was waited for has come, after a sleep."""
