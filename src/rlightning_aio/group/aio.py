@@ -61,7 +61,8 @@ class AioDriver:
 
     def watch_writable(self, source: Source, wanted: bool) -> None:
         """See `base.Watcher.watch_writable`."""
-        loop = asyncio.get_running_loop()
+        # Not the running loop: `step_async` may be called from anywhere.
+        loop = self._futures[source].get_loop()
         if wanted:
             self._writing.add(source)
             loop.add_writer(source.fileno(), source.on_writable)
