@@ -6,6 +6,7 @@ see `Outcome`. Its observations say which env it is and what has happened to it.
 
 from __future__ import annotations
 
+import pickle
 from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -141,22 +142,24 @@ class FakeHost:
             else:
                 self._take(row, entry, lambda row=row, entry=entry: self._step(row, entry, None))
 
-    def request_step(self, row: int, number: int, action: Any, extras: dict[str, Any]) -> None:
+    def pack(self, content: Any) -> Any:
+        return pickle.loads(pickle.dumps(content))
+
+    def request_step(self, row: int, number: int, packed: Any) -> None:
+        action, extras = packed
         entry = rings.entry(number, self.first_slot + row, rings.STEP)
         self.extras[self.first_slot + row] = extras
         if type(action) is str and action == NO_ACTION:
             action = None
         self._take(row, entry, lambda: self._step(row, entry, action, by_frame=True))
 
-    def request_reset(
-        self, row: int, number: int, seed: int | None, options: dict[str, Any] | None
-    ) -> None:
+    def request_reset(self, row: int, number: int, packed: Any) -> None:
         entry = rings.entry(number, self.first_slot + row, rings.RESET)
         self._take(row, entry, lambda: self._reset(row, entry, by_frame=True))
 
-    def request_call(
-        self, row: int, number: int, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]
-    ) -> None:
+    def request_call(self, row: int, number: int, packed: Any) -> None:
+        name, args, _ = packed
+
         def call() -> Reply:
             if name == "raise":
                 return self._error(row, number)
@@ -240,6 +243,9 @@ class FakeHost:
             self.ordered = 0
             return True
         return False
+
+    def has_news(self) -> bool:
+        return any(reply.tell is None for reply in self.unread)
 
     def sweep(self) -> None:
         """Frames lie in the channel, which only `on_readable` reads."""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import threading
 from typing import TYPE_CHECKING, Any
 
 import pytest
 from group.fake_host import PLAIN, RAISES, FakeGroup
 
 from rlightning_aio.batch import BatchedData
-from rlightning_aio.errors import EnvBusy, EnvRaised, GroupClosed, NothingPending
+from rlightning_aio.errors import BadAction, EnvBusy, EnvRaised, GroupClosed, NothingPending
 from rlightning_aio.types import PolicyResponse
 
 if TYPE_CHECKING:
@@ -185,3 +186,42 @@ def test_a_group_that_is_not_open_says_so(moment: str) -> None:
     with pytest.raises(GroupClosed, match=hint):
         group.begin(group.core.call(group.now, 0, "who", (), {})).result()
     group.close()
+
+
+def test_what_cannot_be_pickled_is_refused_before_anything_is_sent(new_group: NewGroup) -> None:
+    """Extras, options and arguments: nothing is half-sent, and every env stays usable."""
+    group = new_group(1, 1, reads_extras=[True, True])
+    unpicklable = threading.Lock()
+    batch = BatchedData(
+        ["fake-0", "fake-1"],
+        [PolicyResponse("fake-0", 0, good=1), PolicyResponse("fake-1", 0, bad=unpicklable)],
+    )
+    with pytest.raises(BadAction, match=r"'fake-1'.*nothing was sent"):
+        group.core.step_async(batch, group.now)
+    with pytest.raises(BadAction, match="'fake-1'"):
+        group.begin(group.core.step(batch, group.now)).result()
+    with pytest.raises(TypeError, match="options for env 'fake-0'"):
+        group.begin(group.core.reset(group.now, 0, {"bad": unpicklable}, None)).result()
+    with pytest.raises(TypeError, match=r"arguments of who\(\)"):
+        group.begin(group.core.call(group.now, 0, "who", (unpicklable,), {})).result()
+    assert not any(host.waiting for host in group.hosts)
+    running = group.begin(group.core.step(steps(0, 1), group.now))
+    group.finish(0)
+    group.finish(1)
+    assert ids_of(running) == ["fake-0", "fake-1"]
+
+
+def test_extras_for_some_envs_of_a_batch_leave_the_others_in_their_rows(
+    new_group: NewGroup,
+) -> None:
+    """Only what somebody reads travels beside the rows."""
+    group = new_group(1, 1, reads_extras=[False, True])
+    batch = BatchedData(
+        ["fake-0", "fake-1"], [PolicyResponse(f"fake-{k}", 0, value=k) for k in range(2)]
+    )
+    running = group.begin(group.core.step(batch, group.now))
+    group.finish(1)
+    group.finish(0)
+    assert ids_of(running) == ["fake-0", "fake-1"]
+    assert group.hosts[0].extras == {}
+    assert group.hosts[1].extras == {1: {"value": 1}}

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 import numpy as np
 
 from rlightning_aio.errors import (
+    BadAction,
     EnvBusy,
     EnvFault,
     EnvRaised,
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio.batch import BatchedData
+    from rlightning_aio.group.actions import Letters
     from rlightning_aio.group.fleet import Fleet
     from rlightning_aio.hosts.base import Host
     from rlightning_aio.hosts.worker import ErrorText
@@ -133,6 +135,7 @@ class Core:
         table = self.slots
         self._check_sendable(slots, "step")
         letters = write_actions(batch, slots, table, self.fleet.slabs)
+        packed = [] if letters is None else self._pack_letters(slots, letters)
         resets = self.auto.due(slots)
         if self.fleet.lost:
             resets = resets | self.fleet.claim_lost(slots)
@@ -144,8 +147,37 @@ class Core:
         by_letter &= ~resets
         plain = ~by_letter
         if plain.any():
-            self._send_entries(slots[plain], resets[plain], owner, now)
-        self._send_letters(slots, letters, by_letter, owner, now)
+            chosen = resets if resets is NO_RESETS else resets[plain]
+            self._send_entries(slots[plain], chosen, owner, now)
+        for position, letter in zip(letters.positions.tolist(), packed, strict=True):
+            if by_letter[position]:
+                slot = int(slots[position])
+                self._mark_sent(slots[position : position + 1], STEP, owner, now)
+                host = self._host(slot)
+                host.request_step(slot - host.first_slot, table.number(slot), letter)
+
+    def _pack_letters(self, slots: NDArray[np.intp], letters: Letters) -> list[Any]:
+        """What the channel will carry, pickled before anything is sent."""
+        chosen = slots[letters.positions].tolist()
+        try:
+            return [
+                self._pack(slot, content, "the response")
+                for slot, content in zip(chosen, letters.contents, strict=True)
+            ]
+        except TypeError as error:
+            raise BadAction(str(error)) from error
+
+    def _pack(self, slot: int, content: Any, what: str) -> Any:
+        try:
+            return self._host(slot).pack(content)
+        except Exception as error:
+            raise TypeError(
+                f"{what} for {self.slots.describe(slot)} can't be sent to its worker: {error}; "
+                "nothing was sent"
+            ) from error
+
+    def _host(self, slot: int) -> Host:
+        return self.fleet.hosts[self.slots.host[slot]]
 
     def _send_entries(
         self, slots: NDArray[np.intp], resets: NDArray[np.bool_], owner: int, now: float
@@ -186,24 +218,6 @@ class Core:
         else:
             self._in_flight += len(slots)
         return entries
-
-    def _send_letters(
-        self,
-        slots: NDArray[np.intp],
-        letters: Any,
-        wanted: NDArray[np.bool_],
-        owner: int,
-        now: float,
-    ) -> None:
-        table = self.slots
-        for position, (action, extras) in zip(
-            letters.positions.tolist(), letters.contents, strict=True
-        ):
-            if wanted[position]:
-                slot = int(slots[position])
-                self._mark_sent(slots[position : position + 1], STEP, owner, now)
-                host = self.fleet.hosts[table.host[slot]]
-                host.request_step(slot - host.first_slot, table.number(slot), action, extras)
 
     # -- replies (called by the fleet) --------------------------------------------
 
@@ -469,6 +483,7 @@ class Core:
         slots = table.all if env_ids is None else self._distinct(env_ids)
         seeds = self._seeds(seed, slots)
         self._check_sendable(slots, "reset")
+        packed = [] if options is None else self._pack_resets(slots, seeds, options)
         self.fleet.forget_lost(slots)
         ticket = self._new_ticket(slots)
         if options is None:
@@ -476,16 +491,19 @@ class Core:
             self._post(slots, self._mark_sent(slots, RESET, ticket.owner, now) + _OPS[RESET])
         else:
             self._mark_sent(slots, RESET, ticket.owner, now)
-            for slot, one in zip(slots.tolist(), seeds.tolist(), strict=True):
-                host = self.fleet.hosts[table.host[slot]]
-                host.request_reset(
-                    slot - host.first_slot,
-                    table.number(slot),
-                    None if one == NO_SEED else one,
-                    options,
-                )
+            for slot, one in zip(slots.tolist(), packed, strict=True):
+                host = self._host(slot)
+                host.request_reset(slot - host.first_slot, table.number(slot), one)
         yield from self._await_ticket(ticket)
         return self._settled(ticket, slots)
+
+    def _pack_resets(
+        self, slots: NDArray[np.intp], seeds: NDArray[np.int64], options: dict[str, Any]
+    ) -> list[Any]:
+        return [
+            self._pack(slot, (None if seed == NO_SEED else seed, options), "the options")
+            for slot, seed in zip(slots.tolist(), seeds.tolist(), strict=True)
+        ]
 
     def _seeds(
         self, seed: int | Sequence[int] | Mapping[str, int] | None, slots: NDArray[np.intp]
@@ -524,29 +542,36 @@ class Core:
         self, now: float, slot: int, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]
     ) -> Operation[Any]:
         """Call a method of one env; its value."""
-        slots = np.array([slot], np.intp)
-        self._check_sendable(slots, f"call {name} of")
-        ticket = self._new_ticket(slots, calls=True)
-        self._mark_sent(slots, CALL, ticket.owner, now)
-        host = self.fleet.hosts[self.slots.host[slot]]
-        host.request_call(slot - host.first_slot, self.slots.number(slot), name, args, kwargs)
-        yield from self._await_ticket(ticket)
-        if ticket.faults:
-            raise ticket.faults[0]
-        return ticket.value
+        return (yield from self._call(now, np.array([slot], np.intp), name, args, kwargs))
 
     def call_all(self, now: float, name: str) -> Operation[None]:
         """Call a method of every env, all at once."""
-        slots = self.slots.all
+        yield from self._call(now, self.slots.all, name, (), {})
+
+    def _call(
+        self,
+        now: float,
+        slots: NDArray[np.intp],
+        name: str,
+        args: tuple[Any, ...],
+        kwargs: dict[str, Any],
+    ) -> Operation[Any]:
+        """The value of the last call to return."""
         self._check_sendable(slots, f"call {name} of")
+        chosen = slots.tolist()
+        packed = [
+            self._pack(slot, (name, args, kwargs), f"the arguments of {name}()") for slot in chosen
+        ]
         ticket = self._new_ticket(slots, calls=True)
         self._mark_sent(slots, CALL, ticket.owner, now)
-        for slot in slots.tolist():
-            host = self.fleet.hosts[self.slots.host[slot]]
-            host.request_call(slot - host.first_slot, self.slots.number(slot), name, (), {})
+        for slot, one in zip(chosen, packed, strict=True):
+            host = self._host(slot)
+            host.request_call(slot - host.first_slot, self.slots.number(slot), one)
         yield from self._await_ticket(ticket)
         if ticket.faults:
+            ticket.faults[0].others = tuple(ticket.faults[1:])
             raise ticket.faults[0]
+        return ticket.value
 
     def pending(self) -> int:
         """Requests that `collect_async` has still to answer, ready or not."""

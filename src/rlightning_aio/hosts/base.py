@@ -100,20 +100,23 @@ class Host(Source, Protocol):
         """Send numbered requests whose arguments lie in the rows."""
         ...
 
-    def request_step(self, row: int, number: int, action: Any, extras: dict[str, Any]) -> None:
-        """Send a step whose arguments don't fit the row."""
+    def pack(self, content: Any) -> Any:
+        """`content` as the requests below send it; nobody's later change reaches it.
+
+        Raises whatever makes it impossible to send, which is why it comes before anything is.
+        """
         ...
 
-    def request_reset(
-        self, row: int, number: int, seed: int | None, options: dict[str, Any] | None
-    ) -> None:
-        """Send a reset with options."""
+    def request_step(self, row: int, number: int, packed: Any) -> None:
+        """Send a step whose arguments don't fit the row: (action, extras)."""
         ...
 
-    def request_call(
-        self, row: int, number: int, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]
-    ) -> None:
-        """Send a method call."""
+    def request_reset(self, row: int, number: int, packed: Any) -> None:
+        """Send a reset with options: (seed, options)."""
+        ...
+
+    def request_call(self, row: int, number: int, packed: Any) -> None:
+        """Send a method call: (name, args, kwargs)."""
         ...
 
     def order(self, count: int) -> bool:

@@ -100,25 +100,29 @@ class InlineHost:
             stepped = entry & ring_entries.OP_MASK == ring_entries.STEP
             self._enqueue(row, number, runner.step if stepped else runner.reset_from_row)
 
-    def request_step(self, row: int, number: int, action: Any, extras: dict[str, Any]) -> None:
+    def pack(self, content: Any) -> Any:
+        """See `base.Host.pack`."""
+        return _owned(content)
+
+    def request_step(self, row: int, number: int, packed: tuple[Any, dict[str, Any]]) -> None:
         """See `base.Host.request_step`."""
         runner = self._runners[row]
-        self._enqueue(row, number, lambda: runner.step_with(action, extras))
+        self._enqueue(row, number, lambda: runner.step_with(*packed))
 
     def request_reset(
-        self, row: int, number: int, seed: int | None, options: dict[str, Any] | None
+        self, row: int, number: int, packed: tuple[int | None, dict[str, Any]]
     ) -> None:
         """See `base.Host.request_reset`."""
         runner = self._runners[row]
-        self._enqueue(row, number, lambda: runner.reset(seed, options))
+        self._enqueue(row, number, lambda: runner.reset(*packed))
 
     def request_call(
-        self, row: int, number: int, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]
+        self, row: int, number: int, packed: tuple[str, tuple[Any, ...], dict[str, Any]]
     ) -> None:
         """See `base.Host.request_call`."""
 
         def call() -> None:
-            value = self._runners[row].call(name, args, kwargs)
+            value = self._runners[row].call(*packed)
             self._inbox.on_value(self, row, number, value)
 
         self.in_flight += 1
@@ -131,7 +135,7 @@ class InlineHost:
                 done = ring_entries.entry(number, self.first_slot + row, 0)
                 self._inbox.on_reports(np.array([done], np.int64))
             else:
-                self._inbox.on_rest(self, row, number, rest)
+                self._inbox.on_rest(self, row, number, _owned(rest))
 
         self.in_flight += 1
         self._queue.append(lambda: self._guarded(row, number, run))
@@ -184,3 +188,19 @@ class InlineHost:
         self._runners.clear()
         self._queue.clear()
         self.in_flight = 0
+
+
+def _owned(value: Any) -> Any:
+    """`value` with its containers and arrays copied: its maker may change them later.
+
+    Everything else is left as it is; a tensor must stay the tensor it is.
+    """
+    if isinstance(value, np.ndarray):
+        return value.copy()
+    if type(value) is dict:
+        return {key: _owned(inner) for key, inner in value.items()}
+    if type(value) in (tuple, list):
+        return type(value)(map(_owned, value))
+    if isinstance(value, tuple) and hasattr(value, "_make"):
+        return type(value)._make(map(_owned, value))  # A graph, for one.
+    return value

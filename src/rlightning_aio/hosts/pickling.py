@@ -27,7 +27,9 @@ def dumped(value: Any, what: str) -> bytes:
         TypeError: it can't be pickled.
     """
     try:
-        return pickle.dumps(value, pickle.HIGHEST_PROTOCOL)
+        pickled = pickle.dumps(value, pickle.HIGHEST_PROTOCOL)
+        # The other end has a `__main__` of its own, which has none of this one's names.
+        return dumped_with_code(value) if b"__main__" in pickled else pickled
     except Exception:
         try:
             return dumped_with_code(value)

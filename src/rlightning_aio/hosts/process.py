@@ -270,27 +270,24 @@ class ProcessHost:
         if self._rings.request(entries):
             self._write(BELL)
 
-    def request_step(self, row: int, number: int, action: Any, extras: dict[str, Any]) -> None:
+    def pack(self, content: Any) -> bytes:
+        """See `base.Host.pack`."""
+        return dumped(content, "it")
+
+    def request_step(self, row: int, number: int, packed: bytes) -> None:
         """See `base.Host.request_step`."""
-        payload = dumped((action, extras), "the response")
         self.in_flight += 1
-        self._send(FrameKind.STEP, row, number, payload)
+        self._send(FrameKind.STEP, row, number, packed)
 
-    def request_reset(
-        self, row: int, number: int, seed: int | None, options: dict[str, Any] | None
-    ) -> None:
+    def request_reset(self, row: int, number: int, packed: bytes) -> None:
         """See `base.Host.request_reset`."""
-        payload = dumped((seed, options), "the reset's options")
         self.in_flight += 1
-        self._send(FrameKind.RESET, row, number, payload)
+        self._send(FrameKind.RESET, row, number, packed)
 
-    def request_call(
-        self, row: int, number: int, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]
-    ) -> None:
+    def request_call(self, row: int, number: int, packed: bytes) -> None:
         """See `base.Host.request_call`."""
-        payload = dumped_with_code((name, args, kwargs))
         self.in_flight += 1
-        self._send(FrameKind.CALL, row, number, payload)
+        self._send(FrameKind.CALL, row, number, packed)
 
     def _send(self, kind: FrameKind, row: int = 0, number: int = 0, payload: bytes = b"") -> None:
         self._frames_outgoing += 1
