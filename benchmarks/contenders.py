@@ -9,18 +9,18 @@ EnvPool, this library, the in-process loops), that result counts as well.
 from __future__ import annotations
 
 import multiprocessing as mp
+import os
 import time
-from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib import import_module
 from itertools import cycle
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from harness import Contender, throughput
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterator
     from multiprocessing.connection import Connection
 
 # Batches of actions that are sampled beforehand and used in turn.
@@ -57,6 +57,14 @@ class Work:
             self.task, max_episode_steps=self.max_episode_steps, disable_env_checker=True
         )
 
+    def episode_limit(self) -> int | None:
+        """Steps after which an episode of it ends, by its own or the registered limit."""
+        import gymnasium as gym
+
+        for module in self.modules:
+            import_module(module)
+        return self.max_episode_steps or gym.spec(self.task).max_episode_steps
+
     def makers(self) -> list[Callable[[], Any]]:
         return [self.make] * self.num_envs
 
@@ -70,12 +78,51 @@ def sampled(space: Any, num_envs: int) -> Iterator[Any]:
     return cycle(batches)
 
 
+@dataclass
+class Stepped(Contender):
+    """Whatever is driven by a blocking call that brings some results."""
+
+    name: str
+    work: Work
+
+    package = "gymnasium"
+    _envs: ClassVar[Any] = None
+
+    @property
+    def requires(self) -> tuple[str, ...]:
+        return (self.package, *self.work.modules)
+
+    def step(self) -> int:
+        """Bring some results; how many."""
+        raise NotImplementedError
+
+    def round(self, seconds: float) -> float:
+        return throughput(self.step, seconds)
+
+    def teardown(self) -> None:
+        if self._envs is not None:
+            self._envs.close()
+
+
 # ---- this library
 
 
+def group_config(work: Work, envs_per_process: int | str) -> dict[str, Any]:
+    """One config entry for all envs of `work`."""
+    return {
+        "name": "bench",
+        "backend": work.backend,
+        "task": work.task,
+        "num_workers": work.num_envs,
+        "max_episode_steps": work.episode_limit(),
+        "envs_per_process": envs_per_process,
+        "imports": list(work.modules),
+    }
+
+
 @dataclass
-class _Ours(Contender):
-    """What both kinds of group share.
+class OursSync(Stepped):
+    """`rlightning_aio.sync.EnvGroup`: all envs step, all results are awaited.
 
     Attributes:
         envs_per_process: as in a config entry.
@@ -83,74 +130,51 @@ class _Ours(Contender):
             one need not.
     """
 
-    name: str
-    work: Work
     envs_per_process: int | str = "auto"
     auto_reset: bool = True
 
-    @property
-    def requires(self) -> tuple[str, ...]:
-        return ("rlightning_aio", *self.work.modules)
-
-    def config(self) -> dict[str, Any]:
-        return {
-            "name": "bench",
-            "backend": self.work.backend,
-            "task": self.work.task,
-            "num_workers": self.work.num_envs,
-            "max_episode_steps": self.work.max_episode_steps or self._own_limit(),
-            "envs_per_process": self.envs_per_process,
-            "imports": list(self.work.modules),
-        }
-
-    def _own_limit(self) -> int | None:
-        import gymnasium as gym
-
-        for module in self.work.modules:
-            import_module(module)
-        return gym.spec(self.work.task).max_episode_steps
-
-
-@dataclass
-class OursSync(_Ours):
-    """`rlightning_aio.sync.EnvGroup`: all envs step, all results are awaited."""
+    package = "rlightning_aio"
 
     def setup(self) -> None:
         from rlightning_aio.sync import build_env_group
 
-        self._stack = ExitStack()
-        self._group = self._stack.enter_context(build_env_group(self.config()))
+        self._envs = build_env_group(group_config(self.work, self.envs_per_process))
+        self._envs.init()
         if self.auto_reset:
-            self._stack.enter_context(self._group.auto_reset())
-        self._batch, _ = self._group.reset(seed=0)
-        self._actions = sampled(self._group.get_action_spaces()[0], self.work.num_envs)
+            self._envs.auto_reset().__enter__()
+        self._batch, _ = self._envs.reset(seed=0)
+        self._actions = sampled(self._envs.get_action_spaces()[0], self.work.num_envs)
 
     def step(self) -> int:
         response = self._batch.respond(action=next(self._actions))
-        self._batch, _ = self._group.step(response)
+        self._batch, _ = self._envs.step(response)
         _ = self._batch.observation, self._batch.reward
         return self.work.num_envs
 
-    def round(self, seconds: float) -> float:
-        return throughput(self.step, seconds)
-
-    def teardown(self) -> None:
-        if hasattr(self, "_stack"):
-            self._stack.close()
-
 
 @dataclass
-class OursAsync(_Ours):
+class OursAsync(Contender):
     """`rlightning_aio.EnvGroup`: whoever is ready is collected and sent on.
 
     Attributes:
+        envs_per_process, auto_reset: see `OursSync`.
         min_results, max_results: of `collect_async`.
         uvloop: run on uvloop rather than on asyncio's own loop.
     """
 
+    name: str
+    work: Work
+    envs_per_process: int | str = "auto"
+    auto_reset: bool = True
     min_results: int = 1
     max_results: int | None = None
     uvloop: bool = True
+
+    _runner: ClassVar[Any] = None
+
+    @property
+    def requires(self) -> tuple[str, ...]:
+        return ("rlightning_aio", *self.work.modules)
 
     def setup(self) -> None:
         import asyncio
@@ -159,20 +183,20 @@ class OursAsync(_Ours):
 
         loop_factory = import_module("uvloop").new_event_loop if self.uvloop else None
         self._runner = asyncio.Runner(loop_factory=loop_factory)
-        self._group = build_env_group(self.config())
-        self._runner.run(self._open())
-        self._actions = sampled(self._group.get_action_spaces()[0], self.work.num_envs)
+        self._envs = build_env_group(group_config(self.work, self.envs_per_process))
+        self._runner.run(self._envs.init())
+        if self.auto_reset:
+            self._envs.auto_reset().__enter__()
+        self._first, _ = self._runner.run(self._envs.reset(seed=0))
+        self._actions = sampled(self._envs.get_action_spaces()[0], self.work.num_envs)
+        self.begin()
+
+    def begin(self) -> None:
+        """Have every env step, so that there is something to collect."""
         self._send(self._first)
 
-    async def _open(self) -> None:
-        self._stack = ExitStack()
-        await self._group.init()
-        if self.auto_reset:
-            self._stack.enter_context(self._group.auto_reset())
-        self._first, _ = await self._group.reset(seed=0)
-
     def _send(self, batch: Any) -> None:
-        self._group.step_async(batch.respond(action=next(self._actions)[: len(batch)]))
+        self._envs.step_async(batch.respond(action=next(self._actions)[: len(batch)]))
 
     async def collect(self, seconds: float) -> int:
         """Collect and send on for that long; how many results came."""
@@ -180,7 +204,7 @@ class OursAsync(_Ours):
         count = 0
         until = clock() + seconds
         while clock() < until:
-            batch, _ = await self._group.collect_async(
+            batch, _ = await self._envs.collect_async(
                 min_results=self.min_results, max_results=self.max_results
             )
             _ = batch.observation, batch.reward
@@ -188,18 +212,19 @@ class OursAsync(_Ours):
             count += len(batch)
         return count
 
-    async def _round(self, seconds: float) -> float:
+    async def measure(self, seconds: float) -> float:
+        """One round, within the event loop."""
         await self.collect(0.1 * seconds)
         began = time.perf_counter()
         count = await self.collect(0.9 * seconds)
         return count / (time.perf_counter() - began)
 
     def round(self, seconds: float) -> float:
-        return self._runner.run(self._round(seconds))
+        return self._runner.run(self.measure(seconds))
 
     def teardown(self) -> None:
-        if hasattr(self, "_runner"):
-            self._runner.run(self._group.close())
+        if self._runner is not None:
+            self._runner.run(self._envs.close())
             self._runner.close()
 
 
@@ -207,15 +232,8 @@ class OursAsync(_Ours):
 
 
 @dataclass
-class GymnasiumAsync(Contender):
+class GymnasiumAsync(Stepped):
     """`gymnasium.vector.AsyncVectorEnv` with shared memory: one process for each env."""
-
-    name: str
-    work: Work
-
-    @property
-    def requires(self) -> tuple[str, ...]:
-        return ("gymnasium", *self.work.modules)
 
     def setup(self) -> None:
         from gymnasium.vector import AsyncVectorEnv
@@ -228,29 +246,19 @@ class GymnasiumAsync(Contender):
         self._envs.step(next(self._actions))
         return self.work.num_envs
 
-    def round(self, seconds: float) -> float:
-        return throughput(self.step, seconds)
-
-    def teardown(self) -> None:
-        if hasattr(self, "_envs"):
-            self._envs.close()
-
 
 @dataclass
-class StableBaselines3(Contender):
+class StableBaselines3(Stepped):
     """`SubprocVecEnv` of Stable-Baselines3: one process for each env, results pickled."""
 
-    name: str
-    work: Work
-
-    @property
-    def requires(self) -> tuple[str, ...]:
-        return ("stable_baselines3", *self.work.modules)
+    package = "stable_baselines3"
 
     def setup(self) -> None:
         from stable_baselines3.common.vec_env import SubprocVecEnv
 
-        self._envs = SubprocVecEnv(self.work.makers())
+        # By default each of its processes imports torch anew, for minutes in all; how fast
+        # they step afterwards is the same.
+        self._envs = SubprocVecEnv(self.work.makers(), start_method="fork")
         self._actions = sampled(self._envs.action_space, self.work.num_envs)
         self._envs.seed(0)
         self._envs.reset()
@@ -259,24 +267,12 @@ class StableBaselines3(Contender):
         self._envs.step(next(self._actions))
         return self.work.num_envs
 
-    def round(self, seconds: float) -> float:
-        return throughput(self.step, seconds)
-
-    def teardown(self) -> None:
-        if hasattr(self, "_envs"):
-            self._envs.close()
-
 
 @dataclass
-class Tianshou(Contender):
+class Tianshou(Stepped):
     """`ShmemVectorEnv` of Tianshou: one process for each env; its user resets."""
 
-    name: str
-    work: Work
-
-    @property
-    def requires(self) -> tuple[str, ...]:
-        return ("tianshou", *self.work.modules)
+    package = "tianshou"
 
     def setup(self) -> None:
         from tianshou.env import ShmemVectorEnv
@@ -293,29 +289,18 @@ class Tianshou(Contender):
             self._envs.reset(ended)
         return self.work.num_envs
 
-    def round(self, seconds: float) -> float:
-        return throughput(self.step, seconds)
-
-    def teardown(self) -> None:
-        if hasattr(self, "_envs"):
-            self._envs.close()
-
 
 @dataclass
-class EnvPool(Contender):
+class EnvPool(Stepped):
     """EnvPool: the same tasks written anew in C++, stepped by its threads.
 
     Attributes:
         batch_size: results it hands out at a time; all envs if None (synchronous).
     """
 
-    name: str
-    work: Work
     batch_size: int | None = None
 
-    @property
-    def requires(self) -> tuple[str, ...]:
-        return ("envpool",)
+    package = "envpool"
 
     def setup(self) -> None:
         import envpool
@@ -335,13 +320,6 @@ class EnvPool(Contender):
         self._envs.send(next(self._actions)[: len(rewards)], info["env_id"])
         return len(rewards)
 
-    def round(self, seconds: float) -> float:
-        return throughput(self.step, seconds)
-
-    def teardown(self) -> None:
-        if hasattr(self, "_envs"):
-            self._envs.close()
-
 
 # ---- no runtime at all
 
@@ -349,12 +327,12 @@ class EnvPool(Contender):
 class InLine:
     """Envs stepped one after the other in a plain loop, each reset where it has ended."""
 
-    def __init__(self, work: Work, num_envs: int) -> None:
+    def __init__(self, work: Work, num_envs: int, steps_per_look: int = STEPS_PER_LOOK) -> None:
         self._envs = [work.make() for _ in range(num_envs)]
         for seed, env in enumerate(self._envs):
             env.reset(seed=seed)
         batches = sampled(self._envs[0].action_space, num_envs)
-        # An element for each env: a Python number for Discrete, an array for Box.
+        # As a policy's output would be split: Python numbers for Discrete, arrays for Box.
         self._actions = cycle(
             [
                 [row.item() if row.ndim == 0 else row for row in np.array(next(batches))]
@@ -362,7 +340,7 @@ class InLine:
             ]
         )
         self._ended = [False] * num_envs
-        self._passes = max(1, STEPS_PER_LOOK // num_envs)
+        self._passes = max(1, steps_per_look // num_envs)
 
     def step(self) -> int:
         ended = self._ended
@@ -382,78 +360,67 @@ class InLine:
 
 
 @dataclass
-class InProcess(Contender):
+class InProcess(Stepped):
     """All envs in a plain loop of the trainer's own process."""
-
-    name: str
-    work: Work
-
-    @property
-    def requires(self) -> tuple[str, ...]:
-        return ("gymnasium", *self.work.modules)
 
     def setup(self) -> None:
         self._envs = InLine(self.work, self.work.num_envs)
 
-    def round(self, seconds: float) -> float:
-        return throughput(self._envs.step, seconds)
-
-    def teardown(self) -> None:
-        if hasattr(self, "_envs"):
-            self._envs.close()
-
-
-def _bare_loop(connection: Connection, work: Work, inherited: Sequence[Connection]) -> None:
-    """One process of the limit; a round for each number of seconds that comes."""
-    for other in inherited:
-        other.close()
-    envs = InLine(work, 1)
-    connection.send(0.0)
-    try:
-        while True:
-            connection.send(throughput(envs.step, connection.recv()))
-    except EOFError:
-        envs.close()
+    def step(self) -> int:
+        return self._envs.step()
 
 
 @dataclass
 class Limit(Contender):
-    """Bare in-process loops, one for each core, all running at once; nothing around them.
+    """Bare in-process loops around one env each, all running at once; nothing around them.
 
     Attributes:
         processes: how many; as many as there are cores if None.
+        steps_per_look: steps between two looks at the clock.
     """
 
     name: str
     work: Work
     processes: int | None = None
-    _loops: list[tuple[Any, Connection]] = field(default_factory=list)
+    steps_per_look: int = STEPS_PER_LOOK
 
     @property
     def requires(self) -> tuple[str, ...]:
         return ("gymnasium", *self.work.modules)
 
     def setup(self) -> None:
-        import os
-
+        self._connections: list[Connection] = []
+        self._processes: list[Any] = []
         context = mp.get_context("fork")
         for _ in range(self.processes or len(os.sched_getaffinity(0))):
             ours, theirs = context.Pipe()
-            inherited = [ours, *(connection for _, connection in self._loops)]
-            process = context.Process(target=_bare_loop, args=(theirs, self.work, inherited))
+            self._connections.append(ours)
+            process = context.Process(target=self._loop, args=(theirs,))
             process.start()
             theirs.close()
-            self._loops.append((process, ours))
-        for _, connection in self._loops:
+            self._processes.append(process)
+        for connection in self._connections:
             connection.recv()
 
+    def _loop(self, connection: Connection) -> None:
+        """Run in each process: a round for each number of seconds that comes."""
+        for inherited in self._connections:
+            inherited.close()
+        envs = InLine(self.work, 1, self.steps_per_look)
+        connection.send(0.0)
+        try:
+            while True:
+                connection.send(throughput(envs.step, connection.recv()))
+        except EOFError:
+            envs.close()
+
     def round(self, seconds: float) -> float:
-        for _, connection in self._loops:
+        for connection in self._connections:
             connection.send(seconds)
-        return sum(connection.recv() for _, connection in self._loops)
+        return sum(connection.recv() for connection in self._connections)
 
     def teardown(self) -> None:
-        for _, connection in self._loops:
+        for connection in self._connections:
             connection.close()
-        for process, _ in self._loops:
+        for process in self._processes:
             process.join()

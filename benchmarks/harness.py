@@ -234,6 +234,8 @@ class ContenderFailed(Exception):
 def _perform(connection: Connection, contender: Contender) -> None:
     """Run in the contender's process: rounds as they are asked for, until the pipe ends."""
     with tempfile.TemporaryDirectory() as folder, (Path(folder) / "output").open("w+b") as output:
+        # What a script of the user's would find; a spawned process would go on by spawning.
+        mp.set_start_method(mp.get_all_start_methods()[0], force=True)
         # Simulators print, and MuJoCo writes a log into the working directory.
         os.chdir(folder)
         for descriptor in (1, 2):

@@ -30,7 +30,7 @@ ASYNCIO = "rlightning_aio async, asyncio"
 PING_PONG = "one byte there and back"
 
 
-def _median_us(call: Callable[[], object], seconds: float) -> float:
+def median_us(call: Callable[[], object], seconds: float) -> float:
     clock = time.perf_counter_ns
     for _ in range(WARM_UP_CALLS):
         call()
@@ -49,27 +49,24 @@ def _median_us(call: Callable[[], object], seconds: float) -> float:
 class SyncCalls(OursSync):
     def round(self, seconds: float) -> float:
         response = self._batch.respond(action=next(self._actions))
-        return _median_us(lambda: self._group.step(response), seconds)
+        return median_us(lambda: self._envs.step(response), seconds)
 
 
 @dataclass
 class AsyncCalls(OursAsync):
-    def round(self, seconds: float) -> float:
-        return self._runner.run(self._calls(seconds))
-
-    def _send(self, batch: object) -> None:
+    def begin(self) -> None:
         """Nothing is sent ahead: a call is a request and its reply."""
 
-    async def _calls(self, seconds: float) -> float:
+    async def measure(self, seconds: float) -> float:
         clock = time.perf_counter_ns
         response = self._first.respond(action=next(self._actions))
         for _ in range(WARM_UP_CALLS):
-            await self._group.step(response)
+            await self._envs.step(response)
         times: list[int] = []
         until = clock() + int(seconds * 1e9)
         began = clock()
         while began < until:
-            await self._group.step(response)
+            await self._envs.step(response)
             ended = clock()
             times.append(ended - began)
             began = clock()
@@ -96,7 +93,7 @@ class PingPong(Contender):
         self._channel.recv(1)
 
     def round(self, seconds: float) -> float:
-        return _median_us(self._call, seconds)
+        return median_us(self._call, seconds)
 
     def teardown(self) -> None:
         self._channel.close()

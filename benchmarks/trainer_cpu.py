@@ -35,7 +35,7 @@ class SyncCpu(OursSync):
 
 @dataclass
 class AsyncCpu(OursAsync):
-    async def _round(self, seconds: float) -> float:
+    async def measure(self, seconds: float) -> float:
         busy = time.process_time()
         count = await self.collect(seconds)
         return 1e6 * (time.process_time() - busy) / count
@@ -53,9 +53,7 @@ def _first_ready(num_envs: int) -> AsyncCpu:
 def _eights(num_envs: int) -> AsyncCpu:
     name = f"async, batches of 8, {num_envs} envs"
     work = _work(num_envs)
-    return AsyncCpu(
-        name, work, num_envs // NUM_WORKERS, False, min_results=8, max_results=8
-    )  # fmt: skip
+    return AsyncCpu(name, work, num_envs // NUM_WORKERS, False, min_results=8, max_results=8)
 
 
 KINDS = (_sync, _first_ready, _eights)
