@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import pickle
 import warnings
+from collections import deque
 from dataclasses import dataclass, field, replace
 from enum import Enum, auto
 from math import ceil
@@ -109,6 +110,7 @@ class Fleet:
         self._arena = arena
         self._mixed_actions = mixed_actions
         self._members: list[_Member] = []
+        self._inline: deque[Host] = deque()
         self._start_fault: Exception | None = None
         self._now = 0.0
         self._timed = False
@@ -126,6 +128,8 @@ class Fleet:
     def add(self, host: Host, config: EnvConfig) -> None:
         """Take in a host, before `init`; its slots follow those of the host before."""
         self.hosts.append(host)
+        if host.inline:
+            self._inline.append(host)
         self._members.append(_Member(host, config))
         self._timed = self._timed or self._members[-1].timed
 
@@ -365,15 +369,23 @@ class Fleet:
 
     def run_inline(self, wanted: int) -> bool:
         """Execute waiting requests of inline hosts, one, or as many as nothing else can give."""
-        inline = [host for host in self.hosts if host.in_flight and host.inline]
-        if not inline:
+        if not any(host.in_flight for host in self._inline):
             return False
         if any(host.in_flight for host in self.hosts if not host.inline):
             wanted = 1
         for _ in range(wanted):
-            if not any(host.run_one() for host in inline):
+            if not self._run_next_inline():
                 break
         return True
+
+    def _run_next_inline(self) -> bool:
+        """One request of the next inline host in turn, so that none waits for ever."""
+        for _ in range(len(self._inline)):
+            host = self._inline[0]
+            self._inline.rotate(-1)
+            if host.run_one():
+                return True
+        return False
 
     # -- faults -------------------------------------------------------------------
 
