@@ -97,7 +97,7 @@ def actions_of(batch: BatchedData) -> list[Any]:
     """One action for each value of `batch`."""
     columns = batch.response_columns
     if columns is not None:
-        return [index(columns.get("action"), k) for k in range(len(batch))]
+        return [index(columns["action"], k) for k in range(len(batch))]
     actions: list[Any] = []
     for id_, value in batch.items():
         if not hasattr(value, "action"):
@@ -127,7 +127,7 @@ def _letters(
     for k in positions.tolist():
         slot = int(slots[k])
         extras = _extras(batch, k) if table.reads_extras[slot] else {}
-        slab = slabs[table.slab[slot]]
+        slab = slabs[int(table.slab[slot])]
         action = actions[k]
         if slab.action is not None and _fits(action, slab):
             if not extras:

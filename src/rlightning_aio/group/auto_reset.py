@@ -7,8 +7,9 @@ replaced by a reset; so a limit of L gives a period of L + 1 calls.
 
 from __future__ import annotations
 
+import operator
 import warnings
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.group.slots import Slots
 
-__all__ = ["NO_RESETS", "AutoReset"]
+__all__ = ["NO_RESETS", "AutoReset", "whole"]
 
 NO_RESETS: Final[NDArray[np.bool_]] = np.zeros(1, np.bool_)
 """No env is due; broadcasts to any number of slots."""
@@ -28,6 +29,16 @@ NO_RESETS: Final[NDArray[np.bool_]] = np.zeros(1, np.bool_)
 # 0-d arrays: NumPy takes twice as long over a Python int.
 _ONE: Final = np.array(1)
 _STEP: Final = np.array(STEP, np.int8)
+
+
+def whole(value: Any) -> int | None:
+    """`value` as an int, NumPy's included; None for what is no whole number, as a bool."""
+    if isinstance(value, bool):
+        return None
+    try:
+        return operator.index(value)
+    except TypeError:
+        return None
 
 
 class AutoReset:
@@ -57,10 +68,10 @@ class AutoReset:
         self._limits = self._chosen_limits(max_episode_steps)
         self._on_done = on_done
 
-    def _chosen_limits(self, limit: int | None) -> NDArray[np.int64]:
+    def _chosen_limits(self, given: int | None) -> NDArray[np.int64]:
         table = self._slots
         configured = [config.max_episode_steps for config in table.configs]
-        if limit is None:
+        if given is None:
             if None in configured:
                 slot = configured.index(None)
                 raise ValueError(
@@ -68,8 +79,9 @@ class AutoReset:
                     "auto_reset(max_episode_steps=…)"
                 )
             return np.array(configured, np.int64)
-        if isinstance(limit, bool) or not isinstance(limit, int | np.integer) or limit < 1:
-            raise ValueError(f"max_episode_steps must be a positive int, not {limit!r}")
+        limit = whole(given)
+        if limit is None or limit < 1:
+            raise ValueError(f"max_episode_steps must be a positive int, not {given!r}")
         if any(own is not None and own != limit for own in configured):
             warnings.warn(
                 f"auto_reset(max_episode_steps={limit}) overrides the limits that are configured",
@@ -96,6 +108,6 @@ class AutoReset:
         reached = counts >= self._limits[slots]
         due = reached
         if self._on_done and batch.any_ended:
-            due = reached | (batch.ended & stepped)
+            due = reached | (batch.ended & stepped & ~self._slots.resets_itself[slots])
         self._due[slots] = due
         return reached.tolist()

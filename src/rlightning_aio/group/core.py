@@ -25,7 +25,7 @@ from rlightning_aio.errors import (
     RLightningError,
 )
 from rlightning_aio.group.actions import write_actions
-from rlightning_aio.group.auto_reset import NO_RESETS, AutoReset
+from rlightning_aio.group.auto_reset import NO_RESETS, AutoReset, whole
 from rlightning_aio.group.results import collected
 from rlightning_aio.group.slots import BUSY, IDLE, READY
 from rlightning_aio.group.stats import Stats
@@ -153,7 +153,7 @@ class Core:
             if by_letter[position]:
                 slot = int(slots[position])
                 self._mark_sent(slots[position : position + 1], STEP, owner, now)
-                host = self._host(slot)
+                host = self.fleet.host_of(slot)
                 host.request_step(slot - host.first_slot, table.number(slot), letter)
 
     def _pack_letters(self, slots: NDArray[np.intp], letters: Letters) -> list[Any]:
@@ -169,15 +169,12 @@ class Core:
 
     def _pack(self, slot: int, content: Any, what: str) -> Any:
         try:
-            return self._host(slot).pack(content)
+            return self.fleet.host_of(slot).pack(content)
         except Exception as error:
             raise TypeError(
                 f"{what} for {self.slots.describe(slot)} can't be sent to its worker: {error}; "
                 "nothing was sent"
             ) from error
-
-    def _host(self, slot: int) -> Host:
-        return self.fleet.hosts[self.slots.host[slot]]
 
     def _send_entries(
         self, slots: NDArray[np.intp], resets: NDArray[np.bool_], owner: int, now: float
@@ -201,7 +198,8 @@ class Core:
         cuts = (hosts[1:] != hosts[:-1]).nonzero()[0]
         start = 0
         for end in (*(cuts + 1).tolist(), len(slots)):
-            hosts_of[hosts[start]].request(entries[start:end])
+            host_id: int = hosts[start]
+            hosts_of[host_id].request(entries[start:end])
             start = end
 
     def _mark_sent(
@@ -492,7 +490,7 @@ class Core:
         else:
             self._mark_sent(slots, RESET, ticket.owner, now)
             for slot, one in zip(slots.tolist(), packed, strict=True):
-                host = self._host(slot)
+                host = self.fleet.host_of(slot)
                 host.request_reset(slot - host.first_slot, table.number(slot), one)
         yield from self._await_ticket(ticket)
         return self._settled(ticket, slots)
@@ -565,7 +563,7 @@ class Core:
         ticket = self._new_ticket(slots, calls=True)
         self._mark_sent(slots, CALL, ticket.owner, now)
         for slot, one in zip(chosen, packed, strict=True):
-            host = self._host(slot)
+            host = self.fleet.host_of(slot)
             host.request_call(slot - host.first_slot, self.slots.number(slot), one)
         yield from self._await_ticket(ticket)
         if ticket.faults:
@@ -590,10 +588,10 @@ class Core:
 
 def _checked(seed: Any) -> int:
     """`seed` as an int that every env can count on from."""
-    whole = isinstance(seed, int | np.integer) and not isinstance(seed, bool)
-    if not whole or not 0 <= seed < 1 << 62:
+    value = whole(seed)
+    if value is None or not 0 <= value < 1 << 62:
         raise ValueError(f"a seed must be an int from 0 to 2**62 - 1, not {seed!r}")
-    return int(seed)
+    return value
 
 
 def _first_double(ids: Sequence[str]) -> str:

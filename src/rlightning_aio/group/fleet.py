@@ -300,10 +300,15 @@ class Fleet:
 
     # -- requests -----------------------------------------------------------------
 
+    def host_of(self, slot: int) -> Host:
+        """Where the env of `slot` lives."""
+        return self.hosts[int(self.slots.host[slot])]
+
     def check_usable(self, slots: NDArray[np.intp]) -> None:
         """Raises what befell the worker of a slot, if it was given up."""
         if self._unavailable:
-            for host_id in np.unique(self.slots.host[slots]).tolist():
+            host_ids: list[int] = np.unique(self.slots.host[slots]).tolist()
+            for host_id in host_ids:
                 failure = self._members[host_id].failure
                 if failure is not None:
                     raise failure
@@ -434,7 +439,7 @@ class Fleet:
     def on_death(self, host: Host, death: Death) -> None:
         """See `base.Inbox.on_death`."""
         member = self._members[host.host_id]
-        if member.stage.value < _Stage.UP.value and member.order is None or not self.open:
+        if (member.stage.value < _Stage.UP.value and member.order is None) or not self.open:
             self._died_starting(member, death)
             return
         self._core.absorb()
@@ -545,14 +550,14 @@ class Fleet:
         self.recovering = any(member.restarts for member in self._members)
 
     def _mark(self, slot: int, death: Death, rests: dict[int, Any]) -> None:
-        slab, row = self.slabs[self.slots.slab[slot]], int(self.slots.row[slot])
+        slab = self.slabs[int(self.slots.slab[slot])]
+        row = int(self.slots.row[slot])
         slab.truncated[row] = True
         slab.episode_length[row] = 0
-        rest = rests.get(slot) or {}
-        if isinstance(rest, bytes):
-            rest = pickle.loads(rest)
+        found = rests.get(slot)
+        rest: dict[str, Any] = (pickle.loads(found) if isinstance(found, bytes) else found) or {}
         mark = int(slab.info_mark[row])
-        info = dict(rest.get("info", {}))
+        info: dict[str, Any] = rest.get("info", {})
         if mark not in (NO_INFO, PICKLED):
             info = self.slots.schemas[slot][mark].decode(memoryview(slab.info[row]))
         rests[slot] = {**rest, "info": {**info, "worker_restarted": death.cause}}
@@ -595,7 +600,10 @@ class Fleet:
             server.release()
         self._arena.close()
         if started:
-            warnings.warn("an EnvGroup was not closed; its envs were killed", ResourceWarning)
+            # The collector calls this: no caller's line would say anything.
+            warnings.warn(
+                "an EnvGroup was not closed; its envs were killed", ResourceWarning, stacklevel=1
+            )
 
     def _until_closed(self, members: list[_Member], by: float) -> Operation[None]:
         killed = False

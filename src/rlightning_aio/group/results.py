@@ -25,9 +25,10 @@ def collected(core: Core, slots: NDArray[np.intp], rests: dict[int, Any]) -> Bat
         parts = [_part(core, fleet.slabs[0], slots, None, rests)]
     else:
         slabs = table.slab[slots]
+        present: list[int] = np.unique(slabs).tolist()
         parts = [
             _part(core, fleet.slabs[slab], slots[places], places, rests)
-            for slab in np.unique(slabs).tolist()
+            for slab in present
             for places in (np.flatnonzero(slabs == slab),)
         ]
     return BatchedData.of_results(parts, Origin(core, slots, table))

@@ -117,7 +117,8 @@ class Slots:
 
     def names(self, slots: NDArray[np.intp]) -> list[str]:
         """Config entries of `slots`, in order."""
-        return [self.configs[slot].name for slot in slots.tolist()]
+        chosen: list[int] = slots.tolist()
+        return [self.configs[slot].name for slot in chosen]
 
     def describe(self, slot: int) -> str:
         """How an error message names the env."""
