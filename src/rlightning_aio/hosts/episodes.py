@@ -8,11 +8,10 @@ what comes after an end that nobody has reset yet.
 from __future__ import annotations
 
 from types import EllipsisType
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-
 
 if TYPE_CHECKING:
     from rlightning_aio.types import Autoreset
@@ -35,22 +34,28 @@ class EpisodeSums:
         self._returns = np.zeros(shape)
         self._lengths = np.zeros(shape, np.int64)
         self._over = np.zeros(shape, np.bool_)
+        self._any_over = False
 
     def forget(self) -> None:
         """All episodes begin anew."""
         self._returns[...] = 0.0
         self._lengths[...] = 0
-        self._over[...] = False
+        self._over[...] = self._any_over = False
 
     def add(
         self, reward: NDArray[np.float64], ended: NDArray[np.bool_], which: Which = ...
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
         """Count one step of all sub-environments, or of those that `which` names.
 
         Returns:
             Returns and lengths of the episodes that ended in this step, in the shape of
-            `ended`; elsewhere the length is 0.
+            `ended`, with length 0 elsewhere; None if `ended` is true of none.
         """
+        any_ended = bool(ended.any())
+        if not any_ended and not self._any_over:
+            self._returns[which] += reward
+            self._lengths[which] += 1
+            return None
         over = self._over[which]
         self._returns[which] += np.where(over, 0.0, reward)
         self._lengths[which] += ~over
@@ -63,4 +68,5 @@ class EpisodeSums:
             self._over[which] = ended_now
         elif self._autoreset == "disabled":
             self._over[which] = over | ended
-        return returns, lengths
+        self._any_over = bool(self._over.any())
+        return (returns, lengths) if any_ended else None

@@ -115,9 +115,18 @@ class EnvRunner:
         read_action = self._read_action
         if read_action is None:
             return lambda: self.step_with(None, {})
-        plain = self.meta.autoreset == "disabled" and not self._slab.layout.head
-        if bare is None or self._write_observation is None or not plain:
+        if bare is None or self._write_observation is None:
             return lambda: self.step_with(read_action(), {})
+        if self._slab.layout.head or self.meta.autoreset != "disabled":
+            return _bare_batch_stepper(
+                bare,
+                read_action,
+                self._write_observation,
+                self._info_writer.write,
+                self._slab,
+                self._row,
+                self._count_step,
+            )
         self.reset_episode, step = _bare_stepper(
             bare,
             read_action,
@@ -209,11 +218,16 @@ class EnvRunner:
         self._store_flag("reward", slab.reward, result.last_reward, agents)
         self._store_flag("terminated", terminated, result.last_terminated, agents)
         self._store_flag("truncated", truncated, result.last_truncated, agents)
-        ended = terminated[row] | truncated[row]
-        which = np.asarray(result.info["env_id"]) if self._takes_turns else ...
-        slab.episode_return[row], slab.episode_length[row] = self._episodes.add(
-            slab.reward[row], ended, which
-        )
+        self._count_step(result.info)
+
+    def _count_step(self, info: dict[str, Any]) -> None:
+        """Add the step that the row holds to its episodes."""
+        slab, row = self._slab, self._row
+        which = np.asarray(info["env_id"]) if self._takes_turns else ...
+        ended = slab.terminated[row] | slab.truncated[row]
+        sums = self._episodes.add(slab.reward[row], ended, which)
+        if sums is not None:
+            slab.episode_return[row], slab.episode_length[row] = sums
 
     def _store_flag(self, what: str, column: Any, value: Any, agents: tuple[str, ...]) -> None:
         head = column.shape[1:]
@@ -283,6 +297,34 @@ def _bare_stepper(
         return {"info": info} if mark == PICKLED else None
 
     return forget, step
+
+
+def _bare_batch_stepper(
+    bare: Callable[[Any], tuple[Any, Any, Any, Any, dict[str, Any]]],
+    read_action: Callable[[], Any],
+    write_observation: Callable[[Any], None],
+    write_info: Callable[[dict[str, Any]], int],
+    slab: Slab,
+    row: int,
+    count_step: Callable[[dict[str, Any]], None],
+) -> Callable[[], Rest | None]:
+    """The same for bare simulators whose episodes take more than a sum."""
+    # With an ellipsis an entry of a plain column is a view, too.
+    reward, terminated, truncated = (
+        column[row, ...] for column in (slab.reward, slab.terminated, slab.truncated)
+    )
+
+    def step() -> Rest | None:
+        began = time.monotonic_ns()
+        observation, reward[...], terminated[...], truncated[...], info = bare(read_action())
+        done = time.monotonic_ns()
+        slab.done_ns[row], slab.busy_ns[row] = done, done - began
+        write_observation(observation)
+        count_step(info)
+        mark = slab.info_mark[row] = write_info(info)
+        return {"info": info} if mark == PICKLED else None
+
+    return step
 
 
 def _target(env: BaseEnv, target: str) -> Any:
