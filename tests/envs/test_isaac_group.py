@@ -133,3 +133,20 @@ def test_what_is_wrong_over_there_is_told_here(bare: tuple[Path, dict[str, Any]]
         sync.build_env_group(here),
     ):
         pass
+
+
+@pytest.mark.parametrize("name", ["isaac_cartpole", "isaac_marl"])
+def test_the_examples_end_with_their_tables(bare: tuple[Path, dict[str, Any]], name: str) -> None:
+    """Each example config runs with nothing changed but the Python of its workers."""
+    assets, _ = bare
+    config = Path(__file__).parents[2] / "configs" / f"{name}.yaml"
+    command = [sys.executable, "-c", "from rlightning_aio.cli import main; main()", "rollout"]
+    run = subprocess.run(
+        [*command, config, f"envs.0.interpreter={PYTHON}", "--steps", "128"],
+        env={**os.environ, "ISAACSIM_ASSET_ROOT": str(assets)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 0, run.stderr
+    assert "mean return" in run.stdout

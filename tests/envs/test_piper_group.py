@@ -104,3 +104,15 @@ def test_the_arm_stops_when_its_trainer_dies(death: signal.Signals) -> None:
         assert arm.wait_for(lambda: arm.emergency_stopped, seconds=2)
         assert np.abs(arm.joints - arm.targets).max() == 0
     port.close()
+
+
+def test_the_dry_run_ends_with_its_table() -> None:
+    """The example config runs as it stands, without an arm."""
+    config = Path(__file__).parents[2] / "configs" / "piper.yaml"
+    command = [sys.executable, "-c", "from rlightning_aio.cli import main; main()", "rollout"]
+    run = subprocess.run(
+        [*command, config, "--steps", "30"], capture_output=True, text=True, check=False
+    )
+    assert run.returncode == 0, run.stderr
+    assert "mean return" in run.stdout
+    assert "piper" in run.stdout
