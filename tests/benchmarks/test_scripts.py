@@ -1,0 +1,116 @@
+"""Every benchmark runs and tells what it is asked for; how fast is nobody's business here."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+
+
+def run_script(name: str, folder: Path, *arguments: str) -> dict[str, Any]:
+    """The report of one short round."""
+    out = folder / f"{name}.json"
+    run = subprocess.run(
+        [sys.executable, BENCHMARKS / f"{name}.py", "--rounds", "1", "--json", out, *arguments],
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
+    )
+    assert run.returncode == 0, run.stderr
+    return json.loads(out.read_text())
+
+
+SHORT = ("--seconds", "0.05")
+OURS = ("--only", "rlightning_aio")
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "contenders"),
+    [
+        ("cheetah", (*SHORT, "--only", "rlightning_aio async", "--only", "limit"), 2),
+        ("cartpole", (*SHORT, "--only", "rlightning_aio sync", "--only", "loop"), 2),
+        ("humanoid", (*SHORT, "--only", "rlightning_aio sync"), 1),
+        ("round_trip", SHORT, 4),
+        ("facade", SHORT, 2),
+        ("trainer_cpu", (*SHORT, "--only", ", 8 envs"), 3),
+        ("stragglers", SHORT, 3),
+        ("start", (), 2),
+        ("memory", OURS, 1),
+    ],
+)
+def test_script_measures_each_of_its_contenders(
+    name: str, arguments: tuple[str, ...], contenders: int, tmp_path: Path
+) -> None:
+    """A short run ends with a positive figure for every contender that was asked for."""
+    report = run_script(name, tmp_path, *arguments)
+    assert not report["skipped"]
+    assert len(report["results"]) == contenders
+    if name != "facade":  # Both of its sides are alike.
+        assert all(found["median"] > 0 for found in report["results"].values())
+
+
+@pytest.mark.parametrize(
+    ("module", "peer"),
+    [
+        ("gymnasium", "Gymnasium AsyncVectorEnv"),
+        ("stable_baselines3", "SB3 SubprocVecEnv"),
+        ("tianshou", "Tianshou ShmemVectorEnv"),
+        ("envpool", "EnvPool, 16 of 32"),
+    ],
+)
+def test_peer_steps(module: str, peer: str, tmp_path: Path) -> None:
+    """Each peer that is installed can be measured."""
+    if importlib.util.find_spec(module) is None:
+        pytest.skip(f"{module} is not installed")
+    report = run_script("peers", tmp_path, *SHORT, "--only", peer)
+    assert report["results"][peer]["median"] > 0
+
+
+def test_pong(tmp_path: Path) -> None:
+    """Raw frames pass through the synchronous and the asynchronous group."""
+    if importlib.util.find_spec("ale_py") is None:
+        pytest.skip("ale_py is not installed")
+    report = run_script("pong", tmp_path, *SHORT, *OURS)
+    assert len(report["results"]) == 2
+
+
+def test_every_script_has_its_place_in_the_readme(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What `run_all` runs is what the README has tables for."""
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    run_all = importlib.import_module("run_all")
+    marked = re.findall(r"^<!-- (\w+) -->$", (BENCHMARKS / "README.md").read_text(), re.MULTILINE)
+    assert sorted(set(marked) - {"end"}) == sorted(run_all.SCRIPTS)
+
+
+def test_a_renewed_table_stands_between_its_marks(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A table replaces the old one of the same name and nothing else."""
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    run_all = importlib.import_module("run_all")
+    monkeypatch.setattr(run_all, "RESULTS", tmp_path)
+    machine = {
+        "cores": 2, "cpu": "a CPU", "memory_gib": 4, "system": "Linux", "python": "3.11",
+        "versions": {},
+    }  # fmt: skip
+    report = {
+        "title": "T", "unit": "s", "rounds": 3, "machine": machine, "targets": [], "skipped": {},
+        "results": {"A": {"median": 1.0, "low": 0.5, "high": 2.0}},
+    }  # fmt: skip
+    (tmp_path / "a.json").write_text(json.dumps(report))
+    text = "<!-- a -->\nold\n<!-- end -->\n<!-- b -->\nkept\n<!-- end -->\n"
+    renewed = run_all.with_table(text, "a")
+    assert "| A | 1 | 0.5 to 2 |" in renewed
+    assert "old" not in renewed
+    assert renewed.endswith("<!-- b -->\nkept\n<!-- end -->\n")
+    assert run_all.with_table(renewed, "a") == renewed
