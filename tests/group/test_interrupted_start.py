@@ -12,7 +12,7 @@ import textwrap
 import pytest
 
 import rlightning_aio
-from rlightning_aio.errors import GroupClosed
+from rlightning_aio.errors import GroupClosed, StartFailed
 
 ENTRY = {"name": "cartpole", "backend": "gymnasium", "task": "CartPole-v1", "num_workers": 2}
 
@@ -39,6 +39,13 @@ async def test_cancelling_init_twice_does_not_wait_for_the_workers() -> None:
     starting.cancel()
     with pytest.raises(asyncio.CancelledError):
         await starting
+
+
+async def test_a_start_that_fails_keeps_no_memory() -> None:
+    """A group whose envs can't be built is gone with its last reference, unclosed or not."""
+    group = rlightning_aio.build_env_group({**ENTRY, "task": "NoSuchTask-v0"})
+    with pytest.raises(StartFailed):
+        await group.init()
 
 
 def test_interrupting_a_synchronous_init_raises_the_interrupt() -> None:

@@ -155,6 +155,8 @@ class Fleet:
             yield from self._until(_Stage.UP)
         except BaseException:
             yield from self.close(self._now)
+            # Its traceback leads to the group, which would never be collected.
+            self._start_fault = None
             raise
         self.open = True
         return self.metas
