@@ -1,0 +1,67 @@
+"""The command as a user starts it, and as a function in this process."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from typer.testing import CliRunner
+
+from rlightning_aio.cli.app import app
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+COMMAND = [sys.executable, "-c", "from rlightning_aio.cli import main; main()"]
+TESTS = Path(__file__).parent.parent
+"""Where commands are run, so that `imports: [cli.stub_envs]` is found."""
+
+CARTPOLE = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1"}
+
+
+def write_config(folder: Path, *entries: dict[str, Any]) -> str:
+    """A YAML file (JSON is YAML) with `entries`, which may use the stub envs."""
+    path = folder / "config.yaml"
+    document = {"imports": ["cli.stub_envs"], "envs": list(entries)}
+    path.write_text(json.dumps(document))
+    return str(path)
+
+
+def invoke(*words: object) -> Any:
+    """Run the command here; stdout, stderr and exit_code of what came of it."""
+    return CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
+
+
+def invoke_json(*words: object) -> Any:
+    """Run the command here with --json; the document."""
+    done = invoke(*words, "--json")
+    assert done.exit_code == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def run(
+    *words: object, cwd: Path = TESTS, program: Sequence[str] = COMMAND
+) -> subprocess.CompletedProcess[str]:
+    """Run the command in a process of its own, to its end."""
+    return subprocess.run(
+        [*program, *map(str, words)],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+
+
+def start(*words: object) -> subprocess.Popen[str]:
+    """Start the command in a process of its own."""
+    return subprocess.Popen(
+        [*COMMAND, *map(str, words)],
+        cwd=TESTS,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )

@@ -1,0 +1,17 @@
+"""What commands keep for the process they run in is made before tests count descriptors."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+import uvloop
+
+# libuv keeps a pipe for signals from its first loop to the end of the process.
+uvloop.new_event_loop().close()
+
+
+@pytest.fixture(autouse=True)
+def path_as_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A command adds the working folder to the path of its process."""
+    monkeypatch.setattr(sys, "path", list(sys.path))

@@ -1,0 +1,102 @@
+"""Envs that count, fail, die and hang on demand; registered when a config imports this."""
+
+from __future__ import annotations
+
+import os
+import threading
+from pathlib import Path
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+
+import rlightning_aio as rl
+
+
+class Stub(rl.BaseEnv):
+    """Observes its number of steps; ends after ``episode_length`` of them, reward 1 each."""
+
+    steps: ClassVar[int] = 0
+    """Executed in this process by all stubs together, one for each sub-environment."""
+
+    def __init__(self, config: rl.EnvConfig, *args: Any, **kwargs: Any) -> None:
+        super().__init__(config, *args, **kwargs)
+        self.options = config.env_kwargs
+        self.count = 0
+
+    def _batched(self, space: gym.Space[Any]) -> gym.Space[Any]:
+        return gym.vector.utils.batch_space(space, self.num_envs) if self.num_envs > 1 else space
+
+    def get_observation_space(self) -> gym.Space[Any]:
+        shape = (self.options.get("observation_size", 1),)
+        return self._batched(gym.spaces.Box(-np.inf, np.inf, shape, np.float32))
+
+    def get_action_space(self) -> gym.Space[Any]:
+        return self._batched(gym.spaces.Discrete(self.options.get("actions", 2)))
+
+    def _ret(self, **fields: Any) -> rl.EnvRet:
+        space = self.get_observation_space()
+        observation = np.full(space.shape, self.count, np.float32)
+        heads = {"last_reward": 0.0, "last_terminated": False, "last_truncated": False, **fields}
+        if self.num_envs > 1:
+            heads = {name: np.full(self.num_envs, value) for name, value in heads.items()}
+        return rl.EnvRet(env_id=self.env_id, observation=observation, **heads)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> rl.EnvRet:
+        self.count = 0
+        return self._ret()
+
+    def step(self, policy_resp: rl.PolicyResponse) -> rl.EnvRet:
+        self.count += 1
+        Stub.steps += self.num_envs
+        ended = self.count >= self.options.get("episode_length", 10)
+        return self._ret(last_reward=1.0, last_terminated=ended)
+
+
+@rl.ENVS.register("stub")
+class PlainStub(Stub):
+    """Nothing goes wrong."""
+
+
+@rl.ENVS.register("raising")
+class Raising(Stub):
+    """Raises in its third step."""
+
+    def step(self, policy_resp: rl.PolicyResponse) -> rl.EnvRet:
+        if self.count == 2:
+            raise ZeroDivisionError("the floor is missing")
+        return super().step(policy_resp)
+
+
+@rl.ENVS.register("dying")
+class Dying(Stub):
+    """Its worker ends in its third step."""
+
+    def step(self, policy_resp: rl.PolicyResponse) -> rl.EnvRet:
+        if self.count == 2:
+            os._exit(7)
+        return super().step(policy_resp)
+
+
+@rl.ENVS.register("unbuildable")
+class Unbuildable(Stub):
+    """Can't be built."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        raise FileNotFoundError("no such robot")
+
+
+@rl.ENVS.register("stuck")
+class Stuck(Stub):
+    """Never finishes being built, or its third step; says in a file which process it is in."""
+
+    def __init__(self, config: rl.EnvConfig, *args: Any, **kwargs: Any) -> None:
+        super().__init__(config, *args, **kwargs)
+        Path(self.options["pid_file"]).write_text(str(os.getpid()))
+        if self.options["where"] == "init":
+            threading.Event().wait()
+
+    def step(self, policy_resp: rl.PolicyResponse) -> rl.EnvRet:
+        if self.count == 2:
+            threading.Event().wait()
+        return super().step(policy_resp)

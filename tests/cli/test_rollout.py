@@ -1,0 +1,163 @@
+"""``rlightning-aio rollout``: it collects what it was asked to, and says what came."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from typing import TYPE_CHECKING
+
+import pytest
+from cli import stub_policies
+from cli.command import CARTPOLE, TESTS, invoke, invoke_json, run, write_config
+from cli.stub_envs import Stub
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+STUB = {"name": "stub", "backend": "stub", "task": "any", "placement": "inline"}
+
+
+def test_it_collects_through_workers_and_prints_a_line_for_each_entry(tmp_path: Path) -> None:
+    """The real command collects exactly as many steps as it was told, and prints a table."""
+    config = write_config(
+        tmp_path,
+        {**CARTPOLE, "num_workers": 3},
+        {**CARTPOLE, "name": "short", "num_workers": 2, "max_episode_steps": 7},
+    )
+    done = run("rollout", config, "--steps", 1234)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("1,234 steps in ")
+    lines = {line.split()[0]: line.split() for line in done.stdout.splitlines()}
+    assert int(lines["pole"][2]) + int(lines["short"][2]) == 1234
+    assert lines["pole"][1] == "3"
+    assert float(lines["short"][6]) <= 7
+    assert "Traceback" not in done.stderr
+
+
+def test_json_is_all_that_stdout_holds(tmp_path: Path) -> None:
+    """With --json stdout is one document, whatever is said on stderr."""
+    config = write_config(tmp_path, {**CARTPOLE, "num_workers": 2})
+    done = run("rollout", config, "--steps", 500, "--json")
+    document = json.loads(done.stdout)
+    (entry,) = document["entries"]
+    assert (document["steps"], document["interrupted"]) == (500, False)
+    assert (entry["name"], entry["envs"], entry["steps"]) == ("pole", 2, 500)
+    assert entry["mean_return"] == entry["mean_length"] > 1
+    assert entry["step_us"]["p50"] <= entry["step_us"]["p99"]
+    assert document["steps_per_second"] == pytest.approx(500 / document["seconds"])
+    assert "collecting 500 steps" in done.stderr
+
+
+def test_overrides_change_the_configuration(tmp_path: Path) -> None:
+    """What follows the file is applied to it."""
+    config = write_config(tmp_path, {**STUB, "num_workers": 2})
+    document = invoke_json("rollout", config, "envs.0.num_workers=5", "--steps", 50)
+    assert document["entries"][0]["envs"] == 5
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+@pytest.mark.parametrize("episode_length", [1, 4, 1000])
+def test_resets_are_no_steps(tmp_path: Path, episode_length: int, num_envs: int) -> None:
+    """The steps told are those that envs executed, those of sub-environments each."""
+    kwargs = {"episode_length": episode_length}
+    config = write_config(
+        tmp_path, {**STUB, "num_workers": 3, "num_envs": num_envs, "env_kwargs": kwargs}
+    )
+    Stub.steps = 0
+    document = invoke_json("rollout", config, "--steps", 90, "--min-results", 1)
+    assert document["steps"] == 90
+    # Those that were sent on and not collected any more are executed or not.
+    assert 90 <= Stub.steps <= 90 + 3 * num_envs
+    assert document["entries"][0]["episodes"] <= 90 // episode_length
+
+
+def test_a_configured_limit_ends_episodes_of_envs_that_never_end(tmp_path: Path) -> None:
+    """Where every entry has a step limit, episodes end there."""
+    kwargs = {"episode_length": 10**9}
+    config = write_config(
+        tmp_path, {**STUB, "num_workers": 2, "env_kwargs": kwargs, "max_episode_steps": 5}
+    )
+    stub_policies.furthest_seen.clear()
+    invoke_json("rollout", config, "--steps", 100, "--policy", "cli.stub_policies:furthest")
+    assert max(stub_policies.furthest_seen) == 5
+
+
+def test_one_seed_makes_one_rollout(tmp_path: Path) -> None:
+    """In one process, the same seed gives the same episodes, another one others."""
+    config = write_config(tmp_path, {**CARTPOLE, "num_workers": 3, "placement": "inline"})
+
+    def episodes(seed: int) -> tuple[int, float]:
+        (entry,) = invoke_json("rollout", config, "--steps", 600, "--seed", seed)["entries"]
+        return entry["episodes"], entry["mean_return"]
+
+    assert episodes(3) == episodes(3)
+    assert episodes(3) != episodes(4)
+
+
+def test_a_policy_chooses_the_actions(tmp_path: Path) -> None:
+    """A pole that is always pushed to one side falls within eleven steps."""
+    (tmp_path / "one_sided.py").write_text("def left(batch):\n    return [0] * len(batch)\n")
+    config = write_config(tmp_path, {**CARTPOLE, "num_workers": 2, "imports": []})
+    done = run(
+        *("rollout", config, "imports=[]", "--steps", 200, "--policy", "one_sided:left", "--json"),
+        cwd=tmp_path,
+    )
+    (entry,) = json.loads(done.stdout)["entries"]
+    assert 8 <= entry["mean_length"] <= 11
+
+
+def test_a_policy_may_answer_with_a_batch_of_responses(tmp_path: Path) -> None:
+    """What `respond` makes is sent as it is."""
+    config = write_config(tmp_path, {**STUB, "num_workers": 2})
+    document = invoke_json(
+        "rollout", config, "--steps", 30, "--policy", "cli.stub_policies:respond"
+    )
+    assert document["steps"] == 30
+
+
+@pytest.mark.parametrize("differing", [{"observation_size": 2}, {"actions": 3}])
+def test_a_policy_gets_one_batch_for_each_entry_where_spaces_differ(
+    tmp_path: Path, differing: dict[str, int]
+) -> None:
+    """Each call's results stack, and belong to one entry."""
+    other = {**STUB, "name": "other", "env_kwargs": differing}
+    config = write_config(tmp_path, {**STUB, "num_workers": 2}, {**other, "num_workers": 3})
+    stub_policies.names_seen.clear()
+    invoke_json(
+        *("rollout", config, "--steps", 40, "--min-results", 5),
+        *("--policy", "cli.stub_policies:names"),
+    )
+    assert set(stub_policies.names_seen) == {frozenset({"stub"}), frozenset({"other"})}
+
+
+def test_random_actions_suit_entries_with_different_spaces(tmp_path: Path) -> None:
+    """Entries whose actions differ are collected together, each with its own."""
+    pendulum = {"name": "pendulum", "backend": "gymnasium", "task": "Pendulum-v1"}
+    config = write_config(
+        tmp_path,
+        {**CARTPOLE, "placement": "inline"},
+        {**pendulum, "placement": "inline", "num_workers": 2},
+    )
+    document = invoke_json("rollout", config, "--steps", 300)
+    assert all(entry["steps"] > 50 for entry in document["entries"])
+
+
+def test_the_console_script_is_this_command() -> None:
+    """What is installed as rlightning-aio is `cli.main`."""
+    project = tomllib.loads((TESTS.parent / "pyproject.toml").read_text())["project"]
+    assert project["scripts"] == {"rlightning-aio": "rlightning_aio.cli:main"}
+
+
+@pytest.mark.parametrize("command", [[], ["rollout"], ["backends"]])
+def test_help_teaches_by_example(command: list[str]) -> None:
+    """Each help text has command lines to copy."""
+    done = invoke(*command, "--help")
+    assert done.exit_code == 0
+    assert f"rlightning-aio {' '.join(command)}".strip() in done.stdout
+
+
+def test_the_version_is_told() -> None:
+    """--version prints it and nothing else."""
+    import rlightning_aio
+
+    assert invoke("--version").stdout == f"{rlightning_aio.__version__}\n"
