@@ -9,6 +9,7 @@ import pytest
 from envs.bare import gymnasium_outcomes
 from envs.group_contract import GroupContract
 
+from rlightning_aio import sync
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.envs.contract import Outcome, outcome_of, same
 from rlightning_aio.errors import ConfigError
@@ -24,6 +25,7 @@ envpool: Any = pytest.importorskip("envpool")
 pytestmark = [
     pytest.mark.simulators,
     pytest.mark.filterwarnings("ignore:.*precision lowered:UserWarning"),
+    pytest.mark.filterwarnings("ignore:.*overrides the limits:UserWarning"),
 ]
 
 
@@ -109,6 +111,36 @@ def test_asynchronous_trajectories_are_each_sub_environments_own() -> None:
         result = pool.step(PolicyResponse("pool-0", actions))
     for env in (pool, *alone):
         env.close()
+
+
+@pytest.mark.parametrize("placement", ["process", "inline"])
+def test_a_group_counts_the_episodes_of_each_sub_environment(placement: str) -> None:
+    """Turns are told apart, nobody resets what resets itself, and every end is counted."""
+    config = entry(
+        num_envs=4, placement=placement, max_episode_steps=7, env_kwargs={"batch_size": 2}
+    )
+    steps_seen: dict[int, int] = {}
+    finished: list[int] = []
+    with sync.build_env_group(config) as group:
+        batch, _ = group.reset(seed=2)
+        with group.auto_reset(max_episode_steps=10**6):
+            for count in range(200):
+                result = batch.values()[0]
+                for index, step in zip(
+                    result.info["env_id"].tolist(), result.info["elapsed_step"], strict=True
+                ):
+                    assert step in (0, steps_seen.get(index, -1) + 1)
+                    steps_seen[index] = int(step)
+                if count:
+                    ended = result.last_terminated | result.last_truncated
+                    finished += result.info["elapsed_step"][ended].tolist()
+                group.step_async(batch.respond(action=np.array([[count % 2, 1]])))
+                batch, _ = group.collect_async()
+        stats = group.get_env_stats()["pool-0"]
+    last = batch.values()[0]
+    finished += last.info["elapsed_step"][last.last_terminated | last.last_truncated].tolist()
+    assert stats["episodes"] == len(finished) > 20
+    assert stats["mean_length"] == stats["mean_return"] == np.mean(finished)
 
 
 def test_asynchronous_pools_can_be_reset_while_they_compute() -> None:

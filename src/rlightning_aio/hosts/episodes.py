@@ -36,11 +36,13 @@ class EpisodeSums:
         self._over = np.zeros(shape, np.bool_)
         self._any_over = False
 
-    def forget(self) -> None:
-        """All episodes begin anew."""
+    def forget(self, begun: Which = ...) -> None:
+        """All episodes begin anew; those that `begun` leaves out, when next heard of."""
         self._returns[...] = 0.0
         self._lengths[...] = 0
-        self._over[...] = self._any_over = False
+        self._over[...] = True
+        self._over[begun] = False
+        self._any_over = bool(self._over.any())
 
     def add(
         self, reward: NDArray[np.float64], ended: NDArray[np.bool_], which: Which = ...

@@ -172,6 +172,9 @@ class EnvRunner:
         began = time.monotonic_ns()
         result = self.env.reset(seed=seed, options=options)
         self.reset_episode()
+        if self._takes_turns:
+            # The others' first observations are still to come, as results of steps.
+            self._episodes.forget(begun=np.asarray(result.info["env_id"]))
         return self._store(result, began, stepped=False)
 
     def reset_from_row(self) -> Rest | None:
