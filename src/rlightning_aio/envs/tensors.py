@@ -7,12 +7,21 @@ from __future__ import annotations
 
 from typing import Any, cast
 
-__all__ = ["as_numpy", "is_tensor"]
+__all__ = ["as_numpy", "holds_tensor", "is_tensor"]
 
 
 def is_tensor(value: Any) -> bool:
     """Whether `value` is a torch tensor."""
     return type(value).__module__.partition(".")[0] == "torch" and hasattr(value, "detach")
+
+
+def holds_tensor(value: Any) -> bool:
+    """Whether `value` is a torch tensor, or a dict, tuple or list that holds one."""
+    if isinstance(value, dict):
+        return any(map(holds_tensor, cast("dict[Any, Any]", value).values()))
+    if isinstance(value, tuple | list):
+        return any(map(holds_tensor, cast("tuple[Any, ...]", value)))
+    return is_tensor(value)
 
 
 def as_numpy(value: Any) -> Any:

@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from types import FrameType
 
 __all__ = ["BOOTSTRAP", "DUMP_SIGNAL", "Exited", "Fork", "Forked", "Hello", "Kill", "Ready", "main"]
 
@@ -124,6 +125,10 @@ def _die_with_parent() -> None:
         ctypes.CDLL(None, use_errno=True).prctl(pr_set_pdeathsig, signal.SIGKILL)
 
 
+def _on_child(signal_number: int, frame: FrameType | None) -> None:
+    """Does nothing: a signal that has a handler reaches the wake-up descriptor."""
+
+
 class _ForkServer:
     def __init__(self, trainer: socket.socket) -> None:
         self._trainer = trainer
@@ -136,7 +141,7 @@ class _ForkServer:
         wakeup.setblocking(False)
         self._wakeup_writer = wakeup
         signal.set_wakeup_fd(wakeup.fileno(), warn_on_full_buffer=False)
-        signal.signal(signal.SIGCHLD, lambda *_: None)
+        signal.signal(signal.SIGCHLD, _on_child)
         self._poll.register(self._wakeup, select.POLLIN)
 
     def serve(self) -> None:
@@ -250,14 +255,14 @@ class _ForkServer:
             self._tell(Exited(child.host_id, os.waitstatus_to_exitcode(status), tail))
 
     def _tell(self, message: Any) -> None:
-        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+        # The trainer may be gone, and its socket closed.
+        with contextlib.suppress(OSError):
             self._trainer.send(pickle.dumps(message))
 
     def _end_all(self) -> None:
         """The trainer is gone: workers see their channel close; kill whoever stays."""
         self._poll.unregister(self._trainer)
         self._trainer.close()
-        self._tell = lambda message: None
         until = time.monotonic() + _GRACE_SECONDS
         while self._children and time.monotonic() < until:
             self._wait_for_children(until)
@@ -288,7 +293,8 @@ def _run_worker(
             os._exit(1)
         faulthandler.enable(all_threads=True)
         faulthandler.register(DUMP_SIGNAL, all_threads=True)
-        from rlightning_aio.hosts import worker
+        # Not above: the fork server speaks before it imports what may fail.
+        from rlightning_aio.hosts import worker  # noqa: PLC0415
 
         channel = socket.socket(fileno=descriptors[0])
         worker.main(channel, descriptors[1], order.rings_offset, order.first_slot, order.rows)

@@ -8,7 +8,7 @@ while it steps; nothing protects the trainer from an env that crashes.
 from __future__ import annotations
 
 from collections import deque
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -93,7 +93,7 @@ class InlineHost:
 
     def request(self, entries: NDArray[np.int64]) -> None:
         """See `base.Host.request`."""
-        for entry in entries.tolist():
+        for entry in cast("list[int]", entries.tolist()):
             row = ((entry >> ring_entries.OP_BITS) & ring_entries.SLOT_MASK) - self.first_slot
             number = entry >> ring_entries.NUMBER_SHIFT
             runner = self._runners[row]
@@ -148,6 +148,7 @@ class InlineHost:
 
     def order(self, count: int) -> bool:
         """Nothing gets ready by itself here."""
+        del count
         return False
 
     def has_news(self) -> bool:
@@ -196,11 +197,11 @@ def _owned(value: Any) -> Any:
     Everything else is left as it is; a tensor must stay the tensor it is.
     """
     if isinstance(value, np.ndarray):
-        return value.copy()
+        return cast("NDArray[Any]", value).copy()
     if type(value) is dict:
-        return {key: _owned(inner) for key, inner in value.items()}
+        return {key: _owned(inner) for key, inner in cast("dict[Any, Any]", value).items()}
     if type(value) in (tuple, list):
         return type(value)(map(_owned, value))
-    if isinstance(value, tuple) and hasattr(value, "_make"):
-        return type(value)._make(map(_owned, value))  # A graph, for one.
+    if hasattr(value, "_make") and not isinstance(value, type):
+        return value._make(map(_owned, value))  # A named tuple: a graph, for one.
     return value

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rlightning_aio.envs.base import BaseEnv, default_env_preprocess_fn
+from rlightning_aio.envs.tensors import as_numpy, holds_tensor
 from rlightning_aio.hosts.episodes import EpisodeSums
 from rlightning_aio.protocol.columns import row_reader, row_writer
 from rlightning_aio.protocol.info import NO_INFO, PICKLED, InfoSchema, InfoWriter
@@ -21,6 +22,8 @@ from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyRespon
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from numpy.typing import NDArray
 
 __all__ = ["EnvRunner", "Rest"]
 
@@ -192,10 +195,10 @@ class EnvRunner:
                 f"EnvRet or a MultiAgentEnvRet, not {type(result).__name__}"
             )
         rest: Rest = {}
-        if _holds_tensor(result.observation):
+        if holds_tensor(result.observation):
             if self._keeps_tensors:
                 rest["ret"] = result
-            observation = _as_numpy(result.observation)
+            observation = as_numpy(result.observation)
         else:
             observation = result.observation
         self._store_head(result, stepped=stepped)
@@ -235,8 +238,8 @@ class EnvRunner:
     def _store_flag(self, what: str, column: Any, value: Any, agents: tuple[str, ...]) -> None:
         head = column.shape[1:]
         if agents:
-            value = [_as_numpy(value[agent]) for agent in agents]
-        array = np.asarray(_as_numpy(value))
+            value = [as_numpy(value[agent]) for agent in agents]
+        array = np.asarray(as_numpy(value))
         if array.shape != head and array.size == column[self._row].size:
             array = array.reshape(head)  # ManiSkill's (1,) for one sub-environment, say.
         if array.shape != head:
@@ -248,7 +251,7 @@ class EnvRunner:
     def _store_info(self, info: dict[str, Any], rest: Rest) -> None:
         mark = self._info_writer.write(info)
         if mark == PICKLED:
-            rest["info"] = _as_numpy(info)
+            rest["info"] = as_numpy(info)
         self._slab.info_mark[self._row] = mark
 
 
@@ -265,12 +268,9 @@ def _bare_stepper(
     Closures over memoryviews: assigning an element of one costs a fifth of assigning an
     element of an array.
     """
-    rewards = memoryview(slab.reward)
-    terminations = memoryview(slab.terminated)
-    truncations = memoryview(slab.truncated)
-    marks = memoryview(slab.info_mark)
-    done_times = memoryview(slab.done_ns)
-    busy_times = memoryview(slab.busy_ns)
+    rewards, terminations = _view(slab.reward), _view(slab.terminated)
+    truncations, marks = _view(slab.truncated), _view(slab.info_mark)
+    done_times, busy_times = _view(slab.done_ns), _view(slab.busy_ns)
     clock = time.monotonic_ns
     episode_return = 0.0
     episode_length = 0
@@ -330,6 +330,11 @@ def _bare_batch_stepper(
     return step
 
 
+def _view(array: NDArray[Any]) -> memoryview[Any]:
+    # NumPy's types know that arrays are buffers from Python 3.12 on.
+    return memoryview(array)  # pyright: ignore[reportArgumentType]
+
+
 def _target(env: BaseEnv, target: str) -> Any:
     inner = env.env
     if target == "outer" or inner is None:
@@ -347,26 +352,3 @@ def get_attr(env: BaseEnv, name: str, target: str = "unwrapped") -> Any:
 def set_attr(env: BaseEnv, name: str, value: Any, target: str = "unwrapped") -> None:
     """Set attribute `name` of the simulator itself, or of its outermost wrapper."""
     setattr(_target(env, target), name, value)
-
-
-def _is_tensor(value: Any) -> bool:
-    return type(value).__module__.partition(".")[0] == "torch" and hasattr(value, "detach")
-
-
-def _holds_tensor(value: Any) -> bool:
-    if isinstance(value, dict):
-        return any(map(_holds_tensor, value.values()))
-    if isinstance(value, tuple | list):
-        return any(map(_holds_tensor, value))
-    return _is_tensor(value)
-
-
-def _as_numpy(value: Any) -> Any:
-    """`value` with every torch tensor in it as a NumPy array on the CPU."""
-    if _is_tensor(value):
-        return value.detach().cpu().numpy()
-    if isinstance(value, dict):
-        return {key: _as_numpy(inner) for key, inner in value.items()}
-    if type(value) in (tuple, list):
-        return type(value)(_as_numpy(inner) for inner in value)
-    return value
