@@ -140,7 +140,11 @@ class EnvGroup(Facade):
             ConfigError: the envs' action spaces have different shapes (a `ValueError`).
             GroupClosed: the group was closed before.
         """
-        return await self._driver.run(self._fleet.start(time.monotonic()))
+        try:
+            return await self._driver.run(self._fleet.start(time.monotonic()))
+        except BaseException:
+            self._closed()
+            raise
 
     async def __aenter__(self) -> Self:
         await self.init()

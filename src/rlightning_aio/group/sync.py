@@ -106,7 +106,11 @@ class EnvGroup(Facade):
 
     def init(self) -> list[EnvMeta]:
         """See `rlightning_aio.EnvGroup.init`."""
-        return self._driver.run(self._fleet.start(time.monotonic()))
+        try:
+            return self._driver.run(self._fleet.start(time.monotonic()))
+        except BaseException:
+            self._closed()
+            raise
 
     def __enter__(self) -> Self:
         self.init()
