@@ -191,6 +191,8 @@ class Worker:
         while not self._closing:
             if has_frame():
                 self._receive(socket.MSG_DONTWAIT)
+                if self._closing:
+                    break
             requests = rings.requests()
             if not requests:
                 break
