@@ -9,9 +9,10 @@ arrays: nothing that happens later changes them (unless the group was built with
 from __future__ import annotations
 
 import pickle
+import sys
 import time
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 
@@ -114,7 +115,7 @@ class ResultColumns:
         mark = int(self.info_marks[row])
         if self.info is None or mark in (NO_INFO, PICKLED):
             return {}
-        return self.schemas[self.slots[row]][mark].decode(memoryview(self.info[row]))
+        return self.schemas[int(self.slots[row])][mark].decode(memoryview(self.info[row]))
 
     def _episode(self, row: int) -> dict[str, Any]:
         if self.episode_return is None or self.episode_length is None:
@@ -327,11 +328,9 @@ class BatchedData:
         """Which envs' episodes have ended: ``[n]`` bool, all sub-environments and agents of it."""
         whole = np.empty(len(self), np.bool_)
         for part in self._parts:
-            ended = (
-                part.ended
-                if part.ended.ndim == 1
-                else part.ended.all(axis=tuple(range(1, part.ended.ndim)))
-            )
+            ended = part.ended
+            if ended.ndim > 1:
+                ended = np.logical_and.reduce(ended, axis=tuple(range(1, ended.ndim)))
             if part.positions is None:
                 return ended
             whole[part.positions] = ended
@@ -456,15 +455,15 @@ def _stacked(values: list[Any]) -> Any:
     """`values` as columns: arrays, torch tensors, and dicts and tuples of them."""
     first = values[0] if values else None
     if isinstance(first, dict):
-        return {key: _stacked([value[key] for value in values]) for key in first}
+        keys = list(cast("dict[Any, Any]", first))
+        return {key: _stacked([value[key] for value in values]) for key in keys}
     if isinstance(first, tuple):
         return tuple(_stacked(list(parts)) for parts in zip(*values, strict=True))
     if isinstance(first, str):
         return values
     if type(first).__module__.partition(".")[0] == "torch":
-        import torch  # Only a process that already holds tensors comes here.
-
-        return torch.stack(values)
+        # Whoever holds a tensor has imported torch.
+        return sys.modules["torch"].stack(values)
     arrays = [np.asarray(value) for value in values]
     if len({array.shape for array in arrays}) > 1:
         raise ValueError(

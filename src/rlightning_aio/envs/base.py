@@ -10,12 +10,14 @@ from __future__ import annotations
 import abc
 import copy
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
-import gymnasium as gym
-
-from rlightning_aio.config import EnvConfig
 from rlightning_aio.types import Autoreset, EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
+
+if TYPE_CHECKING:
+    import gymnasium as gym
+
+    from rlightning_aio.config import EnvConfig
 
 __all__ = ["BareStep", "BaseEnv", "PreprocessFn", "Result", "default_env_preprocess_fn"]
 

@@ -197,7 +197,7 @@ class EnvGroup(Facade):
 
     async def collect_async(
         self,
-        timeout: float | None = None,
+        timeout: float | None = None,  # noqa: ASYNC109  # Of the window, not of the call.
         wait_all: bool = False,
         min_results: int = 1,
         max_results: int | None = None,
@@ -313,7 +313,7 @@ class EnvHandle:
         )
 
     async def get_attr(self, name: str, target: str = "unwrapped") -> Any:
-        """Attribute `name` of the simulator (``unwrapped``) or its outermost wrapper (``outer``)."""
+        """Attribute `name` of the simulator; of its outermost wrapper with target ``outer``."""
         return await self.call("get_attr", name, target)
 
     async def set_attr(self, name: str, value: Any, target: str = "unwrapped") -> None:
@@ -360,7 +360,7 @@ def build_env_group(
 def run(main: Coroutine[Any, Any, T]) -> T:
     """Run `main` to its end on a uvloop event loop (or asyncio's, where uvloop is missing)."""
     try:
-        import uvloop
+        import uvloop  # noqa: PLC0415  # There is none for Windows.
     except ImportError:
         return asyncio.run(main)
     return uvloop.run(main)

@@ -215,7 +215,7 @@ class EnvHandle:
         )
 
     def get_attr(self, name: str, target: str = "unwrapped") -> Any:
-        """Attribute `name` of the simulator (``unwrapped``) or its outermost wrapper (``outer``)."""
+        """Attribute `name` of the simulator; of its outermost wrapper with target ``outer``."""
         return self.call("get_attr", name, target)
 
     def set_attr(self, name: str, value: Any, target: str = "unwrapped") -> None:
