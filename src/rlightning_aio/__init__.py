@@ -25,7 +25,7 @@ if TYPE_CHECKING:
         UnknownEnv,
         WorkerDied,
     )
-    from rlightning_aio.group.aio import EnvGroup, EnvHandle, build_env_group, run
+    from rlightning_aio.group.aio import EnvGroup, EnvHandle, ServerHandle, build_env_group, run
     from rlightning_aio.registry import ENVS
     from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
 
@@ -48,7 +48,7 @@ _HOMES = {
         "UnknownEnv",
         "WorkerDied",
     ),
-    "group.aio": ("EnvGroup", "EnvHandle", "build_env_group", "run"),
+    "group.aio": ("EnvGroup", "EnvHandle", "ServerHandle", "build_env_group", "run"),
     "registry": ("ENVS",),
     "types": ("EnvMeta", "EnvRet", "MultiAgentEnvRet", "PolicyResponse"),
 }
@@ -73,6 +73,7 @@ __all__ = [
     "NothingPending",
     "PolicyResponse",
     "RLightningError",
+    "ServerHandle",
     "StartFailed",
     "UnknownEnv",
     "WorkerDied",

@@ -40,6 +40,10 @@ class EnvTable(Protocol):
         """Ids of `slots`, in order."""
         ...
 
+    def batch_ids(self, slots: NDArray[np.intp]) -> list[str]:
+        """Ids of `slots` as a batch has them: a client goes by its server's id."""
+        ...
+
     def names(self, slots: NDArray[np.intp]) -> list[str]:
         """Config entries of `slots`, in order."""
         ...
@@ -225,7 +229,8 @@ class BatchedData:
     def ids(self) -> list[str]:
         """The ids, in order. Results of a remote client carry its server's id."""
         if self._ids is None:
-            self._ids = self.env_ids()
+            origin = self._origin
+            self._ids = [] if origin is None else origin.table.batch_ids(origin.slots)
         return self._ids
 
     def env_ids(self) -> list[str]:
@@ -290,6 +295,9 @@ class BatchedData:
         """
         if len(self._parts) == 1 and self._parts[0].observation is not None:
             return self._parts[0].observation
+        if self._parts:
+            places = _by_position(self._parts, len(self))
+            return _stacked([part.observation_of(row) for part, row in places])
         return _stacked([value.observation for value in self.values()])
 
     @property

@@ -17,6 +17,7 @@ __all__ = [
     "BadAction",
     "ClientRefused",
     "ConfigError",
+    "EnvAway",
     "EnvBusy",
     "EnvHung",
     "EnvRaised",
@@ -142,6 +143,10 @@ class EnvHung(WorkerDied):
 
     ``stderr_tail`` ends with the stack dump of the worker's threads.
     """
+
+
+class EnvAway(EnvFault):
+    """The client of a remote env is not connected; it may come back."""
 
 
 class StartFailed(EnvFault):

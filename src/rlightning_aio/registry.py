@@ -86,6 +86,7 @@ BACKENDS: dict[str, Backend] = {
                 preload=("rlightning_aio.envs.gymnasium", "gymnasium.envs.mujoco")),
         Backend("gymnasium", "rlightning_aio.envs.gymnasium:GymnasiumEnv", "gymnasium",
                 "gymnasium", cpu_bound=True, preload=("rlightning_aio.envs.gymnasium",)),
+        Backend("env_server", "rlightning_aio.hosts.remote:RemoteHost", "zmq", "pyzmq"),
         Backend("ale", "rlightning_aio.envs.ale:ALEEnv", "ale_py", "ale-py", extra="ale",
                 cpu_bound=True, vectorized=True, preload=("rlightning_aio.envs.ale",)),
         Backend("pettingzoo", "rlightning_aio.envs.pettingzoo:PettingZooEnv", "pettingzoo",

@@ -89,6 +89,7 @@ class FakeHost:
     arena: Arena
     inbox: Any
     inline: bool = False
+    elastic: bool = False
     reads_extras: bool = False
     in_flight: int = 0
     ordered: int = 0

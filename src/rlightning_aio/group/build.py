@@ -6,9 +6,10 @@ Rule: everything that can be known to be wrong without starting a process is sai
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio.config import EnvConfig, check_installed, parse_configs
 from rlightning_aio.errors import ConfigError
@@ -18,6 +19,7 @@ from rlightning_aio.hosts.arena import Arena
 from rlightning_aio.hosts.inline import InlineHost
 from rlightning_aio.hosts.pickling import dumped_with_code
 from rlightning_aio.hosts.process import ForkServer, ProcessHost
+from rlightning_aio.hosts.server import MAX_CLIENTS, ServerHost
 from rlightning_aio.hosts.spinner import Spinner
 from rlightning_aio.hosts.worker import StartOrder
 from rlightning_aio.registry import BACKENDS, ENVS
@@ -26,7 +28,9 @@ from rlightning_aio.types import PolicyResponse
 if TYPE_CHECKING:
     from rlightning_aio.hosts.base import Host, Watcher
 
-__all__ = ["Plan", "build_fleet", "plan_group"]
+ENV_SERVER: Final = "env_server"
+
+__all__ = ["ENV_SERVER", "Plan", "build_fleet", "plan_group"]
 
 PreprocessFn = Callable[[PolicyResponse], Any]
 
@@ -60,8 +64,28 @@ def plan_group(
             raise ConfigError(
                 f"entry {config.name!r}: placement 'ray' is not available yet; use 'process'"
             )
+        if config.backend == ENV_SERVER:
+            _check_server(config, ignored=preprocess_fn is not None)
     fns = _preprocess_fns(configs, preprocess_fn)
     return Plan(configs, fns, mixed_actions, zero_copy)
+
+
+def _check_server(config: EnvConfig, *, ignored: bool) -> None:
+    # ZMQ is imported where an env_server is asked for.
+    from rlightning_aio.hosts.remote import server_settings  # noqa: PLC0415
+
+    server_settings(config)
+    if config.num_workers > 1:
+        raise ConfigError(
+            f"entry {config.name!r}, num_workers: an env_server is one; its clients are as many as "
+            "connect (env_kwargs.min_clients)"
+        )
+    if ignored:
+        warnings.warn(
+            f"entry {config.name!r}: preprocess_fn is ignored for an env_server; it runs at the "
+            "client",
+            stacklevel=5,
+        )
 
 
 def _preprocess_fns(
@@ -121,16 +145,20 @@ def _culprit(fn: Any) -> str:
 
 def build_fleet(plan: Plan, watcher: Watcher) -> Fleet:
     """The hosts of a plan, not started."""
-    env_ids = [
-        f"{config.name}-{index}" for config in plan.configs for index in range(config.num_workers)
-    ]
-    configs = [config for config in plan.configs for _ in range(config.num_workers)]
+    local = [config for config in plan.configs if config.backend != ENV_SERVER]
+    remote = [config for config in plan.configs if config.backend == ENV_SERVER]
+    slots = Slots(
+        [config for config in local for _ in range(config.num_workers)],
+        [f"{config.name}-{index}" for config in local for index in range(config.num_workers)],
+        [(f"{config.name}-0", config, MAX_CLIENTS) for config in remote],
+    )
     arena = Arena()
-    fleet = Fleet(Slots(configs, env_ids), arena, mixed_actions=plan.mixed_actions)
+    fleet = Fleet(slots, arena, mixed_actions=plan.mixed_actions)
     cores = sorted(os.sched_getaffinity(0))
     orders = [
         (config, shares)
         for config, fns in zip(plan.configs, plan.preprocess_fns, strict=True)
+        if config.backend != ENV_SERVER
         for shares in _shares(config, fns, len(cores))
     ]
     num_processes = sum(config.placement == "process" for config, _ in orders)
@@ -153,10 +181,28 @@ def build_fleet(plan: Plan, watcher: Watcher) -> Fleet:
             host = ProcessHost(host_id, first_slot, order, server, arena, fleet, watcher)
         fleet.add(host, config)
         first_slot += len(shares)
+    for config in remote:
+        host_id = len(fleet.hosts)
+        fleet.add(_server_host(config, host_id, first_slot, fleet, watcher), config)
+        first_slot += MAX_CLIENTS
     fleet.servers = list(servers.values())
     # A trainer that spins needs a core that no worker needs.
     fleet.spinner = Spinner(enabled=0 < num_processes < len(cores))
     return fleet
+
+
+def _server_host(
+    config: EnvConfig, host_id: int, first_slot: int, fleet: Fleet, watcher: Watcher
+) -> ServerHost:
+    from rlightning_aio.hosts.remote import RemoteHost, server_settings  # noqa: PLC0415
+
+    listener = RemoteHost(
+        f"{config.name}-0",
+        server_settings(config),
+        step_timeout=config.step_timeout,
+        reset_timeout=config.reset_timeout,
+    )
+    return ServerHost(host_id, first_slot, listener, fleet, watcher)
 
 
 def _shares(

@@ -17,6 +17,7 @@ import numpy as np
 
 from rlightning_aio.errors import (
     BadAction,
+    EnvAway,
     EnvBusy,
     EnvFault,
     EnvRaised,
@@ -40,12 +41,16 @@ if TYPE_CHECKING:
     from rlightning_aio.group.actions import Letters
     from rlightning_aio.group.fleet import Fleet
     from rlightning_aio.hosts.base import Host
+    from rlightning_aio.hosts.server import ServerHost
     from rlightning_aio.hosts.worker import ErrorText
     from rlightning_aio.protocol.info import InfoSchema
+    from rlightning_aio.types import EnvMeta
 
 __all__ = ["Core"]
 
 CALL: Final = 3
+JOINED: Final = 4
+"""Not a request: the first result of a client, for which nobody asked."""
 NOBODY: Final = -1
 """Owner of a call that was given up."""
 
@@ -160,6 +165,8 @@ class Core:
         """What the channel will carry, pickled before anything is sent."""
         chosen = slots[letters.positions].tolist()
         try:
+            for slot, (action, _) in zip(chosen, letters.contents, strict=True):
+                self.fleet.check_step(slot, action)
             return [
                 self._pack(slot, content, "the response")
                 for slot, content in zip(chosen, letters.contents, strict=True)
@@ -279,6 +286,40 @@ class Core:
         """See `base.Inbox.on_schema`."""
         self.slots.schemas[host.first_slot][number] = schema
         self.info_width = max(self.info_width, schema.size)
+
+    def on_client(self, host: Host, row: int, meta: EnvMeta) -> int:
+        """See `base.Inbox.on_client`."""
+        slot = host.first_slot + row
+        self.slots.christen(slot, meta.env_id)
+        self.slots.seed_offset[slot] = self.fleet.num_local_seeds + row * meta.num_envs
+        self.slots.resets_itself[slot] = meta.autoreset != "disabled"
+        if self.slots.state[slot] == IDLE:
+            self._mark_sent(np.array([slot]), JOINED, 0, 0.0)
+        return self.slots.number(slot)
+
+    def on_withdrawn(self, host: Host, row: int, number: int) -> None:
+        """See `base.Inbox.on_withdrawn`."""
+        slot = host.first_slot + row
+        if not self._is_current(slot, number):
+            return
+        owner = int(self.slots.owner[slot])
+        if owner in self._tickets:
+            self.fail([slot], EnvAway(self._away(slot), env_id=self.slots.env_ids[slot]))
+            return
+        self.slots.state[slot] = IDLE
+        self._in_flight -= 1
+
+    def _away(self, slot: int) -> str:
+        return (
+            f"the client of {self.slots.describe(slot)} is not connected; its next first result "
+            "comes through collect_async when it is back"
+        )
+
+    def on_fault(self, host: Host, row: int, number: int, fault: EnvFault) -> None:
+        """See `base.Inbox.on_fault`."""
+        slot = host.first_slot + row
+        if self._is_current(slot, number):
+            self.fail([slot], fault)
 
     def _is_current(self, slot: int, number: int) -> bool:
         table = self.slots
@@ -458,7 +499,7 @@ class Core:
     def step(self, batch: BatchedData, now: float) -> Operation[tuple[BatchedData, Flags | None]]:
         """See `EnvGroup.step`."""
         slots = self.slots_of(batch)
-        self.fleet.check_steppable(slots)
+        self.fleet.check_local(slots, "step")
         ticket = self._new_ticket(slots)
         try:
             self._send_steps(batch, slots, ticket.owner, now)
@@ -477,31 +518,78 @@ class Core:
         env_ids: Sequence[str] | None,
     ) -> Operation[tuple[BatchedData, Flags]]:
         """See `EnvGroup.reset`."""
+        if env_ids is None and self.fleet.elastic:
+            yield from self._await_clients(now)
+        slots = self._everyone() if env_ids is None else self._distinct(env_ids)
+        return (yield from self._reset(now, seed, options, slots))
+
+    def reset_clients(
+        self, now: float, listener: ServerHost, seed: int | None, options: dict[str, Any] | None
+    ) -> Operation[tuple[BatchedData, Flags]]:
+        """See `ServerHandle.reset`."""
+        yield from self._await_clients(now)
+        slots = np.array(listener.clients(), np.intp) + listener.first_slot
+        seeds = None if seed is None else [_checked(seed) + k for k in range(len(slots))]
+        return (yield from self._reset(now, seeds, options, slots))
+
+    def _reset(
+        self,
+        now: float,
+        seed: int | Sequence[int] | Mapping[str, int] | None,
+        options: dict[str, Any] | None,
+        slots: NDArray[np.intp],
+    ) -> Operation[tuple[BatchedData, Flags]]:
         table = self.slots
-        slots = table.all if env_ids is None else self._distinct(env_ids)
         seeds = self._seeds(seed, slots)
+        if self.fleet.elastic:
+            self._forget_first_results(slots)
         self._check_sendable(slots, "reset")
-        packed = [] if options is None else self._pack_resets(slots, seeds, options)
+        by_letter = options is not None or self.fleet.elastic
+        packed = self._pack_resets(slots, seeds, options) if by_letter else []
         self.fleet.forget_lost(slots)
         ticket = self._new_ticket(slots)
-        if options is None:
-            self.fleet.write_seeds(slots, seeds)
-            self._post(slots, self._mark_sent(slots, RESET, ticket.owner, now) + _OPS[RESET])
-        else:
-            self._mark_sent(slots, RESET, ticket.owner, now)
+        self._mark_sent(slots, RESET, ticket.owner, now)
+        if by_letter:
             for slot, one in zip(slots.tolist(), packed, strict=True):
                 host = self.fleet.host_of(slot)
                 host.request_reset(slot - host.first_slot, table.number(slot), one)
+        else:
+            self.fleet.write_seeds(slots, seeds)
+            self._post(slots, table.entry[slots] + _OPS[RESET])
         yield from self._await_ticket(ticket)
         return self._settled(ticket, slots)
 
     def _pack_resets(
-        self, slots: NDArray[np.intp], seeds: NDArray[np.int64], options: dict[str, Any]
+        self, slots: NDArray[np.intp], seeds: NDArray[np.int64], options: dict[str, Any] | None
     ) -> list[Any]:
         return [
             self._pack(slot, (None if seed == NO_SEED else seed, options), "the options")
             for slot, seed in zip(slots.tolist(), seeds.tolist(), strict=True)
         ]
+
+    def _everyone(self) -> NDArray[np.intp]:
+        """Slots of the local envs and of the clients that are here."""
+        clients = self.fleet.clients()
+        return np.concatenate((self.slots.all, clients)) if clients else self.slots.all
+
+    def _await_clients(self, now: float) -> Operation[None]:
+        """Until each env_server has the clients that it needs."""
+        began = now
+        while (lacking := self.fleet.lacking(now - began)) is not None:
+            now = yield Wait(earliest(began + lacking, self.fleet.next_check()))
+            self.fleet.check(now)
+
+    def _forget_first_results(self, slots: NDArray[np.intp]) -> None:
+        """Clients that have only just joined may be reset: nothing of theirs was asked for."""
+        table = self.slots
+        fresh = slots[(table.op[slots] == JOINED) & (table.state[slots] == READY)]
+        if not len(fresh):
+            return
+        table.state[fresh] = IDLE
+        self._ready = deque(kept for q in self._ready if len(kept := q[~np.isin(q, fresh)]))
+        self._ready_count -= len(fresh)
+        for slot in fresh.tolist():
+            self._rests.pop(slot, None)
 
     def _seeds(
         self, seed: int | Sequence[int] | Mapping[str, int] | None, slots: NDArray[np.intp]
@@ -555,6 +643,7 @@ class Core:
         kwargs: dict[str, Any],
     ) -> Operation[Any]:
         """The value of the last call to return."""
+        self.fleet.check_local(slots, f"call {name} of")
         self._check_sendable(slots, f"call {name} of")
         chosen = slots.tolist()
         packed = [

@@ -89,16 +89,17 @@ class Facade:
 
     @property
     def env_ids(self) -> list[str]:
-        """Ids of the envs, in order."""
-        return list(self._core.slots.env_ids)
+        """Ids of the local envs, then of the env_servers, in order."""
+        slots = self._core.slots
+        return [*slots.local_ids, *slots.server_ids]
 
     def __len__(self) -> int:
         """Envs of the group, each env_server counted once."""
-        return len(self._core.slots)
+        return len(self.env_ids)
 
     def size(self) -> int:
         """Local envs of the group."""
-        return len(self._core.slots)
+        return len(self._core.slots.local_ids)
 
     def get_observation_spaces(self) -> list[gym.Space[Any] | None]:
         """Observation space of each env, in order."""

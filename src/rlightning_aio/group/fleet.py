@@ -30,12 +30,14 @@ from rlightning_aio.group.slots import BUSY, Slots
 from rlightning_aio.group.wait import Operation, Wait, earliest
 from rlightning_aio.hosts.arena import Arena, map_shared
 from rlightning_aio.hosts.base import Death, Host
+from rlightning_aio.hosts.server import ServerHost
 from rlightning_aio.hosts.spinner import Spinner
 from rlightning_aio.hosts.worker import AttachOrder, ErrorText, Started
 from rlightning_aio.protocol.columns import leaves
 from rlightning_aio.protocol.info import NO_INFO, PICKLED
 from rlightning_aio.protocol.rings import OP_BITS, RESET, SLOT_MASK, STEP
 from rlightning_aio.protocol.slab import NO_SEED, Slab
+from rlightning_aio.types import EnvMeta
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -45,7 +47,6 @@ if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.group.core import Core
     from rlightning_aio.hosts.process import ForkServer
-    from rlightning_aio.types import EnvMeta
 
 __all__ = ["Fleet"]
 
@@ -80,7 +81,9 @@ class _Member:
 
     @property
     def timed(self) -> bool:
-        return self.config.step_timeout is not None or self.config.reset_timeout is not None
+        return not self.host.elastic and (
+            self.config.step_timeout is not None or self.config.reset_timeout is not None
+        )
 
 
 class Fleet:
@@ -111,6 +114,8 @@ class Fleet:
         self._mixed_actions = mixed_actions
         self._members: list[_Member] = []
         self._inline: deque[Host] = deque()
+        self._elastic: list[ServerHost] = []
+        self.num_local_seeds = 0
         self._start_fault: Exception | None = None
         self._now = 0.0
         self._timed = False
@@ -124,12 +129,18 @@ class Fleet:
         self.on_value = core.on_value
         self.on_error = core.on_error
         self.on_schema = core.on_schema
+        self.on_client = core.on_client
+        self.on_withdrawn = core.on_withdrawn
+        self.on_fault = core.on_fault
 
     def add(self, host: Host, config: EnvConfig) -> None:
         """Take in a host, before `init`; its slots follow those of the host before."""
         self.hosts.append(host)
         if host.inline:
             self._inline.append(host)
+        if isinstance(host, ServerHost):
+            self._elastic.append(host)
+            self.elastic = True
         self._members.append(_Member(host, config))
         self._timed = self._timed or self._members[-1].timed
 
@@ -159,6 +170,10 @@ class Fleet:
             self._start_fault = None
             raise
         self.open = True
+        self.metas += [
+            EnvMeta(env_id=host.remote.server_id, observation_space=None, action_space=None)
+            for host in self._elastic
+        ]
         return self.metas
 
     def _launch(self, member: _Member, now: float) -> None:
@@ -276,6 +291,10 @@ class Fleet:
                 for s, config in zip(started[:slot], table.configs, strict=False)
             )
             table.resets_itself[slot] = env.meta.autoreset != "disabled"
+        self.num_local_seeds = int(sum(s.meta.num_envs for s in started))
+        for host in self._elastic:
+            rows = slice(host.first_slot, host.first_slot + host.rows)
+            table.by_frame[rows] = table.reads_extras[rows] = True
         table.letters = bool(table.by_frame.any() or table.reads_extras.any())
         parts = self._make_slabs([e.layout for e in started], list(keys.values()), rows_used)
         for member in self._members:
@@ -315,11 +334,51 @@ class Fleet:
                 if failure is not None:
                     raise failure
 
-    def check_steppable(self, slots: NDArray[np.intp]) -> None:
-        """Raises NotImplementedError for envs that have no synchronous step."""
+    def check_local(self, slots: NDArray[np.intp], what: str) -> None:
+        """Raises NotImplementedError if any of `slots` belongs to a client."""
+        if self.elastic and (remote := slots[slots >= len(self.slots.all)]).size:
+            raise NotImplementedError(
+                f"can't {what} {self.slots.describe(int(remote[0]))}: remote envs answer when they "
+                "can; use step_async and collect_async"
+            )
+
+    def check_step(self, slot: int, action: Any) -> None:
+        """Raises `BadAction` if a client can't take `action`."""
+        if slot >= len(self.slots.all):
+            host = self.host_of(slot)
+            assert isinstance(host, ServerHost)
+            host.check_step(slot - host.first_slot, action)
+
+    def listener(self, server_id: str) -> ServerHost | None:
+        """The env_server of that id, if there is one."""
+        return next((h for h in self._elastic if h.remote.server_id == server_id), None)
+
+    def clients(self) -> list[int]:
+        """Slots of the clients that are here."""
+        return [host.first_slot + row for host in self._elastic for row in host.clients()]
+
+    def lacking(self, waited: float) -> float | None:
+        """How long a reset may go on waiting for clients; None if there are enough.
+
+        Raises:
+            TimeoutError: it has waited for longer than a server's ``connect_timeout``.
+        """
+        lacking = [host for host in self._elastic if host.missing]
+        for host in lacking:
+            settings = host.remote.settings
+            if waited >= settings.connect_timeout:
+                raise TimeoutError(
+                    f"{len(host.remote.clients)} of {settings.min_clients} clients have joined "
+                    f"{host.remote.server_id!r} at {host.remote.address} within "
+                    f"{settings.connect_timeout} s; start more, or lower min_clients"
+                )
+        return min((host.remote.settings.connect_timeout for host in lacking), default=None)
 
     def write_seeds(self, slots: NDArray[np.intp], seeds: NDArray[np.int64]) -> None:
-        """Put the seeds of resets into the rows."""
+        """Put the seeds of resets into the rows; clients have none."""
+        if self.elastic:
+            local = slots < len(self.slots.all)
+            slots, seeds = slots[local], seeds[local]
         if len(self.slabs) == 1:
             self.slabs[0].seed[self.slots.row[slots]] = seeds
             return
@@ -403,6 +462,7 @@ class Fleet:
         )
         if self._timed:
             times += [self._expiry(m) for m in self._members if m.timed and m.host.in_flight]
+        times += [host.deadline() for host in self._elastic]
         return earliest(*times)
 
     def _expiry(self, member: _Member) -> float | None:
@@ -428,6 +488,10 @@ class Fleet:
             raise GroupClosed("the group was closed while this call was waiting")
         if self.lost or self.restarting:
             self._check_start_times()
+        for host in self._elastic:
+            due = host.deadline()
+            if due is not None and due <= now:
+                host.tick(now)
         if not self._timed:
             return
         for member in self._members:

@@ -37,8 +37,16 @@ _NEXT_NUMBER: Final = np.array(1 << NUMBER_SHIFT)
 class Slots:
     """Arrays over the envs of a group.
 
+    Local envs come first, then so many slots for each env_server as it may have clients.
+
+    Args:
+        configs, env_ids: of the local envs.
+        servers: id, config and number of slots of each env_server.
+
     Attributes:
-        env_ids, configs: of each slot.
+        env_ids, configs: of each slot; the id of a slot that no client has taken is empty.
+        local_ids, server_ids: of the local envs, and of the env_servers.
+        all: slots of the local envs.
         host: host id.
         entry: ring entry of the current request, without its operation; so it also holds the
             request's number.
@@ -51,14 +59,26 @@ class Slots:
         schemas: of its worker.
     """
 
-    def __init__(self, configs: Sequence[EnvConfig], env_ids: Sequence[str]) -> None:
-        size = len(env_ids)
+    def __init__(
+        self,
+        configs: Sequence[EnvConfig],
+        env_ids: Sequence[str],
+        servers: Sequence[tuple[str, EnvConfig, int]] = (),
+    ) -> None:
+        self.local_ids = list(env_ids)
+        self.server_ids = [server_id for server_id, _, _ in servers]
         self.configs = list(configs)
-        self.env_ids = list(env_ids)
+        # What a batch calls a slot: a client goes by its server's id there.
+        self._batch_ids = list(env_ids)
+        for server_id, config, count in servers:
+            self.configs += [config] * count
+            self._batch_ids += [server_id] * count
+        size = len(self.configs)
+        self.env_ids = [*env_ids, *[""] * (size - len(env_ids))]
         self._index = {env_id: slot for slot, env_id in enumerate(env_ids)}
-        self.all = np.arange(size)
+        self.all = np.arange(len(env_ids))
         self.host = np.zeros(size, np.int64)
-        self.entry = self.all << OP_BITS
+        self.entry = np.arange(size) << OP_BITS
         self.state = np.zeros(size, np.int8)
         self.op = np.zeros(size, np.int8)
         self.owner = np.zeros(size, np.int64)
@@ -73,7 +93,12 @@ class Slots:
         self.schemas: list[dict[int, InfoSchema]] = [{} for _ in range(size)]
 
     def __len__(self) -> int:
-        return len(self.env_ids)
+        return len(self.configs)
+
+    def christen(self, slot: int, env_id: str) -> None:
+        """Name the client that has taken a server's slot."""
+        self.env_ids[slot] = env_id
+        self._index[env_id] = slot
 
     def number(self, slot: int) -> int:
         """Number of the current request; 0 before the first."""
@@ -91,7 +116,7 @@ class Slots:
         Raises:
             UnknownEnv: an id is no env's of this group.
         """
-        if len(env_ids) == len(self.env_ids) and list(env_ids) == self.env_ids:
+        if len(env_ids) == len(self.local_ids) and list(env_ids) == self.local_ids:
             return self.all
         index = self._index
         try:
@@ -107,13 +132,19 @@ class Slots:
             raise UnknownEnv(self._unknown(env_id)) from None
 
     def _unknown(self, env_id: Any) -> str:
-        known = ", ".join(self.env_ids[:8]) + (", …" if len(self.env_ids) > 8 else "")
+        ids = list(self._index)
+        known = ", ".join(ids[:8]) + (", …" if len(ids) > 8 else "")
         return f"no env of this group is called {env_id!r}; its envs are {known}"
 
     def ids(self, slots: NDArray[np.intp]) -> list[str]:
         """Ids of `slots`, in order."""
         env_ids = self.env_ids
         return [env_ids[slot] for slot in slots.tolist()]
+
+    def batch_ids(self, slots: NDArray[np.intp]) -> list[str]:
+        """Ids of `slots` as a batch has them: a client goes by its server's id."""
+        chosen: list[int] = slots.tolist()
+        return [self._batch_ids[slot] for slot in chosen]
 
     def names(self, slots: NDArray[np.intp]) -> list[str]:
         """Config entries of `slots`, in order."""
@@ -123,7 +154,8 @@ class Slots:
     def describe(self, slot: int) -> str:
         """How an error message names the env."""
         config = self.configs[slot]
+        env_id = self.env_ids[slot] or self._batch_ids[slot]
         return (
-            f"env {self.env_ids[slot]!r} (entry {config.name!r}, backend {config.backend}, "
+            f"env {env_id!r} (entry {config.name!r}, backend {config.backend}, "
             f"task {config.task!r})"
         )

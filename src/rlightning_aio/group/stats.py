@@ -135,12 +135,14 @@ class Stats:
         """See `EnvGroup.get_env_stats`."""
         found: dict[str, dict[str, Any]] = {}
         for slot, env_id in enumerate(self._table.env_ids):
+            if not env_id:
+                continue
             episodes = int(self._episodes[slot])
             found[env_id] = {
                 "requests": self._table.number(slot) - int(self._requests_before[slot]),
                 "episodes": episodes,
-                "mean_return": self._returns[slot] / episodes if episodes else None,
-                "mean_length": self._lengths[slot] / episodes if episodes else None,
+                "mean_return": float(self._returns[slot]) / episodes if episodes else None,
+                "mean_length": int(self._lengths[slot]) / episodes if episodes else None,
                 "last_return": float(self._last_return[slot]) if episodes else None,
                 "last_length": int(self._last_length[slot]) if episodes else None,
             }

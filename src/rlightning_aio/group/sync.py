@@ -20,9 +20,10 @@ if TYPE_CHECKING:
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.group.wait import Operation
     from rlightning_aio.hosts.base import Source
+    from rlightning_aio.hosts.server import ServerHost
     from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
 
-__all__ = ["EnvGroup", "EnvHandle", "SyncDriver"]
+__all__ = ["EnvGroup", "EnvHandle", "ServerHandle", "SyncDriver"]
 
 T = TypeVar("T")
 
@@ -165,7 +166,10 @@ class EnvGroup(Facade):
         return self._auto_reset(max_episode_steps, on_done)
 
     def __getitem__(self, env_id: str) -> EnvHandle:
-        """A handle on one env; raises `UnknownEnv`."""
+        """A handle on one env, or on one env_server; raises `UnknownEnv`."""
+        listener = self._fleet.listener(env_id)
+        if listener is not None:
+            return ServerHandle(self, listener)
         return EnvHandle(self, self._core.slots.find_one(env_id))
 
     def offload(self) -> None:
@@ -192,7 +196,7 @@ class EnvHandle:
     @property
     def env_id(self) -> str:
         """Its id."""
-        return self._group.env_ids[self._slot]
+        return self._group._core.slots.env_ids[self._slot]  # pyright: ignore[reportPrivateUsage]
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -233,6 +237,58 @@ class EnvHandle:
     def reload(self) -> None:
         """Take device memory again."""
         self.call("reload")
+
+
+
+class ServerHandle(EnvHandle):
+    """An env_server of a synchronous group; see `rlightning_aio.ServerHandle`."""
+
+    def __init__(self, group: EnvGroup, listener: ServerHost) -> None:
+        super().__init__(group, -1)
+        self._listener = listener
+
+    @property
+    def env_id(self) -> str:
+        """Its id."""
+        return self._listener.remote.server_id
+
+    @property
+    def address(self) -> str:
+        """Where clients connect to, as ``tcp://host:port``."""
+        return self._listener.remote.address
+
+    @property
+    def clients(self) -> list[str]:
+        """Ids of the envs of the clients that are connected, ``<server id>/<client name>``."""
+        return [f"{self.env_id}/{name}" for name in self._listener.remote.clients]
+
+    def reset(  # pyright: ignore[reportIncompatibleMethodOverride]  # One for each client.
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> list[EnvRet | MultiAgentEnvRet]:
+        """Reset all clients, of which there must be ``min_clients`` within ``connect_timeout``.
+
+        Args:
+            seed: client k, in the order in which they first joined, gets ``seed + k``.
+            options: passed to each.
+
+        Raises:
+            TimeoutError: too few clients have joined.
+        """
+        group = self._group
+        operation = group._core.reset_clients(  # pyright: ignore[reportPrivateUsage]
+            time.monotonic(), self._listener, seed, options
+        )
+        return (group._driver.run(operation))[0].values()  # pyright: ignore[reportPrivateUsage]
+
+    def step(self, response: PolicyResponse | Any) -> EnvRet | MultiAgentEnvRet:
+        """Raises NotImplementedError: remote envs answer when they can."""
+        raise NotImplementedError(
+            f"{self.env_id} is an env_server; use the group's step_async and collect_async"
+        )
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> Any:
+        """Raises NotImplementedError: methods of remote envs can't be called."""
+        raise NotImplementedError(f"{self.env_id} is an env_server; it can't call {name}()")
 
 
 def build_env_group(

@@ -15,7 +15,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio.hosts.worker import AttachOrder, ErrorText, Started
+    from rlightning_aio.errors import EnvFault
     from rlightning_aio.protocol.info import InfoSchema
+    from rlightning_aio.types import EnvMeta
 
 __all__ = ["Death", "Host", "Inbox", "Source", "Watcher"]
 
@@ -79,6 +81,7 @@ class Host(Source, Protocol):
         in_flight: requests that are not answered yet.
         ordered: results after which it will wake us next; 0 if nothing was ordered.
         inline: its requests are executed by `run_one`, not by themselves.
+        elastic: its envs come and go, so it may tell of results that nobody asked for.
     """
 
     host_id: int
@@ -87,6 +90,7 @@ class Host(Source, Protocol):
     in_flight: int
     ordered: int
     inline: bool
+    elastic: bool
 
     def start(self) -> None:
         """Begin to build the envs; `Inbox.on_started` or `Inbox.on_start_error` follows."""
@@ -181,6 +185,18 @@ class Inbox(Protocol):
 
     def on_error(self, host: Host, row: int, number: int, error: ErrorText) -> None:
         """A request has raised."""
+        ...
+
+    def on_client(self, host: Host, row: int, meta: EnvMeta) -> int:
+        """An env has joined, and its first result follows; the number to give it."""
+        ...
+
+    def on_withdrawn(self, host: Host, row: int, number: int) -> None:
+        """A request will not be answered: its env is away, and the caller was told so."""
+        ...
+
+    def on_fault(self, host: Host, row: int, number: int, fault: EnvFault) -> None:
+        """A request has ended in an error that is known as such."""
         ...
 
     def on_schema(self, host: Host, number: int, schema: InfoSchema) -> None:

@@ -285,6 +285,8 @@ def _run_worker(
     """Everything that a forked child does; never returns."""
     code = 1
     try:
+        # Standard output too: the trainer's may be read by a program.
+        os.dup2(stderr, 1)
         os.dup2(stderr, 2)
         os.close(stderr)
         leave()

@@ -46,6 +46,7 @@ class InlineHost:
         self.rows = len(order.worker_indices)
         self.in_flight = 0
         self.ordered = 0
+        self.elastic = False
         self.inline = True
         self._order = order
         self._arena = arena

@@ -178,6 +178,7 @@ class ProcessHost:
         self.rows = len(order.worker_indices)
         self.in_flight = 0
         self.ordered = 0
+        self.elastic = False
         self.inline = False
         self.pid: int | None = None
         self._start_payload = dumped_with_code(order)

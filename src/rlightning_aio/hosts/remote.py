@@ -282,6 +282,10 @@ class RemoteHost:
             self._has_more = True
             os.eventfd_write(self._more, 1)
 
+    def check(self, client: str, action: Any) -> None:
+        """Raises `BadAction` if `client` can't take `action`; nothing is sent."""
+        self._sessions.check(client, action)
+
     def submit(
         self, client: str, number: int, action: Any, extras: Mapping[str, Any], now: float
     ) -> bool:

@@ -18,6 +18,7 @@ from rlightning_aio.protocol.payload import Outcome, Packed, ResultLayout, Space
 from rlightning_aio.protocol.server_session import PATIENCE, random_token
 from rlightning_aio.protocol.space_description import describe
 from rlightning_aio.protocol.wire import (
+    STALE_REQUEST,
     VERSION,
     Bye,
     Failure,
@@ -198,7 +199,8 @@ class ClientSession:
             self._send(self._hello)
         elif self._session is not None:
             self._send(Ping(session=self._session))
-        self._ask_at = now + self._pause
+        serving = self.phase is Phase.SERVING
+        self._ask_at = now + (self._heartbeat if serving else self._pause)
 
     def deadline(self) -> float | None:
         """When `tick` is due (monotonic seconds); None if never."""
@@ -246,7 +248,8 @@ class ClientSession:
             # Not at once: a server that closes would only be asked in vain.
             self._greet_at(now + self._pause)
             return self._end(f"the server closed: {message.reason[:1000]}")
-        self.phase, self._ask_at = Phase.SERVING, None
+        # A server that has forgotten this session, and whose word of it got lost, is silent.
+        self.phase, self._ask_at = Phase.SERVING, now + self._heartbeat
         if isinstance(message, Step | Reset):
             return self._on_request(message, frames, now)
         if isinstance(message, Ping):
@@ -280,7 +283,7 @@ class ClientSession:
             Failure(
                 session=message.session,
                 number=message.number,
-                exception_type="StaleRequest",
+                exception_type=STALE_REQUEST,
                 text=text,
                 traceback="",
             )
@@ -288,10 +291,10 @@ class ClientSession:
 
     def _on_answer(self, message: Welcome | Refusal, now: float) -> Event | None:
         if isinstance(message, Welcome):
-            return self._on_welcome(message)
+            return self._on_welcome(message, now)
         return self._on_refusal(message, now)
 
-    def _on_welcome(self, welcome: Welcome) -> Event | None:
+    def _on_welcome(self, welcome: Welcome, now: float) -> Event | None:
         if welcome.session == self._session:
             # The server is still waiting for the first result, or was when it said so.
             if self._number == 0:
@@ -299,9 +302,10 @@ class ClientSession:
             return None
         if self.phase is not Phase.GREETING or welcome.nonce != self._hello.nonce:
             return None
-        self.phase, self._ask_at, self.refusal = Phase.SERVING, None, None
+        self.phase, self.refusal = Phase.SERVING, None
         self._session = self._hello.previous = welcome.session
         self._heartbeat = welcome.heartbeat
+        self._ask_at = now + welcome.heartbeat
         self._number = -1
         return ResetRequest(0)
 
@@ -335,8 +339,8 @@ class ClientSession:
 
     # What the env did
 
-    def finish(self, number: int, ret: EnvRet | MultiAgentEnvRet) -> None:
-        """Answer request `number` with `ret`.
+    def finish(self, number: int, ret: EnvRet | MultiAgentEnvRet, busy_ns: int = 0) -> None:
+        """Answer request `number` with `ret`, which the env took `busy_ns` to make.
 
         What of its info can't travel is left out; one warning names each such key.
 
@@ -349,10 +353,10 @@ class ClientSession:
         result = Result(
             session=self._session,
             number=number,
-            sent_ns=ret.ts_env_sent_ns,
+            busy_ns=busy_ns,
             info=ret.info,
             # The contract gives this field its name.
-            extra=ret._extra,  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
+            extra=ret._extra,  # pyright: ignore[reportPrivateUsage]
         )
         packed = Packed([], result.texts)
         header = self._results.pack(outcome, packed)

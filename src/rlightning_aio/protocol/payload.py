@@ -109,7 +109,9 @@ class _Array(_Node):
         packed.frames.append(array.tobytes())
 
     def _fitted(self, array: NDArray[Any]) -> NDArray[Any]:
-        if array.shape != self.form.shape or not np.can_cast(array.dtype, self.form.dtype, "same_kind"):
+        if array.shape != self.form.shape or not np.can_cast(
+            array.dtype, self.form.dtype, "same_kind"
+        ):
             raise Misfit(
                 f"{self._what} doesn't fit its space: expected shape {self.form.shape} and dtype "
                 f"{self.form.dtype}, found shape {array.shape} and dtype {array.dtype}"

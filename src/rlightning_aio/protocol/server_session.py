@@ -22,6 +22,7 @@ from rlightning_aio.protocol.columns import Misfit
 from rlightning_aio.protocol.payload import Packed, ResultLayout, SpaceLayout
 from rlightning_aio.protocol.space_description import describe, space_from
 from rlightning_aio.protocol.wire import (
+    STALE_REQUEST,
     VERSION,
     Bye,
     Failure,
@@ -78,7 +79,7 @@ class RemoteResult:
         reward, terminated, truncated: numbers, arrays ``[num_envs]``, or dicts of either
             by agent.
         info, extra: as the env gave them; ``info["client_lost"]`` says why a client is gone.
-        sent_ns: when the client made it, in ns since the epoch by its own clock.
+        busy_ns: how long the env took, by the client's clock.
         error: set instead of all that, if the env raised.
     """
 
@@ -90,7 +91,7 @@ class RemoteResult:
     truncated: Any = False
     info: dict[str, Any] = field(default_factory=dict[str, Any])
     extra: dict[str, Any] = field(default_factory=dict[str, Any])
-    sent_ns: int = 0
+    busy_ns: int = 0
     error: EnvRaised | None = None
 
 
@@ -402,6 +403,10 @@ class ServerSessions:
             if session.route == route and session.unreachable_since is None:
                 session.unreachable_since = now
 
+    def _dismiss(self, session: _Session, cause: str) -> None:
+        self._send(session.route, Gone(session=session.token, text=cause))
+        self._lose(session, cause)
+
     def _lose(self, session: _Session, cause: str) -> None:
         """End `session`; whoever waits for its client, or will, is told `cause`."""
         _log.info("%s lost the client %r: %s", self._server_id, session.seat.name, cause)
@@ -426,6 +431,13 @@ class ServerSessions:
         self._results.append(RemoteResult(seat.name, number, *outcome, info=info))
 
     # Requests
+
+    def check(self, client: str, action: Any) -> None:
+        """Raises `BadAction` if `client` is here and can't take `action`; nothing is sent."""
+        seat = self._seats.get(client)
+        session = None if seat is None else seat.session
+        if session is not None:
+            self._step_parts(session, action, {})
 
     def submit(
         self, client: str, number: int, action: Any, extras: Mapping[str, Any], now: float
@@ -565,11 +577,10 @@ class ServerSessions:
             self._complain(str(error), now)
             session.bad_results += 1
             if session.bad_results >= _MAX_BAD_RESULTS:
-                self._send(session.route, Gone(session=session.token, text=str(error)))
-                self._lose(session, f"its results don't fit what it announced: {error}")
+                self._dismiss(session, f"its results don't fit what it announced: {error}")
             return
         result = RemoteResult(
-            session.seat.name, number, *outcome, message.info, message.extra, message.sent_ns
+            session.seat.name, number, *outcome, message.info, message.extra, message.busy_ns
         )
         if number is None:
             self._join(session, result)
@@ -587,8 +598,7 @@ class ServerSessions:
     def _join(self, session: _Session, result: RemoteResult) -> None:
         if self._kind is not None and session.kind != self._kind:
             # Another client of another kind joined while this one was resetting.
-            self._send(session.route, Gone(session=session.token, text="another kind of env"))
-            self._lose(session, "its spaces differ from those of the other clients")
+            self._dismiss(session, "its spaces differ from those of the other clients")
             return
         seat = session.seat
         self._kind = session.kind
@@ -617,6 +627,10 @@ class ServerSessions:
         seat, request = session.seat, session.seat.request
         if number == _LATE or request is None:
             self.late += 1
+            return
+        if message.exception_type == STALE_REQUEST:
+            # Not so: nothing newer was ever asked. The two no longer mean the same by a number.
+            self._dismiss(session, f"it lost count: {message.text}")
             return
         seat.request = None
         error = EnvRaised(
@@ -684,8 +698,7 @@ class ServerSessions:
         for session in list(self._sessions.values()):
             cause = self._end_of_patience(session, now)
             if cause is not None:
-                self._send(session.route, Gone(session=session.token, text=cause))
-                self._lose(session, cause)
+                self._dismiss(session, cause)
             elif now - max(session.heard_at, session.asked_at) >= self._heartbeat / PATIENCE:
                 self._ping(session, now)
         self._next_tick = now + self._tick_every if self._sessions else None

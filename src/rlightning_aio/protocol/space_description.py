@@ -117,7 +117,9 @@ def _dtype_name(space: gym.Space[Any], what: str) -> str:
 
 def _bounds(array: NDArray[Any]) -> Any:
     """`array` as nested lists, without the leading axes along which it is constant."""
-    if array.size and (array == array.flat[0]).all():
+    if not array.size:
+        return 0
+    if (array == array.flat[0]).all():
         return _number_said(array.flat[0].item())
     while array.ndim > 1 and (array == array[:1]).all():
         array = array[0]

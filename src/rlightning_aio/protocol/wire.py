@@ -27,6 +27,7 @@ __all__ = [
     "MAX_HEADER_BYTES",
     "MAX_NAME_LENGTH",
     "MAX_PARTS",
+    "STALE_REQUEST",
     "VERSION",
     "ArrayForm",
     "Bye",
@@ -57,6 +58,8 @@ MAX_FRAME_BYTES: Final = 64 << 20
 MAX_PARTS: Final = 1024
 """Header and frames of one message."""
 MAX_NAME_LENGTH: Final = 128
+STALE_REQUEST: Final = "StaleRequest"
+"""What a client calls a request that is older than one it has executed."""
 
 DTYPES: Final[Mapping[str, np.dtype[Any]]] = {
     name: np.dtype(name).newbyteorder("<")
@@ -144,7 +147,8 @@ class Result(Struct, tag="result", tag_field="type", kw_only=True, omit_defaults
 
     session: Count
     number: Count
-    sent_ns: int
+    busy_ns: Count = 0
+    """How long the env took."""
     reward: float | None = None
     terminated: bool | None = None
     truncated: bool | None = None
@@ -227,7 +231,7 @@ class ArrayForm:
 def as_array(value: Any) -> NDArray[Any]:
     """`value` as NumPy; tensors come from their device to the CPU."""
     if type(value) is np.ndarray:
-        return cast("NDArray[Any]", value)
+        return value
     if hasattr(value, "detach"):
         value = value.detach().cpu()
     return np.asarray(value)

@@ -271,10 +271,10 @@ class RemoteEnvClient:
     def _execute(self, request: StepRequest | ResetRequest) -> None:
         if request.number == 0:
             self.num_sessions += 1
-            self._answer(0, self._env.reset())
+            self._answer(request)
             return
         try:
-            self._answer(request.number, self._perform(request))
+            self._answer(request)
         except Exception as error:  # noqa: BLE001  # Whatever it is, the trainer learns of it.
             self._session.fail(request.number, *_in_words(error))
             self._flush()
@@ -287,10 +287,13 @@ class RemoteEnvClient:
         self.num_steps += 1
         return ret
 
-    def _answer(self, number: int, ret: Any) -> None:
+    def _answer(self, request: StepRequest | ResetRequest) -> None:
+        began_ns = time.perf_counter_ns()
+        ret = self._perform(request)
+        busy_ns = time.perf_counter_ns() - began_ns
         if not isinstance(ret, EnvRet | MultiAgentEnvRet):
             raise Misfit(f"the env returned {type(ret).__name__}, not an EnvRet")
-        self._session.finish(number, ret)
+        self._session.finish(request.number, ret, busy_ns)
         self._flush()
 
 
