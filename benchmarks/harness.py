@@ -27,16 +27,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
     from multiprocessing.connection import Connection
 
 # One math thread for everybody: none of the contenders gains by more, and some would
 # start one for each core in each of their processes.
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-PACKAGES = (
-    "rlightning-aio", "gymnasium", "mujoco", "numpy", "uvloop", "stable_baselines3", "tianshou",
-    "envpool", "ale-py", "torch",
-)  # fmt: skip
+# Modules whose versions are told, beside those of the peers that take part.
+ALWAYS_USED = ("rlightning_aio", "gymnasium", "mujoco", "numpy", "uvloop")
 NAME_WIDTH = 34
 
 
@@ -265,7 +263,7 @@ def measure(question: Question, rounds: int, seconds: float, only: Sequence[str]
     """Run a question; its report as plain data."""
     figures: dict[str, Figures] = {}
     skipped: dict[str, str] = {}
-    machine = machine_facts()
+    machine = machine_facts({name for c in question.contenders for name in c.requires})
     with ExitStack() as stack:
         stages = _stages(question, only, stack, skipped)
         for number in range(rounds):
@@ -331,14 +329,14 @@ def _judged(target: Target, figures: dict[str, Figures]) -> dict[str, Any]:
     return {**asdict(target), **found.as_json(), "met": target.is_met(found.median)}
 
 
-def machine_facts() -> dict[str, Any]:
-    """What the figures depend on beside the code."""
+def machine_facts(modules: Iterable[str]) -> dict[str, Any]:
+    """What the figures depend on beside the code; `modules` are those that take part."""
     versions: dict[str, str] = {}
-    for package in PACKAGES:
+    for name in (*ALWAYS_USED, *sorted(set(modules) - set(ALWAYS_USED))):
         try:
-            versions[package] = importlib.metadata.version(package)
+            versions[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
-            continue
+            continue  # Not installed, or a module beside this one.
     return {
         "cores": len(os.sched_getaffinity(0)),
         "cpu": _cpu_model(),
@@ -402,10 +400,10 @@ def tables(report: dict[str, Any]) -> str:
 def _target_row(target: dict[str, Any], unit: str) -> str:
     sign, suffix = ("minus", f" {unit}") if target["difference"] else ("/", "")
     bound = f"{'≤' if target['at_most'] else '≥'} {target['bound']:g}{suffix}"
-    spread = f"{target['low']:.2f} to {target['high']:.2f}"
+    spread = f"{number_text(target['low'])} to {number_text(target['high'])}"
     met = "met" if target["met"] else "missed"
     compared = f"{target['subject']} {sign} {target['reference']}"
-    return f"| {compared} | {target['median']:.2f} | {spread} | {bound} | {met} |"
+    return f"| {compared} | {number_text(target['median'])} | {spread} | {bound} | {met} |"
 
 
 def machine_text(machine: dict[str, Any]) -> str:
