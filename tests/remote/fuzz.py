@@ -1,0 +1,106 @@
+"""Spoilt messages against both ends, with a service in between that has to go on.
+
+The tests run a few thousand; ``benchmarks/fuzz_remote.py`` runs as many as asked for.
+"""
+
+from __future__ import annotations
+
+import tracemalloc
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from remote.random_spaces import mutation
+from remote.unreliable import World
+
+from rlightning_aio.protocol.client_session import Refused
+
+_KEPT = 200
+
+
+@dataclass
+class Tally:
+    """What came of a run.
+
+    Attributes:
+        frames: spoilt messages that were delivered.
+        steps: steps that were answered meanwhile.
+        malformed: spoilt messages that were recognised as no messages.
+        grown: bytes by which memory grew over the second half.
+    """
+
+    frames: int = 0
+    steps: int = 0
+    malformed: int = 0
+    grown: int = 0
+
+
+def fuzz(frames: int, seed: int) -> Tally:
+    """Deliver `frames` spoilt messages to each end; every fiftieth time, expect service."""
+    rng = np.random.default_rng(seed)
+    world = World()
+    world.join_all()
+    seen = {True: deque[list[bytes]](maxlen=_KEPT), False: deque[list[bytes]](maxlen=_KEPT)}
+    tally = Tally()
+    number = 0
+    tracemalloc.start()
+    try:
+        held = 0
+        while tally.frames < frames:
+            name = "ab"[tally.frames % 2]
+            number += 1
+            step(world, name, number, tally)
+            for (_, to_server), said in world.said.items():
+                seen[to_server].extend(said)
+            world.said.clear()
+            for _ in range(25):
+                spoil(world, name, seen, rng)
+                tally.frames += 1
+            if not held and tally.frames >= frames // 2:
+                held = tracemalloc.get_traced_memory()[0]
+        tally.grown = tracemalloc.get_traced_memory()[0] - held
+    finally:
+        tracemalloc.stop()
+    tally.malformed = world.server.malformed + sum(
+        client.session.malformed for client in world.clients.values()
+    )
+    return tally
+
+
+def spoil(
+    world: World, name: str, seen: dict[bool, deque[list[bytes]]], rng: np.random.Generator
+) -> None:
+    """One spoilt message to each end."""
+    client = world.clients[name]
+    for to_server, said in seen.items():
+        parts = mutation(rng)(said[int(rng.integers(len(said)))])
+        if to_server:
+            world.server.receive(client.route or b"?", None, parts, world.clock.now)
+            world.flush()
+        else:
+            client.receive(parts)
+    world.settle()
+    world.take()
+
+
+def step(world: World, name: str, number: int, tally: Tally) -> None:
+    """Have the client step; it may have been driven out, but must come back and serve."""
+    for _ in range(200):
+        client = world.clients[name]
+        if isinstance(client.todo, Refused):
+            # A process that was sent away ends; somebody starts it again.
+            client.kill()
+            client.connect()
+        world.settle()
+        if name in world.server.clients and world.submit_reset(name, number):
+            break
+        world.pass_time(1.0)
+    else:
+        raise AssertionError(f"{name} never came back")
+    for _ in range(20):
+        world.settle()
+        if any(result.number == number for result in world.take()):
+            tally.steps += 1
+            return
+        world.pass_time(1.0)
+    raise AssertionError(f"{name} never answered")

@@ -1,0 +1,18 @@
+"""Nonsense does no harm: no exception escapes, nothing piles up, service goes on."""
+
+from __future__ import annotations
+
+import pytest
+from remote.fuzz import fuzz
+
+FRAMES = 4_000
+"""For each end and seed; `benchmarks/fuzz_remote.py` does 100,000."""
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_spoilt_messages_do_no_harm(seed: int) -> None:
+    """Between them, every request is answered."""
+    tally = fuzz(FRAMES, seed)
+    assert tally.steps >= FRAMES // 25
+    assert tally.malformed > FRAMES // 2
+    assert tally.grown < 200_000

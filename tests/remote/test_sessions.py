@@ -1,0 +1,474 @@
+"""The rules of sessions, one by one, without a network."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from remote.unreliable import HEARTBEAT, OBSERVATION, Client, World
+
+from rlightning_aio.errors import BadAction, EnvBusy, EnvRaised, UnknownEnv
+from rlightning_aio.protocol.client_session import ClientSession, Ended, Phase, Refused
+from rlightning_aio.protocol.server_session import ServerSessions
+from rlightning_aio.protocol.wire import Hello, Welcome, Writer
+from rlightning_aio.types import EnvMeta, EnvRet
+
+
+@pytest.fixture
+def world() -> World:
+    world = World()
+    world.join_all()
+    return world
+
+
+def only(results: list[Any]) -> Any:
+    (result,) = results
+    return result
+
+
+def test_a_client_that_joins_brings_its_first_result_unasked(world: World) -> None:
+    """Joining is a reset, and its result belongs to no request."""
+    first = {result.client: result for result in world.take()}
+    assert set(first) == set(world.server.clients) == {"a", "b"}
+    assert first["a"].number is None
+    assert first["a"].observation.tolist() == [1, 1, 0]
+    assert world.server.clients["b"].env_id == "srv/b"
+
+
+def test_a_step_and_a_reset_come_back_under_their_numbers(world: World) -> None:
+    """Numbers are the caller's own, whatever travels."""
+    world.take()
+    assert world.submit("a", 70)
+    world.settle()
+    assert only(world.take()).number == 70
+    assert world.submit_reset("a", 5)
+    world.settle()
+    result = only(world.take())
+    assert (result.number, result.observation[2]) == (5, 0)
+
+
+def test_a_client_that_owes_a_result_is_busy(world: World) -> None:
+    """A second request is refused before anything is sent."""
+    world.submit("a", 1)
+    with pytest.raises(EnvBusy, match="srv/a still owes the result of a step"):
+        world.submit("a", 2)
+
+
+def test_a_client_that_never_joined_is_unknown(world: World) -> None:
+    """The message says who is here."""
+    with pytest.raises(UnknownEnv, match="no client named 'c' has joined srv; joined are 'a', 'b'"):
+        world.submit("c", 1)
+
+
+def test_an_action_that_does_not_fit_is_not_sent(world: World) -> None:
+    """The client stays free for a better one."""
+    with pytest.raises(BadAction, match=r"srv/a.*expected shape \(2,\)"):
+        world.server.submit("a", 1, np.zeros(3, np.float32), {}, 0.0)
+    assert world.submit("a", 2)
+
+
+def test_reset_options_that_cannot_travel_are_refused(world: World) -> None:
+    """They would arrive as something else, or not at all."""
+    with pytest.raises(ValueError, match="options can't be sent"):
+        world.submit_reset("a", 1, options={"x": object()})
+
+
+def test_an_exception_arrives_with_its_traceback_and_the_env_goes_on(world: World) -> None:
+    """The env can be stepped again after it raised."""
+    world.take()
+    client = world.clients["a"]
+    client.raises = True
+    world.submit("a", 1)
+    world.settle()
+    result = only(world.take())
+    assert result.number == 1
+    assert isinstance(result.error, EnvRaised)
+    assert result.error.env_id == "srv/a"
+    assert (result.error.exception_type, result.error.traceback_text) == ("Oops", "trace")
+    client.raises = False
+    world.submit("a", 2)
+    world.settle()
+    assert only(world.take()).error is None
+
+
+def test_a_lost_request_and_a_lost_result_are_made_good_by_the_next_ping(world: World) -> None:
+    """Whichever way the message was lost, the request is executed once."""
+    world.take()
+    client = world.clients["a"]
+    world.submit("a", 1)
+    client.inbox.clear()
+    world.pass_time(HEARTBEAT / 8)
+    world.settle()
+    assert only(world.take()).observation[2] == 1
+    world.submit("a", 2)
+    world.to_client(client)
+    client.execute()
+    client.outbox.clear()
+    world.pass_time(HEARTBEAT / 8)
+    world.settle()
+    assert only(world.take()).observation[2] == 2
+
+
+def test_a_repeated_request_gets_the_same_reply_and_an_older_one_is_refused(world: World) -> None:
+    """The env steps once for each request."""
+    world.take()
+    client = world.clients["a"]
+    for number in (1, 2):
+        world.submit("a", number)
+        world.to_client(client)
+        client.execute()
+        world.to_server(client)
+    world.replay(client, 0, to_server=False)
+    world.replay(client, 1, to_server=False)
+    again, refused = client.outbox
+    assert again == world.said["a", True][-1]
+    assert b"StaleRequest" in refused[0]
+    assert client.steps == 2
+    world.settle()
+    assert len(world.take()) == 2
+
+
+def test_a_client_that_dies_in_a_step_leaves_one_marked_result(world: World) -> None:
+    """Truncated, at its last observation, with the cause."""
+    world.take()
+    world.submit("a", 1)
+    world.clients["a"].kill()
+    while "a" in world.server.clients:
+        world.pass_time(HEARTBEAT / 8)
+        assert world.clock.now <= HEARTBEAT
+    result = only(world.take())
+    assert (result.number, result.truncated, result.terminated) == (1, True, False)
+    assert result.observation.tolist() == [1, 1, 0]
+    assert "connection broke" in result.info["client_lost"]
+
+
+def test_who_is_gone_and_known_to_be_is_asked_in_vain(world: World) -> None:
+    """No stream of marked results: what comes next is the client's return."""
+    world.submit("a", 1)
+    world.clients["a"].kill()
+    world.pass_time(HEARTBEAT)
+    world.pass_time(HEARTBEAT)
+    world.take()
+    assert not world.submit("a", 2)
+    assert not world.take()
+    world.clients["a"].connect()
+    world.settle()
+    result = only(world.take())
+    assert result.number is None
+    assert result.observation.tolist() == [1, 2, 0]
+
+
+def test_a_loss_nobody_waited_for_is_told_by_the_next_step(world: World) -> None:
+    """The trainer learns that the episode ended before it sees the next one."""
+    world.take()
+    world.clients["a"].kill()
+    world.clients["a"].connect()
+    world.settle()
+    world.pass_time(HEARTBEAT)
+    world.pass_time(HEARTBEAT)
+    world.settle()
+    assert not world.take(), "the first result waits until the loss is told"
+    assert world.submit("a", 1)
+    assert "client_lost" in only(world.take()).info
+    assert world.submit("a", 2)
+    result = only(world.take())
+    assert (result.number, result.observation.tolist()) == (2, [1, 2, 0])
+
+
+def test_a_reset_takes_the_place_of_a_loss_and_of_a_first_result(world: World) -> None:
+    """Who resets doesn't care how the last episode ended."""
+    assert world.submit_reset("a", 1)
+    world.settle()
+    results = world.take()
+    assert [r.number for r in results if r.client == "a"] == [None, 1]
+    world.clients["a"].kill()
+    world.clients["a"].connect()
+    world.settle()
+    world.pass_time(2 * HEARTBEAT)
+    world.pass_time(HEARTBEAT)
+    world.settle()
+    assert world.submit_reset("a", 2)
+    world.settle()
+    assert only(world.take()).number == 2
+
+
+def test_a_broken_connection_is_resumed_within_a_quarter_of_the_heartbeat(world: World) -> None:
+    """The session goes on, and the request under way is executed once."""
+    world.take()
+    client = world.clients["a"]
+    world.submit("a", 1)
+    world.to_client(client)
+    client.execute()
+    client.cut()
+    world.pass_time(HEARTBEAT / 8)
+    client.connect()
+    world.settle()
+    assert only(world.take()).observation.tolist() == [1, 1, 1]
+    assert not client.ended
+
+
+def test_a_client_gives_its_server_up_after_a_quarter_of_the_heartbeat(world: World) -> None:
+    """Then the env is to be made safe, and the next session starts afresh."""
+    client = world.clients["a"]
+    client.cut()
+    world.clock.now += HEARTBEAT / 4
+    client.tick()
+    assert client.ended == ["the connection to the server broke and did not come back"]
+    client.connect()
+    world.settle()
+    assert client.session.phase is Phase.SERVING
+    assert world.clients["a"].steps == 0
+
+
+def test_an_idle_client_that_falls_silent_is_given_up_within_the_heartbeat(world: World) -> None:
+    """Even if its connection seems to live."""
+    world.take()
+    while "a" in world.server.clients:
+        world.pass_time(HEARTBEAT / 8)
+        world.clients["a"].inbox.clear()
+        world.clients["a"].outbox.clear()
+        world.settle()
+        assert world.clock.now <= 1.3 * HEARTBEAT
+    assert "b" in world.server.clients
+
+
+def test_a_busy_client_may_be_silent_as_long_as_it_likes(world: World) -> None:
+    """A step may take hours; its connection tells whether the client lives."""
+    world.take()
+    client = world.clients["a"]
+    world.submit("a", 1)
+    world.to_client(client)
+    for _ in range(100):
+        world.pass_time(HEARTBEAT)
+    client.execute()
+    world.settle()
+    assert only([r for r in world.take() if r.client == "a"]).number == 1
+
+
+def test_a_step_past_its_timeout_loses_the_client() -> None:
+    """One marked result; the client learns that its session is over."""
+    world = World(step_timeout=3.0)
+    world.join_all()
+    world.take()
+    client = world.clients["a"]
+    world.submit("a", 1)
+    world.to_client(client)
+    while "a" in world.server.clients:
+        world.pass_time(0.5)
+    assert world.clock.now <= 4.0
+    assert "no result of a step within 3.0 s" in only(world.take()).info["client_lost"]
+    client.execute()
+    world.settle()
+    assert any("within 3.0 s" in cause for cause in client.ended)
+
+
+def test_a_client_that_leaves_says_so(world: World) -> None:
+    """Its reason is in the marked result."""
+    world.take()
+    world.submit("a", 1)
+    client = world.clients["a"]
+    client.session.leave("battery empty")
+    client.flush()
+    world.to_server(client)
+    assert "it left: battery empty" in only(world.take()).info["client_lost"]
+
+
+def test_a_second_client_of_a_name_waits_until_the_first_is_gone(world: World) -> None:
+    """The one that is here keeps its session."""
+    second = Client("a", 9, world.clock)
+    second.routes = iter(range(50, 60))
+    first, world.clients["a"] = world.clients["a"], second
+    second.connect()
+    world.to_server(second)
+    world.to_client(second)
+    assert second.session.phase is Phase.GREETING
+    assert "a client named 'a' is here already" in (second.session.refusal or "")
+    assert first.session.phase is Phase.SERVING
+    for _ in range(40):
+        # Whatever is sent to the first one finds nobody.
+        world.pass_time(HEARTBEAT / 8)
+        world.settle()
+    assert second.session.phase is Phase.SERVING
+
+
+def test_a_restarted_server_gets_its_clients_back() -> None:
+    """A new server doesn't know the old session; the client says hello again."""
+    world = World("a")
+    world.join_all()
+    client = world.clients["a"]
+    world.server = ServerSessions("srv", heartbeat=HEARTBEAT)
+    client.cut()
+    client.connect()
+    world.settle()
+    world.pass_time(1.0)
+    world.settle()
+    assert client.ended == ["the server ended the session: no such session"]
+    assert client.session.phase is Phase.SERVING
+
+
+def test_a_server_that_closes_says_goodbye(world: World) -> None:
+    """Clients end their sessions at once, and ask again later."""
+    world.server.close("done")
+    world.flush()
+    world.settle()
+    assert world.clients["a"].ended == ["the server closed: done"]
+    assert world.clients["a"].session.phase is Phase.GREETING
+
+
+def meta(**changes: Any) -> EnvMeta:
+    fields: dict[str, Any] = {
+        "env_id": "env",
+        "observation_space": OBSERVATION,
+        "action_space": gym.spaces.Discrete(2),
+    }
+    return EnvMeta(**{**fields, **changes})
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "code"),
+    [
+        ("c/d", {}, "name"),
+        ("c\n", {}, "name"),
+        ("c", {}, "spaces"),  # Another action space than the others'.
+        ("c", {"action_space": gym.spaces.Box(-1, 1, (2,)), "num_envs": 2}, "spaces"),
+        ("c", {"action_space": gym.spaces.Box(-1, 1, (2,)), "agents": ("x",)}, "spaces"),
+    ],
+)
+def test_who_does_not_fit_is_refused_for_good(
+    world: World, name: str, changes: dict[str, Any], code: str
+) -> None:
+    """The client is told why, and gives up."""
+    stranger = ClientSession(meta(**changes), name, heartbeat=HEARTBEAT)
+    stranger.connected(0.0)
+    world.server.receive(b"r", None, stranger.outbox.popleft(), 0.0)
+    event = stranger.receive(world.server.outbox.popleft().parts, 0.0)
+    assert isinstance(event, Refused)
+    assert event.code == code
+    assert "c" not in world.server.clients
+
+
+def test_another_version_is_refused_by_name_of_both(world: World) -> None:
+    """Neither side guesses what the other means."""
+    hello = Hello(version=9, name="z", nonce=1, observation_space={}, action_space={})
+    world.server.receive(b"r", None, Writer().write(hello), 0.0)
+    assert b"speaks version 1, not 9" in world.server.outbox.popleft().parts[0]
+
+
+def test_a_session_answers_to_the_key_it_was_opened_with_alone() -> None:
+    """Knowing a session's number is not enough to speak in it."""
+    server = ServerSessions("srv", heartbeat=HEARTBEAT, new_token=lambda: 7)
+    session = ClientSession(meta(), "a", heartbeat=HEARTBEAT)
+    session.connected(0.0)
+    server.receive(b"r", "alice", session.outbox.popleft(), 0.0)
+    session.receive(server.outbox.popleft().parts, 0.0)
+    session.finish(0, EnvRet(env_id="e", observation=np.zeros(3)))
+    result = session.outbox.popleft()
+    server.receive(b"s", "mallory", result, 0.0)
+    assert not server.take()
+    assert server.malformed == 1
+    server.receive(b"s", "alice", result, 0.0)
+    assert server.take()
+
+
+def test_results_that_never_fit_end_the_session() -> None:
+    """A client that breaks its word three times for one request is sent away."""
+    world = World("a")
+    world.join_all()
+    world.take()
+    client = world.clients["a"]
+    world.submit("a", 1)
+    world.to_client(client)
+    client.execute()
+    (header, _), client.outbox[:] = client.outbox[0], []
+    for _ in range(3):
+        assert not world.results
+        world.server.receive(client.route or b"", None, [header, b"short"], 0.0)
+        world.flush()
+    assert "don't fit what it announced" in only(world.take()).info["client_lost"]
+    world.settle()
+    assert client.ended
+
+
+def test_a_client_counts_and_drops_what_is_no_message(world: World) -> None:
+    """A server's mistakes are no reason to fail."""
+    client = world.clients["a"]
+    client.receive([b"\xc1"])
+    assert client.session.malformed == 1
+    assert world.submit("a", 1)
+
+
+def test_a_flood_of_nonsense_is_logged_once_in_a_while(
+    world: World, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The count goes on, the log doesn't fill."""
+    with caplog.at_level(logging.WARNING):
+        for k in range(1000):
+            world.server.receive(b"r", None, [b"\xc1"], 30 * k / 1000)
+    assert world.server.malformed == 1000
+    assert len(caplog.records) == 3
+
+
+def test_what_of_an_info_cannot_travel_is_named_once(
+    world: World, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The result arrives without it, each time."""
+    world.take()
+    client = world.clients["a"]
+    with caplog.at_level(logging.WARNING):
+        for number in (1, 2):
+            world.submit("a", number)
+            world.to_client(client)
+            assert client.todo is not None
+            ret = client.ret()
+            ret.info = {"fine": 1, "camera": object()}
+            wire_number, client.todo = client.todo.number, None
+            client.session.finish(wire_number, ret)
+            client.flush()
+            world.settle()
+    assert [result.info for result in world.take()] == [{"fine": 1}] * 2
+    assert [record.message for record in caplog.records] == [
+        "a: of the env's info, camera can't travel and is left out"
+    ]
+
+
+def test_extras_travel_to_a_client_that_reads_them() -> None:
+    """What the policy attaches reaches the env; what can't travel is dropped."""
+    server = ServerSessions("srv", heartbeat=HEARTBEAT)
+    session = ClientSession(meta(), "a", heartbeat=HEARTBEAT, reads_extras=True, free_actions=True)
+    session.connected(0.0)
+    server.receive(b"r", None, session.outbox.popleft(), 0.0)
+    session.receive(server.outbox.popleft().parts, 0.0)
+    session.finish(0, EnvRet(env_id="e", observation=np.zeros(3)))
+    server.receive(b"r", None, session.outbox.popleft(), 0.0)
+    chunk = {"chunk": np.ones((4, 2)), "mode": "fast"}
+    server.submit("a", 1, chunk, {"log_prob": -0.5, "net": object()}, 0.0)
+    event = session.receive(server.outbox.popleft().parts, 0.0)
+    assert np.array_equal(event.action["chunk"], chunk["chunk"])
+    assert event.action["mode"] == "fast"
+    assert event.extras == {"log_prob": -0.5}
+
+
+def test_a_client_obeys_no_welcome_that_it_did_not_ask_for(world: World) -> None:
+    """Answers to greetings of long ago change nothing."""
+    client = world.clients["a"]
+    stray = Welcome(nonce=1, session=99, env_id="x", heartbeat=1.0)
+    assert client.session.receive(Writer().write(stray), 0.0) is None
+    assert world.submit("a", 1)
+
+
+def test_ended_is_what_a_client_hears_when_its_server_forgot_it(world: World) -> None:
+    """`Ended` carries the server's reason."""
+    client = world.clients["a"]
+    world.server._lose(client_session_of(world, "a"), "test")
+    client.cut()
+    client.connect()
+    world.to_server(client)
+    event = client.session.receive(client.inbox.pop(0), 0.0)
+    assert isinstance(event, Ended)
+
+
+def client_session_of(world: World, name: str) -> Any:
+    return world.server._seats[name].session

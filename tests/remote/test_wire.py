@@ -1,0 +1,259 @@
+"""What goes onto the wire comes off it again, and nothing else does."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.vector.utils import batch_space
+from hypothesis import given
+from hypothesis import strategies as st
+from remote.random_spaces import any_info, any_space, same, sampled
+
+from rlightning_aio.protocol import wire
+from rlightning_aio.protocol.columns import Misfit
+from rlightning_aio.protocol.payload import Outcome, Packed, ResultLayout, SpaceLayout
+from rlightning_aio.protocol.space_description import UnsupportedSpace, describe, space_from
+from rlightning_aio.protocol.wire import FromClient, Reader, Result, WireError, Writer, portable
+
+
+def through_wire(message: Any, frames: list[bytes] | None = None) -> tuple[Any, Any]:
+    return Reader[Any](FromClient).read(Writer().write(message, frames))
+
+
+@given(any_space)
+def test_a_space_survives_its_description_even_as_json(space: Any) -> None:
+    """Any language that has JSON can announce and understand a space."""
+    text = json.dumps(describe(space, "observation"), allow_nan=False)
+    assert space_from(json.loads(text)) == space
+
+
+@given(any_space, st.integers(0, 2**16))
+def test_values_survive_in_structure_dtype_shape_and_content(space: Any, seed: int) -> None:
+    """What a space samples arrives as it was."""
+    value = sampled(space, seed)
+    packed = Packed([], [])
+    SpaceLayout(space, "observation").pack(value, packed)
+    assert same(SpaceLayout(space, "observation").unpack(*packed), value)
+
+
+@given(any_info)
+def test_infos_survive_with_their_arrays(info: dict[str, Any]) -> None:
+    """Whatever msgpack can say travels, and arrays travel as frames."""
+    message, _ = through_wire(Result(session=1, number=2, info=info))
+    assert same(message.info, info)
+
+
+def test_a_frame_named_in_an_info_is_no_view_of_the_message() -> None:
+    """An info's arrays are the reader's own, and writable."""
+    message, _ = through_wire(Result(session=1, number=2, info={"a": np.arange(3)}))
+    message.info["a"][0] = 7
+
+
+@pytest.mark.parametrize("agents", [(), ("left", "right")])
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_rewards_and_flags_survive_for_agents_and_sub_environments(
+    agents: tuple[str, ...], num_envs: int
+) -> None:
+    """Each agent's and sub-environment's reward and flags come back as its own."""
+    single = spaces.Box(-1, 1, (2,))
+    each = batch_space(single, num_envs) if num_envs > 1 else single
+    space = spaces.Dict({agent: each for agent in agents}) if agents else each
+    shape = (num_envs,) if num_envs > 1 else ()
+
+    def per_agent(value: Any) -> Any:
+        return {agent: value + k for k, agent in enumerate(agents)} if agents else value
+
+    reward = per_agent(np.full(shape, 0.5))
+    ended = per_agent(np.zeros(shape, np.int64))
+    ended = {a: v.astype(bool) for a, v in ended.items()} if agents else ended.astype(bool)
+    outcome = Outcome(sampled(space, 3), reward, ended, ended)
+    layout = ResultLayout(space, num_envs, agents)
+    packed = Packed([], [])
+    header = layout.pack(outcome, packed)
+    assert same(tuple(layout.unpack(*packed, header[1:])), tuple(outcome))
+
+
+def test_what_cannot_travel_is_left_out_and_named() -> None:
+    """The rest of an info arrives although one value in it is an object."""
+    lost: list[str] = []
+    info = {"good": 1, "deep": {"bad": object(), "array": np.ones(2)}, "big": 2**70}
+    kept = portable(info, lost)
+    assert same(kept, {"good": 1, "deep": {"array": np.ones(2)}})
+    assert lost == ["deep.bad", "big"]
+
+
+def test_an_info_that_contains_itself_is_left_out() -> None:
+    """A cycle is no way to hang or crash a client."""
+    info: dict[str, Any] = {"good": 1}
+    info["self"] = info
+    lost: list[str] = []
+    assert portable(info, lost)["good"] == 1
+    assert lost
+
+
+def test_numpy_scalars_and_tuples_travel_as_plain_values() -> None:
+    """An info may hold what simulators put there."""
+    info = {"x": np.float64(0.5), "n": np.int32(3), "t": (1, 2), "words": np.array(["a", "b"])}
+    message, _ = through_wire(Result(session=1, number=2, info=info))
+    assert message.info == {"x": 0.5, "n": 3, "t": [1, 2], "words": ["a", "b"]}
+
+
+@pytest.mark.parametrize(
+    ("space", "value", "says"),
+    [
+        (spaces.Box(0, 1, (3,)), np.zeros(2, np.float32), r"shape \(3,\).*found shape \(2,\)"),
+        (spaces.MultiDiscrete([3]), np.zeros(1), "dtype int64, found .* dtype float64"),
+        (spaces.Dict(a=spaces.Discrete(2)), {"b": 1}, "keys \\['a'\\], found keys \\['b'\\]"),
+        (spaces.Tuple([spaces.Discrete(2)]), [], "a tuple of 1, found one of 0"),
+        (spaces.Text(2), "too long", "not in"),
+    ],
+)
+def test_a_value_that_does_not_fit_its_space_is_not_sent(space: Any, value: Any, says: str) -> None:
+    """The message names what was expected and what was found."""
+    with pytest.raises(Misfit, match=says):
+        SpaceLayout(space, "observation").pack(value, Packed([], []))
+
+
+@pytest.mark.parametrize(
+    ("space", "frames", "texts"),
+    [
+        (spaces.Box(0, 1, (3,)), [b"\0" * 8], []),
+        (spaces.Box(0, 1, (3,)), [], []),
+        (spaces.Box(0, 1, (3,)), [b"\0" * 12], ["a text"]),
+        (spaces.Box(0, 1, (2,), np.bool_), [b"\1\2"], []),
+        (spaces.Discrete(3), [(3).to_bytes(8, "little")], []),
+        (spaces.Text(2), [], ["abc"]),
+    ],
+)
+def test_frames_of_the_wrong_size_or_content_are_refused(
+    space: Any, frames: list[bytes], texts: list[str]
+) -> None:
+    """Nothing is made of bytes that aren't what the space says."""
+    with pytest.raises(WireError):
+        SpaceLayout(space, "observation").unpack(frames, texts)
+
+
+@pytest.mark.parametrize(
+    "space", [spaces.Sequence(spaces.Discrete(2)), spaces.Dict(a=spaces.Graph(spaces.Box(0, 1), None)),
+              spaces.Box(0, 1, (1,), np.longdouble), None]
+)  # fmt: skip
+def test_a_space_that_cannot_be_announced_is_named(space: Any) -> None:
+    """The message says where in the space it stands."""
+    with pytest.raises(UnsupportedSpace, match="the observation"):
+        describe(space, "the observation")
+
+
+@pytest.mark.parametrize(
+    "description",
+    [
+        {"type": "box", "shape": [2**40], "dtype": "float64", "low": 0, "high": 1},
+        {"type": "box", "shape": [-1], "dtype": "float64", "low": 0, "high": 1},
+        {"type": "box", "shape": [2], "dtype": "object", "low": 0, "high": 1},
+        {"type": "box", "shape": [2], "dtype": "uint8", "low": 0, "high": 300},
+        {"type": "box", "shape": [2], "dtype": "float32", "low": float("nan"), "high": 1},
+        {"type": "box", "shape": [2], "dtype": "float32", "low": [0, [1]], "high": 1},
+        {"type": "box", "shape": 2, "dtype": "float32", "low": 0, "high": 1},
+        {"type": "discrete", "n": 0},
+        {"type": "discrete", "n": True},
+        {"type": "multi_binary", "n": 2**40},
+        {"type": "multi_discrete", "nvec": [], "start": "no"},
+        {"type": "text", "max_length": 2**40, "charset": "a"},
+        {"type": "dict", "spaces": [["a", {"type": "discrete", "n": 2}]] * 2},
+        {"type": "tuple", "spaces": [{"type": "discrete", "n": 2}] * 300},
+        {"type": "tuple", "spaces": [{"type": "box", "shape": [2**20], "dtype": "float64",
+                                      "low": 0, "high": 1}] * 9},
+        {"type": "pickle"},
+        {},
+        [],
+        "box",
+    ],
+)  # fmt: skip
+def test_a_description_of_no_space_or_of_a_huge_one_is_refused(description: Any) -> None:
+    """Nobody makes the trainer allocate without end, or fail in any other way."""
+    with pytest.raises(WireError):
+        space_from(description)
+
+
+def test_a_deeply_nested_description_is_refused() -> None:
+    """Depth is bounded before anything is built."""
+    description: Any = {"type": "discrete", "n": 2}
+    for _ in range(100):
+        description = {"type": "tuple", "spaces": [description]}
+    with pytest.raises(WireError):
+        space_from(description)
+
+
+def reference(*payload: Any) -> msgspec.msgpack.Ext:
+    return msgspec.msgpack.Ext(1, msgspec.msgpack.encode(payload))
+
+
+@pytest.mark.parametrize(
+    "info",
+    [
+        {"a": reference("float64", [3], 0)},  # A frame of another size.
+        {"a": reference("object", [1], 0)},
+        {"a": reference("uint8", [8], 1)},  # No such frame.
+        {"a": reference("uint8", [8], 0), "b": reference("uint8", [8], 0)},  # Twice the same.
+        {"a": reference("uint8", [-8], 0)},
+        {"a": reference("uint8")},
+        {"a": msgspec.msgpack.Ext(2, b"")},
+        {"a": msgspec.msgpack.Ext(1, b"\xff")},
+    ],
+)
+def test_an_info_that_names_frames_wrongly_is_refused(info: dict[str, Any]) -> None:
+    """A reference to a frame must fit the frame, and each frame is named once at most."""
+    header = {"type": "result", "session": 1, "number": 2, "info": info}
+    with pytest.raises(WireError):
+        Reader[Any](FromClient).read([msgspec.msgpack.encode(header), b"\0" * 8])
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        [],
+        [b""],
+        [b"\xc1"],
+        [b"\x91" * 100_000],
+        [msgspec.msgpack.encode({"type": "step", "session": 1, "number": 1})],
+        [msgspec.msgpack.encode({"type": "result", "session": -1, "number": 1})],
+        [msgspec.msgpack.encode({"type": "result", "session": 1, "number": 2**63})],
+        [msgspec.msgpack.encode({"type": "bye", "session": "1"})],
+        [b"\x82\xa4type\xa3bye\xa7session\xa1\xff"],
+        [b"\0" * (wire.MAX_HEADER_BYTES + 1)],
+        [b"\x80"] * (wire.MAX_PARTS + 1),
+    ],
+)
+def test_what_is_no_message_is_refused_as_such(parts: list[bytes]) -> None:
+    """Every way of being wrong is one kind of error."""
+    with pytest.raises(WireError):
+        Reader[Any](FromClient).read(parts)
+
+
+class Bomb:
+    exploded = False
+
+    def __reduce__(self) -> Any:
+        return (setattr, (Bomb, "exploded", True))
+
+
+@pytest.mark.parametrize("where", ["header", "frame", "info"])
+def test_a_pickle_does_nothing(where: str) -> None:
+    """Bytes that would run code elsewhere are bytes here."""
+    bomb = pickle.dumps(Bomb())
+    good = Writer().write(Result(session=1, number=1, info={"a": bomb}), [])
+    parts = {"header": [bomb], "frame": [good[0], bomb], "info": good}[where]
+    try:
+        message, _ = Reader[Any](FromClient).read(parts)
+    except WireError:
+        message = None
+    assert not Bomb.exploded
+    assert where == "header" or message.info == {"a": bomb}
+    pickle.loads(bomb)
+    assert Bomb.exploded, "the bomb must be a real one"
+    Bomb.exploded = False
