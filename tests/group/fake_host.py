@@ -7,11 +7,13 @@ see `Outcome`. Its observations say which env it is and what has happened to it.
 from __future__ import annotations
 
 import pickle
+from asyncio import CancelledError
 from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pytest
 from gymnasium import spaces
 
 from rlightning_aio.config import EnvConfig
@@ -370,7 +372,8 @@ class FakeGroup:
         self.turn()
 
     def cancel(self, running: Running) -> None:
-        running.operation.close()
+        with pytest.raises(CancelledError):
+            running.operation.throw(CancelledError())
         running.done = True
         self.running.remove(running)
         self.wake()

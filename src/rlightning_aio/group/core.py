@@ -35,6 +35,8 @@ from rlightning_aio.protocol.rings import OP_BITS, OP_MASK, RESET, SLOT_MASK, ST
 from rlightning_aio.protocol.slab import NO_SEED
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from rlightning_aio.batch import BatchedData
@@ -270,17 +272,15 @@ class Core:
         if not self._is_current(slot, number):
             return
         doing = {STEP: "step", RESET: "reset", CALL: "call"}[int(self.slots.op[slot])]
-        self.fail(
-            [slot],
-            EnvRaised(
-                f"{self.slots.describe(slot)} raised in {doing}: {error.type_name}: {error.text}; "
-                "the remote traceback is above; reset the env to go on",
-                env_id=self.slots.env_ids[slot],
-                exception_type=error.type_name,
-                exception_text=error.text,
-                traceback_text=error.traceback,
-            ),
+        raised = EnvRaised(
+            f"{self.slots.describe(slot)} raised in {doing}: {error.type_name}: {error.text}; "
+            "the remote traceback is above; reset the env to go on",
+            env_id=self.slots.env_ids[slot],
+            exception_type=error.type_name,
+            exception_text=error.text,
+            traceback_text=error.traceback,
         )
+        self.fail(np.array([slot], np.intp), lambda _: raised)
 
     def on_schema(self, host: Host, number: int, schema: InfoSchema) -> None:
         """See `base.Inbox.on_schema`."""
@@ -349,22 +349,23 @@ class Core:
         self._ready_count += len(slots)
         self._in_flight -= len(slots)
 
-    def fail(self, slots: Sequence[int], fault: EnvFault) -> None:
-        """End the requests of `slots`, all of which are outstanding, with one error."""
+    def fail(
+        self, slots: NDArray[np.intp], error_for: Callable[[NDArray[np.intp]], EnvFault]
+    ) -> None:
+        """End the outstanding requests of `slots` with one error for each caller."""
         table = self.slots
-        owners = {int(table.owner[slot]) for slot in slots}
-        for owner in owners:
-            mine = [slot for slot in slots if table.owner[slot] == owner]
+        for owner in set(table.owner[slots].tolist()):
+            mine = slots[table.owner[slots] == owner]
             table.state[mine] = IDLE
             if owner == NOBODY:
                 table.owner[mine] = 0
             elif owner:
                 ticket = self._tickets[owner]
                 ticket.remaining -= len(mine)
-                ticket.faults.append(fault)
+                ticket.faults.append(error_for(mine))
             else:
                 self._in_flight -= len(mine)
-                self._faults.append(fault)
+                self._faults.append(error_for(mine))
 
     # -- collect ------------------------------------------------------------------
 

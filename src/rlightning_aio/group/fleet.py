@@ -13,6 +13,7 @@ import warnings
 from collections import deque
 from dataclasses import dataclass, field, replace
 from enum import Enum, auto
+from functools import partial
 from math import ceil
 from typing import TYPE_CHECKING, Any
 
@@ -40,7 +41,7 @@ from rlightning_aio.protocol.slab import NO_SEED, Slab
 from rlightning_aio.types import EnvMeta
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
@@ -77,7 +78,7 @@ class _Member:
     restarts: int = 0
     hung_slot: int | None = None
     rebuild_error: ErrorText | None = None
-    failure: WorkerDied | None = None
+    failure: Callable[[], WorkerDied] | None = None
 
     @property
     def timed(self) -> bool:
@@ -93,7 +94,8 @@ class Fleet:
         lost: slots whose env was replaced while nothing was asked of it; the next step
             has to tell.
         restarting: slots whose next reply comes from a replacement, with the cause.
-        recovering: some worker was replaced and has not shown yet that it works.
+        recovering: some worker was replaced and has not shown yet that it works, or has
+            still to tell of it.
     """
 
     def __init__(self, slots: Slots, arena: Arena, *, mixed_actions: bool) -> None:
@@ -332,7 +334,7 @@ class Fleet:
             for host_id in host_ids:
                 failure = self._members[host_id].failure
                 if failure is not None:
-                    raise failure
+                    raise failure()
 
     def check_local(self, slots: NDArray[np.intp], what: str) -> None:
         """Raises NotImplementedError if any of `slots` belongs to a client."""
@@ -524,15 +526,16 @@ class Fleet:
         give_up = member.config.on_worker_death == "raise" or (
             member.restarts > member.config.max_restarts
         )
-        error = self._death_error(member, death, owed, hung_slot)
+        # A replacement answers for steps and resets, but not for calls.
+        calls = owed[~np.isin(self.slots.op[owed], (STEP, RESET))]
+        error_for = partial(self._death_error, member, death, hung_slot)
+        self._core.fail(owed if give_up else calls, error_for)
         if give_up:
             member.stage = _Stage.FAILED
-            member.failure = error
+            member.failure = partial(error_for, owed)
             self._unavailable = True
-            if len(owed):
-                self._core.fail(owed.tolist(), error)
             return
-        self._replace(member, death, owed, error)
+        self._replace(member, death, np.setdiff1d(owed, calls))
 
     def _died_starting(self, member: _Member, death: Death) -> None:
         member.stage = _Stage.CLOSED
@@ -543,15 +546,9 @@ class Fleet:
         )
         self._start_fault = self._start_fault or fault
 
-    def _replace(
-        self, member: _Member, death: Death, owed: NDArray[np.intp], error: WorkerDied
-    ) -> None:
+    def _replace(self, member: _Member, death: Death, owed: NDArray[np.intp]) -> None:
         """Start a new worker in place of a dead one, and let it answer for what was owed."""
         table, host = self.slots, member.host
-        calls = [slot for slot in owed.tolist() if table.op[slot] not in (STEP, RESET)]
-        if calls:
-            self._core.fail(calls, error)
-        owed = owed[np.isin(table.op[owed], (STEP, RESET))]
         schemas: dict[int, Any] = {}
         # A new list: batches that were handed out go on reading the old one.
         table.schemas = list(table.schemas)
@@ -577,7 +574,7 @@ class Fleet:
         return {STEP: "a step", RESET: "a reset"}.get(int(self.slots.op[slot]), "a call")
 
     def _death_error(
-        self, member: _Member, death: Death, owed: NDArray[np.intp], hung_slot: int | None
+        self, member: _Member, death: Death, hung_slot: int | None, owed: NDArray[np.intp]
     ) -> WorkerDied:
         slot = int(owed[0]) if len(owed) else member.host.first_slot
         if hung_slot is not None:
@@ -613,7 +610,7 @@ class Fleet:
                 self._mark(slot, death, rests)
             elif self.slots.op[slot] == STEP:
                 self._members[int(self.slots.host[slot])].restarts = 0
-        self.recovering = any(member.restarts for member in self._members)
+        self.recovering = bool(self.restarting) or any(m.restarts for m in self._members)
 
     def _mark(self, slot: int, death: Death, rests: dict[int, Any]) -> None:
         slab = self.slabs[int(self.slots.slab[slot])]
