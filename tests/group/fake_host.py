@@ -324,7 +324,7 @@ class FakeGroup:
         self.env_ids = [f"fake-{k}" for k in range(sum(rows))]
         arena = Arena()
         slots = Slots([self.config] * sum(rows), self.env_ids)
-        self.fleet = Fleet(slots, arena, mixed_actions=False)
+        self.fleet = Fleet(slots, arena, self, mixed_actions=False)
         self.hosts: list[FakeHost] = []
         for host_id, count in enumerate(rows):
             host = FakeHost(
@@ -376,13 +376,12 @@ class FakeGroup:
             running.operation.throw(CancelledError())
         running.done = True
         self.running.remove(running)
-        self.wake()
+        self.turn()
 
     def wake(self) -> None:
-        """What a driver does when requests or results came in by another way than a host."""
+        """See `hosts.base.Watcher.wake`."""
         for running in self.running:
             running.woken = True
-        self.turn()
 
     def host_of(self, slot: int) -> FakeHost:
         return next(h for h in self.hosts if h.first_slot <= slot < h.first_slot + h.rows)
@@ -395,8 +394,8 @@ class FakeGroup:
         self.turn(newest_first=newest_first)
 
     def close(self) -> None:
-        for running in list(self.running):
-            self.cancel(running)
+        while self.running:
+            self.cancel(self.running[0])
         assert self.begin(self.fleet.close(self.now)).done
 
 

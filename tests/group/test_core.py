@@ -225,3 +225,49 @@ def test_extras_for_some_envs_of_a_batch_leave_the_others_in_their_rows(
     assert ids_of(running) == ["fake-0", "fake-1"]
     assert group.hosts[0].extras == {}
     assert group.hosts[1].extras == {1: {"value": 1}}
+
+
+def test_an_env_whose_error_was_not_raised_yet_is_busy(new_group: NewGroup) -> None:
+    """Its caller still waits for others; a request in between would get mixed up with them."""
+    group = new_group(2)
+    running = group.begin(group.core.step(steps(0, 1, action=RAISES), group.now))
+    group.finish(0)
+    with pytest.raises(EnvBusy, match="was not collected"):
+        group.core.step_async(steps(0), group.now)
+    group.finish(1)
+    with pytest.raises(EnvRaised):
+        running.result()
+    group.core.step_async(steps(0, 1), group.now)
+
+
+def test_a_collector_waits_for_what_is_sent_meanwhile_too(new_group: NewGroup) -> None:
+    """It has asked one worker to wake it; now another worker has the first result."""
+    group = new_group(1, 1)
+    group.core.step_async(steps(0), group.now)
+    waiting = collect(group)
+    group.core.step_async(steps(1), group.now)
+    group.turn()
+    group.finish(1)
+    assert ids_of(waiting) == ["fake-1"]
+
+
+def test_a_collector_gets_what_another_caller_gives_up(new_group: NewGroup) -> None:
+    """Results that are there already wake it."""
+    group = new_group(3)
+    group.core.step_async(steps(2), group.now)
+    stepping = group.begin(group.core.step(steps(0, 1), group.now))
+    waiting = collect(group)
+    group.finish(0)
+    group.cancel(stepping)
+    assert ids_of(waiting) == ["fake-0"]
+
+
+def test_a_result_that_somebody_else_took_in_wakes_its_caller(new_group: NewGroup) -> None:
+    """A collect of nothing looks at every worker's reports, and others still get theirs."""
+    group = new_group(2)
+    resetting = group.begin(group.core.reset(group.now, 0, None, None))
+    group.finish(0)
+    with pytest.raises(NothingPending):
+        collect(group).result()
+    group.finish(1)
+    assert ids_of(resetting) == ["fake-0", "fake-1"]

@@ -227,7 +227,7 @@ class CoreMachine(RuleBasedStateMachine):
         batch, actions = self.responses(data, slots)
         self.core.step_async(batch, self.group.now)
         self.requests_for(slots, actions)
-        self.group.wake()
+        self.group.turn()
         self.settle()
 
     @precondition(lambda self: self.idle())
@@ -405,8 +405,7 @@ class CoreMachine(RuleBasedStateMachine):
                 request.op, request.seed, request.restarts = "reset", None, True
                 model.lost = False
         host.die()
-        for running in self.group.running:
-            running.woken = True
+        self.group.wake()
         self.group.turn()
         self.settle()
 

@@ -71,11 +71,21 @@ class AioDriver:
             self._writing.discard(source)
             loop.remove_writer(source.fileno())
 
+    def wake(self) -> None:
+        """See `base.Watcher.wake`."""
+        for source in self._futures:
+            # Whoever waits, waits for all of them.
+            self._tell(source)
+            return
+
     def _readable(self, source: Source) -> None:
         try:
             source.on_readable()
         except BaseException as error:  # An event loop would log it and let the waiter hang.
             self._broken = error
+        self._tell(source)
+
+    def _tell(self, source: Source) -> None:
         future = self._futures.get(source)
         if future is not None:
             # Invariant: whoever starts to wait from now on gets a future that is not done;

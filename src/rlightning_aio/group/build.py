@@ -153,7 +153,7 @@ def build_fleet(plan: Plan, watcher: Watcher) -> Fleet:
         [(f"{config.name}-0", config, MAX_CLIENTS) for config in remote],
     )
     arena = Arena()
-    fleet = Fleet(slots, arena, mixed_actions=plan.mixed_actions)
+    fleet = Fleet(slots, arena, watcher, mixed_actions=plan.mixed_actions)
     cores = sorted(os.sched_getaffinity(0))
     orders = [
         (config, shares)

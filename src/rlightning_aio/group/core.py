@@ -66,12 +66,18 @@ Flags: TypeAlias = "list[bool]"
 
 @dataclass(slots=True)
 class Ticket:
-    """What waits for requests of its own, beside `collect_async`; `calls` are of methods."""
+    """What waits for requests of its own, beside `collect_async`.
+
+    Attributes:
+        calls: they are calls of methods.
+        spent: slots whose reply was an error or a value, so that no result is left in a row.
+    """
 
     owner: int
     slots: NDArray[np.intp]
     remaining: int
     calls: bool = False
+    spent: list[int] = field(default_factory=list[int])
     faults: list[EnvFault] = field(default_factory=list[EnvFault])
     value: Any = None
 
@@ -100,6 +106,7 @@ class Core:
         self._reports: list[NDArray[np.int64]] = []
         self._collecting = False
         self._wanted: list[int] = []
+        self._news = False
         self.info_width = 0
         fleet.deliver_to(self)
 
@@ -135,6 +142,9 @@ class Core:
     def step_async(self, batch: BatchedData, now: float) -> None:
         """Send a batch of steps that `collect` will answer."""
         self._send_steps(batch, self.slots_of(batch), 0, now)
+        if self._wanted:
+            # The collector has not asked these envs' workers to wake it.
+            self.fleet.watcher.wake()
 
     def _send_steps(
         self, batch: BatchedData, slots: NDArray[np.intp], owner: int, now: float
@@ -257,13 +267,15 @@ class Core:
         """See `base.Inbox.on_value`."""
         slot = host.first_slot + row
         if self._is_current(slot, number):
-            self.slots.state[slot] = IDLE
+            self._news = True
             owner = int(self.slots.owner[slot])
             if owner == NOBODY:
-                self.slots.owner[slot] = 0
+                self.slots.owner[slot] = self.slots.state[slot] = 0
                 return
+            self.slots.state[slot] = READY
             ticket = self._tickets[owner]
             ticket.value = value
+            ticket.spent.append(slot)
             ticket.remaining -= 1
 
     def on_error(self, host: Host, row: int, number: int, error: ErrorText) -> None:
@@ -330,6 +342,7 @@ class Core:
         if not len(slots):
             return
         table = self.slots
+        self._news = True
         table.state[slots] = READY
         if self.fleet.recovering:
             self.fleet.note_restarted(slots, self._rests)
@@ -354,13 +367,16 @@ class Core:
     ) -> None:
         """End the outstanding requests of `slots` with one error for each caller."""
         table = self.slots
+        self._news = True
         for owner in set(table.owner[slots].tolist()):
             mine = slots[table.owner[slots] == owner]
             table.state[mine] = IDLE
             if owner == NOBODY:
                 table.owner[mine] = 0
             elif owner:
+                table.state[mine] = READY
                 ticket = self._tickets[owner]
+                ticket.spent += mine.tolist()
                 ticket.remaining -= len(mine)
                 ticket.faults.append(error_for(mine))
             else:
@@ -392,7 +408,7 @@ class Core:
             if wait_all:
                 timeout = None
             while True:
-                self.fleet.sweep()
+                self._sweep()
                 if self._faults:
                     raise self._faults.popleft()
                 ready, total = self._ready_count, self._ready_count + self._in_flight
@@ -421,6 +437,18 @@ class Core:
         finally:
             self._collecting = False
         return self._take(most)
+
+    def _sweep(self) -> None:
+        """Take in what hosts have ready.
+
+        Invariant: whoever waits looks again, and orders anew, after every reply that is taken
+        in; here somebody else takes it.
+        """
+        self.fleet.sweep()
+        if self._news:
+            self._news = False
+            if self._wanted:
+                self.fleet.watcher.wake()
 
     def _wait(self, wanted: int, until: float | None) -> Operation[float]:
         """One turn of waiting for `wanted` more replies; the time after it."""
@@ -471,22 +499,28 @@ class Core:
         """Until all replies of `ticket` are there. Given up, they go to `collect_async`."""
         try:
             while True:
-                self.fleet.sweep()
+                self._sweep()
                 if ticket.remaining <= 0:
                     break
                 yield from self._wait(ticket.remaining, None)
         except BaseException:
             self._disown(ticket)
             raise
+        self._tear_up(ticket)
+
+    def _tear_up(self, ticket: Ticket) -> None:
         del self._tickets[ticket.owner]
         # Invariant: the owner of an idle slot is 0.
         self.slots.owner[ticket.slots] = 0
+        if ticket.spent:
+            self.slots.state[ticket.spent] = IDLE
 
     def _disown(self, ticket: Ticket) -> None:
         """The caller has given up: `collect_async` gets what was stepped and reset for it."""
-        del self._tickets[ticket.owner]
+        self._tear_up(ticket)
+        if self._wanted:
+            self.fleet.watcher.wake()
         table, slots = self.slots, ticket.slots
-        table.owner[slots] = 0
         if ticket.calls:
             table.owner[slots[table.state[slots] == BUSY]] = NOBODY
             return

@@ -47,6 +47,7 @@ if TYPE_CHECKING:
 
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.group.core import Core
+    from rlightning_aio.hosts.base import Watcher
     from rlightning_aio.hosts.process import ForkServer
 
 __all__ = ["Fleet"]
@@ -91,6 +92,7 @@ class Fleet:
     """The hosts of one group and the memory that they share with it.
 
     Attributes:
+        watcher: the driver.
         lost: slots whose env was replaced while nothing was asked of it; the next step
             has to tell.
         restarting: slots whose next reply comes from a replacement, with the cause.
@@ -98,8 +100,11 @@ class Fleet:
             still to tell of it.
     """
 
-    def __init__(self, slots: Slots, arena: Arena, *, mixed_actions: bool) -> None:
+    def __init__(
+        self, slots: Slots, arena: Arena, watcher: Watcher, *, mixed_actions: bool
+    ) -> None:
         self.slots = slots
+        self.watcher = watcher
         self.hosts: list[Host] = []
         self.slabs: list[Slab] = []
         self.open = False

@@ -63,6 +63,9 @@ class SyncDriver:
             events = select.EPOLLIN | select.EPOLLOUT if wanted else select.EPOLLIN
             self._epoll.modify(descriptor, events)
 
+    def wake(self) -> None:
+        """See `base.Watcher.wake`. One operation runs at a time: nobody else waits."""
+
     def run(self, operation: Operation[T]) -> T:
         """Wait until `operation` ends; its result. It gets to clean up if it is interrupted."""
         try:

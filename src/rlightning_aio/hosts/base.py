@@ -70,6 +70,10 @@ class Watcher(Protocol):
         """Also call `source.on_writable` whenever its descriptor is writable."""
         ...
 
+    def wake(self) -> None:
+        """Have every operation that waits look again, as if a source had told something."""
+        ...
+
 
 class Host(Source, Protocol):
     """Envs of one worker, numbered by row from 0.
