@@ -19,11 +19,32 @@ if TYPE_CHECKING:
 
     from rlightning_aio.config import EnvConfig
 
-__all__ = ["BareStep", "BaseEnv", "PreprocessFn", "Result", "default_env_preprocess_fn"]
+__all__ = [
+    "BareStep",
+    "BaseEnv",
+    "PreprocessFn",
+    "Result",
+    "default_env_preprocess_fn",
+    "result_of",
+]
 
 PreprocessFn = Callable[[PolicyResponse], Any]
 Result = EnvRet | MultiAgentEnvRet | list[EnvRet]
 BareStep = Callable[[Any], tuple[Any, Any, Any, Any, dict[str, Any]]]
+
+
+def result_of(env_id: str, outcome: tuple[Any, Any, Any, Any, dict[str, Any]]) -> EnvRet:
+    """The result that the five values of a Gymnasium step make."""
+    observation, reward, terminated, truncated, info = outcome
+    # Not validated: that would cost more than everything else here.
+    return EnvRet.model_construct(
+        env_id=env_id,
+        observation=observation,
+        last_reward=reward,
+        last_terminated=terminated,
+        last_truncated=truncated,
+        info=info,
+    )
 
 
 def default_env_preprocess_fn(policy_resp: PolicyResponse) -> Any:

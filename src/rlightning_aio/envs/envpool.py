@@ -13,7 +13,13 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from gymnasium.vector.utils import batch_space
 
-from rlightning_aio.envs.base import BareStep, BaseEnv, PreprocessFn, default_env_preprocess_fn
+from rlightning_aio.envs.base import (
+    BareStep,
+    BaseEnv,
+    PreprocessFn,
+    default_env_preprocess_fn,
+    result_of,
+)
 from rlightning_aio.envs.tensors import as_numpy
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.types import EnvRet, PolicyResponse
@@ -114,17 +120,7 @@ class EnvPoolEnv(BaseEnv):
         return EnvRet(env_id=self.env_id, observation=observation, info=info)
 
     def step(self, policy_resp: PolicyResponse) -> EnvRet:
-        observation, reward, terminated, truncated, info = self._step(
-            self._preprocess_fn(policy_resp)
-        )
-        return EnvRet(
-            env_id=self.env_id,
-            observation=observation,
-            last_reward=reward,
-            last_terminated=terminated,
-            last_truncated=truncated,
-            info=info,
-        )
+        return result_of(self.env_id, self._step(self._preprocess_fn(policy_resp)))
 
     def bare_step(self) -> BareStep | None:
         plain = type(self).step is EnvPoolEnv.step

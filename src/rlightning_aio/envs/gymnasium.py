@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 
-from rlightning_aio.envs.base import BareStep, BaseEnv, PreprocessFn, default_env_preprocess_fn
+from rlightning_aio.envs.base import (
+    BareStep,
+    BaseEnv,
+    PreprocessFn,
+    default_env_preprocess_fn,
+    result_of,
+)
 from rlightning_aio.envs.tensors import as_numpy
 from rlightning_aio.types import EnvRet, PolicyResponse
 
@@ -55,17 +61,8 @@ class GymnasiumEnv(BaseEnv):
         return EnvRet(env_id=self.env_id, observation=observation, info=info)
 
     def step(self, policy_resp: PolicyResponse) -> EnvRet:
-        observation, reward, terminated, truncated, info = self.env.step(
-            as_numpy(self._preprocess_fn(policy_resp))
-        )
-        return EnvRet(
-            env_id=self.env_id,
-            observation=observation,
-            last_reward=reward,
-            last_terminated=terminated,
-            last_truncated=truncated,
-            info=info,
-        )
+        action = as_numpy(self._preprocess_fn(policy_resp))
+        return result_of(self.env_id, self.env.step(action))
 
     def bare_step(self) -> BareStep | None:
         plain = type(self).step is GymnasiumEnv.step

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rlightning_aio.envs.base import BaseEnv, default_env_preprocess_fn
+from rlightning_aio.envs.base import BaseEnv, default_env_preprocess_fn, result_of
 from rlightning_aio.envs.tensors import as_numpy, holds_tensor
 from rlightning_aio.hosts.episodes import EpisodeSums
 from rlightning_aio.protocol.columns import row_reader, row_writer
@@ -157,15 +157,7 @@ class EnvRunner:
         began = time.monotonic_ns()
         bare = self.env.bare_step()
         if bare is not None:
-            observation, reward, terminated, truncated, info = bare(action)
-            result = EnvRet.model_construct(
-                env_id=self.env.env_id,
-                observation=observation,
-                last_reward=reward,
-                last_terminated=terminated,
-                last_truncated=truncated,
-                info=info,
-            )
+            result = result_of(self.env.env_id, bare(action))
         else:
             result = self.env.step(PolicyResponse(self.env.env_id, action, **extras))
         return self._store(result, began, stepped=True)
@@ -177,6 +169,7 @@ class EnvRunner:
         self.reset_episode()
         if self._takes_turns:
             # The others' first observations are still to come, as results of steps.
+            assert isinstance(result, EnvRet)
             self._episodes.forget(begun=np.asarray(result.info["env_id"]))
         return self._store(result, began, stepped=False)
 
