@@ -8,7 +8,7 @@ returned as a dict, the *rest*; None means that the row holds everything.
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -170,7 +170,8 @@ class EnvRunner:
         if self._takes_turns:
             # The others' first observations are still to come, as results of steps.
             assert isinstance(result, EnvRet)
-            self._episodes.forget(begun=np.asarray(result.info["env_id"]))
+            info = cast("EnvRet", result).info
+            self._episodes.forget(begun=np.asarray(info["env_id"]))
         return self._store(result, began, stepped=False)
 
     def reset_from_row(self) -> Rest | None:
