@@ -247,8 +247,11 @@ class FakeHost:
             return True
         return False
 
-    def has_news(self) -> bool:
-        return any(reply.tell is None for reply in self.unread)
+    def withdraw(self) -> None:
+        self.ordered = 0
+
+    def unread(self) -> int:
+        return 0
 
     def sweep(self) -> None:
         """Frames lie in the channel, which only `on_readable` reads."""

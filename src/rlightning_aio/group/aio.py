@@ -376,7 +376,8 @@ class ServerHandle(EnvHandle):
         """Reset all clients, of which there must be ``min_clients`` within ``connect_timeout``.
 
         Args:
-            seed: client k, in the order in which they first joined, gets ``seed + k``.
+            seed: client k, in the order of their names, gets ``seed + k`` (counting
+                sub-environments).
             options: passed to each.
 
         Raises:

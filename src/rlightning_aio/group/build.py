@@ -186,8 +186,8 @@ def build_fleet(plan: Plan, watcher: Watcher) -> Fleet:
         fleet.add(_server_host(config, host_id, first_slot, fleet, watcher), config)
         first_slot += MAX_CLIENTS
     fleet.servers = list(servers.values())
-    # A trainer that spins needs a core that no worker needs.
-    fleet.spinner = Spinner(enabled=0 < num_processes < len(cores))
+    fleet.num_cores = len(cores)
+    fleet.spinner = Spinner(enabled=num_processes > 0)
     return fleet
 
 

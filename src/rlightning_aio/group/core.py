@@ -150,6 +150,10 @@ class Core:
         self, batch: BatchedData, slots: NDArray[np.intp], owner: int, now: float
     ) -> None:
         table = self.slots
+        if self.fleet.elastic:
+            batch, slots = self._without_returned(batch, slots)
+            if not len(slots):
+                return
         self._check_sendable(slots, "step")
         letters = write_actions(batch, slots, table, self.fleet.slabs)
         packed = [] if letters is None else self._pack_letters(slots, letters)
@@ -172,6 +176,25 @@ class Core:
                 self._mark_sent(slots[position : position + 1], STEP, owner, now)
                 host = self.fleet.host_of(slot)
                 host.request_step(slot - host.first_slot, table.number(slot), letter)
+
+    def _without_returned(
+        self, batch: BatchedData, slots: NDArray[np.intp]
+    ) -> tuple[BatchedData, NDArray[np.intp]]:
+        """`batch` without the clients that have come back since it was decided upon.
+
+        What they would be asked was meant for the episode that they have lost; the first
+        result of the new one, which waits to be collected, is their answer.
+        """
+        returned = self._has_joined(slots)
+        if not returned.any():
+            return batch, slots
+        kept = np.flatnonzero(~returned).tolist()
+        env_ids, values = batch.env_ids(), batch.values()
+        return BatchedData([env_ids[k] for k in kept], [values[k] for k in kept]), slots[kept]
+
+    def _has_joined(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Which of `slots` have a first result that nobody has collected."""
+        return (self.slots.op[slots] == JOINED) & (self.slots.state[slots] == READY)
 
     def _pack_letters(self, slots: NDArray[np.intp], letters: Letters) -> list[Any]:
         """What the channel will carry, pickled before anything is sent."""
@@ -303,7 +326,6 @@ class Core:
         """See `base.Inbox.on_client`."""
         slot = host.first_slot + row
         self.slots.christen(slot, meta.env_id)
-        self.slots.seed_offset[slot] = self.fleet.num_local_seeds + row * meta.num_envs
         self.slots.resets_itself[slot] = meta.autoreset != "disabled"
         if self.slots.state[slot] == IDLE:
             self._mark_sent(np.array([slot]), JOINED, 0, 0.0)
@@ -456,7 +478,7 @@ class Core:
         try:
             # Whoever else waits meanwhile must be woken as early as it asked for.
             fleet, first = self.fleet, min(self._wanted)
-            if fleet.run_inline(wanted) or fleet.spin() or fleet.order(first):
+            if fleet.run_inline(wanted) or fleet.spin(first) or fleet.order(first):
                 return (yield Wait(0.0))
             now = yield Wait(earliest(until, fleet.next_check()))
             fleet.slept()
@@ -485,6 +507,9 @@ class Core:
         batch = collected(self, slots, self._rests)
         flags = self.auto.account(slots, batch)
         self.stats.account(batch.parts, synchronous=synchronous)
+        if len(slots):
+            sample = batch.parts[0].busy_ns.item(0)
+            self.fleet.step_ns += 0.1 * (sample - self.fleet.step_ns)
         return batch, flags
 
     # -- calls that wait for their own replies ------------------------------------
@@ -575,14 +600,20 @@ class Core:
         slots: NDArray[np.intp],
     ) -> Operation[tuple[BatchedData, Flags]]:
         table = self.slots
-        seeds = self._seeds(seed, slots)
         if self.fleet.elastic:
-            self._forget_first_results(slots)
-        self._check_sendable(slots, "reset")
+            self.fleet.rank_clients()
+        seeds = self._seeds(seed, slots)
+        joined = self._has_joined(slots)
+        self._check_sendable(slots[~joined], "reset")
         by_letter = options is not None or self.fleet.elastic
         packed = self._pack_resets(slots, seeds, options) if by_letter else []
         self.fleet.forget_lost(slots)
         ticket = self._new_ticket(slots)
+        if joined.any():
+            plain = seed is None and options is None
+            self._take_first_results(slots[joined], ticket, enough=plain)
+            if plain:
+                slots, packed = slots[~joined], [packed[k] for k in np.flatnonzero(~joined)]
         self._mark_sent(slots, RESET, ticket.owner, now)
         if by_letter:
             for slot, one in zip(slots.tolist(), packed, strict=True):
@@ -614,16 +645,22 @@ class Core:
             now = yield Wait(earliest(began + lacking, self.fleet.next_check()))
             self.fleet.check(now)
 
-    def _forget_first_results(self, slots: NDArray[np.intp]) -> None:
-        """Clients that have only just joined may be reset: nothing of theirs was asked for."""
-        table = self.slots
-        fresh = slots[(table.op[slots] == JOINED) & (table.state[slots] == READY)]
-        if not len(fresh):
+    def _take_first_results(
+        self, slots: NDArray[np.intp], ticket: Ticket, *, enough: bool
+    ) -> None:
+        """Let a reset have the first results of clients that have only just joined.
+
+        Joining was a reset; unless this one asks for more than that, it was `enough`: an env
+        that takes minutes to reset, as a robot may, isn't reset twice.
+        """
+        self._ready = deque(kept for q in self._ready if len(kept := q[~np.isin(q, slots)]))
+        self._ready_count -= len(slots)
+        if enough:
+            self.slots.owner[slots] = ticket.owner
+            ticket.remaining -= len(slots)
             return
-        table.state[fresh] = IDLE
-        self._ready = deque(kept for q in self._ready if len(kept := q[~np.isin(q, fresh)]))
-        self._ready_count -= len(fresh)
-        for slot in fresh.tolist():
+        self.slots.state[slots] = IDLE
+        for slot in slots.tolist():
             self._rests.pop(slot, None)
 
     def _seeds(

@@ -52,6 +52,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Fleet"]
 
+_WAKE_UP_NS = 80_000
+"""What it takes to wake the trainer, about."""
 _CLOSE_SECONDS = 1.5
 """How long envs may take to close before their worker is killed."""
 
@@ -117,6 +119,9 @@ class Fleet:
         self.close_errors: list[tuple[str, ErrorText]] = []
         self.servers: list[ForkServer] = []
         self.spinner = Spinner(enabled=False)
+        self.num_cores = 0
+        self.step_ns = float(_WAKE_UP_NS)
+        self._spun = False
         self._arena = arena
         self._mixed_actions = mixed_actions
         self._members: list[_Member] = []
@@ -361,8 +366,16 @@ class Fleet:
         return next((h for h in self._elastic if h.remote.server_id == server_id), None)
 
     def clients(self) -> list[int]:
-        """Slots of the clients that are here."""
+        """Slots of the clients that are here, by server and name."""
         return [host.first_slot + row for host in self._elastic for row in host.clients()]
+
+    def rank_clients(self) -> None:
+        """Count the clients' seeds after the local envs', in an order that no race decides."""
+        offset = self.num_local_seeds
+        for host in self._elastic:
+            for row in host.clients():
+                self.slots.seed_offset[host.first_slot + row] = offset
+                offset += host.num_envs(row)
 
     def lacking(self, waited: float) -> float | None:
         """How long a reset may go on waiting for clients; None if there are enough.
@@ -408,25 +421,36 @@ class Fleet:
             for slot in slots.tolist():
                 self.lost.pop(slot, None)
 
-    def spin(self) -> bool:
-        """Whether a worker has reported something within a moment of looking for it."""
-        return self.spinner.spin(self._has_news)
+    def spin(self, wanted: int) -> bool:
+        """Whether `wanted` results have come within a moment of looking for them.
+
+        Tried only while there are more cores than workers at work: theirs come first.
+        """
+        busy = [host for host in self.hosts if host.in_flight]
+        self._spun = 0 < len(busy) < self.num_cores
+        if not self._spun:
+            return False
+        for host in busy:
+            host.withdraw()
+        return self.spinner.spin(lambda: sum(host.unread() for host in busy) >= wanted)
 
     def slept(self) -> None:
         """A wait that was no spin is over."""
-        self.spinner.slept()
-
-    def _has_news(self) -> bool:
-        return any(host.has_news() for host in self.hosts)
+        if self._spun:
+            self.spinner.slept()
 
     def order(self, wanted: int) -> bool:
         """Ask hosts to wake us when `wanted` results may be ready; True if some are already.
 
         Each of H busy hosts is asked for the H-th part, rounded up: when `wanted` results
-        are ready in all, at least one host has its part, so nobody wakes us too late.
+        are ready in all, at least one host has its part, so nobody wakes us too late. Where
+        a step takes less than waking up does, each is asked for one more: then one wake-up
+        mostly does, and is late by one such step at most.
         """
         busy = [host for host in self.hosts if host.in_flight]
         part = ceil(wanted / len(busy)) if busy else 0
+        if len(busy) > 1 and wanted > 1 and self.step_ns < _WAKE_UP_NS:
+            part += 1
         came = False
         for host in busy:
             came = host.order(min(part, host.in_flight)) or came

@@ -131,8 +131,12 @@ class Host(Source, Protocol):
         """Ask to be woken when `count` results are ready; True if they already are."""
         ...
 
-    def has_news(self) -> bool:
-        """Whether results wait to be swept; costs a look into memory."""
+    def withdraw(self) -> None:
+        """Take the last `order` back: the caller looks for results itself."""
+        ...
+
+    def unread(self) -> int:
+        """Results that wait to be swept; costs a look into memory."""
         ...
 
     def sweep(self) -> None:

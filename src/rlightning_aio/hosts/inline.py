@@ -152,9 +152,12 @@ class InlineHost:
         del count
         return False
 
-    def has_news(self) -> bool:
-        """Nothing gets ready by itself here."""
-        return False
+    def withdraw(self) -> None:
+        """Nothing is ever ordered here."""
+
+    def unread(self) -> int:
+        """Nothing waits to be swept here."""
+        return 0
 
     def sweep(self) -> None:
         """Nothing gets ready by itself here."""

@@ -352,9 +352,15 @@ class ProcessHost:
         self._read_channel()
         self.sweep()
 
-    def has_news(self) -> bool:
-        """See `base.Host.has_news`."""
-        return self._alive and self._rings.unread() > 0
+    def withdraw(self) -> None:
+        """See `base.Host.withdraw`."""
+        if self.ordered:
+            self.ordered = 0
+            self._rings.forget_want()
+
+    def unread(self) -> int:
+        """See `base.Host.unread`."""
+        return self._rings.unread()
 
     def sweep(self) -> None:
         """See `base.Host.sweep`."""

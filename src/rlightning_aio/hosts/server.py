@@ -86,12 +86,13 @@ class ServerHost:
     # -- clients ------------------------------------------------------------------
 
     def clients(self) -> list[int]:
-        """Rows of the clients that are here, in the order of their first joining."""
-        return sorted(self._rows[name] for name in self.remote.clients)
+        """Rows of the clients that are here, in the order of their names."""
+        # One that has joined this very moment may not have its row yet.
+        return [self._rows[name] for name in sorted(self.remote.clients) if name in self._rows]
 
-    def meta(self, row: int) -> EnvMeta | None:
-        """What the client of `row` announced; None while it is away."""
-        return self.remote.clients.get(self._names[row])
+    def num_envs(self, row: int) -> int:
+        """Sub-environments of the client of `row`, which is here."""
+        return self.remote.clients[self._names[row]].num_envs
 
     def check_step(self, row: int, action: Any) -> None:
         """Raises `BadAction` if the client of `row` can't take `action`."""
@@ -202,9 +203,12 @@ class ServerHost:
         del count
         return False
 
-    def has_news(self) -> bool:
-        """Whatever comes wakes the driver."""
-        return False
+    def withdraw(self) -> None:
+        """Nothing is ever ordered here."""
+
+    def unread(self) -> int:
+        """Nothing waits to be swept here."""
+        return 0
 
     def sweep(self) -> None:
         """Whatever comes wakes the driver."""

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Spinner"]
 
-_LIMIT_SECONDS: Final = 150e-6
+_LIMIT_SECONDS: Final = 400e-6
 # A yield that nobody took takes half a microsecond.
 _YIELD_SECONDS: Final = 10e-6
 _SKIPPED_AFTER_CONTENTION: Final = 64

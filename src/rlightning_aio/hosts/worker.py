@@ -162,6 +162,7 @@ class Worker:
         self._frames = FrameReader()
         self._rings = WorkerRings(rings_memory, rows)
         self._runners: list[EnvRunner] = []
+        self._steps: list[Callable[[], Rest | None]] = []
         self._schemas = InfoSchemas(self._send_schema)
         self._timed = False
         self._spinner = Spinner(enabled=False)
@@ -187,38 +188,38 @@ class Worker:
     def _run_requests(self) -> None:
         """Execute what the ring holds; frames in between, as they come."""
         rings = self._rings
-        has_frame, run = rings.has_frame, self._run
         while not self._closing:
-            if has_frame():
+            if rings.has_frame():
                 self._receive(socket.MSG_DONTWAIT)
-                if self._closing:
-                    break
-            requests = rings.requests()
-            if not requests:
+            elif not rings.serve(self._run, self._ring):
                 break
-            for request in requests:
-                run(request)
-                if has_frame():
-                    self._receive(socket.MSG_DONTWAIT)
-                    if self._closing:
-                        break
         rings.idle()
 
-    def _run(self, request: int) -> None:
-        """Execute one request of the ring and report it."""
+    def _run(self, request: int) -> bool:
+        """Execute one request of the ring; True if its row holds all of the reply."""
+        if self._rings.has_frame():
+            self._receive(socket.MSG_DONTWAIT)
+        if self._closing:
+            return False
         row = ((request >> OP_BITS) & SLOT_MASK) - self._first_slot
-        runner = self._runners[row]
         if self._timed:
             self._rings.begin(request, time.monotonic_ns())
         try:
-            rest = runner.step() if request & OP_MASK == STEP else runner.reset_from_row()
+            rest = (
+                self._steps[row]()
+                if request & OP_MASK == STEP
+                else self._runners[row].reset_from_row()
+            )
         except BaseException as error:
             self._send_error(row, request >> NUMBER_SHIFT, error)
-            return
-        if rest is not None:
-            self._send_rest(row, request >> NUMBER_SHIFT, rest)
-        elif self._rings.report(request):
-            self._channel.send(BELL)
+            return False
+        if rest is None:
+            return True
+        self._send_rest(row, request >> NUMBER_SHIFT, rest)
+        return False
+
+    def _ring(self) -> None:
+        self._channel.send(BELL)
 
     def _wait(self) -> None:
         """Return when there may be something to do."""
@@ -282,6 +283,7 @@ class Worker:
         os.close(self._arena)
         for runner, (slab_index, row) in zip(self._runners, order.rows, strict=True):
             runner.attach(slabs[slab_index], row, self._schemas.announce)
+        self._steps = [runner.step for runner in self._runners]
         self._attached = True
         self._send(FrameKind.ATTACHED, frame)
 

@@ -241,20 +241,39 @@ class WorkerRings:
         """Say that nothing is being executed."""
         self._words[_CURRENT] = 0
 
-    def report(self, done: int) -> bool:
-        """Append a report; True if the trainer ordered a bell for what is unread now."""
-        words = self._words
-        self._reports[self._sent & self._mask] = done
-        self._sent = sent = self._sent + 1
-        if not _STORES_STAY_IN_ORDER:
-            fence()
-        words[_REPORTS_SENT] = sent
+    def serve(self, execute: Callable[[int], bool], ring: Callable[[], object]) -> bool:
+        """Read the entries that wait and execute them in order; False if there were none.
+
+        Args:
+            execute: takes an entry; returns whether it is done and to be reported here.
+            ring: wakes the trainer; called when it has ordered that.
+        """
+        requests = self.requests()
+        if not requests:
+            return False
+        words, reports, mask = self._words, self._reports, self._mask
+        for request in requests:
+            if not execute(request):
+                continue
+            reports[self._sent & mask] = request
+            self._sent = sent = self._sent + 1
+            if not _STORES_STAY_IN_ORDER:
+                fence()
+            words[_REPORTS_SENT] = sent
+            # Not fenced: an order that is missed here is seen after the next entry, or below.
+            wanted = words[_WANTED]
+            if wanted != self._obeyed and sent - words[_REPORTS_READ] >= wanted & _WANTED_MASK:
+                self._obey(wanted, ring)
         fence()
         wanted = words[_WANTED]
-        if wanted == self._obeyed or sent - words[_REPORTS_READ] < wanted & _WANTED_MASK:
-            return False
+        if wanted != self._obeyed and self._sent - words[_REPORTS_READ] >= wanted & _WANTED_MASK:
+            self._obey(wanted, ring)
+        return True
+
+    def _obey(self, wanted: int, ring: Callable[[], object]) -> None:
         self._obeyed = wanted
-        return wanted != 0
+        if wanted:
+            ring()
 
     def count_frame(self) -> None:
         """Say that one more frame was handed to the channel."""
