@@ -100,3 +100,13 @@ class Stuck(Stub):
         if self.count == 2:
             threading.Event().wait()
         return super().step(policy_resp)
+
+
+@rl.ENVS.register("worker_only")
+class WorkerOnly(Stub):
+    """Refuses to live where commands run."""
+
+    def __init__(self, config: rl.EnvConfig, *args: Any, **kwargs: Any) -> None:
+        super().__init__(config, *args, **kwargs)
+        if config.placement == "inline":
+            raise OSError("needs a process of its own")

@@ -57,7 +57,7 @@ WRONG: dict[str, tuple[str, list[str], list[str]]] = {
 
 
 @pytest.mark.parametrize("wrong", WRONG.values(), ids=WRONG)
-@pytest.mark.parametrize("command", ["rollout"])
+@pytest.mark.parametrize("command", ["rollout", "bench", "tune"])
 def test_a_wrong_config_is_code_2_and_names_its_place(
     tmp_path: Path, command: str, wrong: tuple[str, list[str], list[str]]
 ) -> None:

@@ -14,11 +14,15 @@ import sys
 __all__ = ["main"]
 
 
+def _quit(*_: object) -> None:
+    os._exit(130)
+
+
 def main() -> None:
     """Run the command that `sys.argv` names; the entry point of ``rlightning-aio``."""
     # Until a command begins there is nothing to clean up, and an exception could get lost
     # among those of the imports.
-    signal.signal(signal.SIGINT, lambda *_: os._exit(130))
+    signal.signal(signal.SIGINT, _quit)
     from rlightning_aio.cli.app import app  # noqa: PLC0415
 
     try:

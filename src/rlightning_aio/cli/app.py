@@ -10,8 +10,10 @@ import typer
 
 import rlightning_aio
 from rlightning_aio.cli.backends import backends
+from rlightning_aio.cli.bench import bench
 from rlightning_aio.cli.rollout import rollout
 from rlightning_aio.cli.terminal import guarded
+from rlightning_aio.cli.tune import tune
 
 __all__ = ["app"]
 
@@ -53,5 +55,5 @@ def prepare(
         sys.path.append(here)
 
 
-for command in (rollout, backends):
+for command in (rollout, bench, tune, backends):
     app.command()(guarded(command))

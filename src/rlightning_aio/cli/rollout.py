@@ -5,16 +5,16 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-import warnings
 from dataclasses import asdict, dataclass
 from pathlib import Path  # noqa: TC003 (Typer reads annotations)
-from typing import TYPE_CHECKING, Annotated, Any, Final, Self
+from typing import TYPE_CHECKING, Annotated, Final, Self
 
 import typer
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn
 
 import rlightning_aio
-from rlightning_aio.cli.policies import Policy, RandomPolicy, Responder, load_policy
+from rlightning_aio.cli.collecting import resetting, respond_to_all, responder
+from rlightning_aio.cli.policies import Policy, load_policy
 from rlightning_aio.cli.tally import EntryFigures, Tally
 from rlightning_aio.cli.terminal import (
     INTERRUPTED,
@@ -29,17 +29,13 @@ from rlightning_aio.cli.terminal import (
 from rlightning_aio.config import EnvConfig, load_config
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Sequence
+    from collections.abc import Sequence
 
-    import gymnasium as gym
-
-    from rlightning_aio.batch import BatchedData
     from rlightning_aio.group.aio import EnvGroup
 
-__all__ = ["resetting", "respond_to_all", "rollout"]
+__all__ = ["rollout"]
 
 _REFRESH_SECONDS: Final = 0.2
-_NO_LIMIT: Final = 2**62
 
 
 @dataclass(frozen=True)
@@ -120,7 +116,7 @@ async def _collect(
     group: EnvGroup, configs: Sequence[EnvConfig], order: _Order, tally: Tally, display: _Display
 ) -> None:
     async with group:
-        respond = _responder(group, order)
+        respond = responder(group, order.policy, order.seed)
         batch, _ = await group.reset(seed=order.seed)
         sub_envs = max(config.num_envs for config in configs)
         display.ready()
@@ -138,41 +134,6 @@ async def _collect(
                     display.show()
                     # Where results never keep us waiting, nothing else would let Ctrl-C in.
                     await asyncio.sleep(0)
-
-
-def _responder(group: EnvGroup, order: _Order) -> Responder:
-    actions = group.get_action_spaces()
-    if order.policy is None:
-        policy = RandomPolicy(group.env_ids, actions, order.seed)
-        return Responder(policy, separate=_differ(actions))
-    return Responder(
-        order.policy, separate=_differ(actions) or _differ(group.get_observation_spaces())
-    )
-
-
-def _differ(spaces: Sequence[gym.Space[Any] | None]) -> bool:
-    return any(space != spaces[0] for space in spaces[1:])
-
-
-def respond_to_all(group: EnvGroup, respond: Responder, batch: BatchedData) -> None:
-    """Have every env of `batch` go on."""
-    for response in respond(batch):
-        group.step_async(response)
-
-
-@contextlib.contextmanager
-def resetting(group: EnvGroup, configs: Sequence[EnvConfig]) -> Generator[None]:
-    """Have finished episodes reset, at the configured step limits or at the simulator's own.
-
-    `auto_reset` wants a limit of every entry. Where one has none, episodes of all entries
-    end where their simulators end them, which know the limits that are configured.
-    """
-    limit = None if all(config.max_episode_steps for config in configs) else _NO_LIMIT
-    with contextlib.ExitStack() as stack:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="auto_reset.*overrides")
-            stack.enter_context(group.auto_reset(limit))
-        yield
 
 
 class _Display:

@@ -135,6 +135,12 @@ class Tally:
         p50, p99 = np.percentile(taken, [50, 99]) / 1e3
         return {"p50": float(p50), "p99": float(p99)}
 
+    def mean_step_us(self) -> float | None:
+        """Time in an env's own step, mean over all entries, in microseconds."""
+        if not self._step_times:
+            return None
+        return float(np.concatenate([busy for _, busy in self._step_times]).mean()) / 1e3
+
 
 def _mean(stats: Sequence[Mapping[str, Any]], key: str, episodes: int) -> float | None:
     """Mean over all episodes of all envs."""
