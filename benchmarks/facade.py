@@ -48,6 +48,9 @@ class RawDriver:
     def watch_writable(self, source: Source, wanted: bool) -> None:
         assert not wanted, f"a request of one env fits the channel of {source}"
 
+    def wake(self) -> None:
+        """Nobody to wake: `run` goes on after every read."""
+
     def run(self, operation: Operation[Any]) -> Any:
         try:
             wait = operation.send(None)  # pyright: ignore[reportArgumentType]
