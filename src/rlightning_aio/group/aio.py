@@ -12,13 +12,14 @@ import time
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from rlightning_aio.group.build import PreprocessFn, plan_group
-from rlightning_aio.group.facade import AutoResetContext, Facade, sole, steps_of
+from rlightning_aio.group.facade import AutoResetContext, Facade, ServerView, sole, steps_of
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine, Mapping, Sequence
     from types import TracebackType
 
     from rlightning_aio.batch import BatchedData
+    from rlightning_aio.group.core import Core
     from rlightning_aio.group.wait import Operation
     from rlightning_aio.hosts.base import Source
     from rlightning_aio.hosts.server import ServerHost
@@ -269,8 +270,8 @@ class EnvGroup(Facade):
         """A handle on one env, or on one env_server; raises `UnknownEnv`."""
         listener = self._fleet.listener(env_id)
         if listener is not None:
-            return ServerHandle(self, listener)
-        return EnvHandle(self, self._core.slots.find_one(env_id))
+            return ServerHandle(self, self._core, self._driver, listener)
+        return EnvHandle(self, self._core, self._driver, self._core.slots.find_one(env_id))
 
     async def offload(self) -> None:
         """Have every env free its device memory until `reload`."""
@@ -293,14 +294,16 @@ class EnvGroup(Facade):
 class EnvHandle:
     """One env of an asynchronous group."""
 
-    def __init__(self, group: EnvGroup, slot: int) -> None:
+    def __init__(self, group: EnvGroup, core: Core, driver: AioDriver, slot: int) -> None:
         self._group = group
+        self._core = core
+        self._driver = driver
         self._slot = slot
 
     @property
     def env_id(self) -> str:
         """Its id."""
-        return self._group._core.slots.env_ids[self._slot]  # pyright: ignore[reportPrivateUsage]
+        return self._core.slots.env_ids[self._slot]
 
     async def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -319,12 +322,8 @@ class EnvHandle:
         Raises:
             EnvRaised: the method raised, or its value can't be pickled.
         """
-        group = self._group
-        return await group._driver.run(  # pyright: ignore[reportPrivateUsage]
-            group._core.call(  # pyright: ignore[reportPrivateUsage]
-                time.monotonic(), self._slot, name, args, kwargs
-            )
-        )
+        operation = self._core.call(time.monotonic(), self._slot, name, args, kwargs)
+        return await self._driver.run(operation)
 
     async def get_attr(self, name: str, target: str = "unwrapped") -> Any:
         """Attribute `name` of the simulator; of its outermost wrapper with target ``outer``."""
@@ -347,28 +346,14 @@ class EnvHandle:
         await self.call("reload")
 
 
-
-class ServerHandle(EnvHandle):
+class ServerHandle(ServerView, EnvHandle):
     """An env_server of an asynchronous group; its clients' envs have handles of their own."""
 
-    def __init__(self, group: EnvGroup, listener: ServerHost) -> None:
-        super().__init__(group, -1)
+    def __init__(
+        self, group: EnvGroup, core: Core, driver: AioDriver, listener: ServerHost
+    ) -> None:
+        super().__init__(group, core, driver, -1)
         self._listener = listener
-
-    @property
-    def env_id(self) -> str:
-        """Its id."""
-        return self._listener.remote.server_id
-
-    @property
-    def address(self) -> str:
-        """Where clients connect to, as ``tcp://host:port``."""
-        return self._listener.remote.address
-
-    @property
-    def clients(self) -> list[str]:
-        """Ids of the envs of the clients that are connected, ``<server id>/<client name>``."""
-        return [f"{self.env_id}/{name}" for name in self._listener.remote.clients]
 
     async def reset(  # pyright: ignore[reportIncompatibleMethodOverride]  # One for each client.
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -383,11 +368,8 @@ class ServerHandle(EnvHandle):
         Raises:
             TimeoutError: too few clients have joined.
         """
-        group = self._group
-        operation = group._core.reset_clients(  # pyright: ignore[reportPrivateUsage]
-            time.monotonic(), self._listener, seed, options
-        )
-        return (await group._driver.run(operation))[0].values()  # pyright: ignore[reportPrivateUsage]
+        operation = self._core.reset_clients(time.monotonic(), self._listener, seed, options)
+        return (await self._driver.run(operation))[0].values()
 
     async def step(self, response: PolicyResponse | Any) -> EnvRet | MultiAgentEnvRet:
         """Raises NotImplementedError: remote envs answer when they can."""

@@ -315,7 +315,7 @@ class Core:
             exception_text=error.text,
             traceback_text=error.traceback,
         )
-        self.fail(np.array([slot], np.intp), lambda _: raised)
+        self._fail_one(slot, raised)
 
     def on_schema(self, host: Host, number: int, schema: InfoSchema) -> None:
         """See `base.Inbox.on_schema`."""
@@ -338,7 +338,7 @@ class Core:
             return
         owner = int(self.slots.owner[slot])
         if owner in self._tickets:
-            self.fail([slot], EnvAway(self._away(slot), env_id=self.slots.env_ids[slot]))
+            self._fail_one(slot, EnvAway(self._away(slot), env_id=self.slots.env_ids[slot]))
             return
         self.slots.state[slot] = IDLE
         self._in_flight -= 1
@@ -353,7 +353,7 @@ class Core:
         """See `base.Inbox.on_fault`."""
         slot = host.first_slot + row
         if self._is_current(slot, number):
-            self.fail([slot], fault)
+            self._fail_one(slot, fault)
 
     def _is_current(self, slot: int, number: int) -> bool:
         table = self.slots
@@ -383,6 +383,9 @@ class Core:
         self._ready.append(slots)
         self._ready_count += len(slots)
         self._in_flight -= len(slots)
+
+    def _fail_one(self, slot: int, fault: EnvFault) -> None:
+        self.fail(np.array([slot], np.intp), lambda _: fault)
 
     def fail(
         self, slots: NDArray[np.intp], error_for: Callable[[NDArray[np.intp]], EnvFault]

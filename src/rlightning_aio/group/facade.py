@@ -19,8 +19,9 @@ if TYPE_CHECKING:
     import gymnasium as gym
 
     from rlightning_aio.hosts.base import Watcher
+    from rlightning_aio.hosts.server import ServerHost
 
-__all__ = ["AutoResetContext", "Facade", "sole", "steps_of"]
+__all__ = ["AutoResetContext", "Facade", "ServerView", "sole", "steps_of"]
 
 
 def sole(results: tuple[BatchedData, Any]) -> EnvRet | MultiAgentEnvRet:
@@ -65,6 +66,27 @@ class AutoResetContext:
         trace: TracebackType | None,
     ) -> None:
         self._core.auto.end()
+
+
+class ServerView:
+    """What both kinds of `ServerHandle` tell without waiting."""
+
+    _listener: ServerHost
+
+    @property
+    def env_id(self) -> str:
+        """Its id."""
+        return self._listener.remote.server_id
+
+    @property
+    def address(self) -> str:
+        """Where clients connect to, as ``tcp://host:port``."""
+        return self._listener.remote.address
+
+    @property
+    def clients(self) -> list[str]:
+        """Ids of the envs of the clients that are connected, ``<server id>/<client name>``."""
+        return [f"{self.env_id}/{name}" for name in self._listener.remote.clients]
 
 
 class Facade:

@@ -38,16 +38,15 @@ def collected(core: Core, slots: NDArray[np.intp], rests: dict[int, Any]) -> Bat
     return BatchedData.of_results(parts, Origin(core, slots, table))
 
 
-def _mixed_parts(
-    core: Core, slots: NDArray[np.intp], rests: dict[int, Any]
-) -> list[ResultColumns]:
+def _mixed_parts(core: Core, slots: NDArray[np.intp], rests: dict[int, Any]) -> list[ResultColumns]:
     """Parts of a batch that holds results of clients, which lie in no slab."""
     table = core.slots
     remote = slots >= len(table.all)
     # Clients of one server are of one kind, and so stack.
     kinds = np.where(remote, -1 - table.host[slots], table.slab[slots])
     parts: list[ResultColumns] = []
-    for kind in np.unique(kinds).tolist():
+    present: list[int] = np.unique(kinds).tolist()
+    for kind in present:
         places = np.flatnonzero(kinds == kind)
         if kind < 0:
             parts.append(_remote_part(table, slots[places], places, rests))

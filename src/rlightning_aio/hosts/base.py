@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from rlightning_aio.hosts.worker import AttachOrder, ErrorText, Started
     from rlightning_aio.errors import EnvFault
+    from rlightning_aio.hosts.worker import AttachOrder, ErrorText, Started
     from rlightning_aio.protocol.info import InfoSchema
     from rlightning_aio.types import EnvMeta
 

@@ -8,7 +8,7 @@ away is withdrawn, and its next first result is the answer.
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
@@ -179,7 +179,7 @@ class ServerHost:
         self._inbox.on_rest(self, row, number, self._rest(row, result))
 
     def _rest(self, row: int, result: RemoteResult) -> Rest:
-        agents = tuple(result.reward) if isinstance(result.reward, dict) else ()
+        agents = _agents(result.reward)
         reward = _head(result.reward, agents).astype(np.float64)
         terminated, truncated = _head(result.terminated, agents), _head(result.truncated, agents)
         sums = None
@@ -220,6 +220,10 @@ class ServerHost:
     def executing(self) -> tuple[int, int]:
         """Unknown here; the sessions keep clients' time limits."""
         return 0, 0
+
+
+def _agents(reward: Any) -> tuple[str, ...]:
+    return tuple(cast("dict[str, Any]", reward)) if isinstance(reward, dict) else ()
 
 
 def _head(value: Any, agents: tuple[str, ...]) -> NDArray[Any]:
