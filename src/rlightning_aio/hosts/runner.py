@@ -8,7 +8,7 @@ returned as a dict, the *rest*; None means that the row holds everything.
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -170,8 +170,7 @@ class EnvRunner:
         if self._takes_turns:
             # The others' first observations are still to come, as results of steps.
             assert isinstance(result, EnvRet)
-            info = cast("EnvRet", result).info
-            self._episodes.forget(begun=np.asarray(info["env_id"]))
+            self._episodes.forget(begun=np.asarray(result.info["env_id"]))
         return self._store(result, began, stepped=False)
 
     def reset_from_row(self) -> Rest | None:
