@@ -146,7 +146,7 @@ class _Display:
         self._progress = Progress(
             SpinnerColumn(),
             TextColumn("{task.description}"),
-            BarColumn(bar_width=28),
+            BarColumn(bar_width=16),
             TextColumn("{task.fields[figures]}"),
             console=self._console,
             auto_refresh=False,
@@ -172,7 +172,7 @@ class _Display:
     def ready(self) -> None:
         """All envs have had their first reset."""
         if self._console.is_terminal:
-            self._progress.update(self._task, description="collecting")
+            self._progress.update(self._task, description="")
         else:
             self._console.print(f"collecting {count(self._progress.tasks[0].total or 0)} steps")
 
@@ -201,10 +201,7 @@ def _figures(entries: Sequence[EntryFigures], rate: float) -> str:
     episodes = sum(entry.episodes for entry in entries)
     total = sum((entry.mean_return or 0.0) * entry.episodes for entry in entries)
     mean = number(total / episodes if episodes else None)
-    return (
-        f"{count(steps)} steps  {count(rate)} steps/s  {count(episodes)} episodes  "
-        f"mean return {mean}"
-    )
+    return f"{count(steps)} steps  {count(rate)} steps/s  {count(episodes)} episodes  return {mean}"
 
 
 def _report(
@@ -238,8 +235,8 @@ def _print_table(
 ) -> None:
     table = named_columns(
         title,
-        "entry", "envs", "steps", "steps/s", "episodes", "mean return", "mean length",
-        "step p50", "p99",
+        "entry", "envs", "steps", "steps/s", "episodes", "mean\nreturn", "mean\nlength",
+        "step\np50", "\np99",
     )  # fmt: skip
     for entry in entries:
         step = entry.step_us or {}

@@ -90,7 +90,9 @@ def named_columns(title: str, *names: str) -> Table:
     """An empty table: the first column is text, all others are figures."""
     table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False)
     for position, name in enumerate(names):
-        table.add_column(name, justify="right" if position else "left", no_wrap=True)
+        table.add_column(
+            name, justify="right" if position else "left", no_wrap=True, vertical="bottom"
+        )
     return table
 
 

@@ -1,0 +1,103 @@
+"""Random actions: whatever the space, each row is an action of it, and seeds repeat."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rlightning_aio import BatchedData
+from rlightning_aio.cli.policies import RandomPolicy
+from rlightning_aio.errors import ConfigError
+
+shapes = st.lists(st.integers(1, 3), min_size=1, max_size=2).map(tuple)
+floats = st.floats(-1e6, 1e6, width=32) | st.sampled_from([-np.inf, np.inf, 3e38, -3e38])
+wholes = st.integers(-120, 120)
+
+
+@st.composite
+def boxes(draw: st.DrawFn) -> spaces.Box:
+    """With two bounds, one or none for each number, of any kind of number."""
+    shape = draw(shapes)
+    dtype = draw(st.sampled_from([np.float32, np.float64, np.int8, np.int64]))
+    bounds = floats if np.issubdtype(dtype, np.floating) else wholes
+    ends = [sorted((draw(bounds), draw(bounds))) for _ in range(int(np.prod(shape)))]
+    low, high = np.array(ends, np.float64).reshape(-1, 2).T
+    low[low == np.inf], high[high == -np.inf] = -1.0, 1.0
+    low, high = low.reshape(shape).astype(dtype), high.reshape(shape).astype(dtype)
+    return spaces.Box(low, high, dtype=dtype)
+
+
+leaves = st.one_of(
+    boxes(),
+    st.builds(lambda n, start: spaces.Discrete(n, start=start), st.integers(1, 9), wholes),
+    st.builds(spaces.MultiDiscrete, st.lists(st.integers(1, 5), min_size=1, max_size=3)),
+    st.builds(spaces.MultiBinary, st.integers(1, 4)),
+    st.builds(spaces.Text, st.integers(1, 4)),
+)
+any_space: st.SearchStrategy[Any] = st.recursive(
+    leaves,
+    lambda inner: (
+        st.dictionaries(st.sampled_from("abc"), inner, min_size=1).map(spaces.Dict)
+        | st.lists(inner, min_size=1, max_size=3).map(spaces.Tuple)
+    ),
+    max_leaves=4,
+)
+
+
+def sample(space: gym.Space[Any], num_envs: int, seed: int) -> BatchedData:
+    ids = [f"env-{k}" for k in range(num_envs)]
+    policy = RandomPolicy(ids, [space] * num_envs, seed)
+    batch = BatchedData(ids, [None] * num_envs)
+    return batch.respond(action=policy(batch))
+
+
+@given(any_space, st.integers(1, 5), st.integers(0, 2**32 - 1))
+def test_every_row_is_an_action_of_the_space(
+    space: gym.Space[Any], num_envs: int, seed: int
+) -> None:
+    """Taken one by one, as an env gets them, with the dtypes that the space asks for."""
+    responses = sample(space, num_envs, seed).values()
+    assert len(responses) == num_envs
+    for response in responses:
+        assert space.contains(response.action), (space, response.action)
+
+
+@given(boxes(), st.integers(0, 2**32 - 1))
+def test_a_seed_repeats(space: spaces.Box, seed: int) -> None:
+    """The same seed gives the same actions."""
+    first, second = sample(space, 3, seed), sample(space, 3, seed)
+    assert np.array_equal(first.action, second.action)
+
+
+def test_bounded_numbers_are_spread_over_their_range() -> None:
+    """Both halves of each dimension's range are met equally often."""
+    space = spaces.Box(np.array([-1.0, 10.0]), np.array([1.0, 30.0]), dtype=np.float64)
+    actions = sample(space, 4000, 0).action
+    middle = (space.low + space.high) / 2
+    assert np.abs((actions > middle).mean(axis=0) - 0.5).max() < 0.05
+
+
+def test_numbers_without_bounds_stay_small() -> None:
+    """A simulator that takes any number is not thrown about."""
+    space = spaces.Box(-np.inf, np.inf, (2,))
+    actions = sample(space, 1000, 0).action
+    assert 0.05 < actions.std() < 0.2
+
+
+def test_envs_get_actions_of_their_own_space() -> None:
+    """Who is asked for decides, not the order of the group."""
+    policy = RandomPolicy(["a-0", "b-0"], [spaces.Discrete(1), spaces.Discrete(1, start=7)], 0)
+    assert policy(BatchedData(["b-0"], [None])).tolist() == [7]
+    assert policy(BatchedData(["a-0"], [None])).tolist() == [0]
+
+
+def test_an_env_without_an_action_space_needs_a_policy() -> None:
+    """It is said before anything is collected."""
+    with pytest.raises(ConfigError, match="--policy"):
+        RandomPolicy(["a-0"], [None], 0)

@@ -1,0 +1,77 @@
+"""What counts as a step."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from cli import stub_envs
+from cli.stub_envs import Stub
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rlightning_aio import EnvConfig, sync
+from rlightning_aio.cli.tally import Tally
+
+if TYPE_CHECKING:
+    from rlightning_aio import BatchedData
+
+assert stub_envs  # Its import registers the envs.
+
+
+def act(batch: BatchedData) -> BatchedData:
+    return batch.respond(action=[0] * len(batch))
+
+
+@given(
+    lengths=st.lists(st.integers(1, 6), min_size=1, max_size=3),
+    num_workers=st.integers(1, 4),
+    limit=st.integers(1, 8),
+    collects=st.lists(st.tuples(st.integers(1, 12), st.integers(1, 12)), max_size=12),
+)
+def test_steps_are_what_envs_have_executed(
+    lengths: list[int], num_workers: int, limit: int, collects: list[tuple[int, int]]
+) -> None:
+    """With any episode lengths, step limit and order of arrival, resets are left out."""
+    configs = [
+        EnvConfig(
+            name=f"entry{index}",
+            backend="stub",
+            task="any",
+            placement="inline",
+            num_workers=num_workers,
+            env_kwargs={"episode_length": length},
+        )
+        for index, length in enumerate(lengths)
+    ]
+    tally = Tally(configs)
+    with sync.build_env_group(configs) as group:
+        batch, _ = group.reset()
+        Stub.steps = 0
+        tally.begin()
+        with group.auto_reset(limit):
+            group.step_async(act(batch))
+            for least, most in collects:
+                batch, flags = group.collect_async(min_results=min(least, most), max_results=most)
+                tally.add(batch, flags)
+                group.step_async(act(batch))
+            tally.add(*group.collect_async(wait_all=True))
+        stats = group.get_env_stats()
+    assert tally.steps == Stub.steps
+    entries = tally.by_entry(stats)
+    assert sum(entry.steps for entry in entries) == tally.steps
+    for entry, length in zip(entries, lengths, strict=True):
+        finished = length <= limit and entry.episodes > 0
+        assert entry.mean_length == (length if finished else None)
+        assert entry.mean_return == (length if finished else None)
+
+
+def test_an_entry_that_was_not_met_has_no_figures() -> None:
+    """None stands for what is not known; zero would be a lie."""
+    config = EnvConfig(name="idle", backend="stub", task="any")
+    idle: dict[str, Any] = {"episodes": 0, "mean_return": None, "mean_length": None}
+    (figures,) = Tally([config]).by_entry({"idle-0": idle})
+    assert (figures.steps, figures.episodes) == (0, 0)
+    assert figures.mean_return is None
+    assert figures.step_us is None
+    assert figures.steps_per_second == pytest.approx(0)
