@@ -22,7 +22,7 @@ from rlightning_aio.protocol.info import NO_INFO, PICKLED, InfoSchema
 from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -114,6 +114,13 @@ class ResultColumns:
             info = self._info_in_row(row)
         episode = self._episode(row)
         return {"episode": episode, **info} if episode else info
+
+    def reports(self, row: int, keys: Iterable[str]) -> bool:
+        """Whether the info of `row` may hold any of `keys`; tells without decoding it."""
+        mark = int(self.info_marks[row])
+        if mark in (NO_INFO, PICKLED):
+            return row in self.rests
+        return not set(keys).isdisjoint(self.schemas[int(self.slots[row])][mark].keys)
 
     def _info_in_row(self, row: int) -> dict[str, Any]:
         mark = int(self.info_marks[row])

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from envs.group_contract import GroupContract
 
+from rlightning_aio import sync
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.envs.contract import Outcome, same
 from rlightning_aio.envs.vulkan import render_device_is_usable
@@ -163,6 +164,20 @@ def test_the_verdict_ends_the_episode() -> None:
     assert result.info["fail"] is True
     assert result.last_terminated is True
     env.close()
+
+
+def test_a_group_tells_how_often_the_task_failed() -> None:
+    """The verdicts at the ends of episodes are in the env's statistics."""
+    config = entry("MS-CartpoleBalance-v1", max_episode_steps=200)
+    with sync.build_env_group(config) as group:
+        batch, _ = group.reset(seed=0)
+        with group.auto_reset():
+            for _ in range(300):
+                batch, _ = group.step(batch.respond(action=np.ones((1, 1), np.float32)))
+        stats = group.get_env_stats()["skill-0"]
+    assert stats["episodes"] >= 2
+    assert stats["fail_rate"] == 1.0
+    assert stats["success_rate"] is None
 
 
 def test_the_step_limit_is_the_tasks_unless_configured() -> None:

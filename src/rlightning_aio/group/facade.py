@@ -185,6 +185,10 @@ class Facade:
     def get_env_stats(self, reset: bool = False) -> dict[str, dict[str, Any]]:
         """By env id: requests sent, episodes ended, mean and last return and length.
 
+        Where the env judges its episodes (``info["success"]`` and ``info["fail"]`` of the
+        results that end them), ``success_rate`` and ``fail_rate`` are the shares that were
+        true; None where it doesn't.
+
         Args:
             reset: start the sums anew after this call.
         """

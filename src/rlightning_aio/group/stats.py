@@ -25,6 +25,8 @@ __all__ = ["Stats"]
 
 _WINDOW_BATCHES: Final = 1024
 _WINDOW_SECONDS: Final = 10.0
+_VERDICTS: Final = ("success", "fail")
+"""Booleans in an info by which an env judges its episodes."""
 
 
 @dataclass(slots=True)
@@ -39,6 +41,22 @@ class _Sample:
     synchronous: bool
 
 
+@dataclass(slots=True)
+class _Verdicts:
+    """How many episodes of each slot an env has judged, and how many of these were true."""
+
+    count: NDArray[np.int64]
+    true: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, size: int) -> _Verdicts:
+        return cls(np.zeros(size, np.int64), np.zeros(size, np.int64))
+
+    def rate(self, slot: int) -> float | None:
+        count = int(self.count[slot])
+        return int(self.true[slot]) / count if count else None
+
+
 class Stats:
     """Windows over what was handed out, and sums over the episodes that have ended."""
 
@@ -51,6 +69,7 @@ class Stats:
         self._last_return = np.full(len(slots), np.nan)
         self._last_length = np.zeros(len(slots), np.int64)
         self._requests_before = np.zeros(len(slots), np.int64)
+        self._verdicts = {name: _Verdicts.of(len(slots)) for name in _VERDICTS}
 
     def account(self, parts: Sequence[ResultColumns], *, synchronous: bool) -> None:
         """Take note of results that are handed out."""
@@ -62,16 +81,13 @@ class Stats:
                 _Sample(now, slots, sent_ns[slots], part.done_ns, part.busy_ns, synchronous)
             )
             if part.episode_return is not None and part.episode_length is not None:
-                self._note_episodes(slots, part.ended, part.episode_return, part.episode_length)
+                self._note_episodes(part, part.episode_return, part.episode_length)
 
     def _note_episodes(
-        self,
-        slots: NDArray[np.intp],
-        ended: NDArray[np.bool_],
-        returns: NDArray[np.float64],
-        lengths: NDArray[np.int64],
+        self, part: ResultColumns, returns: NDArray[np.float64], lengths: NDArray[np.int64]
     ) -> None:
-        ended = ended & (lengths > 0)
+        slots = part.slots
+        ended = part.ended & (lengths > 0)
         for k in np.flatnonzero(ended.reshape(len(slots), -1).any(axis=1)).tolist():
             slot, mask = slots[k], ended[k]
             own_returns, own_lengths = np.atleast_1d(returns[k][mask]), lengths[k][mask]
@@ -80,6 +96,18 @@ class Stats:
             self._lengths[slot] += own_lengths.sum()
             self._last_return[slot] = own_returns.ravel()[-1]
             self._last_length[slot] = np.ravel(own_lengths)[-1]
+            if part.reports(k, _VERDICTS):
+                self._note_verdicts(slot, part.info_of(k), mask)
+
+    def _note_verdicts(self, slot: np.intp, info: dict[str, Any], ended: NDArray[np.bool_]) -> None:
+        """Count what the env says of the episodes that have `ended`."""
+        for name, verdicts in self._verdicts.items():
+            given: Any = info.get(name)
+            # A tensor may lie on another device.
+            array = np.asarray(given.tolist() if hasattr(given, "tolist") else given)
+            if array.dtype.kind == "b" and array.shape == ended.shape:
+                verdicts.count[slot] += np.count_nonzero(ended)
+                verdicts.true[slot] += np.count_nonzero(array & ended)
 
     def summary(self) -> dict[str, Any]:
         """See `EnvGroup.get_stats`."""
@@ -145,6 +173,7 @@ class Stats:
                 "mean_length": int(self._lengths[slot]) / episodes if episodes else None,
                 "last_return": float(self._last_return[slot]) if episodes else None,
                 "last_length": int(self._last_length[slot]) if episodes else None,
+                **{f"{name}_rate": v.rate(slot) for name, v in self._verdicts.items()},
             }
         return found
 
@@ -155,6 +184,8 @@ class Stats:
             self._returns,
             self._lengths,
             self._last_length,
+            *(v.count for v in self._verdicts.values()),
+            *(v.true for v in self._verdicts.values()),
         ):
             sums[:] = 0
         self._last_return[:] = np.nan

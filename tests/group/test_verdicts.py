@@ -1,0 +1,92 @@
+"""How an env judges its episodes, in the group's statistics."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector.utils import batch_space
+
+from rlightning_aio import ENVS, BaseEnv, EnvConfig, EnvRet, PolicyResponse, sync
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+@pytest.fixture
+def backend() -> Iterator[str]:
+    name = "judging"
+    ENVS.register(name)(JudgingEnv)
+    yield name
+    ENVS._classes.pop(name)
+
+
+class JudgingEnv(BaseEnv):
+    """Sub-environment k ends in every step that k + 1 divides, in success every other time."""
+
+    autoreset = "same_step"
+
+    def _batched(self, space: Any) -> Any:
+        return batch_space(space, self.num_envs) if self.num_envs > 1 else space
+
+    def get_observation_space(self) -> Any:
+        return self._batched(gym.spaces.Box(0, 1, (1,), np.float32))
+
+    def get_action_space(self) -> Any:
+        return self._batched(gym.spaces.Discrete(2))
+
+    def _answer(self, **fields: Any) -> EnvRet:
+        observation = np.zeros(self.get_observation_space().shape, np.float32)
+        return EnvRet(env_id=self.env_id, observation=observation, **fields)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> EnvRet:
+        self.count = 0
+        return self._answer(info={"success": self._shaped(True)})
+
+    def step(self, policy_resp: PolicyResponse) -> EnvRet:
+        self.count += 1
+        period = np.arange(1, self.num_envs + 1)
+        ended, success = self.count % period == 0, self.count % (2 * period) == 0
+        info = {"success": self._shaped(success)}
+        if "nested" in self.config.env_kwargs:
+            info["nested"] = {"travels": "pickled"}
+        return self._answer(
+            last_reward=self._shaped(np.ones(self.num_envs)),
+            last_terminated=self._shaped(ended),
+            last_truncated=self._shaped(np.zeros(self.num_envs, bool)),
+            info=info,
+        )
+
+    def _shaped(self, values: Any) -> Any:
+        values = np.broadcast_to(values, (self.num_envs,)).copy()
+        return values if self.num_envs > 1 else values[0].item()
+
+
+@pytest.mark.parametrize("placement", ["process", "inline"])
+@pytest.mark.parametrize("env_kwargs", [{}, {"nested": True}], ids=["in the row", "pickled"])
+@pytest.mark.parametrize(("num_envs", "episodes"), [(1, 12), (3, 12 + 6 + 4)])
+def test_success_is_counted_where_an_episode_ends(
+    backend: str, placement: str, env_kwargs: dict[str, Any], num_envs: int, episodes: int
+) -> None:
+    """Only what is said at an end counts, for each sub-environment that has ended."""
+    config = EnvConfig(
+        name="judging",
+        backend=backend,
+        task="any",
+        num_envs=num_envs,
+        placement=placement,
+        env_kwargs=env_kwargs,
+    )
+    with sync.build_env_group(config) as group:
+        batch, _ = group.reset()
+        action = np.zeros((1, *group.get_action_spaces()[0].shape), np.int64)
+        for _ in range(12):
+            batch, _ = group.step(batch.respond(action=action))
+        stats = group.get_env_stats(reset=True)["judging-0"]
+        again = group.get_env_stats()["judging-0"]
+    assert stats["episodes"] == episodes
+    assert stats["success_rate"] == 0.5
+    assert stats["fail_rate"] is None
+    assert again["success_rate"] is None
