@@ -31,12 +31,15 @@ class Death:
         exit_code: negative for a signal; None if nobody knows.
         stderr_tail: the last lines it wrote.
         hung: it was killed because an env ran into its timeout.
+        requests: ring entries, those first that it may have been executing; they may be
+            answered already, or be 0.
     """
 
     cause: str
     exit_code: int | None = None
     stderr_tail: str = ""
     hung: bool = False
+    requests: tuple[int, ...] = ()
 
 
 class Source(Protocol):

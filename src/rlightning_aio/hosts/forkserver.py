@@ -44,7 +44,7 @@ except BaseException:
     import os, traceback
     os.write(int(sys.argv[2]), b"!" + traceback.format_exc()[-60000:].encode())
     os._exit(1)
-main(int(sys.argv[2]))
+main(int(sys.argv[2]), int(sys.argv[3]))
 """
 """Runs `main` from this very package, whatever the interpreter has installed.
 
@@ -57,6 +57,8 @@ _GRACE_SECONDS: Final = 1.2
 """How long workers may take to notice that the trainer is gone and stop a robot."""
 _DUMP_SECONDS: Final = 0.3
 _MESSAGE_BYTES: Final = 1 << 16
+_OUTLET_BYTES: Final = 1 << 20
+_STDERR: Final = 2
 
 
 @dataclass(frozen=True)
@@ -111,11 +113,54 @@ class Exited:
 
 @dataclass
 class _Child:
+    """A worker. Its end of the channel is kept open until it is buried: so the trainer hears
+    why it died before it hears that its channel has closed, and it can be told to stop.
+    """
+
     host_id: int
     pid: int
     stderr: int
+    channel: int
     tail: bytearray = field(default_factory=bytearray)
     kill_at: float | None = None
+    silent: bool = False
+
+
+class _Outlet:
+    """Passes on what workers write to stderr, and never blocks.
+
+    A trainer's stderr may be a pipe that nobody reads. Then output waits here, and once
+    there is too much of it, in the workers' own pipes.
+    """
+
+    def __init__(self, poll: select.poll) -> None:
+        self._poll = poll
+        self._waiting = bytearray()
+
+    @property
+    def full(self) -> bool:
+        return len(self._waiting) > _OUTLET_BYTES
+
+    def write(self, data: bytes) -> None:
+        self._waiting += data
+        self.flush()
+
+    def flush(self) -> None:
+        """Write what can be written now; have the poll tell when more can."""
+        probe = select.poll()
+        probe.register(_STDERR, select.POLLOUT)
+        while self._waiting:
+            events = probe.poll(0)
+            if not events:
+                self._poll.register(_STDERR, select.POLLOUT)
+                return
+            try:
+                # A pipe that is writable takes this much without blocking.
+                del self._waiting[: os.write(_STDERR, self._waiting[: select.PIPE_BUF])]
+            except OSError:
+                self._waiting.clear()  # Nobody can ever read it.
+        with contextlib.suppress(KeyError):
+            self._poll.unregister(_STDERR)
 
 
 def _die_with_parent() -> None:
@@ -130,11 +175,17 @@ def _on_child(signal_number: int, frame: FrameType | None) -> None:
 
 
 class _ForkServer:
-    def __init__(self, trainer: socket.socket) -> None:
+    """Args: the socket to the trainer, and a descriptor of its process (-1 if unknown)."""
+
+    def __init__(self, trainer: socket.socket, trainer_process: int) -> None:
         self._trainer = trainer
+        self._trainer_process = trainer_process
         self._children: dict[int, _Child] = {}
         self._poll = select.poll()
         self._poll.register(trainer, select.POLLIN)
+        if trainer_process >= 0:
+            self._poll.register(trainer_process, select.POLLIN)
+        self._outlet = _Outlet(self._poll)
         # A byte arrives here whenever a child has ended.
         self._wakeup, wakeup = socket.socketpair()
         self._wakeup.setblocking(False)
@@ -157,17 +208,26 @@ class _ForkServer:
     def _step(self, until: float | None) -> bool:
         timeout = None if until is None else max(0.0, until - time.monotonic()) * 1000
         for descriptor, _ in self._poll.poll(timeout):
+            if descriptor == self._trainer_process:
+                return False
             if descriptor == self._trainer.fileno():
                 if not self._obey():
                     return False
-            elif descriptor == self._wakeup.fileno():
-                with contextlib.suppress(BlockingIOError):
-                    self._wakeup.recv(4096)
             else:
-                self._listen(descriptor)
+                self._attend(descriptor)
         self._kill_due()
         self._bury()
         return True
+
+    def _attend(self, descriptor: int) -> None:
+        if descriptor == self._wakeup.fileno():
+            with contextlib.suppress(BlockingIOError):
+                self._wakeup.recv(4096)
+        elif descriptor == _STDERR:
+            self._outlet.flush()
+            self._choose_heard()
+        else:
+            self._listen(descriptor)
 
     def _obey(self) -> bool:
         try:
@@ -184,16 +244,27 @@ class _ForkServer:
         return True
 
     def _fork(self, order: Fork, descriptors: list[int]) -> None:
-        reader, writer = os.pipe()
+        pipe: list[int] = []
         parent = os.getpid()
-        pid = os.fork()
+        try:
+            if len(descriptors) < 2:
+                raise OSError("its descriptors didn't arrive: too many are open")
+            pipe += os.pipe()
+            pid = os.fork()
+        except OSError as error:
+            for descriptor in (*pipe, *descriptors):
+                os.close(descriptor)
+            self._tell(Exited(order.host_id, 1, f"no worker could be forked: {error}"))
+            return
+        reader, writer = pipe
+        channel, arena = descriptors
         if pid == 0:
-            _run_worker(self._become_worker, parent, writer, order, descriptors)
-        for descriptor in (writer, *descriptors):
-            os.close(descriptor)
+            _run_worker(self._become_worker, parent, writer, order, channel, arena)
+        os.close(writer)
+        os.close(arena)
         os.set_blocking(reader, False)
-        self._children[pid] = _Child(order.host_id, pid, reader)
-        self._poll.register(reader, select.POLLIN)
+        self._children[pid] = _Child(order.host_id, pid, reader, channel)
+        self._choose_heard()
         self._tell(Forked(order.host_id, pid))
 
     def _become_worker(self) -> None:
@@ -202,6 +273,9 @@ class _ForkServer:
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
         for child in self._children.values():
             os.close(child.stderr)
+            os.close(child.channel)
+        if self._trainer_process >= 0:
+            os.close(self._trainer_process)
         for end in (self._trainer, self._wakeup, self._wakeup_writer):
             end.close()
 
@@ -211,6 +285,7 @@ class _ForkServer:
                 if order.dump:
                     os.kill(child.pid, DUMP_SIGNAL)
                 child.kill_at = time.monotonic() + (_DUMP_SECONDS if order.dump else 0.0)
+        self._choose_heard()
 
     def _kill_due(self) -> None:
         now = time.monotonic()
@@ -218,6 +293,16 @@ class _ForkServer:
             if child.kill_at is not None and child.kill_at <= now:
                 os.kill(child.pid, signal.SIGKILL)
                 child.kill_at = None
+
+    def _choose_heard(self) -> None:
+        """Read from all workers, unless too much waits; from one to be killed in any case."""
+        for child in self._children.values():
+            heard = not child.silent and (not self._outlet.full or child.kill_at is not None)
+            if heard:
+                self._poll.register(child.stderr, select.POLLIN)
+            else:
+                with contextlib.suppress(KeyError):
+                    self._poll.unregister(child.stderr)
 
     def _listen(self, descriptor: int) -> None:
         """Pass on what a worker wrote to stderr, and keep its end."""
@@ -231,13 +316,15 @@ class _ForkServer:
         except BlockingIOError:
             return False
         if not data:
-            with contextlib.suppress(KeyError):
-                self._poll.unregister(child.stderr)
+            child.silent = True
+            self._choose_heard()
             return False
         child.tail += data
         del child.tail[:-_TAIL_BYTES]
-        with contextlib.suppress(OSError):
-            os.write(2, data)
+        was_full = self._outlet.full
+        self._outlet.write(data)
+        if self._outlet.full != was_full:
+            self._choose_heard()
         return True
 
     def _bury(self) -> None:
@@ -253,6 +340,7 @@ class _ForkServer:
             os.close(child.stderr)
             tail = bytes(child.tail).decode(errors="replace")
             self._tell(Exited(child.host_id, os.waitstatus_to_exitcode(status), tail))
+            os.close(child.channel)
 
     def _tell(self, message: Any) -> None:
         # The trainer may be gone, and its socket closed.
@@ -263,6 +351,15 @@ class _ForkServer:
         """The trainer is gone: workers see their channel close; kill whoever stays."""
         self._poll.unregister(self._trainer)
         self._trainer.close()
+        if self._trainer_process >= 0:
+            self._poll.unregister(self._trainer_process)
+        for child in self._children.values():
+            # A child that the trainer has forked may hold the other end of it still.
+            with (
+                socket.socket(fileno=os.dup(child.channel)) as channel,
+                contextlib.suppress(OSError),
+            ):
+                channel.shutdown(socket.SHUT_RDWR)
         until = time.monotonic() + _GRACE_SECONDS
         while self._children and time.monotonic() < until:
             self._wait_for_children(until)
@@ -271,16 +368,12 @@ class _ForkServer:
 
     def _wait_for_children(self, until: float) -> None:
         for descriptor, _ in self._poll.poll(max(0.0, until - time.monotonic()) * 1000):
-            if descriptor == self._wakeup.fileno():
-                with contextlib.suppress(BlockingIOError):
-                    self._wakeup.recv(4096)
-            else:
-                self._listen(descriptor)
+            self._attend(descriptor)
         self._bury()
 
 
 def _run_worker(
-    leave: Callable[[], None], parent: int, stderr: int, order: Fork, descriptors: list[int]
+    leave: Callable[[], None], parent: int, stderr: int, order: Fork, channel: int, arena: int
 ) -> None:
     """Everything that a forked child does; never returns."""
     code = 1
@@ -298,8 +391,8 @@ def _run_worker(
         # Not above: the fork server speaks before it imports what may fail.
         from rlightning_aio.hosts import worker  # noqa: PLC0415
 
-        channel = socket.socket(fileno=descriptors[0])
-        worker.main(channel, descriptors[1], order.rings_offset, order.first_slot, order.rows)
+        trainer = socket.socket(fileno=channel)
+        worker.main(trainer, arena, order.rings_offset, order.first_slot, order.rows)
         code = 0
     except BaseException:
         traceback.print_exc()
@@ -310,20 +403,24 @@ def _run_worker(
         os._exit(code)
 
 
-def _watch_trainer(trainer: socket.socket, finished: socket.socket) -> None:
+def _watch_trainer(trainer: socket.socket, process: int, finished: socket.socket) -> None:
     """Exit if the trainer dies while modules are still being imported."""
     poll = select.poll()
     poll.register(trainer, select.POLLRDHUP)
     poll.register(finished, select.POLLIN)
+    if process >= 0:
+        poll.register(process, select.POLLIN)
     for descriptor, _ in poll.poll():
-        if descriptor == trainer.fileno():
+        if descriptor != finished.fileno():
             os._exit(0)
 
 
-def _preload(trainer: socket.socket, modules: tuple[str, ...]) -> str | None:
+def _preload(trainer: socket.socket, process: int, modules: tuple[str, ...]) -> str | None:
     """Import what every worker needs; an error that only one env would meet is left to it."""
     finish, finished = socket.socketpair()
-    watcher = threading.Thread(target=_watch_trainer, args=(trainer, finished), daemon=True)
+    watcher = threading.Thread(
+        target=_watch_trainer, args=(trainer, process, finished), daemon=True
+    )
     watcher.start()
     error = None
     try:
@@ -339,16 +436,36 @@ def _preload(trainer: socket.socket, modules: tuple[str, ...]) -> str | None:
     return error
 
 
-def main(descriptor: int) -> None:
-    """Serve the trainer at the other end of socket `descriptor`; never returns."""
+def _process_of(pid: int) -> int:
+    """A descriptor that is readable once process `pid` is dead; -1 where there is no such thing.
+
+    The trainer's sockets would do, but for a trainer that has forked: its child holds them, too.
+    """
+    try:
+        return os.pidfd_open(pid)
+    except ProcessLookupError:
+        os._exit(0)
+    except (AttributeError, OSError):
+        return -1
+
+
+def main(descriptor: int, trainer_pid: int) -> None:
+    """Serve the trainer, which is at the other end of socket `descriptor`; never returns."""
     trainer = socket.socket(fileno=descriptor)
-    hello: Hello = pickle.loads(trainer.recv(_MESSAGE_BYTES))
+    process = _process_of(trainer_pid)
+    data = trainer.recv(_MESSAGE_BYTES)
+    if not data:
+        os._exit(0)
+    hello: Hello = pickle.loads(data)
     if hello.path is not None:
         sys.path[:] = hello.path
-    error = _preload(trainer, hello.preload)
+    error = _preload(trainer, process, hello.preload)
     gc.collect()
     gc.freeze()
-    trainer.send(pickle.dumps(Ready(error)))
+    try:
+        trainer.send(pickle.dumps(Ready(error)))
+    except (BrokenPipeError, ConnectionResetError):
+        os._exit(0)
     if error is None:
-        _ForkServer(trainer).serve()
+        _ForkServer(trainer, process).serve()
     os._exit(0)

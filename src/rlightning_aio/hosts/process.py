@@ -15,6 +15,7 @@ import signal
 import socket
 import subprocess
 import sys
+from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,14 +24,15 @@ from rlightning_aio.hosts.arena import Arena, map_shared
 from rlightning_aio.hosts.base import Death, Inbox, Watcher
 from rlightning_aio.hosts.forkserver import BOOTSTRAP, Exited, Fork, Forked, Hello, Kill, Ready
 from rlightning_aio.hosts.pickling import dumped, dumped_with_code
+from rlightning_aio.hosts.worker import ErrorText
 from rlightning_aio.protocol.frames import BELL, Frame, FrameKind, FrameReader, encode
-from rlightning_aio.protocol.rings import TrainerRings, rings_size
+from rlightning_aio.protocol.rings import OP_BITS, SLOT_MASK, TrainerRings, rings_size
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from rlightning_aio.hosts.worker import AttachOrder, ErrorText, StartOrder
+    from rlightning_aio.hosts.worker import AttachOrder, StartOrder
 
 __all__ = ["ForkServer", "ProcessHost"]
 
@@ -44,6 +46,10 @@ _ONE_THREAD = dict.fromkeys(
     ),
     "1",
 )
+
+
+_END_SECONDS = 1.5
+"""How long a fork server that is let go may take; it gives its workers a little less."""
 
 
 class ForkServer:
@@ -70,43 +76,75 @@ class ForkServer:
         self._hosts: dict[int, ProcessHost] = {}
         self._socket: socket.socket | None = None
         self._process: subprocess.Popen[bytes] | None = None
-        self._failure = "its fork server is gone"
+        self._orders: deque[tuple[Fork, socket.socket, int]] = deque()
+        self._ready = False
 
     def fileno(self) -> int:
         """The socket to the fork server."""
         assert self._socket is not None
         return self._socket.fileno()
 
-    def on_writable(self) -> None:
-        """Never asked for."""
-
     def fork(self, host: ProcessHost, channel: socket.socket, arena: Arena, order: Fork) -> None:
-        """Start a worker for `host`; starts the fork server first if it isn't running."""
+        """Start a worker for `host`; starts the fork server first if it isn't running.
+
+        It takes `channel`, the worker's end.
+        """
         if self._socket is None:
             self._launch()
-        assert self._socket is not None
         self._hosts[order.host_id] = host
-        socket.send_fds(self._socket, [pickle.dumps(order)], [channel.fileno(), arena.descriptor])
+        self._orders.append((order, channel, arena.descriptor))
+        if len(self._orders) == 1:
+            self.on_writable()
+
+    def on_writable(self) -> None:
+        """Send the orders that wait; a fork server that is importing reads none for a while."""
+        assert self._socket is not None
+        while self._orders:
+            order, channel, arena = self._orders[0]
+            try:
+                socket.send_fds(
+                    self._socket,
+                    [pickle.dumps(order)],
+                    [channel.fileno(), arena],
+                    socket.MSG_DONTWAIT,
+                )
+            except BlockingIOError:
+                break
+            except (BrokenPipeError, ConnectionResetError):
+                return  # `on_readable` hears of it, too.
+            channel.close()
+            self._orders.popleft()
+        self._watcher.watch_writable(self, bool(self._orders))
 
     def kill(self, host: ProcessHost, *, dump: bool) -> None:
         """Kill the worker of `host`, if it is still there."""
-        if self._socket is not None:
+        if not self._ready and self._process is not None:
+            self._process.kill()  # It hangs in an import, and obeys nobody.
+        elif self._socket is not None:
             with contextlib.suppress(OSError):
                 self._socket.send(pickle.dumps(Kill(host.host_id, dump)))
 
     def _launch(self) -> None:
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._ready = False
+        modules = ", ".join(self._preload) or "its modules"
+        self._failure = f"it ended while it was importing {modules}"
         package = str(Path(rlightning_aio.__file__).parent)
         command = [self._interpreter or sys.executable, "-P", "-c", BOOTSTRAP, package]
-        with theirs:
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        try:
             self._process = subprocess.Popen(
-                [*command, str(theirs.fileno())],
+                [*command, str(theirs.fileno()), str(os.getpid())],
                 pass_fds=[theirs.fileno()],
                 env={**os.environ, **_ONE_THREAD, **self._env_vars},
                 stdin=subprocess.DEVNULL,
                 # Ctrl-C in the terminal is the trainer's business alone.
                 start_new_session=True,
             )
+        except BaseException:
+            ours.close()
+            raise
+        finally:
+            theirs.close()
         path = None if self._interpreter else list(sys.path)
         ours.send(pickle.dumps(Hello(path, self._preload)))
         self._socket = ours
@@ -133,7 +171,8 @@ class ForkServer:
             return
         message = pickle.loads(data)
         if isinstance(message, Ready):
-            self._failure = message.error or self._failure
+            self._ready = True
+            self._failure = message.error or "it was killed, or it crashed"
         elif isinstance(message, Forked):
             self._hosts[message.host_id].pid = message.pid
         elif isinstance(message, Exited):
@@ -148,15 +187,21 @@ class ForkServer:
         for host in hosts:
             host.on_fork_server_lost(self._failure)
 
-    def release(self) -> None:
-        """Let the fork server go; it ends what workers it still has."""
+    def release(self, seconds: float = _END_SECONDS) -> None:
+        """Let the fork server go; it ends what workers it still has, within `seconds`."""
         if self._socket is None:
             return
         self._watcher.unwatch(self)
         self._socket.close()
         self._socket = None
+        while self._orders:
+            self._orders.popleft()[1].close()
         if self._process is not None:
-            self._process.wait()
+            try:
+                self._process.wait(seconds)
+            except subprocess.TimeoutExpired:
+                self._process.kill()  # The kernel then kills its workers.
+                self._process.wait()
             self._process = None
 
 
@@ -204,18 +249,22 @@ class ProcessHost:
         self.ordered = 0
         self._closing = False
         self._hung = False
-        self._close_errors: list[tuple[int, ErrorText]] = []
+        self._killed = ""
+        self._close_errors: list[tuple[int, ErrorText]] | None = None
         self.in_flight = 0
         ours, theirs = socket.socketpair()
         ours.setblocking(False)
         self._socket = ours
-        with theirs:
+        try:
             self._fork_server.fork(
                 self,
                 theirs,
                 self._arena,
                 Fork(self.host_id, self.first_slot, self._rings_offset, self.rows),
             )
+        except BaseException:
+            theirs.close()
+            raise
         self._alive = True
         self._watcher.watch(self)
         self._send(FrameKind.START, payload=self._start_payload)
@@ -227,6 +276,7 @@ class ProcessHost:
     def kill(self, *, dump: bool) -> None:
         """See `base.Host.kill`."""
         self._hung = self._hung or dump
+        self._killed = "did not close in time and was killed" if self._closing else ""
         self._fork_server.kill(self, dump=dump)
 
     def close(self) -> None:
@@ -234,6 +284,8 @@ class ProcessHost:
         self._closing = True
         if self._alive:
             self._send(FrameKind.CLOSE)
+        else:
+            self._inbox.on_closed(self, [])
 
     def release(self) -> None:
         """See `base.Host.release`."""
@@ -247,21 +299,28 @@ class ProcessHost:
         """The worker has ended; whatever it still said is heard first."""
         if self._socket is not None:
             self._read_channel()
-        self.sweep()
-        self._ended(Death(_ending(exit_code), exit_code, stderr_tail, self._hung))
+        by_us = self._killed and exit_code == -signal.SIGKILL
+        self._ended(self._killed if by_us else _ending(exit_code), exit_code, stderr_tail)
 
     def on_fork_server_lost(self, why: str) -> None:
         """The worker ended with its fork server."""
-        self.sweep()
-        self._ended(Death(f"ended with its fork server: {why}"))
+        self._ended(f"ended with its fork server: {why}", None, "")
 
-    def _ended(self, death: Death) -> None:
+    def _ended(self, cause: str, exit_code: int | None, stderr_tail: str) -> None:
+        self.sweep()
         self.release()
         self.pid = None
-        if self._closing:
-            self._inbox.on_closed(self, self._close_errors)
-        else:
-            self._inbox.on_death(self, death)
+        self.in_flight = 0
+        current, _ = self._rings.current()
+        if not self._closing:
+            last = (current, *self._rings.last_requests())
+            self._inbox.on_death(self, Death(cause, exit_code, stderr_tail, self._hung, last))
+            return
+        errors = self._close_errors
+        if errors is None:
+            row = ((current >> OP_BITS) & SLOT_MASK) - self.first_slot if current else 0
+            errors = [(row, ErrorText("WorkerDied", f"its worker {cause}", stderr_tail))]
+        self._inbox.on_closed(self, errors)
 
     # -- requests -----------------------------------------------------------------
 
@@ -306,7 +365,8 @@ class ProcessHost:
             self._all_written()
 
     def _write_some(self, data: bytes | bytearray) -> int:
-        assert self._socket is not None
+        if self._socket is None:
+            return len(data)
         try:
             return self._socket.send(data)
         except BlockingIOError:
@@ -381,11 +441,11 @@ class ProcessHost:
             except ConnectionResetError:
                 data = b""
             if not data:
-                # Nothing more will come; a worker without a channel is of no use.
+                # The fork server holds the other end until it has buried the worker, and
+                # tells why it died; there is nothing more to hear from here.
                 self._watcher.unwatch(self)
                 self._socket.close()
                 self._socket = None
-                self._fork_server.kill(self, dump=False)
                 return
             for frame in self._frames.feed(data):
                 self._frames_received += 1
@@ -400,17 +460,27 @@ class ProcessHost:
             inbox.on_rest(self, row, number, frame.payload)
         elif kind == FrameKind.INFO_SCHEMA:
             inbox.on_schema(self, number, pickle.loads(frame.payload))
-        elif kind == FrameKind.VALUE:
-            self.in_flight -= 1
-            inbox.on_value(self, row, number, pickle.loads(frame.payload))
+        elif kind in (FrameKind.VALUE, FrameKind.STARTED):
+            self._receive_object(kind, row, number, frame.payload)
         elif kind == FrameKind.ERROR:
             self._receive_error(row, number, pickle.loads(frame.payload))
-        elif kind == FrameKind.STARTED:
-            inbox.on_started(self, pickle.loads(frame.payload))
         elif kind == FrameKind.ATTACHED:
             inbox.on_attached(self)
         elif kind == FrameKind.CLOSED:
             self._close_errors = pickle.loads(frame.payload)
+
+    def _receive_object(self, kind: int, row: int, number: int, payload: bytes) -> None:
+        """Take in an object of the user's, whose class may be unknown here."""
+        try:
+            received = pickle.loads(payload)
+        except Exception as error:
+            self._receive_error(row, number, ErrorText.of(error))
+            return
+        if kind == FrameKind.STARTED:
+            self._inbox.on_started(self, received)
+        else:
+            self.in_flight -= 1
+            self._inbox.on_value(self, row, number, received)
 
     def _receive_error(self, row: int, number: int, error: ErrorText) -> None:
         if number:

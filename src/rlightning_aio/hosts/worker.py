@@ -116,11 +116,11 @@ class ErrorText:
             name = f"{kind.__module__}.{name}"
         try:
             text = str(error)
-        except Exception as broken:
+        except BaseException as broken:
             text = f"<its __str__ raised {type(broken).__name__}>"
         try:
             lines = "".join(traceback.format_exception(error))
-        except Exception:
+        except BaseException:
             lines = "".join(traceback.format_tb(error.__traceback__)) + f"{name}: {text}\n"
         return cls(name, text, lines)
 
@@ -177,10 +177,12 @@ class Worker:
             while not self._closing:
                 self._run_requests()
                 self._wait()
-        except (TrainerGone, BrokenPipeError, ConnectionResetError):
+        except TrainerGone as gone:
             for runner in self._runners:
                 with contextlib.suppress(Exception):
                     runner.env.on_disconnect()
+            if not isinstance(gone.__cause__, BrokenPipeError | ConnectionResetError | None):
+                raise
         finally:
             if not self._closing:
                 self._close_envs()
@@ -219,7 +221,7 @@ class Worker:
         return False
 
     def _ring(self) -> None:
-        self._channel.send(BELL)
+        self._write(BELL)
 
     def _wait(self) -> None:
         """Return when there may be something to do."""
@@ -235,18 +237,24 @@ class Worker:
             data = self._channel.recv(1 << 18, flags)
         except BlockingIOError:
             return
+        except ConnectionResetError:  # It died with something of ours unread.
+            data = b""
         if not data:
             raise TrainerGone
         for frame in self._frames.feed(data):
             self._rings.frame_seen()
             self._handle(frame)
 
+    def _begin(self, row: int, number: int) -> None:
+        """Say which env is being worked on, should that be the last thing it does."""
+        self._rings.begin(entry(number, self._first_slot + row, 0), time.monotonic_ns())
+
     def _handle(self, frame: Frame) -> None:
         """Execute one frame and answer it."""
-        self._rings.begin(entry(frame.number, self._first_slot + frame.row, 0), time.monotonic_ns())
+        self._begin(frame.row, frame.number)
         try:
             self._handlers[frame.kind](self, frame)
-        except (TrainerGone, BrokenPipeError, ConnectionResetError):
+        except TrainerGone:
             raise
         except BaseException as error:
             self._send_error(frame.row, frame.number, error)
@@ -258,16 +266,18 @@ class Worker:
             os.sched_setaffinity(0, {order.core})
         self._spinner = Spinner(enabled=order.spins)
         self._timed = (order.config.step_timeout or order.config.reset_timeout) is not None
+        started: list[Started] = []
         for row, (index, fn) in enumerate(
             zip(order.worker_indices, order.preprocess_fns, strict=True)
         ):
+            self._begin(row, 0)
             try:
                 env = build_env(order.config, order.env_class, index, fn)
                 self._runners.append(EnvRunner(env))
+                started.append(Started.of(self._runners[-1]))
             except BaseException as error:
                 self._send_error(row, frame.number, error)
                 return
-        started = [Started.of(runner) for runner in self._runners]
         # What was built stays: sparing the collector from walking it saves time and pages.
         gc.collect()
         gc.freeze()
@@ -321,6 +331,7 @@ class Worker:
     def _close_envs(self) -> list[tuple[int, ErrorText]]:
         errors: list[tuple[int, ErrorText]] = []
         for row, runner in enumerate(self._runners):
+            self._begin(row, 0)
             try:
                 runner.env.close()
             except BaseException as error:
@@ -328,8 +339,15 @@ class Worker:
         self._runners.clear()
         return errors
 
+    def _write(self, data: bytes) -> None:
+        try:
+            self._channel.sendall(data)
+        except BaseException as error:
+            # A part may be out, which nothing can follow; and no env has raised this.
+            raise TrainerGone from error
+
     def _send(self, kind: FrameKind, asked: Frame, payload: bytes = b"") -> None:
-        self._channel.sendall(encode(kind, asked.row, asked.number, payload))
+        self._write(encode(kind, asked.row, asked.number, payload))
         self._rings.count_frame()
 
     def _send_rest(self, row: int, number: int, rest: Rest) -> None:
@@ -338,17 +356,17 @@ class Worker:
         except BaseException as error:
             self._send_error(row, number, error)
             return
-        self._channel.sendall(encode(FrameKind.RESULT, row, number, payload))
+        self._write(encode(FrameKind.RESULT, row, number, payload))
         self._rings.count_frame()
 
     def _send_error(self, row: int, number: int, error: BaseException) -> None:
         payload = pickle.dumps(ErrorText.of(error))
-        self._channel.sendall(encode(FrameKind.ERROR, row, number, payload))
+        self._write(encode(FrameKind.ERROR, row, number, payload))
         self._rings.count_frame()
 
     def _send_schema(self, number: int, schema: InfoSchema) -> None:
         payload = pickle.dumps(schema)
-        self._channel.sendall(encode(FrameKind.INFO_SCHEMA, 0, number, payload))
+        self._write(encode(FrameKind.INFO_SCHEMA, 0, number, payload))
         self._rings.count_frame()
 
 

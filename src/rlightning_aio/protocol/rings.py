@@ -140,6 +140,12 @@ class TrainerRings:
         self._words[_REQUESTS_SENT] = self._sent
         return self.worker_sleeps()
 
+    def last_requests(self) -> tuple[int, ...]:
+        """The entries that were sent last, oldest first; all unanswered ones are among them."""
+        start = self._sent & self._mask
+        ring = self._requests.tolist()
+        return tuple((ring[start:] + ring[:start])[-self._sent :] if self._sent else ())
+
     def worker_sleeps(self) -> bool:
         """Whether the worker must be rung to see what was just published."""
         fence()
