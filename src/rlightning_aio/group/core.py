@@ -307,9 +307,11 @@ class Core:
         if not self._is_current(slot, number):
             return
         doing = {STEP: "step", RESET: "reset", CALL: "call"}[int(self.slots.op[slot])]
+        death = self.fleet.restarting.pop(slot, None)
+        after = f" (its worker {death.cause}, and was replaced)" if death else ""
         raised = EnvRaised(
-            f"{self.slots.describe(slot)} raised in {doing}: {error.type_name}: {error.text}; "
-            "the remote traceback is above; reset the env to go on",
+            f"{self.slots.describe(slot)} raised in {doing}: {error.type_name}: {error.text}"
+            f"{after}; the remote traceback is above; reset the env to go on",
             env_id=self.slots.env_ids[slot],
             exception_type=error.type_name,
             exception_text=error.text,
@@ -354,6 +356,13 @@ class Core:
         slot = host.first_slot + row
         if self._is_current(slot, number):
             self._fail_one(slot, fault)
+
+    def detach_infos(self, slots: NDArray[np.intp]) -> None:
+        """Decode infos of results that wait here: what can read them is about to change."""
+        failed = {slot for ticket in self._tickets.values() for slot in ticket.spent}
+        for slot in slots.tolist():
+            if slot not in failed:
+                self.fleet.detach_info(slot, self._rests)
 
     def _is_current(self, slot: int, number: int) -> bool:
         table = self.slots
@@ -426,6 +435,7 @@ class Core:
             raise RLightningError(
                 "another collect_async is already waiting on this group; one collector at a time"
             )
+        self.fleet.look(now)
         self._collecting = True
         try:
             end = None if deadline is None else now + deadline
@@ -482,7 +492,9 @@ class Core:
             # Whoever else waits meanwhile must be woken as early as it asked for.
             fleet, first = self.fleet, min(self._wanted)
             if fleet.run_inline(wanted) or fleet.spin(first) or fleet.order(first):
-                return (yield Wait(0.0))
+                now = yield Wait(0.0)
+                fleet.look(now)
+                return now
             now = yield Wait(earliest(until, fleet.next_check()))
             fleet.slept()
         finally:

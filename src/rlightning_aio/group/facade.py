@@ -208,7 +208,9 @@ class Facade:
 
     def _closed(self) -> None:
         self._finalizer.detach()
-        _warn_of(self._fleet.close_errors)
+        errors = list(self._fleet.close_errors)
+        self._fleet.close_errors.clear()  # Told once, however often it is closed.
+        _warn_of(errors)
 
 
 def _warn_of(errors: Sequence[tuple[str, Any]]) -> None:

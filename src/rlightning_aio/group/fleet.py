@@ -8,6 +8,7 @@ result of its replacement or by one error.
 
 from __future__ import annotations
 
+import logging
 import pickle
 import warnings
 from collections import deque
@@ -27,7 +28,7 @@ from rlightning_aio.errors import (
     StartFailed,
     WorkerDied,
 )
-from rlightning_aio.group.slots import BUSY, Slots
+from rlightning_aio.group.slots import BUSY, READY, Slots
 from rlightning_aio.group.wait import Operation, Wait, earliest
 from rlightning_aio.hosts.arena import Arena, map_shared
 from rlightning_aio.hosts.base import Death, Host
@@ -36,7 +37,7 @@ from rlightning_aio.hosts.spinner import Spinner
 from rlightning_aio.hosts.worker import AttachOrder, ErrorText, Started
 from rlightning_aio.protocol.columns import leaves
 from rlightning_aio.protocol.info import NO_INFO, PICKLED
-from rlightning_aio.protocol.rings import OP_BITS, RESET, SLOT_MASK, STEP
+from rlightning_aio.protocol.rings import OP_BITS, OP_MASK, RESET, SLOT_MASK, STEP
 from rlightning_aio.protocol.slab import NO_SEED, Slab
 from rlightning_aio.types import EnvMeta
 
@@ -56,6 +57,17 @@ _WAKE_UP_NS = 80_000
 """What it takes to wake the trainer, about."""
 _CLOSE_SECONDS = 1.5
 """How long envs may take to close before their worker is killed."""
+_KILL_SECONDS = 0.3
+"""How long the news of a kill may take to come back."""
+
+
+_LOOK_SECONDS = 0.02
+"""How often a trainer that never has to wait looks for what has hung."""
+_DUMP_SECONDS = 1.0
+"""How long a worker that is late may take to write its stacks and die."""
+_NOBODY = -1
+
+_log = logging.getLogger("rlightning_aio")
 
 
 class _Stage(Enum):
@@ -70,7 +82,15 @@ class _Stage(Enum):
 
 @dataclass
 class _Member:
-    """What the fleet knows of one host."""
+    """What the fleet knows of one host.
+
+    Attributes:
+        start_by: when it must be up; late: it wasn't, and is being killed.
+        deaths: by slot, of workers that died while they executed that env, since the env
+            last completed a step; culprit: the slot of the last one.
+        hung_slot: the env for which it is being killed.
+        idle: how far it had got when it was last seen to do nothing (`Fleet._progress`).
+    """
 
     host: Host
     config: EnvConfig
@@ -78,8 +98,12 @@ class _Member:
     started: list[Started] = field(default_factory=list[Started])
     order: AttachOrder | None = None
     start_by: float | None = None
-    restarts: int = 0
+    late: bool = False
+    deaths: dict[int, int] = field(default_factory=dict[int, int])
+    culprit: int = _NOBODY
     hung_slot: int | None = None
+    idle: tuple[int, ...] = ()
+    idle_since: float = 0.0
     rebuild_error: ErrorText | None = None
     failure: Callable[[], WorkerDied] | None = None
 
@@ -131,6 +155,7 @@ class Fleet:
         self._start_fault: Exception | None = None
         self._now = 0.0
         self._timed = False
+        self._looked_at = 0.0
         self._unavailable = False
 
     def deliver_to(self, core: Core) -> None:
@@ -191,6 +216,7 @@ class Fleet:
     def _launch(self, member: _Member, now: float) -> None:
         member.stage = _Stage.BUILDING
         member.start_by = now + member.config.start_timeout
+        member.late = False
         try:
             member.host.start()
         except OSError as error:
@@ -211,17 +237,22 @@ class Fleet:
 
     def _check_start_times(self) -> None:
         for member in self._members:
-            late = member.start_by is not None and self._now >= member.start_by
-            if late and member.stage in (_Stage.BUILDING, _Stage.ATTACHING):
-                member.start_by = None
-                if self.open:
-                    member.host.kill(dump=True)
-                elif self._start_fault is None:
-                    self._start_fault = StartFailed(
-                        f"{self._who(member)} did not start within "
-                        f"{member.config.start_timeout} s; raise start_timeout if it needs longer",
-                        env_id=self._first_id(member),
-                    )
+            if member.start_by is None or self._now < member.start_by:
+                continue
+            # Its stacks come with its death. A host that can't be killed has no other chance.
+            member.start_by = None if member.late else self._now + _DUMP_SECONDS
+            if not member.late:
+                member.late = True
+                member.host.kill(dump=True)
+            elif not self.open:
+                self._start_fault = self._start_fault or self._late_fault(member, "")
+
+    def _late_fault(self, member: _Member, stderr_tail: str) -> StartFailed:
+        return StartFailed(
+            f"{self._who(member)} did not start within {member.config.start_timeout} s; raise "
+            "start_timeout if it needs longer" + _said(stderr_tail),
+            env_id=self._first_id(member),
+        )
 
     def _first_id(self, member: _Member) -> str:
         return self.slots.env_ids[member.host.first_slot]
@@ -245,11 +276,11 @@ class Fleet:
     def on_start_error(self, host: Host, row: int, error: ErrorText) -> None:
         """See `base.Inbox.on_start_error`."""
         member = self._members[host.host_id]
-        if member.order is not None:
-            member.rebuild_error = error
+        slot = host.first_slot + row
+        if self.open:
+            member.rebuild_error, member.culprit = member.rebuild_error or error, slot
             host.kill(dump=False)
             return
-        slot = host.first_slot + row
         # ConfigError keeps its type: what is wrong with the config is wrong everywhere.
         fault: Exception
         if error.type_name == "rlightning_aio.errors.ConfigError":
@@ -488,9 +519,7 @@ class Fleet:
 
     def next_check(self) -> float | None:
         """When `check` must be called at the latest."""
-        times: list[float | None] = (
-            [m.start_by for m in self._members] if self.lost or (self.restarting) else []
-        )
+        times: list[float | None] = [m.start_by for m in self._members] if self.recovering else []
         if self._timed:
             times += [self._expiry(m) for m in self._members if m.timed and m.host.in_flight]
         times += [host.deadline() for host in self._elastic]
@@ -502,11 +531,21 @@ class Fleet:
             return None
         entry, since_ns = member.host.executing()
         limits = (member.config.step_timeout, member.config.reset_timeout)
+        shortest = min(limit for limit in limits if limit is not None)
         if not entry:
-            return self._now + min(limit for limit in limits if limit is not None)
+            # A stopped process does nothing at all, for all that it was asked to.
+            idle = member.idle == self._progress(member)
+            return (member.idle_since if idle else self._now) + shortest
         op = int(self.slots.op[self._slot(entry)])
         limit = limits[0] if op == STEP else limits[1] if op == RESET else None
-        return None if limit is None else since_ns / 1e9 + limit
+        # What has no limit is looked at again: what comes after it may have one.
+        return self._now + shortest if limit is None else since_ns / 1e9 + limit
+
+    def _progress(self, member: _Member) -> tuple[int, ...]:
+        """Changes with every request and with every reply."""
+        first = member.host.first_slot
+        entries = self.slots.entry[first : first + member.host.rows]
+        return (member.host.in_flight, int(entries.sum()))
 
     @staticmethod
     def _slot(entry: int) -> int:
@@ -517,7 +556,8 @@ class Fleet:
         self._now = now
         if not self.open:
             raise GroupClosed("the group was closed while this call was waiting")
-        if self.lost or self.restarting:
+        self._looked_at = now
+        if self.recovering:
             self._check_start_times()
         for host in self._elastic:
             due = host.deadline()
@@ -527,11 +567,34 @@ class Fleet:
             return
         for member in self._members:
             if member.timed and member.host.in_flight:
-                expiry = self._expiry(member)
-                entry, _ = member.host.executing()
-                if entry and expiry is not None and now >= expiry:
-                    member.hung_slot = self._slot(entry)
-                    member.host.kill(dump=True)
+                self._check_hung(member)
+
+    def look(self, now: float) -> None:
+        """Call `check` if there is anything to be found, and not too often."""
+        if (self._timed or self.recovering) and now >= self._looked_at + _LOOK_SECONDS:
+            self.check(now)
+
+    def _check_hung(self, member: _Member) -> None:
+        entry, _ = member.host.executing()
+        progress = self._progress(member)
+        if not entry and progress != member.idle:
+            member.idle, member.idle_since = progress, self._now
+            return
+        expiry = self._expiry(member)
+        if expiry is None or self._now < expiry:
+            return
+        if not entry:
+            # Its replies may lie here unread: it is idle by right.
+            member.host.on_readable()
+            if self._progress(member) != progress or member.host.executing()[0]:
+                return
+        member.hung_slot = self._slot(entry) if entry else self._first_busy(member)
+        member.host.kill(dump=True)
+
+    def _first_busy(self, member: _Member) -> int:
+        first, last = member.host.first_slot, member.host.first_slot + member.host.rows
+        busy = self.slots.state[first:last] == BUSY
+        return first + int(busy.argmax())
 
     def on_death(self, host: Host, death: Death) -> None:
         """See `base.Inbox.on_death`."""
@@ -540,39 +603,77 @@ class Fleet:
             self._died_starting(member, death)
             return
         self._core.absorb()
-        hung_slot, member.hung_slot = member.hung_slot, None
-        first, last = host.first_slot, host.first_slot + host.rows
-        owed = np.arange(first, last)[self.slots.state[first:last] == BUSY]
-        member.restarts += 1
+        slots = np.arange(host.first_slot, host.first_slot + host.rows)
+        states = self.slots.state[slots]
+        owed = slots[states == BUSY]
+        self._core.detach_infos(slots[states == READY])
+        if member.stage is _Stage.UP:
+            # A replacement that fails to come up falls to the env that made it necessary.
+            member.culprit = self._culprit(member, death, owed)
+        deaths = member.deaths[member.culprit] = member.deaths.get(member.culprit, 0) + 1
         self.recovering = True
-        if hung_slot is not None:
-            death = replace(death, cause=f"hung in {self._doing(hung_slot)} and was killed")
-        elif member.rebuild_error is not None:
-            error_text, member.rebuild_error = member.rebuild_error, None
-            death = replace(
-                death, cause=f"could not be rebuilt: {error_text.type_name}: {error_text.text}"
-            )
-        give_up = member.config.on_worker_death == "raise" or (
-            member.restarts > member.config.max_restarts
-        )
+        cause = self._cause(member, death)
+        raises = member.config.on_worker_death == "raise"
+        if raises:
+            outcome = "on_worker_death is 'raise', so it is not replaced"
+        elif deaths > member.config.max_restarts:
+            outcome = f"it is not replaced after {deaths - 1} restarts in a row (max_restarts)"
+        else:
+            outcome = f"restart {deaths} of {member.config.max_restarts} in a row"
+        error_for = self._death_error(member, replace(death, cause=cause), outcome)
+        member.hung_slot = member.rebuild_error = None
+        if raises or deaths > member.config.max_restarts:
+            self._give_up(member)
+            member.failure = partial(error_for, owed)
+            self._core.fail(owed, error_for)
+            return
+        _log.warning("%s", str(error_for(owed)))
         # A replacement answers for steps and resets, but not for calls.
         calls = owed[~np.isin(self.slots.op[owed], (STEP, RESET))]
-        error_for = partial(self._death_error, member, death, hung_slot)
-        self._core.fail(owed if give_up else calls, error_for)
-        if give_up:
-            member.stage = _Stage.FAILED
-            member.failure = partial(error_for, owed)
-            self._unavailable = True
-            return
-        self._replace(member, death, np.setdiff1d(owed, calls))
+        self._core.fail(calls, error_for)
+        self._replace(member, replace(death, cause=cause), np.setdiff1d(owed, calls))
+
+    def _culprit(self, member: _Member, death: Death, owed: NDArray[np.intp]) -> int:
+        """The env that a worker was executing when it died, as far as can be known."""
+        if member.hung_slot is not None:
+            return member.hung_slot
+        for entry in death.requests:
+            slot = self._slot(entry)
+            if slot in owed and self.slots.entry[slot] == entry & ~OP_MASK:
+                return slot
+        return int(owed[0]) if len(owed) else _NOBODY
+
+    def _cause(self, member: _Member, death: Death) -> str:
+        if member.hung_slot is not None:
+            return f"hung in {self._doing(member.hung_slot)} and was killed"
+        if member.rebuild_error is not None:
+            error = member.rebuild_error
+            return f"could not be rebuilt: {error.type_name}: {error.text}"
+        if member.late:
+            return f"did not start again within {member.config.start_timeout} s and was killed"
+        return death.cause
+
+    def _give_up(self, member: _Member) -> None:
+        member.stage = _Stage.FAILED
+        member.start_by = None
+        self._unavailable = True
+        for slot in range(member.host.first_slot, member.host.first_slot + member.host.rows):
+            self.lost.pop(slot, None)
+            self.restarting.pop(slot, None)
+        self._note_recovery()
 
     def _died_starting(self, member: _Member, death: Death) -> None:
         member.stage = _Stage.CLOSED
-        fault = StartFailed(
-            f"the worker of {self._who(member)} {death.cause} while it started"
-            + _said(death.stderr_tail),
-            env_id=self._first_id(member),
-        )
+        if member.late:
+            fault = self._late_fault(member, death.stderr_tail)
+        else:
+            slot = self._slot(death.requests[0]) if death.requests else 0
+            slot = max(slot, member.host.first_slot)
+            fault = StartFailed(
+                f"the worker of {self.slots.describe(slot)} {death.cause} while it started"
+                + _said(death.stderr_tail),
+                env_id=self.slots.env_ids[slot],
+            )
         self._start_fault = self._start_fault or fault
 
     def _replace(self, member: _Member, death: Death, owed: NDArray[np.intp]) -> None:
@@ -603,33 +704,35 @@ class Fleet:
         return {STEP: "a step", RESET: "a reset"}.get(int(self.slots.op[slot]), "a call")
 
     def _death_error(
-        self, member: _Member, death: Death, hung_slot: int | None, owed: NDArray[np.intp]
-    ) -> WorkerDied:
-        slot = int(owed[0]) if len(owed) else member.host.first_slot
-        if hung_slot is not None:
-            slot = hung_slot
+        self, member: _Member, death: Death, outcome: str
+    ) -> Callable[[NDArray[np.intp]], WorkerDied]:
+        """Makes the error for those of the slots that owed a reply, as things are now."""
+        slot = member.host.first_slot if member.culprit == _NOBODY else member.culprit
         table = self.slots
         doing = self._doing(slot)
         number = table.number(slot)
         last = f"request {number}, {doing}" if number else "none"
-        names = ", ".join(table.ids(owed)) or "none"
-        kind = EnvHung if hung_slot is not None else WorkerDied
-        if hung_slot is not None:
+        if member.hung_slot is not None:
             config = member.config
             limit = config.step_timeout if table.op[slot] == STEP else config.reset_timeout
             what = f"{table.describe(slot)} took longer than {limit} s for {doing} and was killed"
         else:
-            what = f"the worker of {self._who(member)} {death.cause}"
-        error = kind(
-            f"{what} (last request: {last}; envs that owed a reply: {names}; restarts in a row: "
-            f"{member.restarts - 1}, on_worker_death: {member.config.on_worker_death})"
-            + _said(death.stderr_tail),
-            env_id=table.env_ids[slot],
-            exit_code=death.exit_code,
-            stderr_tail=death.stderr_tail,
-        )
-        error.env_ids = tuple(table.ids(owed))
-        return error
+            what = f"the worker of {table.describe(slot)} {death.cause}"
+        kind = WorkerDied if member.hung_slot is None else EnvHung
+
+        def error_for(owed: NDArray[np.intp]) -> WorkerDied:
+            names = ", ".join(table.ids(owed)) or "none"
+            error = kind(
+                f"{what} (last request: {last}; envs that owed a reply: {names}); {outcome}"
+                + _said(death.stderr_tail),
+                env_id=table.env_ids[slot],
+                exit_code=death.exit_code,
+                stderr_tail=death.stderr_tail,
+            )
+            error.env_ids = tuple(table.ids(owed))
+            return error
+
+        return error_for
 
     def note_restarted(self, slots: NDArray[np.intp], rests: dict[int, Any]) -> None:
         """Mark replies that come from a replacement; count what shows that it works."""
@@ -638,21 +741,39 @@ class Fleet:
             if death is not None:
                 self._mark(slot, death, rests)
             elif self.slots.op[slot] == STEP:
-                self._members[int(self.slots.host[slot])].restarts = 0
-        self.recovering = bool(self.restarting) or any(m.restarts for m in self._members)
+                deaths = self._members[int(self.slots.host[slot])].deaths
+                deaths.pop(slot, None)
+                deaths.pop(_NOBODY, None)
+        self._note_recovery()
+
+    def _note_recovery(self) -> None:
+        self.recovering = bool(self.restarting) or any(
+            member.deaths for member in self._members if member.stage is not _Stage.FAILED
+        )
 
     def _mark(self, slot: int, death: Death, rests: dict[int, Any]) -> None:
         slab = self.slabs[int(self.slots.slab[slot])]
         row = int(self.slots.row[slot])
         slab.truncated[row] = True
         slab.episode_length[row] = 0
+        self.detach_info(slot, rests)
+        if not isinstance(rests[slot], bytes):
+            rests[slot]["info"]["worker_restarted"] = death.cause
+
+    def detach_info(self, slot: int, rests: dict[int, Any]) -> None:
+        """Decode the info of a result that is ready, while its row and schemas are there."""
+        slab = self.slabs[int(self.slots.slab[slot])]
+        row = int(self.slots.row[slot])
         found = rests.get(slot)
-        rest: dict[str, Any] = (pickle.loads(found) if isinstance(found, bytes) else found) or {}
+        try:
+            rest: dict[str, Any] = pickle.loads(found) if isinstance(found, bytes) else found or {}
+        except Exception:  # noqa: BLE001  # It may hold anything; whoever reads it learns why not.
+            return
         mark = int(slab.info_mark[row])
         info: dict[str, Any] = rest.get("info", {})
         if mark not in (NO_INFO, PICKLED):
             info = self.slots.schemas[slot][mark].decode(memoryview(slab.info[row]))
-        rests[slot] = {**rest, "info": {**info, "worker_restarted": death.cause}}
+        rests[slot] = {**rest, "info": dict(info)}
 
     # -- close --------------------------------------------------------------------
 
@@ -675,7 +796,7 @@ class Fleet:
                 if member.stage is not _Stage.NEW:
                     member.host.release()
             for server in self.servers:
-                server.release()
+                server.release(_KILL_SECONDS)
             self._arena.close()
 
     def abandon(self) -> None:
@@ -700,12 +821,15 @@ class Fleet:
     def _until_closed(self, members: list[_Member], by: float) -> Operation[None]:
         killed = False
         while any(m.stage is not _Stage.CLOSED for m in members):
-            now = yield Wait(None if killed else by)
-            if now >= by and not killed:
-                killed = True
-                for member in members:
-                    if member.stage is not _Stage.CLOSED:
-                        member.host.kill(dump=False)
+            now = yield Wait(by)
+            if now < by:
+                continue
+            if killed:
+                return  # What doesn't even die is left to the end of its fork server.
+            killed, by = True, by + _KILL_SECONDS
+            for member in members:
+                if member.stage is not _Stage.CLOSED:
+                    member.host.kill(dump=False)
 
     def on_closed(self, host: Host, errors: list[tuple[int, ErrorText]]) -> None:
         """See `base.Inbox.on_closed`."""

@@ -1,0 +1,313 @@
+"""An env that breaks on demand, and a way to use either driver's group from plain code.
+
+An action is a fault and a token; an observation says whose it is, in which life and
+episode, how far it has come, and which token it answers: so whatever is handed out can
+be held against what was asked.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ctypes
+import inspect
+import os
+import resource
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import uvloop
+from gymnasium import spaces
+
+import rlightning_aio
+import rlightning_aio.sync
+from rlightning_aio.envs.base import BaseEnv
+from rlightning_aio.registry import ENVS
+from rlightning_aio.types import EnvRet
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rlightning_aio.batch import BatchedData
+    from rlightning_aio.types import PolicyResponse
+
+
+class OddConstructor(Exception):
+    """Can't be rebuilt from its arguments."""
+
+    def __init__(self, code: int, *, where: str) -> None:
+        super().__init__()
+        self.code, self.where = code, where
+
+    def __str__(self) -> str:
+        return f"code {self.code} in {self.where}"
+
+
+class Unpicklable(Exception):
+    """Holds what no pickle takes."""
+
+    def __init__(self) -> None:
+        super().__init__("it holds a lock")
+        self.lock = threading.Lock()
+
+
+class Unprintable(Exception):
+    """Can't even be shown."""
+
+    def __str__(self) -> str:
+        raise RuntimeError("no words")
+
+
+class Unspeakable(Exception):
+    """Showing it tries to end the program."""
+
+    def __str__(self) -> str:
+        raise SystemExit(3)
+
+
+class NotAnException(BaseException):
+    """What ``except Exception`` lets through."""
+
+
+def _raise(error: BaseException) -> Callable[[], None]:
+    def fault() -> None:
+        raise error
+
+    return fault
+
+
+def _exhaust_memory() -> None:
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (2**30, before[1]))
+    try:
+        bytearray(2**34)
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def _deadlock() -> None:
+    lock = threading.Lock()
+    lock.acquire()
+    lock.acquire()
+
+
+def _recurse() -> None:
+    _recurse()
+
+
+def _signal(number: int) -> Callable[[], None]:
+    return lambda: os.kill(os.getpid(), number)
+
+
+def _print_megabytes() -> None:
+    for _ in range(3000):
+        sys.stdout.write("o" * 1023 + "\n")
+        sys.stderr.write("e" * 1023 + "\n")
+
+
+FAULTS: dict[str, Callable[[], object]] = {
+    "nothing": lambda: None,
+    # Deaths.
+    "sigkill": _signal(signal.SIGKILL),
+    "sigterm": _signal(signal.SIGTERM),
+    "segfault": lambda: ctypes.string_at(0),
+    "abort": os.abort,
+    "exit 0": lambda: os._exit(0),
+    "exit 3": lambda: os._exit(3),
+    # Hangs.
+    "sleep": lambda: time.sleep(3600),
+    "loop in C": lambda: sum(iter(int, 1)),
+    "sleep with the GIL": lambda: ctypes.PyDLL(None).sleep(3600),
+    "deadlock": _deadlock,
+    "stop": _signal(signal.SIGSTOP),
+    # Exceptions.
+    "raise": _raise(ValueError("as asked for")),
+    "odd constructor": _raise(OddConstructor(7, where="step")),
+    "unpicklable": _raise(Unpicklable()),
+    "unprintable": _raise(Unprintable()),
+    "unspeakable": _raise(Unspeakable()),
+    "not an exception": _raise(NotAnException("but raised")),
+    "system exit": _raise(SystemExit(5)),
+    "keyboard interrupt": _raise(KeyboardInterrupt()),
+    "interrupt": lambda: (os.kill(os.getpid(), signal.SIGINT), time.sleep(60)),
+    "generator exit": _raise(GeneratorExit()),
+    "stop iteration": _raise(StopIteration(1)),
+    "surrogates": _raise(ValueError("\udcff")),
+    "a megabyte": _raise(ValueError("x" * 2**20)),
+    "recursion": _recurse,
+    "memory": _exhaust_memory,
+    # Noise.
+    "print": _print_megabytes,
+}
+CODES = {name: code for code, name in enumerate(FAULTS)}
+_BY_CODE = list(FAULTS.values())
+
+
+@ENVS.register("faulty")
+class FaultyEnv(BaseEnv):
+    """Breaks where it is told to.
+
+    ``env_kwargs``: `faults` by place (``building``, ``spaces``, ``resetting``, ``closing``);
+    `only` limits them to one worker index, `while_exists` to the time a file exists. If env
+    0 is built while the FIFO `gate` exists, it waits until somebody has opened and closed it.
+    """
+
+    def __init__(self, config: Any, worker_index: int = 0, preprocess_fn: Any = None) -> None:
+        super().__init__(config, worker_index, preprocess_fn)
+        kwargs = self.config.env_kwargs
+        self._faults: dict[str, str] = dict(kwargs.get("faults", {}))
+        if kwargs.get("only", worker_index) != worker_index:
+            self._faults = {}
+        self._switch = kwargs.get("while_exists")
+        self._resets = self._steps = 0
+        if worker_index == 0 and "gate" in kwargs and Path(kwargs["gate"]).exists():
+            Path(kwargs["gate"]).read_bytes()
+        self._break("building")
+
+    def _break(self, place: str) -> None:
+        fault = self._faults.get(place)
+        if fault is not None and (self._switch is None or Path(self._switch).exists()):
+            FAULTS[fault]()
+
+    def get_observation_space(self) -> spaces.Box:
+        self._break("spaces")
+        return spaces.Box(-np.inf, np.inf, (5,), np.float64)
+
+    def get_action_space(self) -> spaces.Box:
+        return spaces.Box(-np.inf, np.inf, (2,), np.float64)
+
+    def _observation(self, token: float) -> np.ndarray:
+        return np.array([self.worker_index, os.getpid(), self._resets, self._steps, token])
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> EnvRet:
+        self._break("resetting")
+        if options:
+            FAULTS[options["fault"]]()
+        self._resets += 1
+        self._steps = 0
+        return EnvRet(
+            env_id=self.env_id, observation=self._observation(0), info={"resets": self._resets}
+        )
+
+    def step(self, policy_resp: PolicyResponse) -> EnvRet:
+        code, token = self._preprocess_fn(policy_resp)
+        _BY_CODE[int(code)]()
+        self._steps += 1
+        return EnvRet(
+            env_id=self.env_id,
+            observation=self._observation(token),
+            last_reward=float(token),
+            info={"steps": self._steps, "name": self.worker_index},
+        )
+
+    def do(self, fault: str) -> str:
+        """Break in a call."""
+        FAULTS[fault]()
+        return f"{self.env_id} did {fault}"
+
+    def arm(self, place: str, fault: str) -> None:
+        """Break later, at `place`."""
+        self._faults[place] = fault
+
+    def returns(self, make: Callable[[], Any]) -> Any:
+        """What `make`, called here, returns."""
+        return make()
+
+    def close(self) -> None:
+        self._break("closing")
+
+
+class Driven:
+    """A group of either kind, used from plain code: what must be awaited is awaited here."""
+
+    def __init__(self, driver: str, cfgs: Any, **kwargs: Any) -> None:
+        self.runner: asyncio.Runner | None = None
+        if driver == "sync":
+            self.group: Any = rlightning_aio.sync.build_env_group(cfgs, **kwargs)
+        else:
+            factory = uvloop.new_event_loop if driver == "uvloop" else asyncio.new_event_loop
+            self.runner = asyncio.Runner(loop_factory=factory)
+            self.group = rlightning_aio.build_env_group(cfgs, **kwargs)
+
+    def _wait(self, result: Any) -> Any:
+        if not inspect.iscoroutine(result):
+            return result
+        assert self.runner is not None
+        return self.runner.run(result)
+
+    def __getattr__(self, name: str) -> Any:
+        method = getattr(self.group, name)
+        return lambda *args, **kwargs: self._wait(method(*args, **kwargs))
+
+    def __len__(self) -> int:
+        return len(self.group)
+
+    def call(self, env_id: str, name: str, *args: Any) -> Any:
+        """`call` of an env's handle."""
+        return self._wait(self.group[env_id].call(name, *args))
+
+    def end(self) -> None:
+        """Close the group, and the loop."""
+        self._wait(self.group.close())
+        if self.runner is not None:
+            self.runner.close()
+
+
+def entry(num_workers: int = 2, **fields: Any) -> dict[str, Any]:
+    """A config entry of faulty envs, which all share one worker unless `fields` say otherwise."""
+    return {
+        "name": "faulty",
+        "backend": "faulty",
+        "task": "anything",
+        "num_workers": num_workers,
+        "envs_per_process": num_workers,
+        **fields,
+    }
+
+
+class Tokens:
+    """Makes steps with a fresh token for each env, and holds results against them."""
+
+    def __init__(self) -> None:
+        self._next = 1.0
+        self._asked: dict[str, float] = {}
+
+    def steps(self, env_ids: list[str], faults: dict[str, str] | None = None) -> BatchedData:
+        """A batch of steps; `faults` by env id."""
+        actions: list[np.ndarray] = []
+        for env_id in env_ids:
+            self._asked[env_id] = self._next
+            fault = (faults or {}).get(env_id, "nothing")
+            actions.append(np.array([CODES[fault], self._next]))
+            self._next += 1
+        responses = [
+            rlightning_aio.PolicyResponse(env_id, action)
+            for env_id, action in zip(env_ids, actions, strict=True)
+        ]
+        return rlightning_aio.BatchedData(env_ids, responses)
+
+    def check(self, batch: BatchedData) -> None:
+        """Every result of `batch` is its own env's answer to that env's last step."""
+        for env_id, ret in batch.items():
+            index, _, _, steps, token = ret.observation
+            assert env_id == ret.env_id
+            assert env_id == f"faulty-{int(index)}"
+            assert token == self._asked[env_id]
+            assert ret.last_reward == token
+            assert ret.info == {"steps": steps, "name": index}
+
+
+def marked(ret: EnvRet) -> bool:
+    """Whether a result comes from a replacement, and is in all respects what it must be then."""
+    if "worker_restarted" not in ret.info:
+        return False
+    assert ret.last_truncated
+    assert not ret.last_terminated
+    assert ret.last_reward == 0.0
+    assert list(ret.observation[2:]) == [1, 0, 0], "it shows the first reset of a new life"
+    assert ret.info["resets"] == 1
+    return True

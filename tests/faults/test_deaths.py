@@ -1,0 +1,342 @@
+"""A worker that dies is noticed at once, named with its cause, and replaced or raised."""
+
+from __future__ import annotations
+
+import logging
+import os
+import select
+import signal
+import warnings
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import pytest
+from faults.faulty import Driven, Tokens, entry, marked
+
+from rlightning_aio.errors import EnvRaised, StartFailed, WorkerDied
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    Start: TypeAlias = Callable[..., Driven]
+
+DEATHS = {
+    "sigkill": "was killed by SIGKILL",
+    "sigterm": "was killed by SIGTERM",
+    "segfault": "was killed by SIGSEGV",
+    "abort": "was killed by SIGABRT",
+    "exit 0": "exited with code 0",
+    "exit 3": "exited with code 3",
+}
+
+
+def two_workers(**fields: Any) -> dict[str, Any]:
+    """Four envs, two in each worker."""
+    return entry(4, **{"envs_per_process": 2, **fields})
+
+
+def pid_of(group: Driven, env_id: str) -> int:
+    """The process of an env."""
+    return group.call(env_id, "returns", os.getpid)
+
+
+def kill(pid: int) -> None:
+    """Kill a process; returns when it is dead."""
+    descriptor = os.pidfd_open(pid)
+    try:
+        signal.pidfd_send_signal(descriptor, signal.SIGKILL)
+        assert select.select([descriptor], [], [], 10)[0], "it lives"
+    finally:
+        os.close(descriptor)
+
+
+@pytest.mark.parametrize("death", DEATHS)
+def test_death_in_a_step_gives_one_marked_result_for_each_env_that_owed_one(
+    start: Start, death: str
+) -> None:
+    """Envs of the dead worker begin anew and say why; those of the other worker just step."""
+    group, tokens = start(two_workers()), Tokens()
+    batch, _ = group.step(tokens.steps(group.group.env_ids, {"faulty-1": death}))
+    assert batch.ids() == ["faulty-0", "faulty-1", "faulty-2", "faulty-3"]
+    first, second, *others = batch.values()
+    assert marked(second)
+    assert second.info["worker_restarted"].startswith(DEATHS[death])
+    assert not any(map(marked, others))
+    if not marked(first):  # It had replied before; then its next step has to tell.
+        again, _ = group.step(tokens.steps(["faulty-0"]))
+        assert marked(again.values()[0])
+    batch, _ = group.step(tokens.steps(group.group.env_ids))
+    tokens.check(batch)
+    assert [ret.observation[3] for ret in batch.values()] == [1, 1, 2, 2]
+
+
+def test_result_that_was_ready_before_the_death_keeps_its_own_info(start: Start) -> None:
+    """What an env had answered is handed out as it was, though its worker is another now."""
+    group, tokens = start(entry()), Tokens()
+    group.step(tokens.steps(group.group.env_ids))
+    group.step_async(tokens.steps(["faulty-0"]))
+    batch, _ = group.collect_async()
+    before = batch.values()[0]
+    group.step_async(tokens.steps(["faulty-0"]))
+    pid = pid_of(group, "faulty-1")  # It runs after the step: same worker, in order.
+    kill(pid)
+    assert marked(group.step(tokens.steps(["faulty-1"]))[0].values()[0])
+    batch, _ = group.collect_async()
+    assert batch.values()[0].info == {"steps": before.info["steps"] + 1, "name": 0}
+    tokens.check(batch)
+
+
+@pytest.mark.parametrize("death", DEATHS)
+def test_death_in_a_reset_is_answered_by_another_reset(start: Start, death: str) -> None:
+    """The reset that killed its worker has one marked result, the rest of the group none."""
+    group, tokens = start(two_workers()), Tokens()
+    group.call("faulty-0", "arm", "resetting", death)
+    batch, _ = group.reset()
+    first, second, *others = batch.values()
+    assert marked(first)
+    assert first.info["worker_restarted"].startswith(DEATHS[death])
+    assert marked(second)
+    assert [ret.info for ret in others] == [{"resets": 2}, {"resets": 2}]
+    tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
+
+
+def test_death_in_a_reset_with_options_is_answered_by_one_without(start: Start) -> None:
+    """Options may be what kills; the replacement's reset doesn't repeat them."""
+    group = start(two_workers())
+    batch, _ = group.reset(options={"fault": "segfault"}, env_ids=["faulty-2"])
+    assert marked(batch.values()[0])
+
+
+@pytest.mark.parametrize("death", DEATHS)
+def test_death_in_a_call_is_raised_and_the_env_goes_on(start: Start, death: str) -> None:
+    """A call can't be answered by a reset, so it raises; the envs tell at their next step."""
+    group, tokens = start(entry()), Tokens()
+    with pytest.raises(WorkerDied, match="faulty-0") as caught:
+        group.call("faulty-0", "do", death)
+    assert DEATHS[death] in str(caught.value)
+    assert caught.value.env_ids == ("faulty-0",)
+    assert caught.value.exit_code is not None
+    batch, _ = group.step(tokens.steps(group.group.env_ids))
+    assert all(map(marked, batch.values()))
+    tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
+
+
+@pytest.mark.parametrize("death", DEATHS)
+def test_death_in_close_is_told_and_does_not_hold_up_the_others(start: Start, death: str) -> None:
+    """`close` returns, warns which env's worker died and how, and leaves nothing."""
+    group = start(two_workers())
+    group.call("faulty-1", "arm", "closing", death)
+    with pytest.warns(UserWarning, match="faulty-1.*" + DEATHS[death]):
+        group.close()
+
+
+@pytest.mark.parametrize("place", ["building", "spaces"])
+@pytest.mark.parametrize("death", DEATHS)
+def test_death_while_starting_fails_the_start_with_its_cause(
+    build: Start, place: str, death: str
+) -> None:
+    """`init` says which env and how it died, and leaves nothing running."""
+    group = build(two_workers(env_kwargs={"faults": {place: death}, "only": 3}))
+    with pytest.raises(StartFailed, match="faulty-3") as caught:
+        group.init()
+    assert DEATHS[death] in str(caught.value)
+
+
+def test_error_tells_what_the_worker_wrote_and_where_it_crashed(start: Start) -> None:
+    """A segmentation fault's Python stack, and what was printed before, are in the error."""
+    group = start(entry(on_worker_death="raise"))
+    group.call("faulty-0", "do", "print")
+    with pytest.raises(WorkerDied) as caught:
+        group.call("faulty-0", "do", "segfault")
+    assert caught.value.exit_code == -signal.SIGSEGV
+    assert "e" * 1000 in caught.value.stderr_tail
+    assert "Segmentation fault" in caught.value.stderr_tail
+    assert "in string_at" in caught.value.stderr_tail
+    assert "in do" in str(caught.value)
+
+
+def test_sigkill_hints_at_the_out_of_memory_killer(start: Start) -> None:
+    """Nobody else tells the user why a process was killed out of the blue."""
+    group = start(entry(on_worker_death="raise"))
+    with pytest.raises(WorkerDied, match="run out of memory"):
+        group.call("faulty-0", "do", "sigkill")
+
+
+def test_raise_names_the_env_that_was_being_executed(start: Start) -> None:
+    """Of several envs in the worker, the error is about the one that was stepping."""
+    group, tokens = start(two_workers(on_worker_death="raise")), Tokens()
+    with pytest.raises(WorkerDied, match="env 'faulty-3'") as caught:
+        group.step(tokens.steps(group.group.env_ids, {"faulty-3": "exit 3"}))
+    error = caught.value
+    assert error.env_id == "faulty-3"
+    assert "faulty-3" in error.env_ids
+    assert error.exit_code == 3
+    assert error.results is not None
+    assert {"faulty-0", "faulty-1"} <= set(error.results.ids())
+    tokens.check(error.results)
+
+
+def test_raise_gives_up_the_envs_of_the_dead_worker_alone(start: Start) -> None:
+    """They raise their worker's end from then on; the others go on, in every way of asking."""
+    group, tokens = start(two_workers(on_worker_death="raise")), Tokens()
+    group.step_async(tokens.steps(group.group.env_ids, {"faulty-0": "exit 3"}))
+    with pytest.raises(WorkerDied) as caught:
+        group.collect_async(wait_all=True)
+    assert set(caught.value.env_ids) == {"faulty-0", "faulty-1"}
+    batch, _ = group.collect_async(wait_all=True)
+    assert sorted(batch.ids()) == ["faulty-2", "faulty-3"]
+    tokens.check(batch)
+    for _ in range(3):
+        with pytest.raises(WorkerDied, match="exited with code 3"):
+            group.step_async(tokens.steps(["faulty-2", "faulty-1"]))
+        with pytest.raises(WorkerDied, match="exited with code 3"):
+            group.reset(env_ids=["faulty-1"])
+        tokens.check(group.step(tokens.steps(["faulty-2", "faulty-3"]))[0])
+
+
+def test_idle_worker_that_dies_tells_at_the_next_step(start: Start) -> None:
+    """Nobody was waiting when it died, yet no step continues the lost episode silently."""
+    group, tokens = start(two_workers()), Tokens()
+    group.step(tokens.steps(group.group.env_ids))
+    kill(pid_of(group, "faulty-0"))
+    batch, _ = group.step(tokens.steps(group.group.env_ids))
+    assert [marked(ret) for ret in batch.values()] == [True, True, False, False]
+
+
+def test_reset_after_an_idle_death_is_a_plain_reset(start: Start) -> None:
+    """Who begins a new episode anyway needn't be told, and gets the seed that was asked for."""
+    group, tokens = start(two_workers()), Tokens()
+    kill(pid_of(group, "faulty-0"))
+    group.step(tokens.steps(["faulty-2"]))
+    batch, _ = group.reset(seed=3)
+    again, _ = group.step(tokens.steps(group.group.env_ids))
+    marks = [marked(ret) for ret in (*batch.values(), *again.values())]
+    # The death may be noticed while the reset is under way; then that is what tells.
+    assert not any(marks[4:])
+    assert marks[:4] in ([False] * 4, [True, True, False, False])
+
+
+def test_worker_dies_while_a_collect_waits_for_another(start: Start) -> None:
+    """The collect goes on: it neither hangs nor raises, and has each result exactly once."""
+    group, tokens = start(two_workers()), Tokens()
+    group.step_async(tokens.steps(group.group.env_ids, {"faulty-2": "segfault"}))
+    found: list[Any] = []
+    while len(found) < 4:
+        batch, _ = group.collect_async(min_results=1)
+        found += batch.values()
+    assert sorted(ret.env_id for ret in found) == group.group.env_ids
+    assert {ret.env_id for ret in found if marked(ret)} in (
+        {"faulty-2"},
+        {"faulty-2", "faulty-3"},
+    )
+
+
+def test_others_go_on_while_a_worker_is_being_replaced(start: Start, tmp_path: Path) -> None:
+    """A replacement that takes its time to build holds up nobody else."""
+    gate = tmp_path / "gate"
+    group, tokens = start(two_workers(env_kwargs={"gate": str(gate)})), Tokens()
+    os.mkfifo(gate)  # From now on, whoever is built waits here.
+    group.step_async(tokens.steps(["faulty-0"], {"faulty-0": "sigkill"}))
+    for _ in range(200):
+        group.step_async(tokens.steps(["faulty-2", "faulty-3"]))
+        batch, _ = group.collect_async(min_results=2)
+        assert sorted(batch.ids()) == ["faulty-2", "faulty-3"]
+        tokens.check(batch)
+    gate.open("w").close()
+    batch, _ = group.collect_async()
+    assert marked(batch["faulty-0"])
+
+
+def test_more_than_max_restarts_in_a_row_is_raised(start: Start) -> None:
+    """An env that kills its worker again and again is given up, with the count and the cause."""
+    group, tokens = start(entry(1, max_restarts=2)), Tokens()
+    for _ in range(2):
+        batch, _ = group.step(tokens.steps(["faulty-0"], {"faulty-0": "exit 3"}))
+        assert marked(batch["faulty-0"])
+    with pytest.raises(WorkerDied, match=r"exited with code 3.*2 restarts"):
+        group.step(tokens.steps(["faulty-0"], {"faulty-0": "exit 3"}))
+    with pytest.raises(WorkerDied):
+        group.step(tokens.steps(["faulty-0"]))
+
+
+def test_a_completed_step_ends_the_row_of_restarts(start: Start) -> None:
+    """Deaths that have steps in between may be as many as they like."""
+    group, tokens = start(entry(1, max_restarts=1)), Tokens()
+    for _ in range(4):
+        batch, _ = group.step(tokens.steps(["faulty-0"], {"faulty-0": "exit 3"}))
+        assert marked(batch["faulty-0"])
+        tokens.check(group.step(tokens.steps(["faulty-0"]))[0])
+
+
+def test_steps_of_its_neighbours_do_not_absolve_an_env_that_always_dies(start: Start) -> None:
+    """Restarts count against the env that was being executed, not against its worker."""
+    group, tokens = start(entry(2, max_restarts=2)), Tokens()
+    for _ in range(2):
+        group.step(tokens.steps(["faulty-0"]))
+        group.step(tokens.steps(["faulty-1"], {"faulty-1": "exit 3"}))
+    group.step(tokens.steps(["faulty-0"]))
+    with pytest.raises(WorkerDied, match="env 'faulty-1'"):
+        group.step(tokens.steps(["faulty-1"], {"faulty-1": "exit 3"}))
+
+
+def test_replacement_that_can_not_be_built_is_raised_with_why(start: Start, tmp_path: Path) -> None:
+    """What its constructor raised is in the error, after as many tries as are allowed."""
+    broken = tmp_path / "broken"
+    kwargs = {"faults": {"building": "raise"}, "while_exists": str(broken)}
+    group, tokens = start(two_workers(env_kwargs=kwargs, max_restarts=2)), Tokens()
+    broken.touch()
+    with pytest.raises(WorkerDied, match="could not be rebuilt: ValueError: as asked for"):
+        group.step(tokens.steps(["faulty-0"], {"faulty-0": "exit 3"}))
+    tokens.check(group.step(tokens.steps(["faulty-2", "faulty-3"]))[0])
+
+
+def test_replacement_whose_reset_raises_answers_with_that(start: Start, tmp_path: Path) -> None:
+    """The request ends with one error; the next reset is a plain one."""
+    broken = tmp_path / "broken"
+    kwargs = {"faults": {"resetting": "raise"}, "while_exists": str(broken)}
+    group, tokens = start(entry(1, env_kwargs=kwargs)), Tokens()
+    broken.touch()
+    with pytest.raises(EnvRaised, match=r"as asked for.*worker.*exited with code 3"):
+        group.step(tokens.steps(["faulty-0"], {"faulty-0": "exit 3"}))
+    broken.unlink()
+    batch, _ = group.reset()
+    assert not marked(batch["faulty-0"])
+    tokens.check(group.step(tokens.steps(["faulty-0"]))[0])
+
+
+def test_fork_server_that_is_killed_is_replaced_with_its_workers(start: Start) -> None:
+    """Everything of it is gone at once; every env answers once, and goes on."""
+    group, tokens = start(two_workers()), Tokens()
+    (server,) = group.group._fleet.servers
+    group.step_async(tokens.steps(["faulty-1"]))
+    kill(server._process.pid)
+    batch, _ = group.collect_async()
+    assert batch.ids() == ["faulty-1"]
+    if not marked(batch["faulty-1"]):  # It had stepped before.
+        tokens.check(batch)
+        assert marked(group.step(tokens.steps(["faulty-1"]))[0]["faulty-1"])
+    batch, _ = group.step(tokens.steps(["faulty-0", "faulty-2", "faulty-3"]))
+    assert all(map(marked, batch.values()))
+    tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
+
+
+def test_restart_is_logged(start: Start, caplog: pytest.LogCaptureFixture) -> None:
+    """A run that quietly loses episodes would be a lie; each restart is a warning."""
+    group, tokens = start(two_workers()), Tokens()
+    with caplog.at_level(logging.WARNING, "rlightning_aio"):
+        group.step(tokens.steps(group.group.env_ids, {"faulty-2": "exit 3"}))
+    (record,) = caplog.records
+    assert "faulty-2" in record.getMessage()
+    assert "exited with code 3" in record.getMessage()
+    assert "restart 1 of 3" in record.getMessage()
+
+
+def test_group_of_many_workers_starts_and_closes(build: Start) -> None:
+    """More workers than a socket queues messages for must not block anybody."""
+    group = build(entry(40, envs_per_process=1))
+    group.init()
+    batch, _ = group.reset()
+    assert len({ret.observation[1] for ret in batch.values()}) == 40
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        group.close()
