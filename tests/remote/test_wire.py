@@ -63,15 +63,13 @@ def test_rewards_and_flags_survive_for_agents_and_sub_environments(
     """Each agent's and sub-environment's reward and flags come back as its own."""
     single = spaces.Box(-1, 1, (2,))
     each = batch_space(single, num_envs) if num_envs > 1 else single
-    space = spaces.Dict({agent: each for agent in agents}) if agents else each
+    space = spaces.Dict(dict.fromkeys(agents, each)) if agents else each
     shape = (num_envs,) if num_envs > 1 else ()
 
     def per_agent(value: Any) -> Any:
-        return {agent: value + k for k, agent in enumerate(agents)} if agents else value
+        return dict.fromkeys(agents, value) if agents else value
 
-    reward = per_agent(np.full(shape, 0.5))
-    ended = per_agent(np.zeros(shape, np.int64))
-    ended = {a: v.astype(bool) for a, v in ended.items()} if agents else ended.astype(bool)
+    reward, ended = per_agent(np.full(shape, 0.5)), per_agent(np.ones(shape, bool))
     outcome = Outcome(sampled(space, 3), reward, ended, ended)
     layout = ResultLayout(space, num_envs, agents)
     packed = Packed([], [])
@@ -140,9 +138,14 @@ def test_frames_of_the_wrong_size_or_content_are_refused(
 
 
 @pytest.mark.parametrize(
-    "space", [spaces.Sequence(spaces.Discrete(2)), spaces.Dict(a=spaces.Graph(spaces.Box(0, 1), None)),
-              spaces.Box(0, 1, (1,), np.longdouble), None]
-)  # fmt: skip
+    "space",
+    [
+        spaces.Sequence(spaces.Discrete(2)),
+        spaces.Dict(a=spaces.Graph(spaces.Box(0, 1), None)),
+        spaces.Box(0, 1, (1,), np.longdouble),
+        None,
+    ],
+)
 def test_a_space_that_cannot_be_announced_is_named(space: Any) -> None:
     """The message says where in the space it stands."""
     with pytest.raises(UnsupportedSpace, match="the observation"):

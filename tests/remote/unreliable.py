@@ -38,7 +38,9 @@ class Client:
     The observation is (which client, which life, steps since the last reset).
     """
 
-    def __init__(self, name: str, identity: int, clock: Clock, heartbeat: float = HEARTBEAT) -> None:
+    def __init__(
+        self, name: str, identity: int, clock: Clock, heartbeat: float = HEARTBEAT
+    ) -> None:
         self.name = name
         self.identity = identity
         self.clock = clock
@@ -137,12 +139,8 @@ class World:
 
     def __init__(self, names: str = "ab", **server: Any) -> None:
         self.clock = Clock()
-        self.server = ServerSessions(
-            "srv", heartbeat=HEARTBEAT, new_token=counter(), **server
-        )
-        self.clients = {
-            name: Client(name, k + 1, self.clock) for k, name in enumerate(names)
-        }
+        self.server = ServerSessions("srv", heartbeat=HEARTBEAT, new_token=counter(), **server)
+        self.clients = {name: Client(name, k + 1, self.clock) for k, name in enumerate(names)}
         self.results: list[RemoteResult] = []
         self.said: dict[tuple[str, bool], list[list[bytes]]] = {}
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
+from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import (
     BadAction,
     EnvAway,
@@ -39,7 +40,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from rlightning_aio.batch import BatchedData
     from rlightning_aio.group.actions import Letters
     from rlightning_aio.group.fleet import Fleet
     from rlightning_aio.hosts.base import Host
@@ -624,14 +624,15 @@ class Core:
         packed = self._pack_resets(slots, seeds, options) if by_letter else []
         self.fleet.forget_lost(slots)
         ticket = self._new_ticket(slots)
+        asked = slots
         if joined.any():
             plain = seed is None and options is None
             self._take_first_results(slots[joined], ticket, enough=plain)
             if plain:
-                slots, packed = slots[~joined], [packed[k] for k in np.flatnonzero(~joined)]
-        self._mark_sent(slots, RESET, ticket.owner, now)
+                asked, packed = slots[~joined], [packed[k] for k in np.flatnonzero(~joined)]
+        self._mark_sent(asked, RESET, ticket.owner, now)
         if by_letter:
-            for slot, one in zip(slots.tolist(), packed, strict=True):
+            for slot, one in zip(asked.tolist(), packed, strict=True):
                 host = self.fleet.host_of(slot)
                 host.request_reset(slot - host.first_slot, table.number(slot), one)
         else:

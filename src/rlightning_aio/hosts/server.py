@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from rlightning_aio.hosts.runner import Rest
     from rlightning_aio.hosts.worker import AttachOrder
     from rlightning_aio.protocol.server_session import RemoteResult
-    from rlightning_aio.types import EnvMeta
 
 __all__ = ["MAX_CLIENTS", "ServerHost"]
 

@@ -148,6 +148,8 @@ class RemoteEnvClient:
     def run(self) -> None:
         """Serve until ``env.is_finish()`` says so; connects first if need be.
 
+        It is asked after every reset, step and `on_disconnect`, among others.
+
         Raises:
             ClientRefused: the server will never let this client in.
             Exception: whatever the env raises in the reset that opens a session, in
@@ -157,11 +159,11 @@ class RemoteEnvClient:
         try:
             self.connect()
             while not self._env.is_finish():
-                request, self._todo = self._todo, None
-                while request is None:
+                if self._todo is None:
                     self._turn(None)
+                else:
                     request, self._todo = self._todo, None
-                self._execute(request)
+                    self._execute(request)
         except BaseException as error:
             self._leave(f"{type(error).__name__}: {error}")
             raise

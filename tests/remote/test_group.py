@@ -1,0 +1,372 @@
+"""Clients in a group: what a trainer sees of them, awaited or not."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import subprocess
+import sys
+import time
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from remote.counting import ClientThread, CountingEnv
+
+import rlightning_aio
+from rlightning_aio import sync
+from rlightning_aio.errors import EnvRaised
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+HEARTBEAT = 0.8
+
+
+def entry(name: str = "robots", **env_kwargs: Any) -> dict[str, Any]:
+    kwargs = {"heartbeat": HEARTBEAT, "connect_timeout": 20, **env_kwargs}
+    return {"name": name, "backend": "env_server", "env_kwargs": kwargs}
+
+
+CARTPOLE = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1", "num_workers": 2}
+
+
+@contextmanager
+def clients(group: Any, *envs: CountingEnv, server: str = "robots-0") -> Iterator[list[Any]]:
+    """Clients c0, c1, … of the envs; they end when the group is closed within."""
+    threads = [ClientThread(group[server].address, f"c{k}", env) for k, env in enumerate(envs)]
+    yield threads
+    for thread in threads:
+        thread.join()
+
+
+def actions(batch: Any) -> np.ndarray[Any, Any]:
+    return np.zeros((len(batch), 2), np.float32)
+
+
+def test_clients_are_reset_with_their_seeds_and_stepped_by_their_names() -> None:
+    """Results carry the server's id in the batch, and the client's in themselves."""
+    envs = [CountingEnv(k) for k in range(3)]
+    with sync.build_env_group(entry(min_clients=3)) as group, clients(group, *envs):
+        batch, flags = group.reset(seed=10)
+        assert flags == [False] * 3
+        assert batch.ids() == ["robots-0"] * 3
+        assert sorted(ret.env_id for ret in batch.values()) == [f"robots-0/c{k}" for k in range(3)]
+        assert batch.observation[:, :2].tolist() == [[0, 10], [1, 11], [2, 12]]
+        for _ in range(20):
+            group.step_async(batch.respond(action=actions(batch)))
+            batch, _ = group.collect_async(wait_all=True, deadline=20)
+        assert batch.observation[:, 2].tolist() == [20] * 3
+        group.close()
+    assert all(env.disconnects == 1 and env.closed for env in envs)
+
+
+async def test_the_same_awaited() -> None:
+    """The asynchronous group sees the same clients in the same way, on either loop."""
+    envs = [CountingEnv(k) for k in range(3)]
+    async with rlightning_aio.build_env_group(entry(min_clients=3)) as group:
+        with clients(group, *envs):
+            batch, _ = await group.reset(seed=10)
+            steps = dict.fromkeys(batch.env_ids(), 0)
+            for _ in range(60):
+                group.step_async(batch.respond(action=actions(batch)))
+                batch, _ = await group.collect_async(deadline=20)
+                for ret in batch.values():
+                    steps[ret.env_id] += 1
+                    assert ret.observation.tolist()[2] == steps[ret.env_id]
+            await group.close()
+
+
+def test_a_step_of_a_client_must_be_asynchronous() -> None:
+    """The message names the calls to use."""
+    with (
+        sync.build_env_group(entry()) as group,
+        clients(group, CountingEnv()),
+    ):
+        batch, _ = group.reset()
+        with pytest.raises(NotImplementedError, match=r"step_async and collect_async"):
+            group.step(batch.respond(action=actions(batch)))
+        group.close()
+
+
+def test_lengths_count_each_server_once() -> None:
+    """However many clients have joined."""
+    with (
+        sync.build_env_group([CARTPOLE, entry(min_clients=2)], mixed_actions=True) as group,
+        clients(group, CountingEnv(), CountingEnv()),
+    ):
+        group.reset()
+        assert (len(group), group.size()) == (3, 2)
+        assert group.env_ids == ["pole-0", "pole-1", "robots-0"]
+        group.close()
+
+
+def test_local_envs_and_clients_mix_in_one_batch() -> None:
+    """First ready, first served, whoever it is; by_name() makes stackable parts."""
+    envs = [CountingEnv(k) for k in range(2)]
+    seen: dict[str, int] = {}
+    with (
+        sync.build_env_group([CARTPOLE, entry(min_clients=2)], mixed_actions=True) as group,
+        clients(group, *envs),
+    ):
+        batch, _ = group.reset(seed=0)
+        for _ in range(200):
+            for name, part in batch.by_name().items():
+                for ret in part.values():
+                    seen[ret.env_id] = seen.get(ret.env_id, 0) + 1
+                action = actions(part) if name == "robots" else np.zeros(len(part), np.int64)
+                group.step_async(part.respond(action=action))
+            batch, _ = group.collect_async(deadline=20)
+        group.close()
+    assert set(seen) == {"pole-0", "pole-1", "robots-0/c0", "robots-0/c1"}
+    assert min(seen.values()) > 1
+
+
+def test_a_reset_waits_for_min_clients_and_no_longer_than_connect_timeout() -> None:
+    """The message says how many are there, and where they are expected."""
+    with (
+        sync.build_env_group(entry(min_clients=2, connect_timeout=0.3)) as group,
+        clients(group, CountingEnv()),
+        ExitStack() as stack,
+    ):
+        stack.callback(group.close)
+        with pytest.raises(TimeoutError, match=r"of 2 clients have joined.*tcp://127\.0\.0\.1:"):
+            group.reset()
+
+
+def test_a_reset_without_seed_takes_the_reset_that_comes_with_joining() -> None:
+    """A robot that has just been reset isn't reset again."""
+    env = CountingEnv()
+    with sync.build_env_group(entry()) as group, clients(group, env):
+        group.reset()
+        assert env.resets == 1
+        group.reset(seed=3)
+        assert (env.resets, env.seed) == (2, 3)
+        group.close()
+
+
+def test_a_client_that_joins_a_running_group_comes_through_collect() -> None:
+    """Its first result is unasked, and from then on it is an env like the others."""
+    with (
+        sync.build_env_group(entry()) as group,
+        clients(group, CountingEnv(7), CountingEnv(8)),
+    ):
+        batch, _ = group.reset()
+        seen: set[str] = set()
+        while len(seen) < 2:
+            seen.update(ret.env_id for ret in batch.values())
+            group.step_async(batch.respond(action=actions(batch)))
+            batch, _ = group.collect_async(deadline=20)
+        group.close()
+
+
+def test_a_client_that_finishes_leaves_one_marked_result_and_no_hang() -> None:
+    """Stepping the one that left is answered once; then the others go on alone."""
+    leaver, stayer = CountingEnv(0), CountingEnv(1)
+
+    def leave_after_three() -> None:
+        leaver.finished = leaver.steps == 2
+
+    leaver.on_step = leave_after_three
+    marked: list[Any] = []
+    with (
+        sync.build_env_group(entry(min_clients=2)) as group,
+        clients(group, leaver, stayer),
+    ):
+        batch, _ = group.reset()
+        for _ in range(50):
+            group.step_async(batch.respond(action=actions(batch)))
+            batch, _ = group.collect_async(deadline=20)
+            marked += [ret for ret in batch.values() if "client_lost" in ret.info]
+        group.close()
+    (ret,) = marked
+    assert ret.env_id == "robots-0/c0"
+    assert ret.last_truncated
+    assert ret.observation.tolist() == [0, -1, 3]
+    assert "the env is finished" in ret.info["client_lost"]
+
+
+def test_a_client_that_returns_starts_a_new_episode() -> None:
+    """The trainer sees the end of the old one first, whatever loop it runs."""
+    with sync.build_env_group(entry()) as group:
+        address = group["robots-0"].address
+        with clients(group, env := CountingEnv(0)):
+            batch, _ = group.reset()
+            env.on_step = lambda: setattr(env, "finished", True)
+            group.step_async(batch.respond(action=actions(batch)))
+            batch, _ = group.collect_async(deadline=20)
+        again = ClientThread(address, "c0", CountingEnv(5))
+        infos: list[dict[str, Any]] = []
+        while not np.array_equal(batch.observation[0], [5, -1, 3]):
+            group.step_async(batch.respond(action=actions(batch)))
+            batch, _ = group.collect_async(deadline=20)
+            infos += batch.info
+        assert sum("client_lost" in info for info in infos) == 1
+        group.close()
+        again.join()
+
+
+async def test_a_client_that_returns_while_the_trainer_thinks_is_no_error() -> None:
+    """An answer to the old life's last result is not taken for one to the new life's first."""
+    async with rlightning_aio.build_env_group(entry()) as group:
+        address = group["robots-0"].address
+        with clients(group, env := CountingEnv(0)):
+            batch, _ = await group.reset()
+            env.on_step = lambda: setattr(env, "finished", True)
+            group.step_async(batch.respond(action=actions(batch)))
+            batch, _ = await group.collect_async(deadline=20)
+        group.step_async(batch.respond(action=actions(batch)))
+        marked, _ = await group.collect_async(deadline=20)
+        assert "client_lost" in marked.info[0]
+        again = ClientThread(address, "c0", CountingEnv(5))
+        async with asyncio.timeout(20):
+            # The trainer thinks, and the event loop goes on.
+            while not group["robots-0"].clients:  # noqa: ASYNC110  # Nothing tells of it.
+                await asyncio.sleep(0)
+        group.step_async(marked.respond(action=actions(marked)))
+        batch, _ = await group.collect_async(deadline=20)
+        assert batch.observation.tolist() == [[5, -1, 0]]
+        group.step_async(batch.respond(action=actions(batch)))
+        batch, _ = await group.collect_async(deadline=20)
+        assert batch.observation.tolist() == [[5, -1, 1]]
+        await group.close()
+        again.join()
+
+
+def test_an_env_that_raises_at_the_client_can_be_reset_and_used_again() -> None:
+    """`EnvRaised` with the remote traceback, in the client's name."""
+    env = CountingEnv(0)
+
+    def fail() -> None:
+        raise ZeroDivisionError("no way")
+
+    with sync.build_env_group(entry()) as group, clients(group, env):
+        batch, _ = group.reset()
+        env.on_step = fail
+        group.step_async(batch.respond(action=actions(batch)))
+        with pytest.raises(EnvRaised, match="robots-0/c0 raised ZeroDivisionError") as caught:
+            group.collect_async(deadline=20)
+        assert "in fail" in caught.value.traceback_text
+        env.on_step = lambda: None
+        batch, _ = group.reset(env_ids=["robots-0/c0"], seed=4)
+        assert batch.observation.tolist() == [[0, 4, 0]]
+        group.close()
+
+
+def test_auto_reset_reaches_clients() -> None:
+    """A limit of 3 gives a period of 4 calls."""
+    with sync.build_env_group(entry()) as group, clients(group, CountingEnv(0)):
+        batch, _ = group.reset()
+        steps, flags = [], []
+        with group.auto_reset(max_episode_steps=3):
+            for _ in range(8):
+                group.step_async(batch.respond(action=actions(batch)))
+                batch, truncations = group.collect_async(deadline=20)
+                steps.append(int(batch.observation[0, 2]))
+                flags += truncations
+        assert steps == [1, 2, 3, 0, 1, 2, 3, 0]
+        assert flags == [False, False, True, False] * 2
+        group.close()
+
+
+def test_a_server_that_is_restarted_gets_its_clients_back() -> None:
+    """Clients that reconnect survive; each is told once that its server was gone."""
+    env = CountingEnv(0)
+    env.stays = True
+    with sync.build_env_group(entry()) as group:
+        address = group["robots-0"].address
+        thread = ClientThread(address, "c0", env)
+        group.reset()
+    port = int(address.rpartition(":")[2])
+    with sync.build_env_group(entry(port=port)) as group:
+        batch, _ = group.reset(seed=1)
+        assert batch.observation.tolist() == [[0, 1, 0]]
+        assert env.disconnects == 1
+        env.stays = False
+    thread.join()
+    assert env.disconnects == 2
+
+
+@contextmanager
+def client_processes(address: str, count: int, task: str) -> Iterator[list[int]]:
+    """`count` clients in processes of their own; their pids."""
+    script = Path(__file__).with_name("client_processes.py")
+    process = subprocess.Popen(
+        [sys.executable, str(script), address, str(count), task],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+    assert process.stdout is not None
+    try:
+        yield [int(process.stdout.readline()) for _ in range(count)]
+    finally:
+        process.terminate()
+        process.wait(10)
+        process.stdout.close()
+
+
+def test_trajectories_of_clients_equal_local_ones() -> None:
+    """Eight simulators in other processes: same seeds and actions, same bits."""
+    import gymnasium as gym
+
+    count, steps = 8, 100
+    action_of = np.random.default_rng(0).uniform(-1, 1, (steps, count, 6)).astype(np.float32)
+    expected: dict[str, list[Any]] = {}
+    for k in range(count):
+        env = gym.make("HalfCheetah-v5")
+        path = [env.reset(seed=40 + k)[0]]
+        path += [env.step(action_of[t, k])[0] for t in range(steps)]
+        expected[f"robots-0/c{k}"] = path
+        env.close()
+    with (
+        sync.build_env_group(entry(min_clients=count, heartbeat=5)) as group,
+        client_processes(group["robots-0"].address, count, "HalfCheetah-v5"),
+    ):
+        batch, _ = group.reset(seed=40)
+        seen = dict.fromkeys(expected, 0)
+        while min(seen.values()) < steps:
+            ongoing = []
+            for env_id, ret in zip(batch.env_ids(), batch.values(), strict=True):
+                t = seen[env_id]
+                assert np.array_equal(ret.observation, expected[env_id][t])
+                if t < steps:
+                    seen[env_id] = t + 1
+                    action = action_of[t, int(env_id[-1])]
+                    ongoing.append(rlightning_aio.PolicyResponse(env_id, action))
+            group.step_async(rlightning_aio.BatchedData(["robots-0"] * len(ongoing), ongoing))
+            batch, _ = group.collect_async(deadline=60)
+        group.close()
+
+
+@pytest.mark.parametrize("signal_name", ["SIGKILL", "SIGSTOP"])
+def test_a_client_process_that_dies_or_stops_is_found_within_the_heartbeat(
+    signal_name: str,
+) -> None:
+    """Its request ends in one marked result; the others go on."""
+    import signal
+
+    heartbeat = 2.0
+    with (
+        sync.build_env_group(entry(min_clients=2, heartbeat=heartbeat)) as group,
+        client_processes(group["robots-0"].address, 2, "CartPole-v1") as pids,
+    ):
+        batch, _ = group.reset(seed=0)
+        os.kill(pids[0], getattr(signal, signal_name))
+        began = time.monotonic()
+        lost: list[Any] = []
+        steps = 0
+        while not lost:
+            group.step_async(batch.respond(action=np.zeros(len(batch), np.int64)))
+            batch, _ = group.collect_async(deadline=20)
+            lost = [ret for ret in batch.values() if "client_lost" in ret.info]
+            steps += len(batch) - len(lost)
+        found = time.monotonic() - began
+        os.kill(pids[0], signal.SIGKILL)
+        group.close()
+    assert lost[0].env_id == "robots-0/c0"
+    assert lost[0].last_truncated
+    assert found <= heartbeat
+    assert steps > 10
