@@ -1,0 +1,209 @@
+"""Rings: both sides over one block of memory, in any order of events and for real."""
+
+from __future__ import annotations
+
+import mmap
+import os
+import random
+import socket
+from collections import deque
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+
+from rlightning_aio.protocol.rings import (
+    NUMBER_SHIFT,
+    OP_BITS,
+    OP_MASK,
+    RESET,
+    SLOT_MASK,
+    STEP,
+    TrainerRings,
+    WorkerRings,
+    entry,
+    rings_size,
+)
+
+
+class RingsMachine(RuleBasedStateMachine):
+    """Entries arrive once, in order; whoever sleeps is rung when the rules say so.
+
+    Both sides are driven from here, so an event happens as a whole or not at all; the test
+    with two processes is about what happens in between.
+    """
+
+    @initialize(rows=st.integers(1, 6))
+    def start(self, rows: int) -> None:
+        memory = memoryview(bytearray(rings_size(rows)))
+        self.rows = rows
+        self.trainer, self.worker = TrainerRings(memory, rows), WorkerRings(memory, rows)
+        self.number = 0
+        self.requested: deque[int] = deque()
+        self.executing: deque[int] = deque()
+        self.reported: deque[int] = deque()
+        self.frames = [0, 0]
+        self.asleep = False
+        self.ordered: int | None = None
+
+    @precondition(lambda self: self.room())
+    @rule(data=st.data())
+    def request(self, data: st.DataObject) -> None:
+        count = data.draw(st.integers(1, self.room()))
+        entries = [entry(self.number + k + 1, k, STEP) for k in range(count)]
+        self.number += count
+        self.requested.extend(entries)
+        assert self.trainer.request(np.array(entries, np.int64)) == self.asleep
+
+    def room(self) -> int:
+        """Each env may have one request in flight, and no more."""
+        return self.rows - len(self.requested) - len(self.executing) - len(self.reported)
+
+    @precondition(lambda self: not self.asleep)
+    @rule()
+    def take_requests(self) -> None:
+        assert self.worker.requests() == list(self.requested)
+        self.executing.extend(self.requested)
+        self.requested.clear()
+
+    @precondition(lambda self: self.executing)
+    @rule()
+    def report(self) -> None:
+        done = self.executing.popleft()
+        self.reported.append(done)
+        rung = self.worker.report(done)
+        enough = self.ordered is not None and len(self.reported) >= self.ordered
+        assert rung == enough
+        if rung:
+            self.ordered = None
+
+    @rule()
+    def read_reports(self) -> None:
+        assert self.trainer.reports().tolist() == list(self.reported)
+        self.reported.clear()
+
+    @rule(count=st.integers(1, 6))
+    def order(self, count: int) -> None:
+        late = self.trainer.want(count)
+        assert late == (len(self.reported) >= count)
+        # One that came too late is obeyed at the next report, if it still fits then.
+        self.ordered = count
+
+    @rule()
+    def withdraw(self) -> None:
+        self.trainer.forget_want()
+        self.ordered = None
+
+    @rule()
+    def send_frame(self) -> None:
+        self.frames[0] += 1
+        assert self.trainer.count_frame() == self.asleep
+
+    @precondition(lambda self: self.frames[0])
+    @rule()
+    def see_frame(self) -> None:
+        self.frames[0] -= 1
+        self.worker.frame_seen()
+
+    @rule()
+    def send_frame_back(self) -> None:
+        self.worker.count_frame()
+        self.frames[1] += 1
+
+    @precondition(lambda self: not self.asleep)
+    @rule()
+    def fall_asleep(self) -> None:
+        something = bool(self.requested or self.frames[0])
+        self.asleep = self.worker.fall_asleep()
+        assert self.asleep == (not something)
+
+    @precondition(lambda self: self.asleep)
+    @rule()
+    def wake_up(self) -> None:
+        self.worker.wake_up()
+        self.asleep = False
+
+    @invariant()
+    def both_sides_agree(self) -> None:
+        if not hasattr(self, "trainer"):
+            return
+        assert self.trainer.unread() == len(self.reported)
+        assert self.trainer.frames_from_worker() == self.frames[1]
+        assert self.worker.has_frame() == bool(self.frames[0])
+        assert self.worker.has_news() == bool(self.frames[0] or self.requested)
+
+
+TestRings = RingsMachine.TestCase
+TestRings.settings = settings(max_examples=100, stateful_step_count=40, deadline=None)
+
+
+@given(
+    number=st.integers(0, (1 << (63 - NUMBER_SHIFT)) - 1),
+    slot=st.integers(0, SLOT_MASK),
+    op=st.sampled_from((0, STEP, RESET)),
+)
+def test_an_entry_holds_number_slot_and_operation(number: int, slot: int, op: int) -> None:
+    """All three come out as they went in, from one 64-bit word."""
+    packed = int(np.int64(entry(number, slot, op)))
+    assert (packed >> NUMBER_SHIFT, (packed >> OP_BITS) & SLOT_MASK, packed & OP_MASK) == (
+        number,
+        slot,
+        op,
+    )
+
+
+def test_the_trainer_sees_what_the_worker_executes_and_since_when() -> None:
+    """The word that tells of a hang is empty while nothing is executed."""
+    memory = memoryview(bytearray(rings_size(3)))
+    trainer, worker = TrainerRings(memory, 3), WorkerRings(memory, 3)
+    assert trainer.current()[0] == 0
+    worker.begin(entry(7, 2, STEP), 123)
+    assert trainer.current() == (entry(7, 2, STEP), 123)
+    worker.idle()
+    assert trainer.current()[0] == 0
+
+
+def _work(rings: WorkerRings, channel: socket.socket) -> None:
+    """What a worker does, without envs: ends with its trainer's end of the channel."""
+    while True:
+        for request in rings.requests():
+            if rings.report(request):
+                channel.send(b"!")
+        if rings.fall_asleep():
+            if not channel.recv(1 << 16):
+                return
+            rings.wake_up()
+
+
+@pytest.mark.timeout(60)
+def test_two_processes_never_miss_each_other() -> None:
+    """Thousands of rounds in which either side may fall asleep at the wrong moment."""
+    rows = 5
+    memory = memoryview(mmap.mmap(-1, rings_size(rows)))
+    ours, theirs = socket.socketpair()
+    pid = os.fork()
+    if pid == 0:
+        ours.close()
+        try:
+            _work(WorkerRings(memory, rows), theirs)
+        finally:
+            os._exit(0)
+    theirs.close()
+    rings, draw = TrainerRings(memory, rows), random.Random(0)
+    number = 0
+    for _ in range(4000):
+        count = draw.randint(1, rows)
+        entries = [entry(number + k, k, STEP) for k in range(count)]
+        number += count
+        if rings.request(np.array(entries, np.int64)):
+            ours.send(b"!")
+        found: list[int] = []
+        while len(found) < count:
+            if not rings.want(draw.randint(1, count - len(found))):
+                ours.recv(1 << 16)
+            found += rings.reports().tolist()
+        assert found == entries
+    ours.close()
+    assert os.waitpid(pid, 0)[1] == 0

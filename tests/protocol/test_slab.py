@@ -1,0 +1,168 @@
+"""Rows: values of any space go in and come out as they were, and disturb no other row."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from remote.random_spaces import any_space, same, sampled
+
+from rlightning_aio.protocol.columns import (
+    Misfit,
+    gather,
+    index,
+    leaves,
+    mapped,
+    row_reader,
+    row_writer,
+)
+from rlightning_aio.protocol.slab import RowLayout, Slab
+
+fixed_space = any_space.filter(lambda space: leaves(space) is not None)
+HEADS = st.sampled_from([((), ()), ((3,), ()), ((2,), ("a", "b")), ((2, 3), ("a", "b"))])
+
+
+@given(
+    observations=fixed_space,
+    actions=fixed_space,
+    head=HEADS,
+    rows=st.integers(1, 4),
+    seed=st.integers(0, 99),
+)
+@settings(deadline=None)
+def test_values_go_through_rows_unchanged(
+    observations: Any, actions: Any, head: Any, rows: int, seed: int
+) -> None:
+    """What one side writes the other reads, to the dtype; every row keeps its own."""
+    layout = RowLayout(observations, actions, *head)
+    memory = memoryview(bytearray(layout.size(rows)))
+    ours, theirs = Slab(layout, memory, rows), Slab(layout, memory, rows)
+    sent = [sampled(actions, seed + row) for row in range(rows)]
+    seen = [sampled(observations, seed + row) for row in range(rows)]
+    for row in range(rows):
+        row_writer(actions, ours.action, row, "action")(sent[row])
+        row_writer(observations, theirs.observation, row, "observation")(seen[row])
+        theirs.reward[row] = row
+        theirs.terminated[row] = row % 2
+        theirs.info[row] = row
+    for row in range(rows):
+        assert same(row_reader(actions, theirs.action, row)(), sent[row])
+        assert same(index(ours.observation, row), seen[row])
+        assert (ours.reward[row] == row).all()
+        assert (ours.terminated[row] == bool(row % 2)).all()
+        assert not ours.truncated[row].any()
+        assert (ours.info[row] == row).all()
+
+
+@given(space=fixed_space, rows=st.integers(2, 5), data=st.data())
+@settings(deadline=None)
+def test_what_is_gathered_is_a_copy_in_the_order_asked_for(
+    space: Any, rows: int, data: st.DataObject
+) -> None:
+    """Also for a contiguous range, which could be had as a view."""
+    layout = RowLayout(space, spaces.Discrete(2), (), ())
+    slab = Slab(layout, memoryview(bytearray(layout.size(rows))), rows)
+    values = [sampled(space, row) for row in range(rows)]
+    for row, value in enumerate(values):
+        row_writer(space, slab.observation, row, "observation")(value)
+    chosen = data.draw(st.lists(st.integers(0, rows - 1), min_size=1))
+    picked = gather(slab.observation, np.array(chosen, np.intp))
+    ranged = gather(slab.observation, slice(0, rows))
+    for row in range(rows):
+        row_writer(space, slab.observation, row, "observation")(sampled(space, 77))
+    for k, row in enumerate(chosen):
+        assert same(index(picked, k), values[row])
+    for row in range(rows):
+        assert same(index(ranged, row), values[row])
+
+
+@given(space=fixed_space)
+@settings(deadline=None)
+def test_a_value_read_for_an_env_is_its_own(space: Any) -> None:
+    """The next request may write the row while the env still holds the last action."""
+    layout = RowLayout(spaces.Discrete(2), space, (), ())
+    slab = Slab(layout, memoryview(bytearray(layout.size(1))), 1)
+    one, other = sampled(space, 1), sampled(space, 2)
+    write = row_writer(space, slab.action, 0, "action")
+    write(one)
+    read = row_reader(space, slab.action, 0)()
+    write(other)
+    assert same(read, one)
+
+
+@given(space=fixed_space, other=fixed_space)
+@settings(deadline=None)
+def test_rows_of_one_key_have_one_layout(space: Any, other: Any) -> None:
+    """Envs share a slab exactly where their rows have the same arrays at the same places."""
+    one = RowLayout(space, spaces.Discrete(2), (), ())
+    two = RowLayout(other, spaces.Discrete(2), (), ())
+    assume(one.observation_leaves != two.observation_leaves)
+    assert one.key != two.key
+    assert one.key == RowLayout(space, spaces.Discrete(2, start=1), (), ()).key
+    assert one.key != RowLayout(space, spaces.Discrete(2), (2,), ()).key
+    assert one.key != RowLayout(space, spaces.Discrete(2), (2,), ("a", "b")).key
+
+
+@pytest.mark.parametrize(
+    ("space", "value", "said"),
+    [
+        (spaces.Box(0, 1, (3,)), np.zeros(2, np.float32), r"observation .*\(3,\).*\(2,\)"),
+        (spaces.Box(0, 9, (3,), np.uint8), np.zeros(3), "uint8.*float64"),
+        (spaces.Discrete(3), np.zeros(1, int), r"expected shape \(\).*\(1,\)"),
+        (spaces.Discrete(3), 0.5, "int64.*float64"),
+        (spaces.Dict(a=spaces.Discrete(2)), {"b": 0}, r"keys \['a'\], found keys \['b'\]"),
+        (spaces.Dict(a=spaces.Discrete(2)), 3, "found int"),
+        (spaces.Dict(a=spaces.Tuple([spaces.Discrete(2)])), {"a": (0, 0)}, r"\['a'\].*tuple of 1"),
+        (spaces.Tuple([spaces.Discrete(2), spaces.Box(0, 1, (2,))]), (0, [1]), r"\[1\].*\(2,\)"),
+        (spaces.Box(0, 1, (1,)), "text", "dtype <U4"),
+    ],
+)
+def test_a_misfit_says_where_and_what(space: Any, value: Any, said: str) -> None:
+    """Its place, and shape and dtype of both what was expected and what was found."""
+    layout = RowLayout(space, spaces.Discrete(2), (), ())
+    slab = Slab(layout, memoryview(bytearray(layout.size(1))), 1)
+    with pytest.raises(Misfit, match=said):
+        row_writer(space, slab.observation, 0, "observation")(value)
+
+
+def test_doubles_are_narrowed_as_gymnasium_does() -> None:
+    """Simulators compute in doubles and declare floats."""
+    space = spaces.Dict(x=spaces.Box(-1, 1, (2,)), n=spaces.Discrete(5))
+    layout = RowLayout(space, spaces.Discrete(2), (), ())
+    slab = Slab(layout, memoryview(bytearray(layout.size(1))), 1)
+    row_writer(space, slab.observation, 0, "observation")({"n": 3, "x": [0.1, 0.2]})
+    found = index(slab.observation, 0)
+    assert found["x"].tolist() == np.array([0.1, 0.2], np.float32).tolist()
+    assert found["n"] == 3
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        spaces.Text(3),
+        spaces.Sequence(spaces.Discrete(2)),
+        spaces.Graph(spaces.Box(0, 1, (2,)), None),
+        spaces.OneOf([spaces.Discrete(2), spaces.Box(0, 1, (2,))]),
+        spaces.Dict(a=spaces.Discrete(2), b=spaces.Text(3)),
+        spaces.Tuple([spaces.Sequence(spaces.Discrete(2))]),
+    ],
+    ids=str,
+)
+def test_spaces_without_a_fixed_size_have_no_rows(space: Any) -> None:
+    """One such part makes the whole value travel by the channel."""
+    assert leaves(space) is None
+    layout = RowLayout(space, spaces.Discrete(2), (), ())
+    slab = Slab(layout, memoryview(bytearray(layout.size(2))), 2)
+    assert slab.observation is None
+    assert slab.action is not None
+
+
+def test_a_tree_keeps_its_shape_when_its_arrays_are_mapped() -> None:
+    """Dicts stay dicts and tuples tuples."""
+    tree = {"a": (np.ones(2), np.zeros(2)), "b": np.ones(2)}
+    found = mapped(lambda array: array.sum(), tree)
+    assert found == {"a": (2.0, 0.0), "b": 2.0}
