@@ -137,7 +137,8 @@ class Watch:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self._progress.stop()
+        if self._console.is_terminal:
+            self._progress.stop()
 
     def say(self, words: str, *, advance: int = 0) -> None:
         """What is being done now."""

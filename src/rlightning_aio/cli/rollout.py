@@ -152,9 +152,8 @@ class _Display:
             auto_refresh=False,
             transient=True,
         )
-        self._task: TaskID = self._progress.add_task(
-            f"starting {len(group)} envs", total=steps, figures=""
-        )
+        self._starting = f"starting {len(group)} env{'s' if len(group) > 1 else ''}"
+        self._task: TaskID = self._progress.add_task(self._starting, total=steps, figures="")
         self._next_at = 0.0
         self._last = (0.0, 0)
 
@@ -163,11 +162,12 @@ class _Display:
             self._progress.start()
             self._progress.refresh()
         else:
-            self._console.print(f"starting {len(self._group)} envs")
+            self._console.print(self._starting)
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self._progress.stop()
+        if self._console.is_terminal:
+            self._progress.stop()
 
     def ready(self) -> None:
         """All envs have had their first reset."""
