@@ -6,10 +6,13 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 PY := $(VENV)/bin/python
-INSTALL = $(PY) -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable
+# Isaac Lab pins what it shares with the other simulators: it has an environment of its own.
+SIMULATORS := .venv-simulators
+ISAAC := .venv-isaac
+PIP_INSTALL = $(@D)/bin/python -m pip install --quiet --disable-pip-version-check
 
 .DEFAULT_GOAL := help
-.PHONY: help run test check format bench clean
+.PHONY: help run test test-simulators check format bench clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 24
@@ -19,6 +22,14 @@ run: $(VENV)/installed ## collect 100,000 steps of HalfCheetah-v5 asynchronously
 
 test: $(VENV)/installed-test ## the tests
 	$(PY) -m pytest
+
+# Kernels that Isaac Lab compiled once are found again, by workers and tests alike.
+test-simulators: export WARP_CACHE_PATH := $(CURDIR)/$(ISAAC)/warp-cache
+test-simulators: export ISAAC_PYTHON := $(CURDIR)/$(ISAAC)/bin/python
+test-simulators: $(SIMULATORS)/installed $(ISAAC)/installed ## the tests of every backend, on the real simulators (5 GB of packages)
+	tests/simulators/install_debian.sh
+	$(ISAAC)/bin/python -m pytest -m simulators -rs tests/envs/test_isaac.py
+	$(SIMULATORS)/bin/python -m pytest -m simulators -rs tests/envs
 
 check: $(VENV)/installed-check ## the static checks: ruff, pyright, import-linter
 	$(VENV)/bin/ruff check
@@ -33,15 +44,15 @@ format: $(VENV)/installed-check ## lay the code out as `make check` wants it
 bench: $(VENV)/installed-bench ## every benchmark, peers included (their packages are large)
 	$(PY) benchmarks/run_all.py
 
-clean: ## remove the virtual environment and every cache
-	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+clean: ## remove the virtual environments and every cache
+	rm -rf $(VENV) $(SIMULATORS) $(ISAAC) build dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 	find src tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
 
-$(PY):
+%/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 	    || { echo 'Python 3.11 or later is needed; name one with make PYTHON=...' >&2; exit 1; }
-	@$(PYTHON) -m venv $(VENV) \
-	    || { rm -rf $(VENV); echo 'On Debian: apt install python3-venv' >&2; exit 1; }
+	@$(PYTHON) -m venv $* \
+	    || { rm -rf $*; echo 'On Debian: apt install python3-venv' >&2; exit 1; }
 
 # Each stamp is one set of extras. Only the stamp that is asked for is brought up to date,
 # so `make run` never waits for the test tools.
@@ -49,7 +60,16 @@ $(VENV)/installed: extras :=
 $(VENV)/installed-test: extras := [test]
 $(VENV)/installed-check: extras := [test,check]
 $(VENV)/installed-bench: extras := [bench]
-$(VENV)/installed $(VENV)/installed-test $(VENV)/installed-check $(VENV)/installed-bench: \
-    pyproject.toml constraints.txt | $(PY)
-	$(INSTALL) '.$(extras)'
+$(SIMULATORS)/installed: extras := [test,ale,envpool,maniskill,pettingzoo,piper]
+$(VENV)/installed $(VENV)/installed-test $(VENV)/installed-check $(VENV)/installed-bench: | $(PY)
+$(SIMULATORS)/installed: | $(SIMULATORS)/bin/python
+$(VENV)/installed $(VENV)/installed-test $(VENV)/installed-check $(VENV)/installed-bench \
+    $(SIMULATORS)/installed: pyproject.toml constraints.txt
+	$(PIP_INSTALL) --constraint constraints.txt --editable '.$(extras)'
+	@touch $@
+
+$(ISAAC)/installed: pyproject.toml tests/simulators/isaac.txt | $(ISAAC)/bin/python
+	$(PIP_INSTALL) --requirement tests/simulators/isaac.txt
+	$(PIP_INSTALL) --ignore-requires-python --no-deps isaaclab==3.0.0
+	$(PIP_INSTALL) --editable '.[isaac,test]'
 	@touch $@
