@@ -110,3 +110,11 @@ class WorkerOnly(Stub):
         super().__init__(config, *args, **kwargs)
         if config.placement == "inline":
             raise OSError("needs a process of its own")
+
+
+@rl.ENVS.register("unclosable")
+class Unclosable(Stub):
+    """Fails where nobody can help it any more."""
+
+    def close(self) -> None:
+        raise RuntimeError("the lid is stuck")

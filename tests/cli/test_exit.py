@@ -184,3 +184,13 @@ def test_a_policy_that_raises_shows_its_own_traceback(tmp_path: Path) -> None:
     assert done.returncode == 1
     assert "no such weights" in done.stderr
     assert "stub_policies.py" in done.stderr
+
+
+def test_a_warning_is_one_line(tmp_path: Path) -> None:
+    """What the library warns of is told without the line of code that it came from."""
+    entry = {"name": "box", "backend": "unclosable", "task": "any"}
+    done = run("rollout", write_config(tmp_path, entry), "--steps", 5)
+    assert done.returncode == 0
+    (warning,) = [line for line in done.stderr.splitlines() if "the lid is stuck" in line]
+    assert warning.startswith("warning: close() of env 'box-0' raised")
+    assert "self." not in done.stderr

@@ -10,19 +10,17 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import warnings
 
 __all__ = ["main"]
 
 
-def _quit(*_: object) -> None:
-    os._exit(130)
-
-
 def main() -> None:
     """Run the command that `sys.argv` names; the entry point of ``rlightning-aio``."""
-    # Until a command begins there is nothing to clean up, and an exception could get lost
-    # among those of the imports.
+    # Where envs run, a command catches Ctrl-C itself. Anywhere else there is nothing to
+    # clean up, and an exception could get lost in code that expects none.
     signal.signal(signal.SIGINT, _quit)
+    warnings.showwarning = _say
     from rlightning_aio.cli.app import app  # noqa: PLC0415
 
     try:
@@ -32,3 +30,12 @@ def main() -> None:
     finally:
         # All is said; what the interpreter still does to end is not worth a traceback.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _quit(*_: object) -> None:
+    os._exit(130)
+
+
+def _say(message: Warning | str, *_: object) -> None:
+    """Show a warning as a user wants it, without the line of code that it came from."""
+    sys.stderr.write(f"warning: {message}\n")

@@ -25,8 +25,10 @@ from rlightning_aio.cli.measuring import (
 from rlightning_aio.cli.terminal import (
     INTERRUPTED,
     count,
+    counted,
     duration,
     err,
+    interruptible,
     named_columns,
     out,
     print_json,
@@ -85,6 +87,7 @@ def bench(
     try:
         with (
             Watch(settings, rounds * len(contenders)) as watch,
+            interruptible(),
             contextlib.closing(_measure(settings, contenders, rounds, limits, watch)) as measuring,
         ):
             rlightning_aio.run(measuring)
@@ -110,7 +113,7 @@ async def _measure(
     watch: Watch,
 ) -> None:
     async with opened(settings) as stands:
-        watch.say(f"measuring {len(contenders)} contenders, {rounds} rounds")
+        watch.say(f"measuring {counted(len(contenders), 'contender')}, {counted(rounds, 'round')}")
         await take_turns(stands, contenders, rounds, limits, watch.measured)
 
 
@@ -133,7 +136,7 @@ class Watch:
     def __enter__(self) -> Self:
         if self._console.is_terminal:
             self._progress.start()
-        self.say(f"starting {len(self._settings)} groups")
+        self.say(f"starting {counted(len(self._settings), 'group')}")
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -175,7 +178,8 @@ def print_contenders(console: Console, title: str, contenders: Sequence[Contende
     """The table of what was measured, the fastest in bold."""
     fastest = max(contenders, key=lambda contender: contender.steps_per_second)
     table = named_columns(
-        f"{title}: {num_cores()} cores, medians of {len(fastest.rounds)} rounds",
+        f"{title}: {counted(num_cores(), 'core')}, "
+        f"medians of {counted(len(fastest.rounds), 'round')}",
         "envs in", "results", "steps/s", "slowest", "fastest", "latency p50", "p99",
     )  # fmt: skip
     table.columns[1].justify = "left"
@@ -214,7 +218,7 @@ def _draw(config: str, contenders: Sequence[Contender], path: Path) -> None:
         )
     axes.set_yticks([k + 0.4 - height / 2 for k in range(len(settings))], settings)
     axes.invert_yaxis()
-    axes.set(xlabel="env steps per second", title=f"{config}, {num_cores()} cores")
+    axes.set(xlabel="env steps per second", title=f"{config}, {counted(num_cores(), 'core')}")
     figure.legend(loc="outside lower center", ncols=len(rules))
     figure.savefig(path, dpi=150)
     plt.close(figure)

@@ -21,6 +21,7 @@ import rlightning_aio
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.cli.collecting import resetting, respond_to_all, responder
 from rlightning_aio.cli.tally import Tally
+from rlightning_aio.cli.terminal import counted
 from rlightning_aio.errors import ConfigError, RLightningError
 from rlightning_aio.registry import BACKENDS
 
@@ -80,7 +81,7 @@ class Setting:
         """How tables call it."""
         if self.inline:
             return "inline"
-        return f"{self.workers} worker{'s' if self.workers > 1 else ''}"
+        return counted(self.workers, "worker")
 
     def as_json(self) -> dict[str, Any]:
         """The fields that make it."""

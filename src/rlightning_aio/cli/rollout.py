@@ -19,8 +19,10 @@ from rlightning_aio.cli.tally import EntryFigures, Tally
 from rlightning_aio.cli.terminal import (
     INTERRUPTED,
     count,
+    counted,
     duration,
     err,
+    interruptible,
     named_columns,
     number,
     out,
@@ -100,6 +102,7 @@ def rollout(
     try:
         with (
             _Display(group, tally, steps) as display,
+            interruptible(),
             contextlib.closing(_collect(group, configs, order, tally, display)) as collecting,
         ):
             rlightning_aio.run(collecting)
@@ -142,6 +145,7 @@ class _Display:
     def __init__(self, group: EnvGroup, tally: Tally, steps: int) -> None:
         self._group = group
         self._tally = tally
+        self._steps = steps
         self._console = err()
         self._progress = Progress(
             SpinnerColumn(),
@@ -152,7 +156,7 @@ class _Display:
             auto_refresh=False,
             transient=True,
         )
-        self._starting = f"starting {len(group)} env{'s' if len(group) > 1 else ''}"
+        self._starting = f"starting {counted(len(group), 'env')}"
         self._task: TaskID = self._progress.add_task(self._starting, total=steps, figures="")
         self._next_at = 0.0
         self._last = (0.0, 0)
@@ -174,7 +178,7 @@ class _Display:
         if self._console.is_terminal:
             self._progress.update(self._task, description="")
         else:
-            self._console.print(f"collecting {count(self._progress.tasks[0].total or 0)} steps")
+            self._console.print(f"collecting {counted(self._steps, 'step')}")
 
     def due(self) -> bool:
         """Whether it is time to show something new."""

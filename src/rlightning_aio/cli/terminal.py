@@ -6,6 +6,7 @@ only an error in the user's own code (a policy) shows where it happened, in full
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 import re
@@ -20,14 +21,16 @@ from rich.table import Table
 from rlightning_aio.errors import ConfigError, EnvFault, RemoteTraceback, RLightningError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Generator
 
 __all__ = [
     "INTERRUPTED",
     "count",
+    "counted",
     "duration",
     "err",
     "guarded",
+    "interruptible",
     "named_columns",
     "number",
     "out",
@@ -61,8 +64,6 @@ def guarded(command: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def run(*args: Any, **kwargs: Any) -> None:
-        # From here on Ctrl-C has something to clean up (see `cli.main`).
-        signal.signal(signal.SIGINT, signal.default_int_handler)
         try:
             command(*args, **kwargs)
         except RLightningError as error:
@@ -72,6 +73,19 @@ def guarded(command: Callable[..., None]) -> Callable[..., None]:
             raise typer.Exit(INTERRUPTED) from None
 
     return run
+
+
+@contextlib.contextmanager
+def interruptible() -> Generator[None]:
+    """Ctrl-C raises KeyboardInterrupt in here, where there is something to clean up.
+
+    Anywhere else it ends the command on the spot (see `cli.main`).
+    """
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _in_words(error: RLightningError) -> str:
@@ -99,6 +113,11 @@ def named_columns(title: str, *names: str) -> Table:
 def count(value: float) -> str:
     """A count, or a rate of counts."""
     return f"{value:,.0f}"
+
+
+def counted(how_many: int, what: str) -> str:
+    """Such as "1 env" and "16 envs"."""
+    return f"{count(how_many)} {what}{'s' if how_many > 1 else ''}"
 
 
 def number(value: float | None) -> str:

@@ -22,7 +22,15 @@ from rlightning_aio.cli.measuring import (
     possible_settings,
     take_turns,
 )
-from rlightning_aio.cli.terminal import INTERRUPTED, count, duration, err, print_json
+from rlightning_aio.cli.terminal import (
+    INTERRUPTED,
+    count,
+    counted,
+    duration,
+    err,
+    interruptible,
+    print_json,
+)
 from rlightning_aio.config import load_config
 
 if TYPE_CHECKING:
@@ -116,6 +124,7 @@ def tune(
     try:
         with (
             Watch(settings, measurements) as watch,
+            interruptible(),
             contextlib.closing(_search(search, settings, watch)) as searching,
         ):
             rlightning_aio.run(searching)
@@ -132,7 +141,7 @@ async def _search(search: _Search, settings: Sequence[Setting], watch: Watch) ->
         await _measure_env(search, settings, stands)
         half = max(1, search.num_envs // 2)
         search.places = [Contender(setting, _waiting_for(half)) for setting in settings]
-        watch.say(f"trying {len(settings)} settings, {search.rounds} rounds")
+        watch.say(f"trying {counted(len(settings), 'setting')}, {counted(search.rounds, 'round')}")
         await take_turns(stands, search.places, search.rounds, search.limits, watch.measured)
         ranked = sorted(search.places, key=lambda contender: -contender.steps_per_second)
         search.finals = [
@@ -141,7 +150,9 @@ async def _search(search: _Search, settings: Sequence[Setting], watch: Watch) ->
             if contender.rounds
             for least in _least(search.num_envs)
         ]
-        watch.say(f"trying {len(search.finals)} min_results, {search.rounds} rounds")
+        watch.say(
+            f"trying {len(search.finals)} times min_results, {counted(search.rounds, 'round')}"
+        )
         await take_turns(stands, search.finals, search.rounds, search.limits, watch.measured)
 
 
@@ -188,8 +199,8 @@ def _report(config: Path, search: _Search, *, interrupted: bool, as_json: bool) 
         print_contenders(console, "How many results to wait for", search.finals)
     if search.limit is not None:
         console.print(
-            f"A step takes {duration(search.step_us)} in the env: {num_cores()} cores that do "
-            f"nothing else make {count(search.limit)} steps/s."
+            f"A step takes {duration(search.step_us)} in the env: {counted(num_cores(), 'core')} "
+            f"that only step make {count(search.limit)} steps/s."
         )
     typer.echo(_as_yaml(config, best))
 
@@ -205,6 +216,7 @@ def _as_yaml(config: Path, best: Contender) -> str:
     ]
     text = yaml.safe_dump({"envs": entries}, sort_keys=False, allow_unicode=True)
     return (
-        f"# {config}, tuned on {num_cores()} cores: {count(best.steps_per_second)} steps/s\n"
-        f"# with collect_async(min_results={best.rule.min_results}).\n{text}"
+        f"# {config}, tuned on {counted(num_cores(), 'core')}:\n"
+        f"# {count(best.steps_per_second)} steps/s with "
+        f"collect_async(min_results={best.rule.min_results}).\n{text}"
     ).rstrip()
