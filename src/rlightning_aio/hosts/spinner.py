@@ -21,7 +21,7 @@ __all__ = ["Spinner"]
 _LIMIT_SECONDS: Final = 400e-6
 # A yield that nobody took takes half a microsecond.
 _YIELD_SECONDS: Final = 10e-6
-_SKIPPED_AFTER_CONTENTION: Final = 64
+_SKIPPED_AFTER_CONTENTION: Final = 8
 # One long pause (a policy update) says little about the next wait.
 _LONGEST_COUNTED: Final = 4 * _LIMIT_SECONDS
 _WEIGHT: Final = 0.1
