@@ -88,6 +88,11 @@ class ServerView:
         """Ids of the envs of the clients that are connected, ``<server id>/<client name>``."""
         return [f"{self.env_id}/{name}" for name in self._listener.remote.clients]
 
+    @property
+    def metas(self) -> list[EnvMeta]:
+        """What the envs of these clients are like, in the same order."""
+        return list(self._listener.remote.clients.values())
+
 
 class Facade:
     """The plain methods of an `EnvGroup`."""
