@@ -95,6 +95,12 @@ def _deadlock() -> None:
     lock.acquire()
 
 
+def _deadlock_with_the_gil() -> None:
+    libc, mutex = ctypes.PyDLL(None), ctypes.create_string_buffer(64)
+    libc.pthread_mutex_lock(mutex)
+    libc.pthread_mutex_lock(mutex)
+
+
 def _recurse() -> None:
     _recurse()
 
@@ -121,8 +127,8 @@ FAULTS: dict[str, Callable[[], object]] = {
     # Hangs.
     "sleep": lambda: time.sleep(3600),
     "loop in C": lambda: sum(iter(int, 1)),
-    "sleep with the GIL": lambda: ctypes.PyDLL(None).sleep(3600),
     "deadlock": _deadlock,
+    "deadlock with the GIL": _deadlock_with_the_gil,
     "stop": _signal(signal.SIGSTOP),
     # Exceptions.
     "raise": _raise(ValueError("as asked for")),
@@ -164,6 +170,7 @@ class FaultyEnv(BaseEnv):
             self._faults = {}
         self._switch = kwargs.get("while_exists")
         self._resets = self._steps = 0
+        self._seconds = 0.0
         if worker_index == 0 and "gate" in kwargs and Path(kwargs["gate"]).exists():
             Path(kwargs["gate"]).read_bytes()
         self._break("building")
@@ -195,6 +202,7 @@ class FaultyEnv(BaseEnv):
 
     def step(self, policy_resp: PolicyResponse) -> EnvRet:
         code, token = self._preprocess_fn(policy_resp)
+        time.sleep(self._seconds)
         _BY_CODE[int(code)]()
         self._steps += 1
         return EnvRet(
@@ -212,6 +220,10 @@ class FaultyEnv(BaseEnv):
     def arm(self, place: str, fault: str) -> None:
         """Break later, at `place`."""
         self._faults[place] = fault
+
+    def step_takes(self, seconds: float) -> None:
+        """Be slow, and all right."""
+        self._seconds = seconds
 
     def returns(self, make: Callable[[], Any]) -> Any:
         """What `make`, called here, returns."""

@@ -435,7 +435,6 @@ class Core:
             raise RLightningError(
                 "another collect_async is already waiting on this group; one collector at a time"
             )
-        self.fleet.look(now)
         self._collecting = True
         try:
             end = None if deadline is None else now + deadline
@@ -457,7 +456,12 @@ class Core:
                     window = now + timeout
                 open_window = window is not None and now < window and ready < most
                 if ready and ready >= need and not open_window:
-                    break
+                    if not self.fleet.overdue(now):
+                        break
+                    # However much is ready: the dead and the hung must be heard of, too.
+                    now = yield Wait(0.0)
+                    self.fleet.look(now)
+                    continue
                 if end is not None and now >= end:
                     raise TimeoutError(
                         f"{ready} of the {max(need, 1)} results needed came within {deadline} s; "
@@ -661,9 +665,7 @@ class Core:
             now = yield Wait(earliest(began + lacking, self.fleet.next_check()))
             self.fleet.check(now)
 
-    def _take_first_results(
-        self, slots: NDArray[np.intp], ticket: Ticket, *, enough: bool
-    ) -> None:
+    def _take_first_results(self, slots: NDArray[np.intp], ticket: Ticket, *, enough: bool) -> None:
         """Let a reset have the first results of clients that have only just joined.
 
         Joining was a reset; unless this one asks for more than that, it was `enough`: an env

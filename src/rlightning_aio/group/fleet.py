@@ -199,6 +199,7 @@ class Fleet:
             for member in self._members:
                 assert member.order is not None
                 member.stage = _Stage.ATTACHING
+                member.start_by = self._now + member.config.start_timeout
                 member.host.attach(member.order)
             yield from self._until(_Stage.UP)
         except BaseException:
@@ -245,22 +246,25 @@ class Fleet:
                 member.late = True
                 member.host.kill(dump=True)
             elif not self.open:
-                self._start_fault = self._start_fault or self._late_fault(member, "")
+                self._start_fault = self._start_fault or self._late_fault(member, Death(""))
 
-    def _late_fault(self, member: _Member, stderr_tail: str) -> StartFailed:
+    def _late_fault(self, member: _Member, death: Death) -> StartFailed:
+        slot = self._starting(member, death)
+        # How it was killed says nothing; what it went down with may say all.
+        why = f" (it {death.cause})" if death.cause and death.exit_code is None else ""
         return StartFailed(
-            f"{self._who(member)} did not start within {member.config.start_timeout} s; raise "
-            "start_timeout if it needs longer" + _said(stderr_tail),
-            env_id=self._first_id(member),
+            f"{self.slots.describe(slot)} did not start within {member.config.start_timeout} s"
+            f"{why}; raise start_timeout if it needs longer" + _said(death.stderr_tail),
+            env_id=self.slots.env_ids[slot],
         )
+
+    def _starting(self, member: _Member, death: Death) -> int:
+        """The env that a worker was building when it died."""
+        slot = self._slot(death.requests[0]) if death.requests else 0
+        return max(slot, member.host.first_slot)
 
     def _first_id(self, member: _Member) -> str:
         return self.slots.env_ids[member.host.first_slot]
-
-    def _who(self, member: _Member) -> str:
-        first = member.host.first_slot
-        more = f" (and {member.host.rows - 1} more in its worker)" if member.host.rows > 1 else ""
-        return self.slots.describe(first) + more
 
     def on_started(self, host: Host, started: list[Started]) -> None:
         """See `base.Inbox.on_started`."""
@@ -268,6 +272,7 @@ class Fleet:
         if member.order is None:
             member.started = started
             member.stage = _Stage.BUILT
+            member.start_by = None
         elif [s.layout.key for s in started] != [s.layout.key for s in member.started]:
             self.on_start_error(
                 host, 0, ErrorText("ValueError", "its spaces changed with the restart", "")
@@ -569,9 +574,13 @@ class Fleet:
             if member.timed and member.host.in_flight:
                 self._check_hung(member)
 
+    def overdue(self, now: float) -> bool:
+        """Whether nobody has looked after workers for a while, having had no need to wait."""
+        return now >= self._looked_at + _LOOK_SECONDS
+
     def look(self, now: float) -> None:
-        """Call `check` if there is anything to be found, and not too often."""
-        if (self._timed or self.recovering) and now >= self._looked_at + _LOOK_SECONDS:
+        """Call `check`, but not too often."""
+        if self.overdue(now):
             self.check(now)
 
     def _check_hung(self, member: _Member) -> None:
@@ -665,10 +674,9 @@ class Fleet:
     def _died_starting(self, member: _Member, death: Death) -> None:
         member.stage = _Stage.CLOSED
         if member.late:
-            fault = self._late_fault(member, death.stderr_tail)
+            fault = self._late_fault(member, death)
         else:
-            slot = self._slot(death.requests[0]) if death.requests else 0
-            slot = max(slot, member.host.first_slot)
+            slot = self._starting(member, death)
             fault = StartFailed(
                 f"the worker of {self.slots.describe(slot)} {death.cause} while it started"
                 + _said(death.stderr_tail),
@@ -833,8 +841,11 @@ class Fleet:
 
     def on_closed(self, host: Host, errors: list[tuple[int, ErrorText]]) -> None:
         """See `base.Inbox.on_closed`."""
-        self._members[host.host_id].stage = _Stage.CLOSED
-        for row, error in errors:
+        member = self._members[host.host_id]
+        was_built = member.stage is not _Stage.BUILDING
+        member.stage = _Stage.CLOSED
+        # One that is killed while it starts has been told of already.
+        for row, error in errors if was_built else ():
             self.close_errors.append((self.slots.env_ids[host.first_slot + row], error))
 
 

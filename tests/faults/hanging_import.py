@@ -1,0 +1,5 @@
+"""Hangs whoever imports it."""
+
+import threading
+
+threading.Event().wait()

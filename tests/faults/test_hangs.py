@@ -1,0 +1,265 @@
+"""An env that hangs is found, shows its stack, is killed and replaced; nobody is misled after."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import time
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import pytest
+from faults.faulty import Driven, Tokens, entry, marked
+from faults.test_deaths import pid_of, two_workers
+
+import rlightning_aio
+from rlightning_aio import registry
+from rlightning_aio.errors import EnvHung, NothingPending, StartFailed, WorkerDied
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    Start: TypeAlias = Callable[..., Driven]
+
+LIMIT = 0.5
+"""Seconds; long enough for whoever doesn't hang, on a machine that is busy."""
+
+STACKS = {
+    "sleep": "in <lambda>",
+    "loop in C": "in <lambda>",
+    "deadlock": "in _deadlock",
+    "deadlock with the GIL": "in _deadlock_with_the_gil",
+}
+
+
+@pytest.mark.parametrize("hang", STACKS)
+def test_hung_step_raises_with_the_stack_of_the_worker(start: Start, hang: str) -> None:
+    """What held it is in the error, though it held the interpreter's lock and never returned."""
+    group, tokens = start(two_workers(step_timeout=LIMIT, on_worker_death="raise")), Tokens()
+    with pytest.raises(
+        EnvHung, match=f"env 'faulty-1'.*longer than {LIMIT} s for a step"
+    ) as caught:
+        group.step(tokens.steps(group.group.env_ids, {"faulty-1": hang}))
+    error = caught.value
+    assert error.env_id == "faulty-1"
+    assert error.exit_code == -signal.SIGKILL
+    assert STACKS[hang] in error.stderr_tail
+    assert "faulty.py" in error.stderr_tail
+    assert error.results is not None
+    tokens.check(error.results)
+    tokens.check(group.step(tokens.steps(["faulty-2", "faulty-3"]))[0])
+
+
+@pytest.mark.parametrize("hang", [*STACKS, "stop"])
+def test_hung_step_is_answered_by_its_replacement(start: Start, hang: str) -> None:
+    """One marked result each for who owed one; then every env answers what it is asked."""
+    group, tokens = start(two_workers(step_timeout=LIMIT)), Tokens()
+    batch, _ = group.step(tokens.steps(group.group.env_ids, {"faulty-1": hang}))
+    results = batch.values()
+    assert marked(results[1])
+    assert results[1].info["worker_restarted"] == "hung in a step and was killed"
+    assert not marked(results[2])
+    assert not marked(results[3])
+    for _ in range(3):
+        batch, _ = group.step(tokens.steps(group.group.env_ids))
+    tokens.check(batch)
+
+
+def test_hung_reset_is_found_by_its_own_limit(start: Start) -> None:
+    """A step may take as long as it likes where only resets are limited."""
+    group, tokens = start(two_workers(reset_timeout=LIMIT)), Tokens()
+    group.call("faulty-3", "arm", "resetting", "deadlock")
+    group.step_async(tokens.steps(["faulty-0"]))
+    batch, _ = group.reset(env_ids=["faulty-2", "faulty-3"])
+    assert marked(batch["faulty-3"])
+    assert batch["faulty-3"].info["worker_restarted"] == "hung in a reset and was killed"
+    tokens.check(group.collect_async()[0])
+
+
+def test_hung_reset_with_options_is_found(start: Start) -> None:
+    """It went through the channel and not through the ring."""
+    group = start(entry(1, reset_timeout=LIMIT))
+    batch, _ = group.reset(options={"fault": "sleep"})
+    assert marked(batch["faulty-0"])
+
+
+def test_reset_that_hangs_after_a_step_without_limit_is_found(start: Start) -> None:
+    """The worker was looked at while it did something that may take for ever."""
+    group, tokens = start(entry(2, reset_timeout=LIMIT)), Tokens()
+    group.call("faulty-1", "arm", "resetting", "sleep")
+    group.call("faulty-0", "step_takes", 2 * LIMIT)
+    with group.group.auto_reset(max_episode_steps=1):
+        group.step(tokens.steps(["faulty-1"]))
+        batch, _ = group.step(tokens.steps(["faulty-0", "faulty-1"]))
+    assert marked(batch["faulty-1"])
+
+
+def test_worker_that_is_stopped_before_it_is_asked_is_found(start: Start) -> None:
+    """It executes nothing, so nothing takes too long; yet its env has been asked and is late."""
+    group, tokens = start(two_workers(step_timeout=LIMIT)), Tokens()
+    os.kill(pid_of(group, "faulty-0"), signal.SIGSTOP)
+    batch, _ = group.step(tokens.steps(group.group.env_ids))
+    assert [marked(ret) for ret in batch.values()] == [True, True, False, False]
+
+
+def test_hang_is_found_while_others_leave_the_trainer_no_time_to_wait(start: Start) -> None:
+    """Collecting what is always ready must not hide what never comes."""
+    group, tokens = start(two_workers(step_timeout=LIMIT)), Tokens()
+    group.step_async(tokens.steps(["faulty-0"], {"faulty-0": "sleep"}))
+    until = time.monotonic() + 30
+    found: dict[str, Any] = {}
+    while "faulty-0" not in found and time.monotonic() < until:
+        group.step_async(tokens.steps(["faulty-2", "faulty-3"]))
+        while group.group._core.fleet.hosts[1].in_flight:
+            group.group._core.fleet.sweep()  # So that the collect finds all it wants.
+        batch, _ = group.collect_async(min_results=2)
+        found = dict(batch.items())
+    assert marked(found["faulty-0"])
+
+
+def test_trainer_that_comes_late_takes_nobody_for_hung(start: Start) -> None:
+    """Time that the trainer spends elsewhere isn't the env's."""
+    group, tokens = start(two_workers(step_timeout=LIMIT)), Tokens()
+    for _ in range(2):
+        group.step_async(tokens.steps(group.group.env_ids))
+        with pytest.raises(TimeoutError):  # An event loop that has nothing to wait for.
+            asyncio.run(asyncio.wait_for(asyncio.Event().wait(), 2 * LIMIT))
+        batch, _ = group.collect_async(wait_all=True)
+        assert len(batch) == 4
+        tokens.check(batch)
+
+
+def test_start_that_hangs_fails_with_the_stack(build: Start) -> None:
+    """`init` says which limit was exceeded and where the constructor stands."""
+    kwargs = {"faults": {"building": "deadlock"}, "only": 3}
+    group = build(two_workers(env_kwargs=kwargs, start_timeout=5))
+    with pytest.raises(StartFailed, match=r"faulty-3.*did not start within 5") as caught:
+        group.init()
+    assert "in _deadlock" in str(caught.value)
+
+
+def test_fork_server_that_hangs_in_an_import_fails_the_start(
+    build: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It obeys nobody while it imports; so it is killed, and the error names the modules."""
+    backend = registry.Backend(
+        "faulty", "faults.faulty:FaultyEnv", "faults", "faults", preload=("faults.hanging_import",)
+    )
+    monkeypatch.setitem(registry.BACKENDS, "faulty", backend)
+    group = build(entry(start_timeout=LIMIT))
+    with pytest.raises(StartFailed, match=f"did not start within {LIMIT} s") as caught:
+        group.init()
+    assert "faults.hanging_import" in str(caught.value)
+
+
+def test_replacement_that_hangs_is_replaced_until_there_are_too_many(
+    start: Start, tmp_path: Path
+) -> None:
+    """`start_timeout` holds for restarts as well."""
+    broken = tmp_path / "broken"
+    kwargs = {"faults": {"building": "sleep"}, "while_exists": str(broken)}
+    config = two_workers(env_kwargs=kwargs, max_restarts=1, start_timeout=5)
+    group, tokens = start(config), Tokens()
+    for member in group.group._fleet._members:
+        member.config = member.config.model_copy(update={"start_timeout": LIMIT})
+    broken.touch()
+    with pytest.raises(WorkerDied, match=f"did not start again within {LIMIT} s") as caught:
+        group.step(tokens.steps(["faulty-0"], {"faulty-0": "exit 3"}))
+    assert "in __init__" in caught.value.stderr_tail
+    tokens.check(group.step(tokens.steps(["faulty-2"]))[0])
+
+
+def test_replacement_that_hangs_is_found_though_nobody_was_waiting_for_it(
+    start: Start, tmp_path: Path
+) -> None:
+    """The worker died idle, so the first to ask was a plain reset."""
+    broken = tmp_path / "broken"
+    kwargs = {"faults": {"building": "sleep"}, "while_exists": str(broken)}
+    group = start(two_workers(env_kwargs=kwargs, max_restarts=1, start_timeout=5))
+    tokens = Tokens()
+    for member in group.group._fleet._members:
+        member.config = member.config.model_copy(update={"start_timeout": LIMIT})
+    broken.touch()
+    os.kill(pid_of(group, "faulty-0"), signal.SIGKILL)
+    while not group.group._fleet.recovering:
+        group.step(tokens.steps(["faulty-2"]))
+    with pytest.raises(WorkerDied, match="did not start again"):
+        group.reset()
+
+
+@pytest.mark.parametrize("waiting", [{}, {"wait_all": True}, {"timeout": 5}, {"min_results": 2}])
+def test_after_a_missed_deadline_the_next_results_are_right(
+    start: Start, waiting: dict[str, Any]
+) -> None:
+    """Nothing is lost, nothing comes twice, nothing answers another request."""
+    group, tokens = start(two_workers(step_timeout=60)), Tokens()
+    os.kill(pid_of(group, "faulty-0"), signal.SIGSTOP)
+    pid = group.group._fleet.hosts[0].pid
+    group.step_async(tokens.steps(["faulty-0", "faulty-1"]))
+    for _ in range(3):
+        with pytest.raises(TimeoutError, match="nothing is lost"):
+            group.collect_async(deadline=0.05, **waiting)
+    os.kill(pid, signal.SIGCONT)
+    ids: list[str] = []
+    while len(ids) < 2:
+        batch, _ = group.collect_async(**waiting)
+        tokens.check(batch)
+        ids += batch.ids()
+    assert sorted(ids) == ["faulty-0", "faulty-1"]
+    with pytest.raises(NothingPending):
+        group.collect_async()
+    for _ in range(3):
+        tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
+
+
+async def test_cancelled_step_leaves_its_results_to_collect() -> None:
+    """After a cancellation the next results are right, whoever gets them."""
+    tokens = Tokens()
+    async with rlightning_aio.build_env_group(two_workers()) as group:
+        batch, _ = await group.reset()
+        pid = int(batch["faulty-0"].observation[1])
+        os.kill(pid, signal.SIGSTOP)
+        stepping = asyncio.ensure_future(group.step(tokens.steps(group.env_ids)))
+        with pytest.raises(TimeoutError):
+            await asyncio.wait_for(stepping, 0.05)
+        os.kill(pid, signal.SIGCONT)
+        batch, _ = await group.collect_async(wait_all=True)
+        assert sorted(batch.ids()) == group.env_ids
+        tokens.check(batch)
+        for _ in range(3):
+            tokens.check((await group.step(tokens.steps(group.env_ids)))[0])
+
+
+async def test_cancelled_call_answers_nobody_else() -> None:
+    """Its late value is dropped, and the env's next request gets its own reply."""
+    tokens = Tokens()
+    async with rlightning_aio.build_env_group(two_workers()) as group:
+        batch, _ = await group.reset()
+        pid = int(batch["faulty-0"].observation[1])
+        os.kill(pid, signal.SIGSTOP)
+        with pytest.raises(TimeoutError):
+            await asyncio.wait_for(group["faulty-0"].call("returns", os.getpid), 0.05)
+        os.kill(pid, signal.SIGCONT)
+        with pytest.raises(NothingPending):
+            await group.collect_async()
+        # The worker answers in order: once the other env has, the call is over.
+        assert await group["faulty-1"].call("returns", os.getpid) == pid
+        tokens.check((await group.step(tokens.steps(group.env_ids)))[0])
+
+
+async def test_cancelled_collect_loses_nothing() -> None:
+    """Whatever it would have returned is there for the next one."""
+    tokens = Tokens()
+    async with rlightning_aio.build_env_group(two_workers()) as group:
+        batch, _ = await group.reset()
+        pid = int(batch["faulty-0"].observation[1])
+        os.kill(pid, signal.SIGSTOP)
+        group.step_async(tokens.steps(group.env_ids))
+        for _ in range(3):
+            with pytest.raises(TimeoutError):
+                await asyncio.wait_for(group.collect_async(wait_all=True), 0.05)
+        os.kill(pid, signal.SIGCONT)
+        batch, _ = await group.collect_async(wait_all=True)
+        assert sorted(batch.ids()) == group.env_ids
+        tokens.check(batch)
