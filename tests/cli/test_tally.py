@@ -46,9 +46,10 @@ def test_steps_are_what_envs_have_executed(
     ]
     tally = Tally(configs)
     with sync.build_env_group(configs) as group:
+        metas = {meta.env_id: meta for meta in group.init()}
         batch, _ = group.reset()
         Stub.steps = 0
-        tally.begin()
+        tally.begin(metas.__getitem__)
         with group.auto_reset(limit):
             group.step_async(act(batch))
             for least, most in collects:

@@ -7,6 +7,8 @@ import warnings
 from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio.cli.policies import Policy, RandomPolicy, Responder
+from rlightning_aio.group.aio import ServerHandle
+from rlightning_aio.types import EnvMeta
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Sequence
@@ -17,16 +19,41 @@ if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.group.aio import EnvGroup
 
-__all__ = ["resetting", "respond_to_all", "responder"]
+__all__ = ["Roster", "resetting", "respond_to_all", "responder"]
 
 _NO_LIMIT: Final = 2**62
 
 
-def responder(group: EnvGroup, policy: Policy | None, seed: int | None) -> Responder:
+class Roster:
+    """What each env of a group is like; of clients, what they have said on joining.
+
+    Args:
+        group: initialised.
+        metas: what its `init` returned.
+    """
+
+    def __init__(self, group: EnvGroup, metas: Sequence[EnvMeta]) -> None:
+        self._known = {meta.env_id: meta for meta in metas}
+        handles = (group[env_id] for env_id in group.env_ids)
+        self.servers = [handle for handle in handles if isinstance(handle, ServerHandle)]
+
+    def __call__(self, env_id: str) -> EnvMeta:
+        """The env of that id. One that has joined and left unseen is taken for a plain one."""
+        if env_id not in self._known:
+            for server in self.servers:
+                self._known.update((meta.env_id, meta) for meta in server.metas)
+        return self._known.get(env_id) or EnvMeta(
+            env_id=env_id, observation_space=None, action_space=None
+        )
+
+
+def responder(
+    group: EnvGroup, roster: Roster, policy: Policy | None, seed: int | None
+) -> Responder:
     """Answers the group's results with `policy`, or at random; one call for each kind of space."""
     actions = group.get_action_spaces()
     if policy is None:
-        chosen = RandomPolicy(group.env_ids, actions, seed)
+        chosen = RandomPolicy(lambda env_id: roster(env_id).action_space, seed)
         return Responder(chosen, separate=_differ(actions))
     return Responder(policy, separate=_differ(actions) or _differ(group.get_observation_spaces()))
 

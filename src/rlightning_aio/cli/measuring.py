@@ -19,7 +19,7 @@ import numpy as np
 
 import rlightning_aio
 from rlightning_aio.batch import BatchedData
-from rlightning_aio.cli.collecting import resetting, respond_to_all, responder
+from rlightning_aio.cli.collecting import Roster, resetting, respond_to_all, responder
 from rlightning_aio.cli.tally import Tally
 from rlightning_aio.cli.terminal import counted
 from rlightning_aio.errors import ConfigError, RLightningError
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from rlightning_aio.cli.policies import Responder
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.group.aio import EnvGroup
 
@@ -222,14 +221,14 @@ class Stand:
     """
 
     def __init__(
-        self, group: EnvGroup, setting: Setting, respond: Responder, everyone: BatchedData
+        self, group: EnvGroup, setting: Setting, roster: Roster, everyone: BatchedData
     ) -> None:
         self._group = group
-        self._respond = respond
+        self._respond = responder(group, roster, None, 0)
         self._everyone = everyone
         self._sent_at = np.zeros(len(everyone))
         self.tally = Tally(setting.configs)
-        self.tally.begin()
+        self.tally.begin(roster)
 
     async def measure(self, rule: Rule, limits: Limits) -> Round:
         """One measurement, of full length after a few steps that warm the caches."""
@@ -287,9 +286,10 @@ def _joined(responses: list[BatchedData]) -> BatchedData:
 async def _open(stack: contextlib.AsyncExitStack, setting: Setting) -> Stand:
     group = rlightning_aio.build_env_group(list(setting.configs), mixed_actions=True)
     await stack.enter_async_context(group)
+    roster = Roster(group, await group.init())
     everyone, _ = await group.reset(seed=0)
     stack.enter_context(resetting(group, setting.configs))
-    return Stand(group, setting, responder(group, None, 0), everyone)
+    return Stand(group, setting, roster, everyone)
 
 
 @contextlib.asynccontextmanager

@@ -8,7 +8,7 @@ A policy is a callable that takes a `BatchedData` of results and returns actions
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import gymnasium as gym
@@ -16,6 +16,7 @@ import numpy as np
 
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import ConfigError
+from rlightning_aio.protocol.columns import index
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -83,36 +84,38 @@ class RandomPolicy:
     spread. One generator serves all envs in the order in which results arrive.
 
     Args:
-        env_ids: of the group, in order.
-        action_spaces: one for each of them.
+        space_of: an env's action space, by id; asked when its first result comes.
         seed: of the generator; None draws one.
     """
 
-    def __init__(
-        self,
-        env_ids: Sequence[str],
-        action_spaces: Sequence[gym.Space[Any] | None],
-        seed: int | None,
-    ) -> None:
-        rng = np.random.default_rng(seed)
-        known: list[tuple[gym.Space[Any] | None, Sampler]] = []
+    def __init__(self, space_of: Callable[[str], gym.Space[Any] | None], seed: int | None) -> None:
+        self._space_of = space_of
+        self._rng = np.random.default_rng(seed)
+        self._kinds: list[tuple[gym.Space[Any], Sampler]] = []
         self._samplers: dict[str, Sampler] = {}
-        for env_id, space in zip(env_ids, action_spaces, strict=True):
-            sampler = next((sampler for other, sampler in known if other == space), None)
-            if sampler is None:
-                sampler = _sampler(space, rng)
-                known.append((space, sampler))
-            self._samplers[env_id] = sampler
 
     def __call__(self, batch: BatchedData) -> Any:
-        """Actions for a batch of envs that share one action space."""
-        return self._samplers[batch.ids()[0]](len(batch))
+        """Actions for a batch: columns if its envs share one action space, else a list."""
+        samplers = [self._samplers.get(id_) or self._meet(id_) for id_ in batch.env_ids()]
+        first = samplers[0]
+        if samplers.count(first) == len(samplers):
+            return first(len(samplers))
+        return [index(sampler(1), 0) for sampler in samplers]
+
+    def _meet(self, env_id: str) -> Sampler:
+        space = self._space_of(env_id)
+        if space is None:
+            raise ConfigError(f"env {env_id!r} reports no action space; give a --policy")
+        sampler = next((sampler for known, sampler in self._kinds if known == space), None)
+        if sampler is None:
+            sampler = _sampler(space, self._rng)
+            self._kinds.append((space, sampler))
+        self._samplers[env_id] = sampler
+        return sampler
 
 
-def _sampler(space: gym.Space[Any] | None, rng: np.random.Generator) -> Sampler:
+def _sampler(space: gym.Space[Any], rng: np.random.Generator) -> Sampler:
     """A function that makes n actions of `space`, as columns."""
-    if space is None:
-        raise ConfigError("an env reports no action space; give a --policy")
     columns = _columns(space, rng)
     if columns is not None:
         return columns

@@ -13,7 +13,7 @@ import typer
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn
 
 import rlightning_aio
-from rlightning_aio.cli.collecting import resetting, respond_to_all, responder
+from rlightning_aio.cli.collecting import Roster, resetting, respond_to_all, responder
 from rlightning_aio.cli.policies import Policy, load_policy
 from rlightning_aio.cli.tally import EntryFigures, Tally
 from rlightning_aio.cli.terminal import (
@@ -119,11 +119,14 @@ async def _collect(
     group: EnvGroup, configs: Sequence[EnvConfig], order: _Order, tally: Tally, display: _Display
 ) -> None:
     async with group:
-        respond = responder(group, order.policy, order.seed)
+        roster = Roster(group, await group.init())
+        for server in roster.servers:
+            display.say(f"{server.env_id} listens at {server.address}")
         batch, _ = await group.reset(seed=order.seed)
+        respond = responder(group, roster, order.policy, order.seed)
         sub_envs = max(config.num_envs for config in configs)
         display.ready()
-        tally.begin()
+        tally.begin(roster)
         with resetting(group, configs):
             respond_to_all(group, respond, batch)
             while (left := order.steps - tally.steps) > 0:
@@ -179,6 +182,10 @@ class _Display:
             self._progress.update(self._task, description="")
         else:
             self._console.print(f"collecting {counted(self._steps, 'step')}")
+
+    def say(self, words: str) -> None:
+        """Add a line that stays."""
+        self._console.print(words, soft_wrap=True)
 
     def due(self) -> bool:
         """Whether it is time to show something new."""

@@ -8,21 +8,24 @@ from __future__ import annotations
 
 import time
 from collections import Counter, deque
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
-    from rlightning_aio.batch import BatchedData
+    from rlightning_aio.batch import BatchedData, EnvTable
     from rlightning_aio.config import EnvConfig
+    from rlightning_aio.types import EnvMeta
 
 __all__ = ["EntryFigures", "Tally"]
 
+_NOTHING: Final = np.empty(0, np.int64)
 _LATENCY_BATCHES: Final = 4096
 """Batches whose step times are kept for the percentiles."""
 
@@ -54,20 +57,16 @@ class Tally:
 
     def __init__(self, configs: Sequence[EnvConfig]) -> None:
         self._configs = configs
-        self._entry_of = {
+        self._entries = {
             f"{config.name}-{index}": config.name
             for config in configs
             for index in range(config.num_workers)
         }
-        self._sub_envs = {config.name: config.num_envs for config in configs}
-        self._entry_of_slot = np.repeat(
-            np.arange(len(configs)), [config.num_workers for config in configs]
-        )
+        self._meta_of: Callable[[str], EnvMeta] | None = None
+        self._sub_envs: dict[str, int] = {}
         self._counts: Counter[str] = Counter()
         self._resetting: set[str] = set()
-        self._step_times: deque[tuple[NDArray[np.intp], NDArray[np.int64]]] = deque(
-            maxlen=_LATENCY_BATCHES
-        )
+        self._step_times: deque[_StepTimes] = deque(maxlen=_LATENCY_BATCHES)
         self._began = self._ended = 0.0
         self.steps = 0
 
@@ -86,50 +85,87 @@ class Tally:
         """Over the whole time."""
         return self.steps / self.seconds if self.seconds else 0.0
 
-    def begin(self) -> None:
-        """The first steps are about to be sent."""
+    def begin(self, meta_of: Callable[[str], EnvMeta]) -> None:
+        """The first steps are about to be sent.
+
+        Args:
+            meta_of: what the env of an id is like; asked when its first result comes.
+        """
+        self._meta_of = meta_of
         self._began = self._ended = time.monotonic()
 
     def add(self, batch: BatchedData, flags: Sequence[bool]) -> None:
         """Count what `collect_async` or `step` returned inside `auto_reset`."""
         self._ended = time.monotonic()
-        env_ids, entries = batch.env_ids(), self._entry_of
-        resets = self._resetting.intersection(env_ids) if self._resetting else ()
-        counted = Counter(entries[id_] for id_ in batch.ids())
-        for env_id in resets:
-            counted[entries[env_id]] -= 1
-        self._counts += counted
-        self.steps += sum(self._sub_envs[name] * count for name, count in counted.items())
-        self._resetting.difference_update(resets)
-        ended = batch.ended
-        if ended.any() or any(flags):
-            self._resetting.update(env_ids[k] for k in np.flatnonzero(ended | flags).tolist())
+        env_ids = batch.env_ids()
+        stepped = env_ids
+        if resets := self._resetting.intersection(env_ids):
+            stepped = [env_id for env_id in env_ids if env_id not in resets]
+            self._resetting -= resets
+        self._counts.update(stepped)
+        self.steps += sum(self._sub_envs.get(id_) or self._meet(id_) for id_ in stepped)
+        if batch.any_ended or any(flags):
+            self._note_ends(env_ids, batch.ended, flags)
         for part in batch.parts:
-            self._step_times.append((part.slots, part.busy_ns))
+            self._step_times.append(_StepTimes(part.table, part.slots, part.busy_ns))
+
+    def _note_ends(
+        self, env_ids: Sequence[str], ended: NDArray[np.bool_], flags: Sequence[bool]
+    ) -> None:
+        """Remember whose next result is a reset."""
+        assert self._meta_of is not None
+        for position in np.flatnonzero(ended | flags).tolist():
+            env_id = env_ids[position]
+            if flags[position] or self._meta_of(env_id).autoreset == "disabled":
+                self._resetting.add(env_id)
+
+    def _meet(self, env_id: str) -> int:
+        """Sub-environments of an env that is met for the first time."""
+        assert self._meta_of is not None
+        self._sub_envs[env_id] = self._meta_of(env_id).num_envs
+        return self._sub_envs[env_id]
+
+    def _entry(self, env_id: str) -> str:
+        """Its config entry; a client's is its server's, ``<server id>/<client name>``."""
+        if env_id in self._entries:
+            return self._entries[env_id]
+        return next(name for id_, name in self._entries.items() if env_id.startswith(f"{id_}/"))
 
     def by_entry(self, env_stats: Mapping[str, Mapping[str, Any]]) -> list[EntryFigures]:
         """One line for each entry, with the episodes of `EnvGroup.get_env_stats`."""
-        return [self._figures(index, env_stats) for index in range(len(self._configs))]
+        steps, episodes = Counter[str](), dict[str, list[Mapping[str, Any]]]()
+        for env_id, count in self._counts.items():
+            steps[self._entry(env_id)] += count * self._sub_envs[env_id]
+        for env_id, stats in env_stats.items():
+            episodes.setdefault(self._entry(env_id), []).append(stats)
+        return [
+            self._figures(config, steps[config.name], episodes.get(config.name, []))
+            for config in self._configs
+        ]
 
-    def _figures(self, index: int, env_stats: Mapping[str, Mapping[str, Any]]) -> EntryFigures:
-        config = self._configs[index]
-        own = [env_stats[id_] for id_, name in self._entry_of.items() if name == config.name]
-        episodes = sum(stats["episodes"] for stats in own)
-        steps = self._counts[config.name] * config.num_envs
+    def _figures(
+        self, config: EnvConfig, steps: int, stats: Sequence[Mapping[str, Any]]
+    ) -> EntryFigures:
+        episodes = sum(own["episodes"] for own in stats)
         return EntryFigures(
             name=config.name,
-            envs=config.num_workers * config.num_envs,
+            envs=self._num_envs(config),
             steps=steps,
             steps_per_second=steps / self.seconds if self.seconds else 0.0,
             episodes=episodes,
-            mean_return=_mean(own, "mean_return", episodes),
-            mean_length=_mean(own, "mean_length", episodes),
-            step_us=self._step_us(index),
+            mean_return=_mean(stats, "mean_return", episodes),
+            mean_length=_mean(stats, "mean_length", episodes),
+            step_us=self._step_us(config.name),
         )
 
-    def _step_us(self, index: int) -> dict[str, float] | None:
-        times = [busy[self._entry_of_slot[slots] == index] for slots, busy in self._step_times]
-        taken = np.concatenate(times) if times else np.empty(0)
+    def _num_envs(self, config: EnvConfig) -> int:
+        """Sub-environments of all envs of an entry; of a server, those of clients met."""
+        if config.backend != "env_server":
+            return config.num_workers * config.num_envs
+        return sum(n for id_, n in self._sub_envs.items() if self._entry(id_) == config.name)
+
+    def _step_us(self, entry: str) -> dict[str, float] | None:
+        taken = np.concatenate([times.of(entry) for times in self._step_times] or [_NOTHING])
         if not len(taken):
             return None
         p50, p99 = np.percentile(taken, [50, 99]) / 1e3
@@ -139,7 +175,21 @@ class Tally:
         """Time in an env's own step, mean over all entries, in microseconds."""
         if not self._step_times:
             return None
-        return float(np.concatenate([busy for _, busy in self._step_times]).mean()) / 1e3
+        return float(np.concatenate([times.busy_ns for times in self._step_times]).mean()) / 1e3
+
+
+@dataclass(frozen=True, slots=True)
+class _StepTimes:
+    """How long the envs of one batch took."""
+
+    table: EnvTable
+    slots: NDArray[np.intp]
+    busy_ns: NDArray[np.int64]
+
+    def of(self, entry: str) -> NDArray[np.int64]:
+        """Those of an entry's envs."""
+        mine = [name == entry for name in self.table.names(self.slots)]
+        return self.busy_ns[mine]
 
 
 def _mean(stats: Sequence[Mapping[str, Any]], key: str, episodes: int) -> float | None:

@@ -1,0 +1,63 @@
+"""``rollout`` with envs that dial in: who they are is known only when they have come."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+from cli.command import CARTPOLE, start, write_config
+from remote.counting import ClientThread
+
+if TYPE_CHECKING:
+    import subprocess
+    from pathlib import Path
+
+SERVER = {
+    "name": "robots",
+    "backend": "env_server",
+    "env_kwargs": {"min_clients": 2, "connect_timeout": 30},
+}
+
+
+def address(child: subprocess.Popen[str]) -> str:
+    """Where the command says that it listens."""
+    assert child.stderr is not None
+    while not (line := child.stderr.readline()).startswith("robots-0 listens at "):
+        assert line, "the command has ended"
+    return line.split()[-1]
+
+
+def finish(child: subprocess.Popen[str]) -> Any:
+    stdout, stderr = child.communicate(timeout=60)
+    assert child.returncode == 0, stderr
+    return json.loads(stdout)
+
+
+def test_clients_are_collected_from(tmp_path: Path) -> None:
+    """Random actions suit the spaces that clients have announced; their steps are counted."""
+    config = write_config(tmp_path, SERVER)
+    with start("rollout", config, "--steps", 60, "--json") as child:
+        where = address(child)
+        clients = [ClientThread(where, name) for name in ("left", "right")]
+        document = finish(child)
+        for client in clients:
+            client.join()
+    (entry,) = document["entries"]
+    assert (document["steps"], entry["steps"], entry["envs"]) == (60, 60, 2)
+    # Those that were under way when enough had come are not counted.
+    assert 60 <= sum(client.env.steps for client in clients) <= 62
+
+
+def test_clients_and_local_envs_are_collected_together(tmp_path: Path) -> None:
+    """Each gets actions of its own kind."""
+    local = {**CARTPOLE, "num_workers": 2}
+    config = write_config(tmp_path, local, SERVER)
+    with start("rollout", config, "--steps", 400, "--min-results", 1, "--json") as child:
+        where = address(child)
+        clients = [ClientThread(where, name) for name in ("left", "right")]
+        document = finish(child)
+        for client in clients:
+            client.join()
+    steps = {entry["name"]: entry["steps"] for entry in document["entries"]}
+    assert sum(steps.values()) == 400
+    assert min(steps.values()) > 0
