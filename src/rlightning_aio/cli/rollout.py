@@ -92,7 +92,7 @@ def rollout(
     num_envs = sum(entry.num_workers for entry in configs)
     order = _Order(
         steps=steps,
-        min_results=min(min_results or max(1, num_envs // 2), num_envs),
+        min_results=min_results or max(1, num_envs // 2),
         seed=seed,
         policy=load_policy(policy) if policy else None,
     )
