@@ -94,6 +94,11 @@ class ResultColumns:
             rest = self.rests[row] = pickle.loads(rest)
         return rest or {}
 
+    @property
+    def holds_whole_results(self) -> bool:
+        """Whether some are handed over as they are, which is never pickled."""
+        return any("ret" in rest for rest in self.rests.values() if not isinstance(rest, bytes))
+
     def observation_of(self, row: int) -> Any:
         """One env's observation."""
         rest = self.rest(row) if self.rests else {}
@@ -323,9 +328,7 @@ class BatchedData:
         return self._head("truncated", "last_truncated")
 
     def _head(self, column: str, attribute: str) -> Any:
-        if len(self._parts) == 1 and not any(
-            "ret" in self._parts[0].rest(row) for row in self._parts[0].rests
-        ):
+        if len(self._parts) == 1 and not self._parts[0].holds_whole_results:
             part = self._parts[0]
             array = getattr(part, column)
             if part.agents:

@@ -144,6 +144,7 @@ FAULTS: dict[str, Callable[[], object]] = {
     "stop iteration": _raise(StopIteration(1)),
     "surrogates": _raise(ValueError("\udcff")),
     "a megabyte": _raise(ValueError("x" * 2**20)),
+    "broken pipe": _raise(BrokenPipeError("the simulator's, not ours")),
     "recursion": _recurse,
     "memory": _exhaust_memory,
     # Noise.
@@ -171,6 +172,7 @@ class FaultyEnv(BaseEnv):
         self._switch = kwargs.get("while_exists")
         self._resets = self._steps = 0
         self._seconds = 0.0
+        self._instead: dict[str, Callable[[], Any]] = {}
         if worker_index == 0 and "gate" in kwargs and Path(kwargs["gate"]).exists():
             Path(kwargs["gate"]).read_bytes()
         self._break("building")
@@ -205,12 +207,16 @@ class FaultyEnv(BaseEnv):
         time.sleep(self._seconds)
         _BY_CODE[int(code)]()
         self._steps += 1
-        return EnvRet(
-            env_id=self.env_id,
-            observation=self._observation(token),
-            last_reward=float(token),
-            info={"steps": self._steps, "name": self.worker_index},
-        )
+        fields = {
+            "env_id": self.env_id,
+            "observation": self._observation(token),
+            "last_reward": float(token),
+            "info": {"steps": self._steps, "name": self.worker_index},
+        }
+        instead, self._instead = self._instead, {}
+        if "result" in instead:
+            return instead["result"]()
+        return EnvRet(**{**fields, **{name: make() for name, make in instead.items()}})
 
     def do(self, fault: str) -> str:
         """Break in a call."""
@@ -224,6 +230,10 @@ class FaultyEnv(BaseEnv):
     def step_takes(self, seconds: float) -> None:
         """Be slow, and all right."""
         self._seconds = seconds
+
+    def answer_with(self, **instead: Callable[[], Any]) -> None:
+        """At the next step, answer with what these make in place of the fields of that name."""
+        self._instead = instead
 
     def returns(self, make: Callable[[], Any]) -> Any:
         """What `make`, called here, returns."""
@@ -258,9 +268,9 @@ class Driven:
     def __len__(self) -> int:
         return len(self.group)
 
-    def call(self, env_id: str, name: str, *args: Any) -> Any:
+    def call(self, env_id: str, name: str, *args: Any, **kwargs: Any) -> Any:
         """`call` of an env's handle."""
-        return self._wait(self.group[env_id].call(name, *args))
+        return self._wait(self.group[env_id].call(name, *args, **kwargs))
 
     def end(self) -> None:
         """Close the group, and the loop."""

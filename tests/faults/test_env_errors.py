@@ -1,0 +1,272 @@
+"""Whatever an env raises arrives as `EnvRaised` with its traceback, and the env goes on."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import types
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+import pytest
+from faults.faulty import Driven, Tokens, entry
+from faults.test_deaths import two_workers
+
+from rlightning_aio.errors import EnvRaised, RemoteTraceback, StartFailed
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    Start: TypeAlias = Callable[..., Driven]
+
+# What is raised, and what is told of it: type and text.
+RAISED = {
+    "raise": ("ValueError", "as asked for"),
+    "odd constructor": ("faults.faulty.OddConstructor", "code 7 in step"),
+    "unpicklable": ("faults.faulty.Unpicklable", "it holds a lock"),
+    "unprintable": ("faults.faulty.Unprintable", "<its __str__ raised RuntimeError>"),
+    "unspeakable": ("faults.faulty.Unspeakable", "<its __str__ raised SystemExit>"),
+    "not an exception": ("faults.faulty.NotAnException", "but raised"),
+    "system exit": ("SystemExit", "5"),
+    "keyboard interrupt": ("KeyboardInterrupt", ""),
+    "interrupt": ("KeyboardInterrupt", ""),
+    "generator exit": ("GeneratorExit", ""),
+    "stop iteration": ("StopIteration", "1"),
+    "surrogates": ("ValueError", "\udcff"),
+    "a megabyte": ("ValueError", "x" * 2**20),
+    "broken pipe": ("BrokenPipeError", "the simulator's, not ours"),
+    "recursion": ("RecursionError", "maximum recursion depth exceeded"),
+    "memory": ("MemoryError", ""),
+}
+
+
+def check_told(error: EnvRaised, name: str, place: str) -> None:
+    """The error says what was raised, where, and shows the remote traceback above its own."""
+    type_name, text = RAISED[name]
+    assert error.env_id == "faulty-1"
+    assert error.exception_type == type_name
+    assert error.exception_text == text
+    assert (
+        f"env 'faulty-1' (entry 'faulty', backend faulty, task 'anything') raised in {place}"
+        in (str(error))
+    )
+    assert "faulty.py" in error.traceback_text
+    assert isinstance(error.__cause__, RemoteTraceback)
+
+
+def test_whatever_a_step_raises_is_told_and_the_env_goes_on(start: Start) -> None:
+    """The other envs of the batch have their results; the same worker goes on."""
+    group, tokens = start(two_workers()), Tokens()
+    pids = [ret.observation[1] for ret in group.reset()[0].values()]
+    for name in RAISED:
+        with pytest.raises(EnvRaised) as caught:
+            group.step(tokens.steps(group.group.env_ids, {"faulty-1": name}))
+        check_told(caught.value, name, "step")
+        assert caught.value.results is not None
+        assert caught.value.results.ids() == ["faulty-0", "faulty-2", "faulty-3"]
+        tokens.check(caught.value.results)
+        group.reset(env_ids=["faulty-1"])
+        batch, _ = group.step(tokens.steps(group.group.env_ids))
+        tokens.check(batch)
+    assert [ret.observation[1] for ret in batch.values()] == pids
+
+
+def test_whatever_is_raised_while_collecting_ends_one_request(start: Start) -> None:
+    """It is raised once; the results of the others come with the next collect."""
+    group, tokens = start(two_workers()), Tokens()
+    for name in RAISED:
+        group.step_async(tokens.steps(group.group.env_ids, {"faulty-1": name}))
+        ids: list[str] = []
+        errors: list[EnvRaised] = []
+        while len(ids) + len(errors) < 4:
+            try:
+                batch, _ = group.collect_async()
+            except EnvRaised as error:
+                errors.append(error)
+            else:
+                tokens.check(batch)
+                ids += batch.ids()
+        assert sorted(ids) == ["faulty-0", "faulty-2", "faulty-3"]
+        check_told(errors[0], name, "step")
+
+
+@pytest.mark.parametrize("by", ["row", "channel"])
+def test_whatever_a_reset_raises_is_told_and_the_next_reset_works(start: Start, by: str) -> None:
+    """With options (which go through the channel) and without (the row holds the seed)."""
+    group, tokens = start(two_workers()), Tokens()
+    for name in RAISED:
+        if by == "row":
+            group.call("faulty-1", "arm", "resetting", name)
+        options = {"fault": name} if by == "channel" else None
+        with pytest.raises(EnvRaised) as caught:
+            group.reset(seed=1, options=options, env_ids=["faulty-1"])
+        check_told(caught.value, name, "reset")
+        group.call("faulty-1", "arm", "resetting", "nothing")
+        group.reset()
+        tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
+
+
+def test_whatever_a_call_raises_is_told(start: Start) -> None:
+    """Also what looks like the end of the channel, and isn't."""
+    group, tokens = start(two_workers()), Tokens()
+    for name in RAISED:
+        with pytest.raises(EnvRaised) as caught:
+            group.call("faulty-1", "do", name)
+        check_told(caught.value, name, "call")
+        tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
+
+
+@pytest.mark.parametrize("place", ["building", "spaces"])
+def test_whatever_is_raised_while_starting_fails_the_start(driver: str, place: str) -> None:
+    """`init` says which env, and shows the remote traceback; nothing is left running."""
+    for name in ("odd constructor", "unpicklable", "unspeakable", "system exit"):
+        type_name, text = RAISED[name]
+        group = Driven(driver, two_workers(env_kwargs={"faults": {place: name}, "only": 1}))
+        with pytest.raises(StartFailed) as caught:
+            group.init()
+        assert caught.value.env_id == "faulty-1"
+        assert f"could not be built: {type_name}: {text}" in str(caught.value)
+        assert "faulty.py" in str(caught.value.__cause__)
+        group.end()
+
+
+def test_what_a_preprocess_function_raises_is_told(start: Start) -> None:
+    """It runs in the worker, in the step."""
+
+    def preprocess(response: Any) -> Any:
+        if response.action[1] < 0:
+            raise SystemExit("negative")
+        return response.action
+
+    group, tokens = start(two_workers(), preprocess_fn=preprocess), Tokens()
+    batch = tokens.steps(["faulty-1"])
+    batch.values()[0].action[1] = -1
+    with pytest.raises(EnvRaised, match="SystemExit: negative"):
+        group.step(batch)
+    tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
+
+
+def test_what_close_raises_is_a_warning_and_others_are_closed(start: Start) -> None:
+    """There is nothing left that could be done about it, but nobody is kept in the dark."""
+    for name in ("odd constructor", "unpicklable", "unspeakable", "system exit"):
+        type_name, text = RAISED[name]
+        group = start(entry(2))
+        group.call("faulty-0", "arm", "closing", name)
+        with pytest.warns(UserWarning, match="close") as caught:
+            group.close()
+        (warning,) = caught
+        assert f"close() of env 'faulty-0' raised {type_name}: {text}" in str(warning.message)
+
+
+def _foreign() -> Any:
+    """An object of a module that this process alone has."""
+    module = types.ModuleType("nobody_else_has_this")
+    exec("class Thing: pass", module.__dict__)
+    sys.modules[module.__name__] = module
+    return module.Thing()
+
+
+def test_value_that_can_not_travel_is_the_error_of_its_call(start: Start) -> None:
+    """Neither what can't be pickled there nor what can't be unpickled here breaks anything."""
+    group, tokens = start(two_workers()), Tokens()
+    with pytest.raises(EnvRaised, match=r"what returns\(\) returned can't be pickled"):
+        group.call("faulty-1", "returns", threading.Lock)
+    with pytest.raises(EnvRaised, match="nobody_else_has_this"):
+        group.call("faulty-1", "returns", _foreign)
+    tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
+
+
+def test_info_that_can_not_travel_is_the_error_of_its_step(start: Start) -> None:
+    """The step has been made; its result can't be told."""
+    group, tokens = start(two_workers()), Tokens()
+    group.call("faulty-1", "answer_with", info=lambda: {"lock": threading.Lock()})
+    with pytest.raises(EnvRaised, match="the result can't be pickled"):
+        group.step(tokens.steps(["faulty-1"]))
+    tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
+
+
+def test_info_that_can_not_be_read_here_raises_when_it_is_read(start: Start) -> None:
+    """Infos are decoded when somebody asks for them; the rest of the batch is sound."""
+    group, tokens = start(two_workers()), Tokens()
+    group.call("faulty-1", "answer_with", info=lambda: {"thing": _foreign()})
+    batch, _ = group.step(tokens.steps(group.group.env_ids))
+    assert batch.reward.tolist() == batch.observation[:, 4].tolist()
+    with pytest.raises(ModuleNotFoundError, match="nobody_else_has_this"):
+        batch.values()
+    tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
+
+
+MISFITS: dict[str, tuple[dict[str, Any], str]] = {
+    "shape": (
+        {"observation": lambda: np.zeros((2, 3))},
+        r"expected shape \(5,\) and dtype float64, found shape \(2, 3\) and dtype float64",
+    ),
+    "dtype": (
+        {"observation": lambda: np.zeros(5, complex)},
+        r"expected shape \(5,\) and dtype float64, found shape \(5,\) and dtype complex128",
+    ),
+    "text": (
+        {"observation": lambda: "five"},
+        r"expected shape \(5,\) and dtype float64, found shape \(\) and dtype <U4",
+    ),
+    "nothing": (
+        {"observation": lambda: None},
+        r"expected shape \(5,\) and dtype float64, found shape \(\) and dtype object",
+    ),
+    "ragged": ({"observation": lambda: [[1], [1, 2]]}, "inhomogeneous"),
+    "reward": ({"last_reward": lambda: np.zeros(3)}, r"reward .* shape \(3,\), expected \(\)"),
+    "reward of no number": ({"last_reward": lambda: "much"}, "much"),
+    "result": (
+        {"result": lambda: (1, 2)},
+        "must return an EnvRet or a MultiAgentEnvRet, not tuple",
+    ),
+    "no result": ({"result": lambda: None}, "must return an EnvRet .*, not NoneType"),
+}
+
+
+def test_observation_that_does_not_fit_its_space_is_named_with_both_shapes(start: Start) -> None:
+    """Expected and found, shape and dtype; the env can be used on, the others notice nothing."""
+    group, tokens = start(two_workers()), Tokens()
+    for instead, message in MISFITS.values():
+        group.call("faulty-1", "answer_with", **instead)
+        with pytest.raises(EnvRaised, match=message) as caught:
+            group.step(tokens.steps(group.group.env_ids))
+        assert caught.value.results is not None
+        tokens.check(caught.value.results)
+        group.reset(env_ids=["faulty-1"])
+        tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
+
+
+def test_infos_of_ten_megabytes_arrive_whole(start: Start) -> None:
+    """As an array, as text and nested; and the others' results with them."""
+    group, tokens = start(two_workers()), Tokens()
+    size = 10 * 2**20
+    for make in (
+        lambda: {"array": np.arange(size // 8)},
+        lambda: {"text": "x" * size, "nested": {"deep": [list(range(1000))] * 10}},
+    ):
+        for env_id in group.group.env_ids:
+            group.call(env_id, "answer_with", info=make)
+        group.step_async(tokens.steps(group.group.env_ids))
+        batch, _ = group.collect_async(wait_all=True)
+        assert len(batch) == 4
+        for ret in batch.values():
+            assert ret.info.keys() == make().keys()
+            for key, value in make().items():
+                assert np.array_equal(ret.info[key], value)
+        tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
+
+
+def test_megabytes_on_stdout_and_stderr_change_nothing(
+    start: Start, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """They reach the trainer's stderr; the env's step is a step like any other."""
+    group, tokens = start(two_workers()), Tokens()
+    for _ in range(2):
+        batch, _ = group.step(
+            tokens.steps(group.group.env_ids, dict.fromkeys(group.group.env_ids, "print"))
+        )
+        tokens.check(batch)
+    group.close()
+    written = capfd.readouterr().err
+    assert written.count("o") == written.count("e") == 2 * 4 * 3000 * 1023
