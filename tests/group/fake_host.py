@@ -22,7 +22,8 @@ from rlightning_aio.group.fleet import Fleet
 from rlightning_aio.group.slots import Slots
 from rlightning_aio.hosts.arena import Arena, map_shared
 from rlightning_aio.hosts.base import Death
-from rlightning_aio.hosts.worker import NO_ACTION, AttachOrder, ErrorText, Started
+from rlightning_aio.hosts.runner import NO_ACTION
+from rlightning_aio.hosts.worker import AttachOrder, ErrorText, Started
 from rlightning_aio.protocol import rings
 from rlightning_aio.protocol.info import NO_INFO, PICKLED
 from rlightning_aio.protocol.slab import NO_SEED, RowLayout, Slab

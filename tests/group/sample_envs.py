@@ -1,17 +1,22 @@
 """Envs of the tests' own, which workers import by this module's name.
 
-`Tree-v0` has observations and actions of every space that travels in rows, `Words-v0` of
-every kind that doesn't. Each observation is drawn anew, so that seeds matter.
+Of Gymnasium's kind: `Tree-v0` has observations and actions of every space that travels in
+rows, `Words-v0` of every kind that doesn't. Each observation is drawn anew, so that seeds
+matter. The others are registered backends; see each.
 """
 
 from __future__ import annotations
 
+import os
 from copy import deepcopy
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+
+from rlightning_aio import ENVS, BaseEnv, EnvRet, MultiAgentEnvRet, PolicyResponse
 
 TREE = spaces.Dict(
     place=spaces.Box(-1, 1, (3,), np.float32),
@@ -67,3 +72,224 @@ def words() -> DrawnEnv:
 
 gym.register("Tree-v0", entry_point=tree)
 gym.register("Words-v0", entry_point=words)
+
+
+# -- envs of this package's own kind
+
+
+@ENVS.register("probe")
+class Probe(BaseEnv):
+    """Tells what was done to it: [index in its entry, episodes, steps, seed].
+
+    An action is [what to do, a number that comes back as the reward].
+    """
+
+    DO_NOTHING, END, TRUNCATE, RAISE = range(4)
+
+    def __init__(
+        self, config: Any, worker_index: int = 0, preprocess_fn: Any = None, **kwargs: Any
+    ) -> None:
+        super().__init__(config, worker_index, preprocess_fn, **kwargs)
+        self.episodes = 0
+        self.steps = 0
+        self.seed = -1
+        self.offloaded = False
+        self.label = "the env's own"
+        self.env = ProbedSimulator()
+        if config.env_kwargs.get("fails") == worker_index:
+            raise RuntimeError("no simulator here")
+
+    def get_observation_space(self) -> gym.Space[Any]:
+        return spaces.Box(-np.inf, np.inf, (4,), np.float64)
+
+    def get_action_space(self) -> gym.Space[Any]:
+        return spaces.Box(-100, 100, self.config.env_kwargs.get("action_shape", (2,)), np.float64)
+
+    def _result(self, **fields: Any) -> EnvRet:
+        observation = np.array([self.worker_index, self.episodes, self.steps, self.seed], float)
+        return EnvRet(env_id=self.env_id, observation=observation, **fields)
+
+    def reset(
+        self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
+    ) -> EnvRet:
+        self.episodes += 1
+        self.steps = 0
+        self.seed = -1 if seed is None else int(seed)  # type: ignore[arg-type]
+        return self._result(info={} if options is None else {"options": options})
+
+    def step(self, policy_resp: PolicyResponse) -> EnvRet:
+        action = self._preprocess_fn(policy_resp)
+        what, reward = int(action[0]), float(action[1])
+        if what == self.RAISE:
+            raise OddError(7, where="step")
+        self.steps += 1
+        return self._result(
+            last_reward=reward,
+            last_terminated=what == self.END,
+            last_truncated=what == self.TRUNCATE,
+            info={"extras": policy_resp.extras} if policy_resp.extras else {},
+            _extra={"steps": self.steps},
+        )
+
+    def double(self, value: Any, *, times: int = 2) -> Any:
+        return value * times
+
+    def offload(self) -> None:
+        self.offloaded = True
+
+    def reload(self) -> None:
+        self.offloaded = False
+
+
+class OddError(Exception):
+    """Can't be made from a message alone."""
+
+    def __init__(self, code: int, *, where: str) -> None:
+        super().__init__(code, where)
+
+
+class ProbedSimulator(gym.Wrapper[Any, Any, Any, Any]):
+    """A wrapper around what it wraps, each with a label of its own."""
+
+    def __init__(self) -> None:
+        inner = DrawnEnv(spaces.Discrete(2), spaces.Discrete(2))
+        inner.label = "inner"  # type: ignore[attr-defined]
+        inner.render = lambda: np.full((2, 2, 3), 7, np.uint8)  # type: ignore[method-assign]
+        super().__init__(inner)
+        self.label = "outer"
+
+
+@ENVS.register("gated")
+class Gated(Probe):
+    """Each step waits until the test opens the gate, a FIFO in the folder ``gates``."""
+
+    def step(self, policy_resp: PolicyResponse) -> EnvRet:
+        Gate(self.config.env_kwargs["gates"], self.env_id).wait()
+        return super().step(policy_resp)
+
+
+class Gate:
+    """Lets one step of one env through; the env announces each step in another FIFO."""
+
+    def __init__(self, folder: str, env_id: str) -> None:
+        self._path = Path(folder, env_id)
+
+    def make(self) -> Gate:
+        os.mkfifo(self._path)
+        return self
+
+    def wait(self) -> None:
+        with self._path.open("rb") as gate:
+            gate.read()
+
+    def open(self) -> None:
+        """Returns once the env has come to the gate, and goes on."""
+        with self._path.open("wb"):
+            pass
+
+
+@ENVS.register("chunked")
+class Chunked(Probe):
+    """Takes a list of any length of actions, or a dict with one; returns their sum."""
+
+    transforms_actions = True
+
+    def step(self, policy_resp: PolicyResponse) -> EnvRet:
+        action = policy_resp.action
+        chunk = action["chunk"] if isinstance(action, dict) else action
+        self.steps += len(chunk)
+        return self._result(last_reward=float(np.sum(chunk)), info={"type": type(action).__name__})
+
+
+@ENVS.register("batched")
+class Batched(BaseEnv):
+    """Three sub-environments that count; every value has them on its first axis."""
+
+    def get_observation_space(self) -> gym.Space[Any]:
+        return spaces.Box(-np.inf, np.inf, (self.num_envs, 2), np.float64)
+
+    def get_action_space(self) -> gym.Space[Any]:
+        return spaces.MultiDiscrete([9] * self.num_envs)
+
+    def _observation(self) -> Any:
+        return np.stack([self.seeds, self.counts], axis=1).astype(float)
+
+    def reset(
+        self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
+    ) -> EnvRet:
+        self.seeds = np.array(self.sub_env_seeds(0 if seed is None else seed))
+        self.counts = np.zeros(self.num_envs, int)
+        return EnvRet(env_id=self.env_id, observation=self._observation())
+
+    def step(self, policy_resp: PolicyResponse) -> EnvRet:
+        self.counts += policy_resp.action
+        return EnvRet(
+            env_id=self.env_id,
+            observation=self._observation(),
+            last_reward=self.counts.astype(np.float32),
+            last_terminated=self.counts >= 9,
+            last_truncated=np.zeros(self.num_envs, bool),
+        )
+
+
+@ENVS.register("crowd")
+class Crowd(BaseEnv):
+    """Two agents with different spaces; "tall" ends one step before "small"."""
+
+    agents = ("tall", "small")
+
+    def get_observation_space(self) -> gym.Space[Any]:
+        return spaces.Dict(tall=spaces.Box(-9, 9, (3,)), small=spaces.Discrete(9))
+
+    def get_action_space(self) -> gym.Space[Any]:
+        return spaces.Dict(tall=spaces.Box(-1, 1, (1,)), small=spaces.Discrete(2))
+
+    def _result(self, reward: dict[str, float]) -> MultiAgentEnvRet:
+        return MultiAgentEnvRet(
+            env_id=self.env_id,
+            observation={"tall": np.full(3, self.steps, np.float32), "small": self.steps},
+            last_reward=reward,
+            last_terminated={"tall": self.steps >= 2, "small": self.steps >= 3},
+            last_truncated={"tall": False, "small": False},
+        )
+
+    def reset(
+        self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
+    ) -> MultiAgentEnvRet:
+        self.steps = 0
+        return self._result({"tall": 0.0, "small": 0.0})
+
+    def step(self, policy_resp: PolicyResponse) -> MultiAgentEnvRet:
+        self.steps += 1
+        action = policy_resp.action
+        return self._result({"tall": float(action["tall"][0]), "small": float(action["small"])})
+
+
+@ENVS.register("reusing")
+class Reusing(BaseEnv):
+    """Returns the same objects each time, changed in place."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.observation: Any = {"array": np.zeros(3), "items": (np.zeros(2),)}
+        self.info = {"array": np.zeros(3), "nested": {"list": [0]}}
+
+    def get_observation_space(self) -> gym.Space[Any]:
+        array = spaces.Box(-9, 9, (3,), np.float64)
+        items = spaces.Box(-9, 9, (2,), np.float64)
+        return spaces.Dict(array=array, items=spaces.Sequence(items))
+
+    def get_action_space(self) -> gym.Space[Any]:
+        return spaces.Discrete(2)
+
+    def reset(
+        self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
+    ) -> EnvRet:
+        return EnvRet(env_id=self.env_id, observation=self.observation, info=self.info)
+
+    def step(self, policy_resp: PolicyResponse) -> EnvRet:
+        self.observation["array"] += 1
+        self.observation["items"][0][:] += 1
+        self.info["array"] += 1
+        self.info["nested"]["list"][0] += 1
+        return EnvRet(env_id=self.env_id, observation=self.observation, info=self.info)

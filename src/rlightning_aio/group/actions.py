@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rlightning_aio.errors import BadAction
-from rlightning_aio.hosts.worker import NO_ACTION
+from rlightning_aio.hosts.runner import NO_ACTION
 from rlightning_aio.protocol.columns import Leaf, Tree, index
 
 if TYPE_CHECKING:
@@ -172,7 +172,10 @@ def _plain(action: Any) -> Any:
 def _as_array(value: Any) -> NDArray[Any]:
     if hasattr(value, "detach"):
         value = value.detach().cpu()
-    return np.asarray(value)
+    try:
+        return np.asarray(value)
+    except ValueError as error:
+        raise BadAction(f"an action is no array: {error}; nothing was sent") from None
 
 
 def _at(tree: Tree, leaf: Leaf) -> Any:

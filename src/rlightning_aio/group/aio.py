@@ -235,17 +235,8 @@ class EnvGroup(Facade):
                 stay for the next call.
             RuntimeError: another collector is waiting.
         """
-        self._check_collect(timeout, wait_all, min_results, max_results, deadline)
-        return await self._driver.run(
-            self._core.collect(
-                time.monotonic(),
-                timeout=timeout,
-                wait_all=wait_all,
-                min_results=min_results,
-                max_results=max_results,
-                deadline=deadline,
-            )
-        )
+        operation = self._collect(timeout, wait_all, min_results, max_results, deadline)
+        return await self._driver.run(operation)
 
     def auto_reset(
         self, max_episode_steps: int | None = None, on_done: bool = True

@@ -439,8 +439,6 @@ class Core:
         try:
             end = None if deadline is None else now + deadline
             window = None
-            if wait_all:
-                timeout = None
             while True:
                 self._sweep()
                 if self._faults:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     import gymnasium as gym
 
+    from rlightning_aio.group.wait import Operation
     from rlightning_aio.hosts.base import Watcher
     from rlightning_aio.hosts.server import ServerHost
 
@@ -152,14 +153,14 @@ class Facade:
         """
         self._core.step_async(batch, time.monotonic())
 
-    @staticmethod
-    def _check_collect(
+    def _collect(
+        self,
         timeout: float | None,
         wait_all: bool,
         min_results: int,
         max_results: int | None,
         deadline: float | None,
-    ) -> None:
+    ) -> Operation[tuple[BatchedData, list[bool]]]:
         for name, seconds in (("timeout", timeout), ("deadline", deadline)):
             if seconds is not None and not seconds > 0:
                 raise ValueError(f"{name} must be a positive number of seconds, not {seconds!r}")
@@ -171,6 +172,15 @@ class Facade:
             raise ValueError(f"min_results ({min_results}) is above max_results ({max_results})")
         if wait_all and timeout is not None:
             warnings.warn("collect_async(wait_all=True) ignores timeout", stacklevel=3)
+            timeout = None
+        return self._core.collect(
+            time.monotonic(),
+            timeout=timeout,
+            wait_all=wait_all,
+            min_results=min_results,
+            max_results=max_results,
+            deadline=deadline,
+        )
 
     def _auto_reset(self, max_episode_steps: int | None, on_done: bool) -> AutoResetContext:
         return AutoResetContext(self._core, max_episode_steps, on_done)

@@ -151,17 +151,8 @@ class EnvGroup(Facade):
         deadline: float | None = None,
     ) -> tuple[BatchedData, list[bool]]:
         """See `rlightning_aio.EnvGroup.collect_async`."""
-        self._check_collect(timeout, wait_all, min_results, max_results, deadline)
-        return self._driver.run(
-            self._core.collect(
-                time.monotonic(),
-                timeout=timeout,
-                wait_all=wait_all,
-                min_results=min_results,
-                max_results=max_results,
-                deadline=deadline,
-            )
-        )
+        operation = self._collect(timeout, wait_all, min_results, max_results, deadline)
+        return self._driver.run(operation)
 
     def auto_reset(
         self, max_episode_steps: int | None = None, on_done: bool = True

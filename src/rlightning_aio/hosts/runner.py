@@ -8,7 +8,7 @@ returned as a dict, the *rest*; None means that the row holds everything.
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -25,8 +25,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["EnvRunner", "Rest"]
+__all__ = ["NO_ACTION", "EnvRunner", "Rest"]
 
+NO_ACTION: Final = "the action is in the row"
+"""Travels in place of an action whose extras alone did not fit the row."""
 Rest = dict[str, Any]
 """Keys: ``observation``, ``info``, ``extra`` (the result's ``_extra``), ``ret`` (all of it)."""
 
@@ -93,7 +95,7 @@ class EnvRunner:
         self._episodes = EpisodeSums(self._episode_shape(layout.head), self.meta.autoreset)
         self.step = self._stepper()
 
-    def action_in_row(self) -> Any:
+    def _action_in_row(self) -> Any:
         """A copy of the action that the row holds."""
         if self._read_action is None:
             raise RuntimeError("actions of this env don't travel in its row")
@@ -154,6 +156,8 @@ class EnvRunner:
 
     def step_with(self, action: Any, extras: dict[str, Any]) -> Rest | None:
         """Step with an action that didn't come through the row, or with extras."""
+        if type(action) is str and action == NO_ACTION:
+            action = self._action_in_row()
         began = time.monotonic_ns()
         bare = self.env.bare_step()
         if bare is not None:

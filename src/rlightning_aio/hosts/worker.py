@@ -44,9 +44,7 @@ if TYPE_CHECKING:
     from rlightning_aio.envs.base import BaseEnv
     from rlightning_aio.types import EnvMeta
 
-__all__ = ["NO_ACTION", "AttachOrder", "ErrorText", "StartOrder", "Started", "Worker", "main"]
-
-NO_ACTION = "the action is in the row"
+__all__ = ["AttachOrder", "ErrorText", "StartOrder", "Started", "Worker", "main"]
 
 
 @dataclass(frozen=True)
@@ -299,10 +297,8 @@ class Worker:
 
     def _step(self, frame: Frame) -> None:
         action, extras = pickle.loads(frame.payload)
-        runner = self._runners[frame.row]
-        if type(action) is str and action == NO_ACTION:
-            action = runner.action_in_row()
-        self._send_rest(frame.row, frame.number, runner.step_with(action, extras) or {})
+        rest = self._runners[frame.row].step_with(action, extras)
+        self._send_rest(frame.row, frame.number, rest or {})
 
     def _reset(self, frame: Frame) -> None:
         seed, options = pickle.loads(frame.payload)

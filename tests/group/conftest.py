@@ -1,0 +1,100 @@
+"""One test for all places where envs may live and for both drivers."""
+
+from __future__ import annotations
+
+import inspect
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Self
+
+import pytest
+import pytest_asyncio
+from group import sample_envs
+
+import rlightning_aio
+import rlightning_aio.sync
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+assert sample_envs  # Registers its envs.
+
+
+class Awaited:
+    """A synchronous group or handle whose methods may be awaited where the others' must be."""
+
+    def __init__(self, wrapped: Any, like: type) -> None:
+        self.wrapped = wrapped
+        self._like = like
+
+    def __getattr__(self, name: str) -> Any:
+        attribute = getattr(self.wrapped, name)
+        if not inspect.iscoroutinefunction(getattr(self._like, name)):
+            return attribute
+
+        async def awaited(*args: Any, **kwargs: Any) -> Any:
+            return attribute(*args, **kwargs)
+
+        return awaited
+
+    def __len__(self) -> int:
+        return len(self.wrapped)
+
+    def __getitem__(self, env_id: str) -> Awaited:
+        return Awaited(self.wrapped[env_id], rlightning_aio.EnvHandle)
+
+    async def __aenter__(self) -> Self:
+        self.wrapped.__enter__()
+        return self
+
+    async def __aexit__(self, *exc: object) -> None:
+        self.wrapped.__exit__(*exc)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where envs live, and which driver waits for them."""
+
+    name: str
+    fields: dict[str, Any]
+    synchronous: bool = False
+
+    @property
+    def inline(self) -> bool:
+        return self.name == "inline"
+
+    def build(self, entries: Any, **kwargs: Any) -> Any:
+        """A group of `entries`, each put in this place."""
+        listed = entries if isinstance(entries, list) else [entries]
+        placed = [{**entry, **self.fields} for entry in listed]
+        if self.synchronous:
+            group = rlightning_aio.sync.build_env_group(placed, **kwargs)
+            return Awaited(group, rlightning_aio.EnvGroup)
+        return rlightning_aio.build_env_group(placed, **kwargs)
+
+
+INLINE = Place("inline", {"placement": "inline"})
+INLINE_SYNC = Place("inline", {"placement": "inline"}, synchronous=True)
+ONE_SYNC = Place("one worker", {"envs_per_process": 100}, synchronous=True)
+SEVERAL = Place("several workers", {"envs_per_process": 2})
+PLACES = [INLINE, INLINE_SYNC, ONE_SYNC, SEVERAL]
+
+
+@pytest.fixture(params=PLACES, ids=lambda p: f"{p.name}{', sync' if p.synchronous else ''}")
+def place(request: pytest.FixtureRequest) -> Place:
+    """Each host and each driver; the synchronous one thereby inside of a running loop."""
+    return request.param
+
+
+@pytest_asyncio.fixture
+async def start(place: Place) -> AsyncIterator[Any]:
+    """Start a group of some entries in the place; it is closed after the test."""
+    groups: list[Any] = []
+
+    async def start(entries: Any, **kwargs: Any) -> Any:
+        groups.append(place.build(entries, **kwargs))
+        await groups[-1].init()
+        return groups[-1]
+
+    yield start
+    while groups:
+        await groups.pop().close()

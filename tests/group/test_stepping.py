@@ -1,0 +1,369 @@
+"""Resets, steps, handles and errors, wherever envs live and whoever waits."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rlightning_aio import (
+    BadAction,
+    BatchedData,
+    EnvBusy,
+    EnvRaised,
+    EnvRet,
+    NothingPending,
+    PolicyResponse,
+    UnknownEnv,
+)
+
+DO_NOTHING, END, TRUNCATE, RAISE = range(4)
+ENTRY = {"name": "probe", "backend": "probe", "task": "x", "num_workers": 4}
+IDS = [f"probe-{k}" for k in range(4)]
+
+
+def actions(*rewards: float, what: int = DO_NOTHING) -> np.ndarray:
+    return np.array([[what, reward] for reward in rewards])
+
+
+def responses(ids: list[str], *rewards: float, what: int = DO_NOTHING) -> BatchedData:
+    return BatchedData(
+        ids,
+        [PolicyResponse(id_, np.array([what, r])) for id_, r in zip(ids, rewards, strict=True)],
+    )
+
+
+async def test_init_describes_every_env_in_order(start: Any) -> None:
+    """Ids, spaces and counts, before anything is reset; asked again, it tells the same."""
+    group = await start([ENTRY, {**ENTRY, "name": "more", "num_workers": 1}])
+    metas = await group.init()
+    assert [meta.env_id for meta in metas] == group.env_ids == [*IDS, "more-0"]
+    assert len(group) == group.size() == 5
+    assert [space.shape for space in group.get_observation_spaces()] == [(4,)] * 5
+    assert [space.shape for space in group.get_action_spaces()] == [(2,)] * 5
+    assert {(meta.num_envs, meta.agents, meta.max_episode_steps) for meta in metas} == {
+        (1, (), None)
+    }
+
+
+async def test_a_reset_answers_for_the_envs_it_was_asked_for(start: Any) -> None:
+    """All in order, or some in the order given; rewards are 0, flags and ends False."""
+    group = await start(ENTRY)
+    batch, flags = await group.reset(seed=5)
+    assert batch.ids() == IDS
+    assert flags == [False] * 4
+    assert batch.observation.tolist() == [[k, 1, 0, 5 + k] for k in range(4)]
+    ends = batch.terminated | batch.truncated
+    assert (batch.reward.any(), ends.any()) == (False, False)
+    batch, flags = await group.reset(env_ids=["probe-3", "probe-1"])
+    assert batch.ids() == ["probe-3", "probe-1"]
+    assert flags == [False, False]
+    assert batch.observation.tolist() == [[3, 2, 0, -1], [1, 2, 0, -1]]
+
+
+async def test_seeds_are_counted_named_or_listed(start: Any) -> None:
+    """An int counts through the whole group, whichever of its envs are reset."""
+    group = await start(ENTRY)
+
+    async def seeds(**how: Any) -> list[float]:
+        batch, _ = await group.reset(**how)
+        return batch.observation[:, 3].tolist()
+
+    assert await seeds(seed=100) == [100, 101, 102, 103]
+    assert await seeds(seed=100, env_ids=["probe-2", "probe-0"]) == [102, 100]
+    assert await seeds(seed=np.int64(7), env_ids=["probe-1"]) == [8]
+    assert await seeds(seed=[4, 3, 2, 1]) == [4, 3, 2, 1]
+    assert await seeds(seed=(9, 8), env_ids=["probe-3", "probe-1"]) == [9, 8]
+    assert await seeds(seed=np.array([5, 6, 7, 8])) == [5, 6, 7, 8]
+    assert await seeds(seed={"probe-1": 3}) == [-1, 3, -1, -1]
+    assert await seeds(seed={"probe-1": 3, "probe-3": 0}, env_ids=["probe-3"]) == [0]
+    with pytest.raises(UnknownEnv, match="'nobody'"):
+        await group.reset(seed={"nobody": 1})
+    with pytest.raises(ValueError, match="-2"):
+        await group.reset(seed={"probe-0": -2})
+    assert await seeds() == [-1] * 4
+
+
+async def test_options_reach_every_env_of_a_reset(start: Any) -> None:
+    """Together with its seed."""
+    group = await start(ENTRY)
+    batch, _ = await group.reset(seed=3, options={"pose": [1, 2]})
+    assert batch.info == [{"options": {"pose": [1, 2]}}] * 4
+    assert batch.observation[:, 3].tolist() == [3, 4, 5, 6]
+    assert (await group.reset(options={}))[0].info == [{"options": {}}] * 4
+
+
+async def test_a_step_returns_the_same_ids_in_the_same_order(start: Any) -> None:
+    """From columns or single responses, for all envs or some; there are no flags."""
+    group = await start(ENTRY)
+    batch, _ = await group.reset()
+    batch, flags = await group.step(batch.respond(action=actions(1, 2, 3, 4)))
+    assert flags is None
+    assert (batch.ids(), batch.reward.tolist()) == (IDS, [1, 2, 3, 4])
+    some = ["probe-2", "probe-0"]
+    batch, flags = await group.step(responses(some, 7, 8))
+    assert flags is None
+    assert (batch.ids(), batch.reward.tolist()) == (some, [7, 8])
+    assert batch.observation[:, 2].tolist() == [2, 2]
+    batch, _ = await group.step(batch.respond(action=actions(5, 6)))
+    assert (batch.ids(), batch.reward.tolist()) == (some, [5, 6])
+    by_hand = BatchedData.from_dict({"probe-1": PolicyResponse("probe-1", [0, 9])})
+    assert (await group.step(by_hand))[0].reward.tolist() == [9]
+
+
+async def test_flags_extras_and_times_of_a_result(start: Any) -> None:
+    """Each part of an `EnvRet` arrives as the env gave it."""
+    group = await start(ENTRY)
+    batch, _ = await group.reset()
+    batch, _ = await group.step(responses(["probe-0", "probe-1"], 0.5, 1.5, what=END))
+    assert (batch.terminated.tolist(), batch.truncated.tolist()) == ([True] * 2, [False] * 2)
+    batch, _ = await group.step(responses(["probe-0", "probe-1"], 0.5, 1.5, what=TRUNCATE))
+    assert (batch.terminated.tolist(), batch.truncated.tolist()) == ([False] * 2, [True] * 2)
+    ret = batch["probe-1"]
+    assert isinstance(ret, EnvRet)
+    assert (ret.env_id, ret.last_reward, ret._extra) == ("probe-1", 1.5, {"steps": 2})
+    assert abs(ret.ts_env_sent_ns - time.time_ns()) < 60e9
+
+
+async def test_each_result_is_collected_once(start: Any) -> None:
+    """Until none is pending; then there is nothing to wait for, and it is said at once."""
+    group = await start(ENTRY)
+    batch, _ = await group.reset()
+    group.step_async(batch.respond(action=actions(1, 2, 3, 4)))
+    came: dict[str, float] = {}
+    while len(came) < 4:
+        batch, flags = await group.collect_async()
+        assert len(batch) > 0
+        assert flags == [False] * len(batch)
+        assert not came.keys() & set(batch.ids())
+        came.update(zip(batch.ids(), batch.reward.tolist(), strict=True))
+    assert came == {"probe-0": 1, "probe-1": 2, "probe-2": 3, "probe-3": 4}
+    with pytest.raises(NothingPending):
+        await group.collect_async()
+
+
+async def test_a_bad_batch_is_refused_as_a_whole(start: Any) -> None:
+    """Nothing is sent: each env can be stepped afterwards, and has not moved."""
+    group = await start(ENTRY)
+    batch, _ = await group.reset()
+    good = actions(1, 2, 3, 4)
+    for bad, error, said in (
+        (batch.respond(action=np.zeros((4, 3))), BadAction, r"\(4, 2\).*\(4, 3\)"),
+        (batch.respond(action=good.astype(complex)), BadAction, "float64.*complex128"),
+        (batch.respond(action=[[0, 1], [0, 1], [0, 1], [0]]), BadAction, "no array"),
+        (responses([*IDS, "probe-9"], 1, 2, 3, 4, 5), UnknownEnv, "'probe-9'.*probe-0"),
+        (responses([*IDS, "probe-1"], 1, 2, 3, 4, 5), EnvBusy, "'probe-1' comes twice"),
+        (BatchedData(IDS[:2], [PolicyResponse("probe-0", [0, 1]), 3]), BadAction, "int"),
+        (
+            BatchedData(IDS[:2], [PolicyResponse("probe-0", [0, 1]), PolicyResponse("probe-1")]),
+            BadAction,
+            r"'probe-1' .*task 'x'.*\(2,\).*\(\)",
+        ),
+    ):
+        with pytest.raises(error, match=said):
+            group.step_async(bad)
+        with pytest.raises(error, match=said):
+            await group.step(bad)
+    batch, _ = await group.step(batch.respond(action=good))
+    assert batch.observation[:, 2].tolist() == [1] * 4
+
+
+async def test_an_env_that_owes_a_reply_is_busy(start: Any) -> None:
+    """Until it was collected; the other envs of the refused batch are untouched."""
+    group = await start(ENTRY)
+    await group.reset()
+    group.step_async(responses(["probe-1"], 1))
+    for request in (
+        group.step(responses(IDS, 1, 2, 3, 4)),
+        group.reset(),
+        group["probe-1"].step([0, 1]),
+        group["probe-1"].call("double", 1),
+    ):
+        with pytest.raises(EnvBusy, match=r"'probe-1'.*collect it first"):
+            await request
+    with pytest.raises(EnvBusy, match="nothing was sent"):
+        group.step_async(responses(["probe-0", "probe-1"], 1, 2))
+    batch, _ = await group.step(responses(["probe-0", "probe-2"], 3, 4))
+    assert batch.reward.tolist() == [3, 4]
+    batch, _ = await group.collect_async()
+    assert batch.reward.tolist() == [1]
+    batch, _ = await group.step(responses(IDS, 1, 2, 3, 4))
+    assert batch.observation[:, 2].tolist() == [2, 2, 2, 1]
+
+
+async def test_what_an_env_raises_arrives_with_its_traceback(start: Any) -> None:
+    """Named, with what the others returned; the exception's own type is not rebuilt."""
+    group = await start(ENTRY)
+    batch, _ = await group.reset()
+    bad = actions(1, 2, 3, 4)
+    bad[1, 0] = RAISE
+    with pytest.raises(EnvRaised, match=r"'probe-1'.*backend probe.*step.*OddError") as caught:
+        await group.step(batch.respond(action=bad))
+    error = caught.value
+    assert (error.env_id, error.exception_type) == ("probe-1", "group.sample_envs.OddError")
+    assert error.exception_text == "(7, 'step')"
+    assert "raise OddError(7" in error.traceback_text
+    assert "raise OddError(7" in str(error.__cause__)
+    assert error.results is not None
+    assert error.results.ids() == ["probe-0", "probe-2", "probe-3"]
+    assert error.results.reward.tolist() == [1, 3, 4]
+    batch, _ = await group.step(batch.respond(action=actions(1, 2, 3, 4)))
+    assert batch.observation[:, 2].tolist() == [2, 1, 2, 2]
+
+
+async def test_an_error_answers_one_request_of_a_collect(start: Any) -> None:
+    """The others' results are there for the next one."""
+    group = await start(ENTRY)
+    batch, _ = await group.reset()
+    bad = actions(1, 2, 3, 4)
+    bad[2, 0] = RAISE
+    group.step_async(batch.respond(action=bad))
+    came: list[str] = []
+    faults: list[str] = []
+    while len(came) + len(faults) < 4:
+        try:
+            batch, _ = await group.collect_async()
+            came += batch.ids()
+        except EnvRaised as error:
+            faults.append(error.env_id)
+    assert (sorted(came), faults) == (["probe-0", "probe-1", "probe-3"], ["probe-2"])
+    with pytest.raises(NothingPending):
+        await group.collect_async()
+
+
+async def test_a_handle_is_one_env(start: Any) -> None:
+    """It resets, steps and calls methods, with bare actions and seeds of its own."""
+    group = await start(ENTRY)
+    env = group["probe-2"]
+    assert env.env_id == "probe-2"
+    ret = await env.reset(seed=9, options={"a": 1})
+    assert ret.observation.tolist() == [2, 1, 0, 9]
+    assert ret.info == {"options": {"a": 1}}
+    ret = await env.step([0, 3.5])
+    assert (ret.env_id, ret.last_reward) == ("probe-2", 3.5)
+    ret = await env.step(PolicyResponse("probe-2", [0, 4.5], tag=1))
+    assert (ret.last_reward, ret.info) == (4.5, {"extras": {"tag": 1}})
+    assert await env.call("double", 4) == 8
+    assert await env.call("double", "ab", times=3) == "ababab"
+    with pytest.raises(EnvRaised, match="no_such_method"):
+        await env.call("no_such_method")
+    with pytest.raises(UnknownEnv, match="'probe-9'"):
+        group["probe-9"]
+
+
+async def test_attributes_of_the_simulator_or_its_wrapper(start: Any) -> None:
+    """The target is told, and a value that was set is there when the call returns."""
+    group = await start(ENTRY)
+    env = group["probe-1"]
+    assert await env.get_attr("label") == "inner"
+    assert await env.get_attr("label", target="outer") == "outer"
+    await env.set_attr("label", "new")
+    await env.set_attr("label", ["newer"], target="outer")
+    assert await env.get_attr("label", target="unwrapped") == "new"
+    assert await env.get_attr("label", target="outer") == ["newer"]
+    assert await group["probe-0"].get_attr("label") == "inner"
+    with pytest.raises(EnvRaised, match="'unwrapped' or 'outer', not 'middle'"):
+        await env.get_attr("label", target="middle")
+    with pytest.raises(EnvRaised, match="no_such"):
+        await env.get_attr("no_such")
+
+
+async def test_frames_memory_and_what_has_none(start: Any) -> None:
+    """`render` returns a frame; offload and reload reach every env, or name the one that can't."""
+    others = {**ENTRY, "name": "b", "backend": "batched"}
+    group = await start([{**ENTRY, "num_workers": 2}, others], mixed_actions=True)
+    frame = await group["probe-0"].render()
+    assert (frame.dtype, frame.tolist()) == (np.uint8, np.full((2, 2, 3), 7).tolist())
+    await group["probe-1"].offload()
+    assert [await group[id_].call("__getattribute__", "offloaded") for id_ in IDS[:2]] == [
+        False,
+        True,
+    ]
+    await group["probe-1"].reload()
+    with pytest.raises(EnvRaised, match=r"'b-.*NotImplementedError.*no offload") as caught:
+        await group.offload()
+    assert len(caught.value.others) == 3
+    assert await group["probe-0"].call("__getattribute__", "offloaded") is True
+
+
+async def test_results_are_never_overwritten(start: Any) -> None:
+    """Neither arrays, nor infos, nor what envs return in place of new objects."""
+    group = await start(
+        [ENTRY, {**ENTRY, "name": "reusing", "backend": "reusing"}], mixed_actions=True
+    )
+    first, _ = await group.reset()
+    probes, others = first.by_name().values()
+    before = probes.observation.copy()
+    infos = others.info
+    values = others.values()
+    for _ in range(3):
+        await group.step(probes.respond(action=actions(1, 2, 3, 4)))
+        await group.step(others.respond(action=np.zeros(4, int)))
+    await group.reset()
+    assert (probes.observation == before).all()
+    assert all((info["array"] == 0).all() and info["nested"] == {"list": [0]} for info in infos)
+    assert all((value.observation["array"] == 0).all() for value in values)
+    assert all((value.observation["items"][0] == 0).all() for value in values)
+
+
+async def test_a_sent_action_may_be_changed(start: Any) -> None:
+    """What was sent is what is stepped with, also where an env runs only later."""
+    group = await start([ENTRY, {**ENTRY, "name": "chunked", "backend": "chunked"}])
+    batch, _ = await group.reset()
+    probes, chunked = batch.by_name().values()
+    plain, chunk = actions(1, 2, 3, 4), np.ones((4, 5))
+    group.step_async(probes.respond(action=plain))
+    group.step_async(chunked.respond(action=chunk))
+    plain[:] = chunk[:] = 50
+    batch, _ = await group.collect_async(wait_all=True)
+    found = batch.by_name()
+    assert sorted(found["probe"].reward.tolist()) == [1, 2, 3, 4]
+    assert found["chunked"].reward.tolist() == [5] * 4
+
+
+async def test_zero_copy_lends_read_only_views(start: Any) -> None:
+    """They live until the env's next request; without it, an observation is the caller's own."""
+    group = await start(ENTRY, zero_copy=True)
+    batch, _ = await group.reset()
+    lent = batch.observation
+    with pytest.raises(ValueError, match="read-only"):
+        lent[0, 0] = 1.0
+    await group.step(batch.respond(action=actions(1, 2, 3, 4)))
+    assert lent[:, 2].tolist() == [1] * 4, "it is a view of the rows"
+    owned, _ = await group.step(responses(["probe-3", "probe-0"], 1, 2))
+    assert owned.observation[:, 0].tolist() == [3, 0]
+
+
+async def test_what_a_group_has_measured(start: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    """Throughput by entry and kind, batch sizes, latencies, and episodes by env."""
+    group = await start([ENTRY, {**ENTRY, "name": "more", "num_workers": 1}])
+    assert group.get_stats()["steps_per_second"] == 0.0
+    await group.reset()
+    for what, reward in ((DO_NOTHING, 1.0), (END, 2.0)):
+        await group.step(responses(["probe-0", "more-0"], reward, reward, what=what))
+    await group.reset(env_ids=["probe-0"])
+    group.step_async(responses(["probe-0"], 5.0, what=TRUNCATE))
+    batch, _ = await group.collect_async()
+    assert batch.info[0]["episode"] == {"r": 5.0, "l": 1}
+    stats = group.get_stats()
+    assert stats["steps_per_second"] > 0
+    assert set(stats["entries"]) == {"probe", "more"}
+    assert stats["entries"]["probe"]["sync"] > 0 < stats["entries"]["probe"]["async"]
+    assert stats["entries"]["more"]["async"] == 0
+    assert (stats["batch_size"]["min"], stats["batch_size"]["max"]) == (1, 5)
+    for kind in ("step", "wait", "transfer"):
+        assert 0 <= stats["latency_us"][kind]["p50"] <= stats["latency_us"][kind]["p99"]
+    by_env = group.get_env_stats(reset=True)
+    assert list(by_env) == group.env_ids
+    assert (by_env["probe-0"]["episodes"], by_env["probe-0"]["mean_return"]) == (2, 4.0)
+    assert (by_env["probe-0"]["last_return"], by_env["probe-0"]["last_length"]) == (5.0, 1)
+    assert (by_env["more-0"]["episodes"], by_env["more-0"]["mean_length"]) == (1, 2.0)
+    assert by_env["probe-1"]["episodes"] == 0
+    assert by_env["probe-1"]["mean_return"] is None
+    assert group.get_env_stats()["probe-0"]["episodes"] == 0
+    group.print_timing_summary()
+    printed = capsys.readouterr().out
+    assert "steps per second" in printed
+    assert "probe" in printed
