@@ -14,6 +14,7 @@ from unittest import SkipTest
 import numpy as np
 
 from rlightning_aio.envs.tensors import as_numpy
+from rlightning_aio.protocol.columns import mapped
 from rlightning_aio.registry import ENVS
 from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
 
@@ -187,7 +188,7 @@ class EnvContract:
             for action in self.actions(env)[:3]:
                 assert same(
                     outcome_of(_step(env, action)),
-                    outcome_of(_step(other, _converted(action, tensor))),
+                    outcome_of(_step(other, mapped(tensor, action))),
                 )
 
     def test_it_is_the_bare_simulator(self) -> None:
@@ -273,17 +274,8 @@ def _awaits_reset(env: BaseEnv, outcome: Outcome) -> bool:
     return all(bool(np.all(np.logical_or(one, other))) for one, other in flags)
 
 
-def _converted(value: Any, convert: Callable[[Any], Any]) -> Any:
-    """`value` with `convert` applied to every array in it."""
-    if isinstance(value, dict):
-        return {k: _converted(v, convert) for k, v in cast("dict[Any, Any]", value).items()}
-    if isinstance(value, tuple):
-        return tuple(_converted(one, convert) for one in cast("tuple[Any, ...]", value))
-    return convert(value)
-
-
 def _copied(value: Any) -> Any:
-    return _converted(value, lambda one: np.array(one, copy=True))
+    return mapped(lambda one: np.array(one, copy=True), value)
 
 
 def _tensor_maker() -> Callable[[Any], Any]:

@@ -8,7 +8,7 @@ Absent on purpose: EnvPool's tasks with several players, whose batches vary in s
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium.vector.utils import batch_space
@@ -22,6 +22,7 @@ from rlightning_aio.envs.base import (
 )
 from rlightning_aio.envs.tensors import as_numpy
 from rlightning_aio.errors import ConfigError
+from rlightning_aio.protocol.columns import index
 from rlightning_aio.types import EnvRet, PolicyResponse
 
 if TYPE_CHECKING:
@@ -137,7 +138,7 @@ class EnvPoolEnv(BaseEnv):
     def _receive(self) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         result = self.env.recv()
         self._ready = result[-1]["env_id"]
-        return result if self.num_envs > 1 else _first(result)
+        return result if self.num_envs > 1 else index(result, 0)
 
     def get_observation_space(self) -> gym.Space[Any]:
         return self._batched(self.env.observation_space)
@@ -150,12 +151,3 @@ class EnvPoolEnv(BaseEnv):
 
     def close(self) -> None:
         self.env.close()
-
-
-def _first(batch: Any) -> Any:
-    """What a batch of one holds, without the leading axis."""
-    if isinstance(batch, dict):
-        return {key: _first(value) for key, value in cast("dict[str, Any]", batch).items()}
-    if isinstance(batch, tuple):
-        return tuple(map(_first, cast("tuple[Any, ...]", batch)))
-    return batch[0]

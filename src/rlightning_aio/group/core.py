@@ -465,10 +465,8 @@ class Core:
                         f"{ready} of the {max(need, 1)} results needed came within {deadline} s; "
                         "nothing is lost, the next collect_async gets them"
                     )
-                if ready and open_window:
-                    wanted = most - ready
-                else:
-                    wanted = 1 if timeout is not None else max(need - ready, 1)
+                few = 1 if timeout is not None else max(need - ready, 1)
+                wanted = most - ready if ready and open_window else few
                 until = earliest(end, window if open_window else None)
                 now = yield from self._wait(wanted, until)
         finally:

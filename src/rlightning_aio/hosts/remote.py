@@ -291,9 +291,7 @@ class RemoteHost:
     ) -> bool:
         """Ask a client to step; see `ServerSessions.submit`."""
         will_answer = self._sessions.submit(client, number, action, extras, now)
-        self._flush(now)
-        if self._sessions.has_results:
-            self._call_back()
+        self._submitted(now)
         return will_answer
 
     def submit_reset(
@@ -306,10 +304,13 @@ class RemoteHost:
     ) -> bool:
         """Ask a client to reset; see `ServerSessions.submit_reset`."""
         will_answer = self._sessions.submit_reset(client, number, seed, options, now)
+        self._submitted(now)
+        return will_answer
+
+    def _submitted(self, now: float) -> None:
         self._flush(now)
         if self._sessions.has_results:
             self._call_back()
-        return will_answer
 
     def take(self) -> list[RemoteResult]:
         """All results that are ready, oldest first; each is handed out once."""

@@ -26,7 +26,9 @@ __all__ = [
     "Misfit",
     "Rows",
     "Tree",
+    "as_array",
     "assemble",
+    "fitted",
     "gather",
     "index",
     "is_dict",
@@ -138,7 +140,21 @@ class Misfit(ValueError):
     """A value doesn't fit the space it was declared for."""
 
 
-def _fitted(value: Any, leaf: Leaf, what: str) -> NDArray[Any]:
+def as_array(value: Any) -> NDArray[Any]:
+    """`value` as NumPy; tensors come from their device to the CPU."""
+    if type(value) is np.ndarray:
+        return value
+    if hasattr(value, "detach"):
+        value = value.detach().cpu()
+    return np.asarray(value)
+
+
+def fitted(value: Any, leaf: Leaf, what: str) -> NDArray[Any]:
+    """`value` as an array that may be copied into one row of `leaf`.
+
+    Raises:
+        Misfit: it has another shape, or another kind of dtype.
+    """
     array = np.asarray(value)
     if array.shape != leaf.shape or not np.can_cast(array.dtype, leaf.dtype, "same_kind"):
         raise Misfit(
@@ -176,7 +192,7 @@ def row_writer(
 
     def write(value: Any) -> None:
         if type(value) is not np.ndarray or value.shape != shape or value.dtype is not dtype:
-            value = _fitted(value, leaf, what)
+            value = fitted(value, leaf, what)
         view[...] = value
 
     return write
@@ -184,7 +200,7 @@ def row_writer(
 
 def _number_writer(column: NDArray[Any], row: int, leaf: Leaf, what: str) -> Callable[[Any], None]:
     def write(value: Any) -> None:
-        column[row] = _fitted(value, leaf, what)
+        column[row] = fitted(value, leaf, what)
 
     return write
 

@@ -15,8 +15,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from rlightning_aio.protocol.columns import Misfit
-from rlightning_aio.protocol.wire import DTYPES, ArrayForm, Part, WireError, as_array
+from rlightning_aio.protocol.columns import Leaf, Misfit, as_array, fitted
+from rlightning_aio.protocol.wire import DTYPES, ArrayForm, Part, WireError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -99,24 +99,15 @@ class _Array(_Node):
     def __init__(self, space: gym.Space[Any], what: str) -> None:
         shape = tuple(cast("tuple[int, ...]", space.shape))
         self.form = ArrayForm(DTYPES[np.dtype(space.dtype).name], shape)
+        self._leaf = Leaf((), shape, self.form.dtype)
         self._what = what
 
     def pack(self, value: Any, packed: Packed) -> None:
         array = as_array(value)
         form = self.form
         if array.dtype != form.dtype or array.shape != form.shape:
-            array = self._fitted(array)
+            array = fitted(array, self._leaf, self._what).astype(form.dtype)
         packed.frames.append(array.tobytes())
-
-    def _fitted(self, array: NDArray[Any]) -> NDArray[Any]:
-        if array.shape != self.form.shape or not np.can_cast(
-            array.dtype, self.form.dtype, "same_kind"
-        ):
-            raise Misfit(
-                f"{self._what} doesn't fit its space: expected shape {self.form.shape} and dtype "
-                f"{self.form.dtype}, found shape {array.shape} and dtype {array.dtype}"
-            )
-        return array.astype(self.form.dtype)
 
     def unpack(self, arriving: _Arriving) -> Any:
         return self.form.read(next(arriving.frames))

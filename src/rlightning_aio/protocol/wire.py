@@ -16,6 +16,8 @@ import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
+from rlightning_aio.protocol.columns import as_array
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
@@ -48,7 +50,6 @@ __all__ = [
     "Welcome",
     "WireError",
     "Writer",
-    "as_array",
     "portable",
 ]
 
@@ -226,15 +227,6 @@ class ArrayForm:
         if self._is_bool and array.view(np.uint8).max() > 1:
             raise WireError("a frame of bools holds bytes other than 0 and 1")
         return array
-
-
-def as_array(value: Any) -> NDArray[Any]:
-    """`value` as NumPy; tensors come from their device to the CPU."""
-    if type(value) is np.ndarray:
-        return value
-    if hasattr(value, "detach"):
-        value = value.detach().cpu()
-    return np.asarray(value)
 
 
 class Reader(Generic[Message]):
