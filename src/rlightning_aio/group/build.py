@@ -20,7 +20,6 @@ from rlightning_aio.hosts.inline import InlineHost
 from rlightning_aio.hosts.pickling import dumped_with_code
 from rlightning_aio.hosts.process import ForkServer, ProcessHost
 from rlightning_aio.hosts.server import MAX_CLIENTS, ServerHost
-from rlightning_aio.hosts.spinner import Spinner
 from rlightning_aio.hosts.worker import StartOrder
 from rlightning_aio.registry import BACKENDS, ENVS
 from rlightning_aio.types import PolicyResponse
@@ -186,8 +185,7 @@ def build_fleet(plan: Plan, watcher: Watcher) -> Fleet:
         fleet.add(_server_host(config, host_id, first_slot, fleet, watcher), config)
         first_slot += MAX_CLIENTS
     fleet.servers = list(servers.values())
-    fleet.num_cores = len(cores)
-    fleet.spinner = Spinner(enabled=num_processes > 0)
+    fleet.lookout.num_cores = len(cores)
     return fleet
 
 

@@ -479,7 +479,8 @@ class Core:
         Invariant: whoever waits looks again, and orders anew, after every reply that is taken
         in; here somebody else takes it.
         """
-        self.fleet.sweep()
+        self.fleet.lookout.sweep()
+        self.absorb()
         if self._news:
             self._news = False
             if self._wanted:
@@ -491,12 +492,13 @@ class Core:
         try:
             # Whoever else waits meanwhile must be woken as early as it asked for.
             fleet, first = self.fleet, min(self._wanted)
-            if fleet.run_inline(wanted) or fleet.spin(first) or fleet.order(first):
+            look = fleet.lookout
+            if look.run_inline(wanted) or look.spin(first) or look.order(first):
                 now = yield Wait(0.0)
                 fleet.look(now)
                 return now
             now = yield Wait(earliest(until, fleet.next_check()))
-            fleet.slept()
+            look.slept()
         finally:
             self._wanted.remove(wanted)
         fleet.check(now)
@@ -524,7 +526,7 @@ class Core:
         self.stats.account(batch.parts, synchronous=synchronous)
         if len(slots):
             sample = batch.parts[0].busy_ns.item(0)
-            self.fleet.step_ns += 0.1 * (sample - self.fleet.step_ns)
+            self.fleet.lookout.step_ns += 0.1 * (sample - self.fleet.lookout.step_ns)
         return batch, flags
 
     # -- calls that wait for their own replies ------------------------------------

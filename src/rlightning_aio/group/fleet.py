@@ -11,11 +11,9 @@ from __future__ import annotations
 import logging
 import pickle
 import warnings
-from collections import deque
 from dataclasses import dataclass, field, replace
 from enum import Enum, auto
 from functools import partial
-from math import ceil
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,39 +26,38 @@ from rlightning_aio.errors import (
     StartFailed,
     WorkerDied,
 )
-from rlightning_aio.group.slots import BUSY, READY, Slots
+from rlightning_aio.group.lookout import Lookout
+from rlightning_aio.group.seating import check_actions, order_for, seat
+from rlightning_aio.group.slots import BUSY, READY
 from rlightning_aio.group.wait import Operation, Wait, earliest
-from rlightning_aio.hosts.arena import Arena, map_shared
 from rlightning_aio.hosts.base import Death, Host
 from rlightning_aio.hosts.server import ServerHost
-from rlightning_aio.hosts.spinner import Spinner
-from rlightning_aio.hosts.worker import AttachOrder, ErrorText, Started
-from rlightning_aio.protocol.columns import leaves
+from rlightning_aio.hosts.worker import ErrorText, Started
 from rlightning_aio.protocol.info import NO_INFO, PICKLED
 from rlightning_aio.protocol.rings import OP_BITS, OP_MASK, RESET, SLOT_MASK, STEP
-from rlightning_aio.protocol.slab import NO_SEED, Slab
+from rlightning_aio.protocol.slab import NO_SEED
 from rlightning_aio.types import EnvMeta
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
 
     from numpy.typing import NDArray
 
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.group.core import Core
+    from rlightning_aio.group.slots import Slots
+    from rlightning_aio.hosts.arena import Arena
     from rlightning_aio.hosts.base import Watcher
     from rlightning_aio.hosts.process import ForkServer
+    from rlightning_aio.hosts.worker import AttachOrder
+    from rlightning_aio.protocol.slab import Slab
 
 __all__ = ["Fleet"]
 
-_WAKE_UP_NS = 80_000
-"""What it takes to wake the trainer, about."""
 _CLOSE_SECONDS = 1.5
 """How long envs may take to close before their worker is killed."""
 _KILL_SECONDS = 0.3
 """How long the news of a kill may take to come back."""
-
-
 _LOOK_SECONDS = 0.02
 """How often a trainer that never has to wait looks for what has hung."""
 _DUMP_SECONDS = 1.0
@@ -118,7 +115,7 @@ class Fleet:
     """The hosts of one group and the memory that they share with it.
 
     Attributes:
-        watcher: the driver.
+        watcher: the driver; lookout: how results are come by.
         lost: slots whose env was replaced while nothing was asked of it; the next step
             has to tell.
         restarting: slots whose next reply comes from a replacement, with the cause.
@@ -142,16 +139,11 @@ class Fleet:
         self.metas: list[EnvMeta] = []
         self.close_errors: list[tuple[str, ErrorText]] = []
         self.servers: list[ForkServer] = []
-        self.spinner = Spinner(enabled=False)
-        self.num_cores = 0
-        self.step_ns = float(_WAKE_UP_NS)
-        self._spun = False
+        self.lookout = Lookout(self.hosts)
         self._arena = arena
         self._mixed_actions = mixed_actions
         self._members: list[_Member] = []
-        self._inline: deque[Host] = deque()
         self._elastic: list[ServerHost] = []
-        self.num_local_seeds = 0
         self._start_fault: Exception | None = None
         self._now = 0.0
         self._timed = False
@@ -174,7 +166,7 @@ class Fleet:
         """Take in a host, before `init`; its slots follow those of the host before."""
         self.hosts.append(host)
         if host.inline:
-            self._inline.append(host)
+            self.lookout.add_inline(host)
         if isinstance(host, ServerHost):
             self._elastic.append(host)
             self.elastic = True
@@ -194,7 +186,6 @@ class Fleet:
             for member in self._members:
                 self._launch(member, now)
             yield from self._until(_Stage.BUILT)
-            self._check_actions()
             self._seat()
             for member in self._members:
                 assert member.order is not None
@@ -305,67 +296,18 @@ class Fleet:
         member.stage = _Stage.UP
         member.start_by = None
 
-    def _check_actions(self) -> None:
-        """All envs must take actions of one shape, unless the group was built for more."""
-        self.metas = [s.meta for m in self._members for s in m.started]
-        if self._mixed_actions or not self.metas:
-            return
-        first = self.metas[0]
-        for meta in self.metas[1:]:
-            if _action_shape(meta) != _action_shape(first):
-                raise ConfigError(
-                    f"envs {first.env_id!r} and {meta.env_id!r} have different action spaces: "
-                    f"{first.action_space} and {meta.action_space}; if that is meant, build the "
-                    "group with mixed_actions=True"
-                )
-
     def _seat(self) -> None:
         """Give each env a row in the slab of its layout."""
-        table = self.slots
         started = [s for m in self._members for s in m.started]
-        keys: dict[tuple[object, ...], int] = {}
-        rows_used: list[int] = []
-        for slot, env in enumerate(started):
-            slab = keys.setdefault(env.layout.key, len(keys))
-            if slab == len(rows_used):
-                rows_used.append(0)
-            table.slab[slot], table.row[slot] = slab, rows_used[slab]
-            rows_used[slab] += 1
-            table.by_frame[slot] = env.transforms_actions or env.layout.action_leaves is None
-            table.reads_extras[slot] = env.reads_extras
-            # Seeds are the sub-environments', of which a result may hold some only.
-            table.seed_offset[slot] = sum(
-                max(s.meta.num_envs, config.num_envs)
-                for s, config in zip(started[:slot], table.configs, strict=False)
-            )
-            table.resets_itself[slot] = env.meta.autoreset != "disabled"
-        self.num_local_seeds = int(sum(s.meta.num_envs for s in started))
-        for host in self._elastic:
-            rows = slice(host.first_slot, host.first_slot + host.rows)
-            table.by_frame[rows] = table.reads_extras[rows] = True
-        table.letters = bool(table.by_frame.any() or table.reads_extras.any())
-        parts = self._make_slabs([e.layout for e in started], list(keys.values()), rows_used)
+        self.metas = [env.meta for env in started]
+        if not self._mixed_actions:
+            check_actions(self.metas)
+        self.slabs, places = seat(started, self.slots, self._arena)
+        self.slots.take_letters(
+            slice(host.first_slot, host.first_slot + host.rows) for host in self._elastic
+        )
         for member in self._members:
-            first, count = member.host.first_slot, member.host.rows
-            seats = [(int(table.slab[s]), int(table.row[s])) for s in range(first, first + count)]
-            member.order = AttachOrder(tuple(parts), tuple(seats))
-            schemas: dict[int, Any] = {}
-            for row in range(count):
-                table.host[first + row] = member.host.host_id
-                table.schemas[first + row] = schemas
-
-    def _make_slabs(
-        self, layouts: Sequence[Any], slabs: Sequence[int], rows_used: Sequence[int]
-    ) -> list[tuple[Any, int, int]]:
-        parts: list[tuple[Any, int, int]] = []
-        for slab in slabs:
-            layout = layouts[int(np.flatnonzero(self.slots.slab == slab)[0])]
-            size, rows = layout.size(rows_used[slab]), rows_used[slab]
-            offset = self._arena.append(size)
-            memory = map_shared(self._arena.descriptor, offset, size)
-            self.slabs.append(Slab(layout, memory, rows))
-            parts.append((layout, rows, offset))
-        return parts
+            member.order = order_for(member.host, self.slots, places)
 
     # -- requests -----------------------------------------------------------------
 
@@ -407,7 +349,7 @@ class Fleet:
 
     def rank_clients(self) -> None:
         """Count the clients' seeds after the local envs', in an order that no race decides."""
-        offset = self.num_local_seeds
+        offset = self.slots.num_seeds
         for host in self._elastic:
             for row in host.clients():
                 self.slots.seed_offset[host.first_slot + row] = offset
@@ -456,69 +398,6 @@ class Fleet:
         if self.lost:
             for slot in slots.tolist():
                 self.lost.pop(slot, None)
-
-    def spin(self, wanted: int) -> bool:
-        """Whether `wanted` results have come within a moment of looking for them.
-
-        Tried only while there are more cores than workers at work: theirs come first.
-        """
-        busy = [host for host in self.hosts if host.in_flight]
-        self._spun = 0 < len(busy) < self.num_cores
-        if not self._spun:
-            return False
-        for host in busy:
-            host.withdraw()
-        return self.spinner.spin(lambda: sum(host.unread() for host in busy) >= wanted)
-
-    def slept(self) -> None:
-        """A wait that was no spin is over."""
-        if self._spun:
-            self.spinner.slept()
-
-    def order(self, wanted: int) -> bool:
-        """Ask hosts to wake us when `wanted` results may be ready; True if some are already.
-
-        Each of H busy hosts is asked for the H-th part, rounded up: when `wanted` results
-        are ready in all, at least one host has its part, so nobody wakes us too late. Where
-        a step takes less than waking up does, each is asked for one more: then one wake-up
-        mostly does, and is late by one such step at most.
-        """
-        busy = [host for host in self.hosts if host.in_flight]
-        part = ceil(wanted / len(busy)) if busy else 0
-        if len(busy) > 1 and wanted > 1 and self.step_ns < _WAKE_UP_NS:
-            part += 1
-        came = False
-        for host in busy:
-            came = host.order(min(part, host.in_flight)) or came
-        return came
-
-    def sweep(self) -> None:
-        """Take in results that came without a bell."""
-        for host in self.hosts:
-            # A host that was asked for a single result has rung if it has any.
-            if host.in_flight and host.ordered != 1:
-                host.sweep()
-        self._core.absorb()
-
-    def run_inline(self, wanted: int) -> bool:
-        """Execute waiting requests of inline hosts, one, or as many as nothing else can give."""
-        if not any(host.in_flight for host in self._inline):
-            return False
-        if any(host.in_flight for host in self.hosts if not host.inline):
-            wanted = 1
-        for _ in range(wanted):
-            if not self._run_next_inline():
-                break
-        return True
-
-    def _run_next_inline(self) -> bool:
-        """One request of the next inline host in turn, so that none waits for ever."""
-        for _ in range(len(self._inline)):
-            host = self._inline[0]
-            self._inline.rotate(-1)
-            if host.run_one():
-                return True
-        return False
 
     # -- faults -------------------------------------------------------------------
 
@@ -847,17 +726,6 @@ class Fleet:
         # One that is killed while it starts has been told of already.
         for row, error in errors if was_built else ():
             self.close_errors.append((self.slots.env_ids[host.first_slot + row], error))
-
-
-def _action_shape(meta: EnvMeta) -> Any:
-    """Shapes of an action, without the batch axis."""
-    if meta.action_space is None:
-        return None
-    found = leaves(meta.action_space)
-    if found is None:
-        return str(meta.action_space)
-    skip = 1 if meta.num_envs > 1 else 0
-    return [(leaf.path, leaf.shape[skip:]) for leaf in found]
 
 
 def _said(stderr_tail: str) -> str:

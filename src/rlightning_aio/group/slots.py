@@ -14,7 +14,7 @@ from rlightning_aio.errors import UnknownEnv
 from rlightning_aio.protocol.rings import NUMBER_SHIFT, OP_BITS
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
@@ -55,7 +55,8 @@ class Slots:
         slab, row: where its results lie.
         by_frame: actions may not fit the row; reads_extras: responses' extras are read there;
             letters: either is true of any env.
-        seed_offset: sub-environments before it; resets_itself: it needs no reset after an end.
+        seed_offset: sub-environments before it; num_seeds: those of all local envs.
+        resets_itself: it needs no reset after an end.
         schemas: of its worker.
     """
 
@@ -89,6 +90,7 @@ class Slots:
         self.reads_extras = np.zeros(size, np.bool_)
         self.letters = False
         self.seed_offset = np.zeros(size, np.int64)
+        self.num_seeds = 0
         self.resets_itself = np.zeros(size, np.bool_)
         self.schemas: list[dict[int, InfoSchema]] = [{} for _ in range(size)]
 
@@ -99,6 +101,12 @@ class Slots:
         """Name the client that has taken a server's slot."""
         self.env_ids[slot] = env_id
         self._index[env_id] = slot
+
+    def take_letters(self, clients: Iterable[slice]) -> None:
+        """Say which slots are clients', whose requests never lie in a row."""
+        for slots in clients:
+            self.by_frame[slots] = self.reads_extras[slots] = True
+        self.letters = bool(self.by_frame.any() or self.reads_extras.any())
 
     def number(self, slot: int) -> int:
         """Number of the current request; 0 before the first."""

@@ -1,0 +1,107 @@
+"""`Lookout`: how the trainer comes by results, with as few wake-ups as can be.
+
+It looks for them itself for a moment, orders bells of workers, takes in what came
+without one, and executes what is asked of inline envs.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from math import ceil
+from typing import TYPE_CHECKING
+
+from rlightning_aio.hosts.spinner import Spinner
+
+if TYPE_CHECKING:
+    from rlightning_aio.hosts.base import Host
+
+__all__ = ["Lookout"]
+
+_WAKE_UP_NS = 80_000
+"""What it takes to wake the trainer, about."""
+
+
+class Lookout:
+    """Over the hosts of one group.
+
+    Args:
+        hosts: grows as hosts are added to the group.
+
+    Attributes:
+        num_cores: cores that this process and its workers may use.
+        step_ns: what a step takes lately, about.
+    """
+
+    def __init__(self, hosts: list[Host]) -> None:
+        self.num_cores = 0
+        self.step_ns = float(_WAKE_UP_NS)
+        self._hosts = hosts
+        self._inline: deque[Host] = deque()
+        self._spinner = Spinner(enabled=True)
+        self._spun = False
+
+    def add_inline(self, host: Host) -> None:
+        """Let an inline host have its turns."""
+        self._inline.append(host)
+
+    def spin(self, wanted: int) -> bool:
+        """Whether `wanted` results have come within a moment of looking for them.
+
+        Tried only while there are more cores than workers at work: theirs come first.
+        """
+        busy = [host for host in self._hosts if host.in_flight]
+        self._spun = 0 < len(busy) < self.num_cores
+        if not self._spun:
+            return False
+        for host in busy:
+            host.withdraw()
+        return self._spinner.spin(lambda: sum(host.unread() for host in busy) >= wanted)
+
+    def slept(self) -> None:
+        """A wait that was no spin is over."""
+        if self._spun:
+            self._spinner.slept()
+
+    def order(self, wanted: int) -> bool:
+        """Ask hosts to wake us when `wanted` results may be ready; True if some are already.
+
+        Each of H busy hosts is asked for the H-th part, rounded up: when `wanted` results
+        are ready in all, at least one host has its part, so nobody wakes us too late. Where
+        a step takes less than waking up does, each is asked for one more: then one wake-up
+        mostly does, and is late by one such step at most.
+        """
+        busy = [host for host in self._hosts if host.in_flight]
+        part = ceil(wanted / len(busy)) if busy else 0
+        if len(busy) > 1 and wanted > 1 and self.step_ns < _WAKE_UP_NS:
+            part += 1
+        came = False
+        for host in busy:
+            came = host.order(min(part, host.in_flight)) or came
+        return came
+
+    def sweep(self) -> None:
+        """Take in results that came without a bell."""
+        for host in self._hosts:
+            # A host that was asked for a single result has rung if it has any.
+            if host.in_flight and host.ordered != 1:
+                host.sweep()
+
+    def run_inline(self, wanted: int) -> bool:
+        """Execute waiting requests of inline hosts, one, or as many as nothing else can give."""
+        if not any(host.in_flight for host in self._inline):
+            return False
+        if any(host.in_flight for host in self._hosts if not host.inline):
+            wanted = 1
+        for _ in range(wanted):
+            if not self._run_next_inline():
+                break
+        return True
+
+    def _run_next_inline(self) -> bool:
+        """One request of the next inline host in turn, so that none waits for ever."""
+        for _ in range(len(self._inline)):
+            host = self._inline[0]
+            self._inline.rotate(-1)
+            if host.run_one():
+                return True
+        return False
