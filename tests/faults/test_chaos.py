@@ -1,0 +1,36 @@
+"""Random faults under load, counted: the short form of a benchmark that anyone can run."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+
+
+def report_of(script: str, folder: Path, *arguments: str) -> dict[str, Any]:
+    """What a script that ends well has to report."""
+    out = folder / "report.json"
+    run = subprocess.run(
+        [sys.executable, BENCHMARKS / script, *arguments, "--json", out],
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
+    )
+    assert run.returncode == 0, run.stdout + run.stderr
+    return json.loads(out.read_text())
+
+
+def test_every_request_ends_once_and_truly_whatever_breaks(tmp_path: Path) -> None:
+    """Twenty random faults: no request is lost or answered twice, or with another's data."""
+    report = report_of("chaos.py", tmp_path, "--faults", "20")
+    assert report["faults"] == dict.fromkeys(("killed", "stopped", "hung", "raised", "exited"), 4)
+    assert sum(report["ends"].values()) == sum(report["requests"].values()) > 20
+    assert report["noticed_ms"]["deaths"]["count"] == 8
+    assert report["noticed_ms"]["hung"]["count"] == 4
+    assert not report["broken"]
+    assert not report["leaks"]
