@@ -118,3 +118,22 @@ class Unclosable(Stub):
 
     def close(self) -> None:
         raise RuntimeError("the lid is stuck")
+
+
+@rl.ENVS.register("finishing")
+class Finishing(Stub):
+    """Wants no more after ``wanted_steps``; says in a file that it was closed."""
+
+    def __init__(self, config: rl.EnvConfig, *args: Any, **kwargs: Any) -> None:
+        super().__init__(config, *args, **kwargs)
+        self.total = 0
+
+    def step(self, policy_resp: rl.PolicyResponse) -> rl.EnvRet:
+        self.total += 1
+        return super().step(policy_resp)
+
+    def is_finish(self) -> bool:
+        return self.total >= self.options["wanted_steps"]
+
+    def close(self) -> None:
+        Path(self.options["closed_file"]).touch()

@@ -11,6 +11,7 @@ import typer
 import rlightning_aio
 from rlightning_aio.cli.backends import backends
 from rlightning_aio.cli.bench import bench
+from rlightning_aio.cli.remote import client, keygen
 from rlightning_aio.cli.rollout import rollout
 from rlightning_aio.cli.terminal import guarded
 from rlightning_aio.cli.tune import tune
@@ -55,5 +56,5 @@ def prepare(
         sys.path.append(here)
 
 
-for command in (rollout, bench, tune, backends):
+for command in (rollout, bench, tune, backends, client, keygen):
     app.command()(guarded(command))

@@ -1,0 +1,239 @@
+"""``rlightning-aio client`` and ``keygen``: the far end of an env_server, and its keys.
+
+Rule: the env lives in this very process and is closed however the command ends, so that
+a robot's safe stop is reached by Ctrl-C too.
+Absent on purpose: choosing among entries; a config for a client has one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from pathlib import Path  # noqa: TC003 (Typer reads annotations)
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+from rich.live import Live
+from rich.spinner import Spinner
+from rich.text import Text
+
+from rlightning_aio.cli.terminal import (
+    INTERRUPTED,
+    count,
+    counted,
+    err,
+    interruptible,
+    out,
+    print_json,
+)
+from rlightning_aio.config import check_installed, load_config
+from rlightning_aio.errors import ConfigError, EnvRaised, RLightningError
+from rlightning_aio.hosts.worker import ErrorText, build_env
+from rlightning_aio.remote import RemoteEnvClient, make_keys
+
+if TYPE_CHECKING:
+    from collections.abc import Generator, Sequence
+
+    from rlightning_aio.config import EnvConfig
+    from rlightning_aio.envs.base import BaseEnv
+
+__all__ = ["client", "keygen"]
+
+_REFRESHES_A_SECOND: Final = 4
+_MAX_PORT: Final = 65535
+
+
+def client(
+    config: Annotated[Path, typer.Argument(help="YAML file with one entry", show_default=False)],
+    overrides: Annotated[
+        list[str] | None,
+        typer.Argument(help="Dotted overrides, such as envs.0.task=Ant-v5", show_default=False),
+    ] = None,
+    *,
+    connect: Annotated[
+        str, typer.Option(metavar="tcp://HOST:PORT", help="Where the env_server listens.")
+    ],
+    keys: Annotated[
+        Path | None,
+        typer.Option(help="This client's directory of `keygen`.", show_default="no keys"),
+    ] = None,
+    name: Annotated[
+        str | None,
+        typer.Option(help="Unique at the server.", show_default="host name and process id"),
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON document in place of the last line.")
+    ] = False,
+) -> None:
+    """Lend an env of this machine to the env_server of a trainer elsewhere.
+
+    Builds the first env of the config's entry, here in this process, and serves it until it
+    is finished or Ctrl-C is pressed. A server that is not there, or goes away, is dialled
+    again with growing pauses; each time it lets the env in, the env is reset.
+
+    For example:
+
+        rlightning-aio client configs/cartpole.yaml --connect tcp://127.0.0.1:5555
+        rlightning-aio client configs/piper.yaml --connect tcp://10.0.0.2:5555 --keys keys/left
+    """
+    hostname, port = _split(connect)
+    entry = _the_entry(config, load_config(config, overrides or ()))
+    served: RemoteEnvClient | None = None
+    interrupted = False
+    try:
+        with interruptible(), _faults_of(entry):
+            env = build_env(entry, None, 0, None)
+            served = _client_of(env, hostname, port, keys, name)
+            with served, _status(served, connect):
+                served.run()
+    except KeyboardInterrupt:
+        interrupted = True
+        raise typer.Exit(INTERRUPTED) from None
+    finally:
+        if served is not None:
+            _report(served, interrupted=interrupted, as_json=as_json)
+
+
+def _split(address: str) -> tuple[str, int]:
+    """Host and port of ``tcp://host:port``; an IPv6 host stands in brackets there."""
+    match = re.fullmatch(r"tcp://(?:\[([0-9A-Fa-f:.]+)\]|([\w.-]+)):([0-9]{1,5})", address)
+    if match is None or not 0 < int(match[3]) <= _MAX_PORT:
+        raise ConfigError(f"--connect {address!r}: should read like tcp://127.0.0.1:5555")
+    return match[1] or match[2], int(match[3])
+
+
+def _the_entry(path: Path, configs: Sequence[EnvConfig]) -> EnvConfig:
+    """The one entry, if this process can run it.
+
+    Raises:
+        ConfigError: it can't, or there are several; naming file, entry and field.
+    """
+    if len(configs) > 1:
+        names = ", ".join(config.name for config in configs)
+        raise ConfigError(f"{path}: envs: a client has one env, but there are entries {names}")
+    entry = configs[0]
+    place = f"{path}: envs.0 ({entry.name!r})"
+    if entry.backend == "env_server":
+        raise ConfigError(
+            f"{place}, backend: an env_server is what clients dial; name the env's own backend"
+        )
+    for field in ("interpreter", "env_vars"):
+        if getattr(entry, field):
+            raise ConfigError(
+                f"{place}, {field}: a client's env runs in the command's own process; start "
+                "the command that way instead"
+            )
+    check_installed(configs)
+    return entry
+
+
+def _client_of(
+    env: BaseEnv, hostname: str, port: int, keys: Path | None, name: str | None
+) -> RemoteEnvClient:
+    try:
+        return RemoteEnvClient(env, hostname, port, keys=keys, name=name)
+    except BaseException:
+        env.close()
+        raise
+
+
+@contextlib.contextmanager
+def _faults_of(entry: EnvConfig) -> Generator[None]:
+    """What the env raises becomes one message that names it."""
+    try:
+        yield
+    except RLightningError:
+        raise
+    except Exception as error:  # noqa: BLE001  # It is the env author's code.
+        words, env_id = ErrorText.of(error), f"{entry.name}-0"
+        fault = EnvRaised(
+            f"{env_id} (backend {entry.backend!r}, task {entry.task!r}) raised "
+            f"{words.type_name}: {words.text}; the remote traceback is above",
+            env_id=env_id,
+            exception_type=words.type_name,
+            exception_text=words.text,
+            traceback_text=words.traceback,
+        )
+        raise fault from fault.__cause__
+
+
+@contextlib.contextmanager
+def _status(served: RemoteEnvClient, address: str) -> Generator[None]:
+    """A live line on stderr; on anything but a terminal, one plain line at the start."""
+    console = err()
+    if not console.is_terminal:
+        console.print(f"{served.name} dials {address}", soft_wrap=True, markup=False)
+        yield
+        return
+    spinner = Spinner("dots")
+
+    def line() -> Spinner:
+        # As a text: brackets of a name or an address are no markup.
+        words = f"{served.name} at {address}: {served.state}  {_figures(served)}"
+        spinner.update(text=Text(words))
+        return spinner
+
+    with Live(
+        console=console,
+        get_renderable=line,
+        refresh_per_second=_REFRESHES_A_SECOND,
+        transient=True,
+    ):
+        yield
+
+
+def _figures(served: RemoteEnvClient) -> str:
+    sessions = served.num_sessions
+    return f"{count(served.num_steps)} steps in {counted(sessions, 'session')}"
+
+
+def _report(served: RemoteEnvClient, *, interrupted: bool, as_json: bool) -> None:
+    if as_json:
+        print_json(
+            {
+                "name": served.name,
+                "interrupted": interrupted,
+                "steps": served.num_steps,
+                "sessions": served.num_sessions,
+            }
+        )
+        return
+    out().print(f"{served.name}: {_figures(served)}", soft_wrap=True, markup=False)
+
+
+def keygen(
+    directory: Annotated[Path, typer.Argument(help="Made if missing.", show_default=False)],
+    names: Annotated[list[str], typer.Argument(help="Of the clients.", show_default=False)],
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON document in place of the advice.")
+    ] = False,
+) -> None:
+    """Make the CURVE keys of an env_server and of clients that it lets in.
+
+    The server's keys are made the first time and kept from then on, so clients can be added
+    later. Each client gets a directory of its own, which holds a secret: copy it to that
+    client's machine over a channel that you trust. Deleting server/clients/NAME.key shuts
+    a client out.
+
+    For example:
+
+        rlightning-aio keygen keys left_arm right_arm
+    """
+    made = make_keys(directory, names)
+    server = directory / "server"
+    if as_json:
+        print_json(
+            {"server": str(server), "clients": dict(zip(names, map(str, made), strict=True))}
+        )
+        return
+    lines = [
+        f"{server}: stays with the trainer; name it in the env_server's env_kwargs.keys",
+        *(
+            f"{path}: move to the machine of client {name!r}; there, "
+            f"rlightning-aio client CONFIG --connect tcp://HOST:PORT --keys {path.name} "
+            f"--name {name}"
+            for name, path in zip(names, made, strict=True)
+        ),
+    ]
+    for line in lines:
+        out().print(line, soft_wrap=True, markup=False)
