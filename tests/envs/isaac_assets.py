@@ -2,11 +2,13 @@
 
 Two carts on a rail and a ground plane, written with `pxr`, enough for the real
 simulator to build and step its own Cartpole and Pendulum tasks without a network.
+``python isaac_assets.py FOLDER`` writes them for tests that run under another Python.
 Absent on purpose: everything visual.
 """
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 from pxr import Gf, Usd, UsdGeom, UsdPhysics
@@ -101,3 +103,7 @@ def _write_ground(path: Path) -> None:
     plane.CreateAxisAttr("Z")
     UsdPhysics.CollisionAPI.Apply(plane.GetPrim())
     stage.Save()
+
+
+if __name__ == "__main__":
+    write_assets(Path(sys.argv[1]))

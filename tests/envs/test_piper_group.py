@@ -14,6 +14,7 @@ import pytest
 pytest.importorskip("piper_sdk")
 pytest.importorskip("serial")
 
+from envs.closing_table import closing_table, steps
 from envs.watched_arm import WatchedArm
 
 from rlightning_aio import sync
@@ -108,11 +109,4 @@ def test_the_arm_stops_when_its_trainer_dies(death: signal.Signals) -> None:
 
 def test_the_dry_run_ends_with_its_table() -> None:
     """The example config runs as it stands, without an arm."""
-    config = Path(__file__).parents[2] / "configs" / "piper.yaml"
-    command = [sys.executable, "-c", "from rlightning_aio.cli import main; main()", "rollout"]
-    run = subprocess.run(
-        [*command, config, "--steps", "30"], capture_output=True, text=True, check=False
-    )
-    assert run.returncode == 0, run.stderr
-    assert "mean return" in run.stdout
-    assert "piper" in run.stdout
+    assert steps(closing_table("piper", "--steps", "30")["piper"]) == 30

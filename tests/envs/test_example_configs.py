@@ -1,0 +1,29 @@
+"""The examples in configs/ whose simulators run in one environment, from the command line.
+
+Those of Isaac Lab and Piper are with the tests of their backends.
+"""
+
+from __future__ import annotations
+
+import pytest
+from envs.closing_table import closing_table, steps
+
+pytestmark = [
+    pytest.mark.simulators,
+    pytest.mark.timeout(300),  # Importing ManiSkill alone takes seconds.
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "entry", "simulator"),
+    [
+        ("ale", "pong", "ale_py"),
+        ("envpool", "cheetahs", "envpool"),
+        ("maniskill", "pick_cube", "mani_skill"),
+        ("pettingzoo", "spread", "mpe2"),
+    ],
+)
+def test_the_example_ends_with_its_table(name: str, entry: str, simulator: str) -> None:
+    """It runs as it stands, and its closing table counts the steps of its entry."""
+    pytest.importorskip(simulator)
+    assert steps(closing_table(name, "--steps", "400")[entry]) >= 400
