@@ -28,6 +28,7 @@ from rlightning_aio.errors import (
 )
 from rlightning_aio.group.actions import write_actions
 from rlightning_aio.group.auto_reset import NO_RESETS, AutoReset, whole
+from rlightning_aio.group.hint import HINT_AFTER_BATCHES
 from rlightning_aio.group.results import collected
 from rlightning_aio.group.slots import BUSY, IDLE, READY
 from rlightning_aio.group.stats import Stats
@@ -107,6 +108,7 @@ class Core:
         self._collecting = False
         self._wanted: list[int] = []
         self._news = False
+        self._handed_out = 0
         self.info_width = 0
         fleet.deliver_to(self)
 
@@ -527,6 +529,9 @@ class Core:
         if len(slots):
             sample = batch.parts[0].busy_ns.item(0)
             self.fleet.lookout.step_ns += 0.1 * (sample - self.fleet.lookout.step_ns)
+            self._handed_out += 1
+            if self._handed_out == HINT_AFTER_BATCHES:
+                self.fleet.give_hint(self.stats.summary()["latency_us"])
         return batch, flags
 
     # -- calls that wait for their own replies ------------------------------------

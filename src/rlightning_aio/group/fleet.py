@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import pickle
 import warnings
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from enum import Enum, auto
 from functools import partial
@@ -26,6 +27,7 @@ from rlightning_aio.errors import (
     StartFailed,
     WorkerDied,
 )
+from rlightning_aio.group.hint import hint
 from rlightning_aio.group.lookout import Lookout
 from rlightning_aio.group.seating import check_actions, order_for, seat
 from rlightning_aio.group.slots import BUSY, READY
@@ -39,7 +41,7 @@ from rlightning_aio.protocol.slab import NO_SEED
 from rlightning_aio.types import EnvMeta
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from numpy.typing import NDArray
 
@@ -398,6 +400,18 @@ class Fleet:
         if self.lost:
             for slot in slots.tolist():
                 self.lost.pop(slot, None)
+
+    def give_hint(self, latency_us: Mapping[str, Mapping[str, Any]]) -> None:
+        """Log, at INFO, what the measured times say of the group's settings."""
+        workers = Counter(
+            member.config.name
+            for member in self._members
+            if not (member.host.inline or member.host.elastic)
+        )
+        configs = [member.config for member in self._members]
+        text = hint(configs, workers, self.lookout.num_cores, latency_us)
+        if text is not None:
+            _log.info("%s; `rlightning-aio tune` measures what is best", text)
 
     # -- faults -------------------------------------------------------------------
 
