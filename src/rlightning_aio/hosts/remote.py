@@ -94,6 +94,8 @@ def server_settings(config: EnvConfig) -> ServerSettings:
         raise ConfigError(
             f"{place}.{fault['loc'][0]}: {fault['msg']}, got {fault['input']!r}"
         ) from None
+    if settings.keys is not None:
+        read_server_keys(settings.keys)
     if not (_is_loopback(settings.host) or settings.keys or settings.insecure):
         raise ConfigError(
             f"{place}.host: {settings.host!r} can be reached from other machines, and without "

@@ -8,6 +8,7 @@ Absent on purpose: threads, and anything that unpickles.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import socket
@@ -47,6 +48,8 @@ __all__ = ["RemoteEnvClient"]
 _RECONNECT_MS: Final = (100, 5000)
 """From one attempt to connect to the next: at first, and at most; doubled in between."""
 _HANDSHAKE_MS: Final = 5000
+_REDIAL_SECONDS: Final = (1.0, 8.0)
+"""ZMQ gives up for good after a handshake that failed; then it is told to try again."""
 _LINGER_MS: Final = 500
 
 _log = logging.getLogger(__name__)
@@ -108,6 +111,8 @@ class RemoteEnvClient:
             raise ConfigError(f"env {env.env_id!r} can't be a remote client: {error}") from None
         self._todo: StepRequest | ResetRequest | None = None
         self._trouble = ""
+        self._redial_at: float | None = None
+        self._redial_pause = _REDIAL_SECONDS[0]
         self._context: zmq.Context[_Socket] | None = None
         self._dealer: _Socket
         self._monitor: _Socket
@@ -220,7 +225,8 @@ class RemoteEnvClient:
 
     def _turn(self, until: float | None) -> None:
         """Wait for something to happen, at most `until`, and take it in."""
-        times = [t for t in (until, self._session.deadline()) if t is not None]
+        due = (until, self._session.deadline(), self._redial_at)
+        times = [t for t in due if t is not None]
         wait_ms = ceil(1000 * max(0.0, min(times) - time.monotonic())) if times else None
         ready = dict(self._poller.poll(wait_ms))
         if self._monitor in ready:
@@ -229,20 +235,33 @@ class RemoteEnvClient:
             parts = self._dealer.recv_multipart(zmq.NOBLOCK)
             self._obey(self._session.receive(parts, time.monotonic()))
         self._obey(self._session.tick(time.monotonic()))
+        if self._redial_at is not None and time.monotonic() >= self._redial_at:
+            self._redial()
         self._flush()
 
     def _watch(self) -> None:
         """Take in what has become of the connection."""
-        event = recv_monitor_message(self._monitor)["event"]
+        event, now = recv_monitor_message(self._monitor)["event"], time.monotonic()
         if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
             self._trouble = ""
-            self._session.connected(time.monotonic())
+            self._redial_at, self._redial_pause = None, _REDIAL_SECONDS[0]
+            self._session.connected(now)
         elif event == zmq.EVENT_DISCONNECTED:
-            self._session.disconnected(time.monotonic())
+            self._session.disconnected(now)
+            self._redial_at = now + _REDIAL_SECONDS[1]
         elif event == zmq.EVENT_CONNECT_RETRIED and not self._trouble:
             self._trouble = f"nobody answers at {self._address}"
         elif event in _REFUSED_HANDSHAKES:
             self._trouble = _REFUSED_HANDSHAKES[event]
+            self._redial_at = now + self._redial_pause
+
+    def _redial(self) -> None:
+        """Connect anew, in place of a connection that ZMQ may or may not be working on."""
+        with contextlib.suppress(zmq.ZMQError):
+            self._dealer.disconnect(self._address)
+        self._dealer.connect(self._address)
+        self._redial_pause = min(2 * self._redial_pause, _REDIAL_SECONDS[1])
+        self._redial_at = time.monotonic() + _REDIAL_SECONDS[1]
 
     def _flush(self) -> None:
         outbox = self._session.outbox

@@ -1,0 +1,121 @@
+"""Through a proxy that mistreats messages and connections: once executed, once answered."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+import pytest
+from remote.counting import ClientThread, CountingEnv
+from remote.faulty_proxy import Faults, FaultyProxy
+
+from rlightning_aio import BatchedData, PolicyResponse, sync
+
+REQUESTS = int(os.environ.get("RLIGHTNING_AIO_FAULTY_REQUESTS", "400"))
+"""For each kind of network; 10,000 take some minutes."""
+HEARTBEAT = 0.8
+CLIENTS = 3
+
+
+class RecordingEnv(CountingEnv):
+    """Its observation is (identity, the request's number, steps since the reset).
+
+    The action's first element is the request's number.
+    """
+
+    def __init__(self, identity: int) -> None:
+        super().__init__(identity)
+        self.executed: list[int] = []
+        self.number = -1
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
+        self.number = -1
+        return super().reset(seed=seed, options=options)
+
+    def step(self, policy_resp: PolicyResponse) -> Any:
+        self.number = int(policy_resp.action[0] * 2**20)
+        self.executed.append(self.number)
+        return super().step(policy_resp)
+
+    def ret(self) -> Any:
+        ret = super().ret()
+        ret.observation[1] = self.number
+        return ret
+
+
+NETWORKS = {
+    "lossy": Faults(drop=0.04),
+    "repeating and reordering": Faults(repeat=0.1, delay=0.1),
+    "breaking": Faults(cut=0.01),
+    "falling silent": Faults(silence=0.004),
+    "everything": Faults(drop=0.02, repeat=0.05, delay=0.05, cut=0.004, silence=0.002),
+}
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("network", NETWORKS)
+def test_none_is_executed_twice_and_each_ends_once(network: str) -> None:
+    """Every number that a trainer sends ends in its own result, a marked one, or a return."""
+    envs = [RecordingEnv(k) for k in range(CLIENTS)]
+    config = {
+        "name": "robots",
+        "backend": "env_server",
+        "env_kwargs": {"min_clients": CLIENTS, "heartbeat": HEARTBEAT},
+    }
+    with sync.build_env_group(config) as group:
+        with FaultyProxy(group["robots-0"].address, NETWORKS[network], seed=1) as proxy:
+            threads = [
+                ClientThread(proxy.address, f"c{k}", env, heartbeat=HEARTBEAT)
+                for k, env in enumerate(envs)
+            ]
+            for env in envs:
+                env.stays = True
+            ends = exchange(group, REQUESTS)
+            for env in envs:
+                env.stays, env.finished = False, True
+            group.close()
+            for thread in threads:
+                thread.join()
+        print(network, proxy.tally, ends)
+    executed = [number for env in envs for number in env.executed]
+    assert len(executed) == len(set(executed)), "a request was executed twice"
+    assert sum(ends.values()) == REQUESTS
+    assert ends["answered"] <= len(executed) <= REQUESTS
+    fates = [name for name in ("drop", "repeat", "delay", "cut", "silence")
+             if getattr(NETWORKS[network], name)]  # fmt: skip
+    assert all(proxy.tally[name] for name in fates), "the network was too kind"
+    if not {"cut", "silence"} & set(fates):
+        assert ends["answered"] == REQUESTS
+
+
+def exchange(group: Any, requests: int) -> dict[str, int]:
+    """Step whoever has answered until so many requests have ended; what they ended in."""
+    ends = {"answered": 0, "marked": 0, "returned": 0}
+    asked: dict[str, int] = {}
+    sent = 0
+    batch, _ = group.reset()
+    while True:
+        for ret in batch.values():
+            number = asked.pop(ret.env_id, None)
+            if "client_lost" in ret.info:
+                assert ret.last_truncated
+                assert number is not None, "a loss that nobody waited for"
+                ends["marked"] += 1
+            elif number is not None:
+                fresh = ret.observation[1] == -1
+                assert fresh or ret.observation[1] == number, "the result of another request"
+                assert ret.env_id == f"robots-0/c{int(ret.observation[0])}"
+                ends["returned" if fresh else "answered"] += 1
+        if sum(ends.values()) == requests:
+            return ends
+        responses = []
+        for env_id in dict.fromkeys(batch.env_ids()):
+            if sent < requests:
+                asked[env_id] = sent
+                action = np.array([sent / 2**20, 0], np.float32)
+                responses.append(PolicyResponse(env_id, action))
+                sent += 1
+        if responses:
+            group.step_async(BatchedData(["robots-0"] * len(responses), responses))
+        batch, _ = group.collect_async(deadline=60)
