@@ -1,13 +1,15 @@
 """Responses become requests: actions are checked and written before anything is sent.
 
 Rule: all or nothing. A batch is looked through as a whole first (in O(1) where it
-comes as columns), and only then does the first byte leave.
+comes as columns), and only then does the first byte leave. What would cost more than
+that, looking at every number, is done only where ``RLIGHTNING_AIO_DEBUG`` is 1.
 """
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -22,7 +24,10 @@ if TYPE_CHECKING:
     from rlightning_aio.group.slots import Slots
     from rlightning_aio.protocol.slab import Slab
 
-__all__ = ["Letters", "write_actions"]
+__all__ = ["DEBUG", "Letters", "write_actions"]
+
+DEBUG: Final = os.environ.get("RLIGHTNING_AIO_DEBUG") == "1"
+"""Whether actions are searched for NaN, which no action space holds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +69,8 @@ def _write_column(action: Any, slab: Slab, slots: NDArray[np.intp], table: Slots
         source = _as_array(_at(action, leaf))
         if source.shape != (len(slots), *leaf.shape) or not _castable(source, leaf):
             raise BadAction(_misfit(f"the batch's action{leaf.name}", source, leaf, len(slots)))
+        if DEBUG:
+            _refuse_nan(source, leaf, slots, table)
         target[rows] = source
 
 
@@ -90,7 +97,18 @@ def _write_one_by_one(
                 if source.shape != leaf.shape or not _castable(source, leaf):
                     who = table.describe(int(slots[k]))
                     raise BadAction(_misfit(f"action{leaf.name} for {who}", source, leaf))
+            if DEBUG:
+                _refuse_nan(np.array(sources), leaf, slots[positions], table)
             target[rows] = sources
+
+
+def _refuse_nan(source: NDArray[Any], leaf: Leaf, slots: NDArray[np.intp], table: Slots) -> None:
+    if source.dtype.kind not in "fc":
+        return
+    bad = np.isnan(source).reshape(len(slots), -1).any(axis=1)
+    if bad.any():
+        who = table.describe(int(slots[bad.argmax()]))
+        raise BadAction(f"action{leaf.name} for {who} holds NaN; nothing was sent")
 
 
 def actions_of(batch: BatchedData) -> list[Any]:

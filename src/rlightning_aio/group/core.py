@@ -441,6 +441,7 @@ class Core:
         try:
             end = None if deadline is None else now + deadline
             window = None
+            now = yield from self._glance(now)
             while True:
                 self._sweep()
                 if self._faults:
@@ -456,12 +457,7 @@ class Core:
                     window = now + timeout
                 open_window = window is not None and now < window and ready < most
                 if ready and ready >= need and not open_window:
-                    if not self.fleet.overdue(now):
-                        break
-                    # However much is ready: the dead and the hung must be heard of, too.
-                    now = yield Wait(0.0)
-                    self.fleet.look(now)
-                    continue
+                    break
                 if end is not None and now >= end:
                     raise TimeoutError(
                         f"{ready} of the {max(need, 1)} results needed came within {deadline} s; "
@@ -487,6 +483,15 @@ class Core:
             self._news = False
             if self._wanted:
                 self.fleet.watcher.wake()
+
+    def _glance(self, now: float) -> Operation[float]:
+        """Look at all hosts now and then: who always finds enough ready never has to wait, and
+        would never hear of the dead and the hung.
+        """
+        if self.fleet.overdue(now):
+            now = yield Wait(0.0)
+            self.fleet.look(now)
+        return now
 
     def _wait(self, wanted: int, until: float | None) -> Operation[float]:
         """One turn of waiting for `wanted` more replies; the time after it."""

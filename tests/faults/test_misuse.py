@@ -1,0 +1,243 @@
+"""A wrong request is refused by name before anything of it is sent."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import subprocess
+import sys
+import threading
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+import pytest
+from faults.faulty import Driven, Tokens, entry
+from faults.test_deaths import two_workers
+
+import rlightning_aio
+from rlightning_aio import BatchedData, PolicyResponse
+from rlightning_aio.errors import (
+    BadAction,
+    EnvBusy,
+    GroupClosed,
+    NothingPending,
+    RLightningError,
+    UnknownEnv,
+)
+from rlightning_aio.group import actions
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rlightning_aio import EnvGroup
+
+    Start: TypeAlias = Callable[..., Driven]
+
+# For each what the four actions are, and what the message must say. Envs take Box(2, float64).
+BAD_ACTIONS: dict[str, tuple[Any, str]] = {
+    "shape": (np.zeros((4, 3)), r"expected shape \(4, 2\) .* found shape \(4, 3\)"),
+    "shape of each": (np.zeros((4, 2, 1)), r"expected shape \(4, 2\) .* found shape \(4, 2, 1\)"),
+    "dtype": (np.zeros((4, 2), complex), "dtype float64, found .* dtype complex128"),
+    "text": (np.full((4, 2), "x"), "dtype float64, found .* dtype <U1"),
+    "nothing": ([None] * 4, "found .* dtype object"),
+    "ragged": ([[1.0], [1.0, 2.0], [1.0], [1.0]], "action"),
+}
+
+
+def responses(env_ids: list[str], chosen: Any) -> BatchedData:
+    """The same actions as separate values."""
+    values = [PolicyResponse(id_, action) for id_, action in zip(env_ids, chosen, strict=True)]
+    return BatchedData(env_ids, values)
+
+
+@pytest.mark.parametrize("bad", BAD_ACTIONS)
+def test_bad_actions_are_refused_and_nothing_is_sent(start: Start, bad: str) -> None:
+    """As columns and as values, waited for or not; the next request is answered rightly."""
+    group, tokens = start(two_workers()), Tokens()
+    env_ids = group.group.env_ids
+    first, _ = group.step(tokens.steps(env_ids))
+    chosen, message = BAD_ACTIONS[bad]
+    for send in (group.step, group.step_async):
+        with pytest.raises(BadAction, match=message):
+            send(first.respond(action=chosen))
+        with pytest.raises(BadAction, match="action"):
+            send(responses(env_ids, chosen))
+        with pytest.raises(NothingPending):
+            group.collect_async()
+        tokens.check(group.step(tokens.steps(env_ids))[0])
+
+
+def test_one_bad_action_of_many_is_named(start: Start) -> None:
+    """The message is about the env whose action is wrong, and no other env has stepped."""
+    group, tokens = start(two_workers()), Tokens()
+    batch = tokens.steps(group.group.env_ids)
+    batch.values()[2].action = np.zeros(7)
+    with pytest.raises(BadAction, match=r"faulty-2.*found shape \(7,\).*nothing was sent"):
+        group.step(batch)
+    found, _ = group.step(tokens.steps(group.group.env_ids))
+    tokens.check(found)
+    assert found.observation[:, 3].tolist() == [1, 1, 1, 1]
+
+
+def test_responses_must_be_as_many_as_the_batch(start: Start) -> None:
+    """A column of another length is refused where it is given."""
+    group, tokens = start(two_workers()), Tokens()
+    batch, _ = group.step(tokens.steps(group.group.env_ids))
+    for count in (0, 3, 5):
+        with pytest.raises(BadAction, match="action"):
+            group.step(batch.respond(action=np.zeros((count, 2))))
+    with pytest.raises(BadAction, match="PolicyResponse"):
+        group.step(BatchedData(["faulty-0"], [7]))
+    tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
+
+
+@pytest.mark.parametrize("form", ["columns", "values"])
+def test_nan_is_found_when_debugging(
+    start: Start, monkeypatch: pytest.MonkeyPatch, form: str
+) -> None:
+    """The message names the env; without the switch nobody pays for looking."""
+    group, tokens = start(two_workers()), Tokens()
+    env_ids = group.group.env_ids
+    first, _ = group.step(tokens.steps(env_ids))
+    chosen = np.zeros((4, 2))
+    chosen[2, 1] = np.nan
+    batch = first.respond(action=chosen) if form == "columns" else responses(env_ids, chosen)
+    monkeypatch.setattr(actions, "DEBUG", True)
+    with pytest.raises(BadAction, match=r"faulty-2.*NaN"):
+        group.step(batch)
+    tokens.check(group.step(tokens.steps(env_ids))[0])
+    monkeypatch.setattr(actions, "DEBUG", False)
+    assert np.isnan(group.step(batch)[0].reward[2])
+
+
+@pytest.mark.parametrize(("value", "found"), [("1", "True"), ("0", "False"), (None, "False")])
+def test_debugging_is_switched_by_the_environment(value: str | None, found: str) -> None:
+    """``RLIGHTNING_AIO_DEBUG=1``, read when the package is imported."""
+    environment = {k: v for k, v in os.environ.items() if k != "RLIGHTNING_AIO_DEBUG"}
+    if value is not None:
+        environment["RLIGHTNING_AIO_DEBUG"] = value
+    script = "from rlightning_aio.group import actions; print(actions.DEBUG)"
+    result = subprocess.run(
+        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True
+    )
+    assert result.stdout.strip() == found
+
+
+def test_unknown_and_doubled_ids_are_named(start: Start) -> None:
+    """Whichever call they are given to, nothing of it is sent."""
+    group, tokens = start(two_workers()), Tokens()
+    for ids, error, message in (
+        (["faulty-0", "faulty-9"], UnknownEnv, "'faulty-9'; its envs are faulty-0, faulty-1"),
+        (["faulty-0", "faulty-1", "faulty-0"], EnvBusy, "'faulty-0' comes twice"),
+    ):
+        chosen = responses(ids, np.zeros((len(ids), 2)))
+        with pytest.raises(error, match=message):
+            group.step(chosen)
+        with pytest.raises(error, match=message):
+            group.step_async(chosen)
+        with pytest.raises(error, match=message):
+            group.reset(env_ids=ids)
+        tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
+    with pytest.raises(UnknownEnv, match="faulty-9"):
+        group.call("faulty-9", "do", "nothing")
+    with pytest.raises(UnknownEnv, match="faulty-9"):
+        group.reset(seed={"faulty-9": 1})
+
+
+def test_busy_env_refuses_the_whole_batch(start: Start) -> None:
+    """All or nothing: the other envs of the batch are not asked either."""
+    group, tokens = start(two_workers()), Tokens()
+    group.step_async(tokens.steps(["faulty-1"]))
+    everyone = responses(group.group.env_ids, np.zeros((4, 2)))
+    for ask in (
+        lambda: group.step_async(everyone),
+        lambda: group.step(everyone),
+        group.reset,
+        lambda: group.call("faulty-1", "do", "nothing"),
+    ):
+        with pytest.raises(EnvBusy, match=r"faulty-1.*collect it first.*nothing was sent"):
+            ask()
+    batch, _ = group.collect_async()
+    tokens.check(batch)
+    assert batch.ids() == ["faulty-1"]
+    found, _ = group.step(tokens.steps(group.group.env_ids))
+    assert found.observation[:, 3].tolist() == [1, 2, 1, 1]
+
+
+def test_what_can_not_be_sent_is_refused_before_anything_is(start: Start) -> None:
+    """An argument of a call, options of a reset, an extra of one response among many."""
+    group, tokens = start(two_workers(), preprocess_fn=lambda response: response.action), Tokens()
+    lock = threading.Lock()
+    with pytest.raises(TypeError, match=r"faulty-1.*can't be sent.*nothing was sent"):
+        group.call("faulty-1", "do", lock)
+    with pytest.raises(TypeError, match=r"can't be sent.*nothing was sent"):
+        group.reset(options={"lock": lock})
+    batch = tokens.steps(group.group.env_ids)
+    batch.values()[3].lock = lock
+    with pytest.raises(BadAction, match=r"faulty-3.*can't be sent.*nothing was sent"):
+        group.step(batch)
+    found, _ = group.step(tokens.steps(group.group.env_ids))
+    tokens.check(found)
+    assert found.observation[:, 3].tolist() == [1, 1, 1, 1]
+
+
+USES: dict[str, Callable[[Any], Any]] = {
+    "reset": lambda group: group.reset(),
+    "step": lambda group: group.step(Tokens().steps(group.group.env_ids)),
+    "step_async": lambda group: group.step_async(Tokens().steps(group.group.env_ids)),
+    "collect_async": lambda group: group.collect_async(),
+    "call": lambda group: group.call("faulty-0", "do", "nothing"),
+    "offload": lambda group: group.offload(),
+    "get_action_spaces": lambda group: group.get_action_spaces(),
+}
+
+
+@pytest.mark.parametrize("use", USES)
+def test_use_before_init_and_after_close_says_so(build: Start, use: str) -> None:
+    """Neither hangs, and each says what to do instead."""
+    group = build(entry())
+    with pytest.raises(GroupClosed, match="call init"):
+        USES[use](group)
+    group.init()
+    group.close()
+    with pytest.raises(GroupClosed, match="build a new one"):
+        USES[use](group)
+    with pytest.raises(GroupClosed, match="build a new one"):
+        group.init()
+
+
+async def test_second_collector_is_refused_and_the_first_goes_on() -> None:
+    """One at a time: two would take each other's results."""
+    tokens = Tokens()
+    async with rlightning_aio.build_env_group(two_workers()) as group:
+        await group.reset()
+        group.step_async(tokens.steps(group.env_ids))
+        first = asyncio.ensure_future(group.collect_async(wait_all=True))
+        await asyncio.sleep(0)  # It has begun to wait.
+        with pytest.raises(RLightningError, match="one collector at a time"):
+            await group.collect_async()
+        batch, _ = await first
+        tokens.check(batch)
+        assert len(batch) == 4
+
+
+async def test_many_callers_at_once_each_get_their_own() -> None:
+    """Steps, calls and one collector side by side; no reply strays."""
+
+    async def drive(group: EnvGroup, env_id: str) -> None:
+        tokens = Tokens()
+        for _ in range(50):
+            batch, _ = await group.step(tokens.steps([env_id]))
+            tokens.check(batch)
+            assert await group[env_id].call("do", "nothing") == f"{env_id} did nothing"
+
+    async with rlightning_aio.build_env_group(two_workers()) as group:
+        await group.reset()
+        collected = Tokens()
+
+        async def collect() -> None:
+            for _ in range(50):
+                group.step_async(collected.steps(["faulty-3"]))
+                collected.check((await group.collect_async())[0])
+
+        await asyncio.gather(*(drive(group, f"faulty-{k}") for k in range(3)), collect())
