@@ -219,6 +219,18 @@ def test_reset_after_an_idle_death_is_a_plain_reset(start: Start) -> None:
     assert marks[:4] in ([False] * 4, [True, True, False, False])
 
 
+def test_env_that_was_idle_at_the_death_tells_however_late_it_is_asked(start: Start) -> None:
+    """Its neighbour has told, and has shown that the replacement works; it has still to tell."""
+    group, tokens = start(two_workers()), Tokens()
+    group.step(tokens.steps(group.group.env_ids))
+    batch, _ = group.step(tokens.steps(["faulty-1"], {"faulty-1": "sigkill"}))
+    assert marked(batch.values()[0])
+    tokens.check(group.step(tokens.steps(["faulty-1"]))[0])
+    batch, _ = group.step(tokens.steps(["faulty-0"]))
+    assert marked(batch.values()[0])
+    tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
+
+
 def test_worker_dies_while_a_collect_waits_for_another(start: Start) -> None:
     """The collect goes on: it neither hangs nor raises, and has each result exactly once."""
     group, tokens = start(two_workers()), Tokens()

@@ -392,6 +392,8 @@ class Fleet:
             death = self.lost.pop(slot, None)
             if death is not None:
                 self.restarting[slot] = death
+                # Its neighbours may have shown long ago that the replacement works.
+                self.recovering = True
                 claimed[k] = True
         return claimed
 
