@@ -33,6 +33,7 @@ from rlightning_aio.group.seating import check_actions, order_for, seat
 from rlightning_aio.group.slots import BUSY, READY
 from rlightning_aio.group.wait import Operation, Wait, earliest
 from rlightning_aio.hosts.base import Death, Host
+from rlightning_aio.hosts.process import END_SECONDS
 from rlightning_aio.hosts.server import ServerHost
 from rlightning_aio.hosts.worker import ErrorText, Started
 from rlightning_aio.protocol.info import NO_INFO, PICKLED
@@ -695,12 +696,15 @@ class Fleet:
         try:
             yield from self._until_closed(alive, now + _CLOSE_SECONDS)
         finally:
-            for member in self._members:
-                if member.stage is not _Stage.NEW:
-                    member.host.release()
-            for server in self.servers:
-                server.release(_KILL_SECONDS)
-            self._arena.close()
+            self._let_go(_KILL_SECONDS)
+
+    def _let_go(self, seconds: float) -> None:
+        for member in self._members:
+            member.host.release()
+        for server in self.servers:
+            server.release(seconds)
+        self.slabs.clear()
+        self._arena.close()
 
     def abandon(self) -> None:
         """Let go of everything at once: the group was dropped without being closed."""
@@ -709,12 +713,7 @@ class Fleet:
         self.closed = True
         self.open = False
         started = any(m.stage is not _Stage.NEW for m in self._members)
-        for member in self._members:
-            if member.stage is not _Stage.NEW:
-                member.host.release()
-        for server in self.servers:
-            server.release()
-        self._arena.close()
+        self._let_go(END_SECONDS)
         if started:
             # The collector calls this: no caller's line would say anything.
             warnings.warn(

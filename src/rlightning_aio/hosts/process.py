@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
     from rlightning_aio.hosts.worker import AttachOrder, StartOrder
 
-__all__ = ["ForkServer", "ProcessHost"]
+__all__ = ["END_SECONDS", "ForkServer", "ProcessHost"]
 
 _ONE_THREAD = dict.fromkeys(
     (
@@ -48,7 +48,7 @@ _ONE_THREAD = dict.fromkeys(
 )
 
 
-_END_SECONDS = 1.5
+END_SECONDS = 1.5
 """How long a fork server that is let go may take; it gives its workers a little less."""
 
 
@@ -187,7 +187,7 @@ class ForkServer:
         for host in hosts:
             host.on_fork_server_lost(self._failure)
 
-    def release(self, seconds: float = _END_SECONDS) -> None:
+    def release(self, seconds: float = END_SECONDS) -> None:
         """Let the fork server go; it ends what workers it still has, within `seconds`."""
         if self._socket is None:
             return
@@ -289,6 +289,13 @@ class ProcessHost:
 
     def release(self) -> None:
         """See `base.Host.release`."""
+        self._hang_up()
+        self.in_flight = 0
+        # A mapping has a descriptor of its own, which goes with the last that refers to it.
+        self._rings_memory = memoryview(bytearray(rings_size(1)))
+        self._rings = TrainerRings(self._rings_memory, 1)
+
+    def _hang_up(self) -> None:
         self._alive = False
         if self._socket is not None:
             self._watcher.unwatch(self)
@@ -308,7 +315,7 @@ class ProcessHost:
 
     def _ended(self, cause: str, exit_code: int | None, stderr_tail: str) -> None:
         self.sweep()
-        self.release()
+        self._hang_up()
         self.pid = None
         self.in_flight = 0
         current, _ = self._rings.current()

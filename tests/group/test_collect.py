@@ -1,0 +1,330 @@
+"""`collect_async` on real workers, whose envs step when the test opens their gates.
+
+What needs a certain order of events and a clock is in `test_core`; here, workers, channels
+and both drivers have their say.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+import pytest_asyncio
+from group.sample_envs import Gate
+
+import rlightning_aio
+import rlightning_aio.sync
+from rlightning_aio import BatchedData, NothingPending, PolicyResponse
+from rlightning_aio.errors import GroupClosed, RLightningError
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Iterator
+    from pathlib import Path
+
+IDS = [f"gated-{k}" for k in range(4)]
+
+
+def responses(*indices: int) -> BatchedData:
+    ids = [IDS[k] for k in indices]
+    return BatchedData(
+        ids, [PolicyResponse(id_, [0, k]) for k, id_ in zip(indices, ids, strict=True)]
+    )
+
+
+@pytest.fixture
+def gates(tmp_path: Path) -> list[Gate]:
+    return [Gate(str(tmp_path), env_id).make() for env_id in IDS]
+
+
+def entry(tmp_path: Path, **fields: Any) -> dict[str, Any]:
+    return {
+        "name": "gated",
+        "backend": "gated",
+        "task": "x",
+        "num_workers": 4,
+        "env_kwargs": {"gates": str(tmp_path)},
+        **fields,
+    }
+
+
+@pytest_asyncio.fixture
+async def group(tmp_path: Path, gates: list[Gate]) -> AsyncIterator[Any]:
+    """Four envs, each in a worker of its own."""
+    async with rlightning_aio.build_env_group(entry(tmp_path, envs_per_process=1)) as group:
+        await group.reset()
+        yield group
+
+
+@pytest.fixture
+def sync_group(tmp_path: Path, gates: list[Gate]) -> Iterator[Any]:
+    """Four envs in one worker, which steps them in the order in which it is asked."""
+    with rlightning_aio.sync.build_env_group(entry(tmp_path, envs_per_process=4)) as group:
+        group.reset()
+        yield group
+
+
+@contextmanager
+def opened(*gates: Gate) -> Iterator[None]:
+    """Meanwhile, open the gates one after the other."""
+    opener = threading.Thread(target=lambda: [gate.open() for gate in gates])
+    opener.start()
+    yield
+    opener.join()
+
+
+async def open_gates(*gates: Gate) -> None:
+    with opened(*gates):
+        await asyncio.sleep(0)
+
+
+# -- the rules, synchronously
+
+
+def test_the_first_ready_result_is_enough(sync_group: Any, gates: list[Gate]) -> None:
+    """The others stay pending, and come with later calls."""
+    sync_group.step_async(responses(2, 0))
+    with opened(gates[2]):
+        batch, flags = sync_group.collect_async()
+    assert (batch.ids(), flags) == (["gated-2"], [False])
+    with opened(gates[0]):
+        assert sync_group.collect_async()[0].ids() == ["gated-0"]
+    with pytest.raises(NothingPending):
+        sync_group.collect_async()
+
+
+def test_a_minimum_is_waited_for_and_a_maximum_kept(sync_group: Any, gates: list[Gate]) -> None:
+    """A minimum beyond what is pending means all of it; what is left over comes first."""
+    sync_group.step_async(responses(0, 1, 2, 3))
+    with opened(*gates[:2]):
+        batch, _ = sync_group.collect_async(min_results=2)
+    assert batch.ids() == IDS[:2]
+    with opened(*gates[2:]):
+        batch, _ = sync_group.collect_async(min_results=50)
+    assert batch.ids() == IDS[2:]
+    sync_group.step_async(responses(3, 1, 0))
+    with opened(gates[3], gates[1], gates[0]):
+        pass
+    came: list[str] = []
+    for size in (2, 1):
+        batch, flags = sync_group.collect_async(min_results=2, max_results=2)
+        assert len(batch) == len(flags) == size
+        came += batch.ids()
+    assert came == ["gated-3", "gated-1", "gated-0"]
+
+
+def test_waiting_for_all_ignores_a_window_and_says_so(sync_group: Any, gates: list[Gate]) -> None:
+    """All that are pending, none less."""
+    sync_group.step_async(responses(0, 1, 2))
+    with opened(*gates[:3]), pytest.warns(UserWarning, match="ignores timeout"):
+        batch, _ = sync_group.collect_async(wait_all=True, timeout=0.001)
+    assert sorted(batch.ids()) == IDS[:3]
+
+
+def test_a_window_ends_while_others_are_pending(sync_group: Any, gates: list[Gate]) -> None:
+    """It is opened by the first result; who is late comes with the next call."""
+    sync_group.step_async(responses(0, 1))
+    with opened(gates[0]):
+        batch, _ = sync_group.collect_async(timeout=0.05)
+    assert batch.ids() == ["gated-0"]
+    with opened(gates[1]):
+        assert sync_group.collect_async(timeout=60)[0].ids() == ["gated-1"]
+
+
+def test_past_its_deadline_a_collect_loses_nothing(sync_group: Any, gates: list[Gate]) -> None:
+    """What was ready, and what gets ready later, comes with the next call."""
+    sync_group.step_async(responses(0, 1))
+    with pytest.raises(TimeoutError, match="0 of the 1"):
+        sync_group.collect_async(deadline=0.02)
+    with opened(gates[0]), pytest.raises(TimeoutError, match="nothing is lost"):
+        sync_group.collect_async(min_results=2, deadline=0.2)
+    with opened(gates[1]):
+        batch, _ = sync_group.collect_async(min_results=2, deadline=60)
+    assert batch.ids() == IDS[:2]
+
+
+@pytest.mark.parametrize(
+    ("rules", "said"),
+    [
+        ({"timeout": 0}, "timeout must be a positive"),
+        ({"timeout": -1.0}, "timeout must be a positive"),
+        ({"timeout": float("nan")}, "timeout must be a positive"),
+        ({"deadline": 0}, "deadline must be a positive"),
+        ({"min_results": 0}, "min_results must be at least 1"),
+        ({"max_results": 0}, "max_results must be at least 1"),
+        ({"min_results": 3, "max_results": 2}, r"min_results \(3\) is above max_results \(2\)"),
+    ],
+)
+def test_rules_that_make_no_sense_are_refused(rules: dict[str, Any], said: str) -> None:
+    """Each by its name and value."""
+    config = {"name": "a", "backend": "probe", "task": "x", "placement": "inline"}
+    with rlightning_aio.sync.build_env_group(config) as group:
+        batch, _ = group.reset()
+        group.step_async(batch.respond(action=np.zeros((1, 2))))
+        with pytest.raises(ValueError, match=said):
+            group.collect_async(**rules)
+        assert len(group.collect_async()[0]) == 1
+
+
+# -- awaited
+
+
+async def test_whoever_is_ready_first_is_first(group: Any, gates: list[Gate]) -> None:
+    """In whatever order the envs were asked."""
+    group.step_async(responses(0, 1, 2, 3))
+    for k in (2, 0, 3, 1):
+        waiting = asyncio.create_task(group.collect_async(timeout=0.01))
+        await open_gates(gates[k])
+        batch, _ = await waiting
+        assert batch.ids() == [IDS[k]]
+
+
+async def test_results_join_while_the_window_is_open(group: Any, gates: list[Gate]) -> None:
+    """It closes early when nothing more can come."""
+    group.step_async(responses(0, 1, 2))
+    waiting = asyncio.create_task(group.collect_async(timeout=100))
+    await open_gates(gates[1], gates[0])
+    await asyncio.wait([waiting], timeout=0.05)
+    assert not waiting.done()
+    await open_gates(gates[2])
+    batch, _ = await waiting
+    assert sorted(batch.ids()) == IDS[:3]
+
+
+async def test_cancelling_a_collect_loses_no_result(group: Any, gates: list[Gate]) -> None:
+    """Neither what was ready already, nor what was still to come."""
+    group.step_async(responses(0, 1, 2))
+    with pytest.raises(TimeoutError):
+        async with asyncio.timeout(0.02):
+            await group.collect_async()
+    waiting = asyncio.create_task(group.collect_async(min_results=3))
+    await open_gates(gates[1])
+    waiting.cancel()
+    await asyncio.wait([waiting])
+    assert waiting.cancelled()
+    await open_gates(gates[0], gates[2])
+    batch, _ = await group.collect_async(wait_all=True)
+    assert sorted(batch.ids()) == IDS[:3]
+
+
+async def test_a_cancelled_step_or_reset_is_collected(group: Any, gates: list[Gate]) -> None:
+    """The envs have been asked; their results go to whoever collects."""
+    stepping = asyncio.create_task(group.step(responses(0, 1)))
+    await asyncio.sleep(0)
+    resetting = asyncio.create_task(group.reset(env_ids=["gated-3"]))
+    await asyncio.sleep(0)
+    for task in (stepping, resetting):
+        task.cancel()
+    await asyncio.wait([stepping, resetting])
+    await open_gates(gates[0], gates[1])
+    batch, _ = await group.collect_async(wait_all=True)
+    assert sorted(batch.ids()) == ["gated-0", "gated-1", "gated-3"]
+    calling = asyncio.create_task(group["gated-2"].call("double", 2))
+    await asyncio.sleep(0)
+    calling.cancel()
+    await asyncio.wait([calling])
+    with pytest.raises(NothingPending):
+        await group.collect_async()
+
+
+async def test_one_collects_at_a_time(group: Any, gates: list[Gate]) -> None:
+    """The second is sent away; the first gets its result."""
+    group.step_async(responses(0))
+    first = asyncio.create_task(group.collect_async())
+    await asyncio.sleep(0)
+    with pytest.raises(RLightningError, match="one collector at a time"):
+        await group.collect_async()
+    await open_gates(gates[0])
+    assert (await first)[0].ids() == ["gated-0"]
+
+
+async def test_callers_wait_for_their_own_envs_alone(group: Any, gates: list[Gate]) -> None:
+    """A step, a reset, a method call and a collect at once, each answered when it is its turn."""
+    group.step_async(responses(0))
+    collecting = asyncio.create_task(group.collect_async())
+    stepping = asyncio.create_task(group.step(responses(1)))
+    await asyncio.sleep(0)
+    batch, _ = await group.reset(env_ids=["gated-2"])
+    assert batch.ids() == ["gated-2"]
+    assert await group["gated-3"].call("double", 21) == 42
+    assert not collecting.done()
+    assert not stepping.done()
+    await open_gates(gates[1])
+    assert (await stepping)[0].ids() == ["gated-1"]
+    await open_gates(gates[0])
+    assert (await collecting)[0].ids() == ["gated-0"]
+
+
+async def test_a_collect_gets_what_is_sent_while_it_waits(group: Any, gates: list[Gate]) -> None:
+    """From a worker that had nothing to do when it began."""
+    group.step_async(responses(0))
+    collecting = asyncio.create_task(group.collect_async())
+    await asyncio.sleep(0)
+    group.step_async(responses(3))
+    await open_gates(gates[3])
+    assert (await collecting)[0].ids() == ["gated-3"]
+    await open_gates(gates[0])
+    assert (await group.collect_async())[0].ids() == ["gated-0"]
+
+
+async def test_a_collect_gets_what_another_caller_gave_up(group: Any, gates: list[Gate]) -> None:
+    """Also what had arrived before it was given up."""
+    group.step_async(responses(0))
+    stepping = asyncio.create_task(group.step(responses(1, 2)))
+    await asyncio.sleep(0)
+    collecting = asyncio.create_task(group.collect_async())
+    await open_gates(gates[1])
+    await group["gated-3"].call("double", 1)
+    stepping.cancel()
+    assert (await collecting)[0].ids() == ["gated-1"]
+    await open_gates(gates[0], gates[2])
+    batch, _ = await group.collect_async(wait_all=True)
+    assert sorted(batch.ids()) == ["gated-0", "gated-2"]
+
+
+async def test_inline_envs_are_served_while_others_are_waited_for(
+    tmp_path: Path, gates: list[Gate]
+) -> None:
+    """What is sent to them while a collect waits for a worker wakes it."""
+    inline = {
+        "name": "here",
+        "backend": "probe",
+        "task": "x",
+        "placement": "inline",
+        "num_workers": 2,
+    }
+    async with rlightning_aio.build_env_group([entry(tmp_path, num_workers=1), inline]) as group:
+        await group.reset()
+        group.step_async(responses(0))
+        collecting = asyncio.create_task(group.collect_async())
+        await asyncio.sleep(0)
+        group.step_async(BatchedData(["here-1"], [PolicyResponse("here-1", [0, 5])]))
+        assert (await collecting)[0].ids() == ["here-1"]
+        collecting = asyncio.create_task(group.collect_async())
+        await asyncio.sleep(0)
+        assert (await group["here-0"].step([0, 6])).last_reward == 6
+        assert not collecting.done()
+        await open_gates(gates[0])
+        assert (await collecting)[0].ids() == ["gated-0"]
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+async def test_closing_wakes_whoever_waits(group: Any) -> None:
+    """A collector and a stepper learn at once that nothing will come; envs get their time."""
+    group.step_async(responses(0))
+    waiting = [
+        asyncio.create_task(group.collect_async()),
+        asyncio.create_task(group.step(responses(1))),
+    ]
+    await asyncio.sleep(0)
+    closing = asyncio.create_task(group.close())
+    await asyncio.wait(waiting)
+    assert not closing.done()
+    for task in waiting:
+        with pytest.raises(GroupClosed):
+            task.result()
+    with pytest.warns(UserWarning, match="did not close in time"):
+        await closing
