@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -11,6 +11,9 @@ from remote.counting import ClientThread, CountingEnv
 from remote.faulty_proxy import Faults, FaultyProxy
 
 from rlightning_aio import BatchedData, PolicyResponse, sync
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 REQUESTS = int(os.environ.get("RLIGHTNING_AIO_FAULTY_REQUESTS", "400"))
 """For each kind of network; 10,000 take some minutes."""
@@ -55,7 +58,9 @@ NETWORKS = {
 
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("network", NETWORKS)
-def test_none_is_executed_twice_and_each_ends_once(network: str) -> None:
+def test_none_is_executed_twice_and_each_ends_once(
+    network: str, record_property: Callable[[str, Any], None]
+) -> None:
     """Every number that a trainer sends ends in its own result, a marked one, or a return."""
     envs = [RecordingEnv(k) for k in range(CLIENTS)]
     config = {
@@ -77,7 +82,8 @@ def test_none_is_executed_twice_and_each_ends_once(network: str) -> None:
             group.close()
             for thread in threads:
                 thread.join()
-        print(network, proxy.tally, ends)
+        record_property("network", proxy.tally)
+        record_property("requests", ends)
     executed = [number for env in envs for number in env.executed]
     assert len(executed) == len(set(executed)), "a request was executed twice"
     assert sum(ends.values()) == REQUESTS
