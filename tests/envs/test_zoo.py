@@ -31,7 +31,8 @@ ISAAC_PYTHON = os.environ.get("ISAAC_PYTHON", "")
 ZOO = ROOT / "configs" / "zoo.yaml"
 NAMES = ["cheetah", "pong", "pick_cube", "isaac_cartpole", "spread", "piper"]
 ISAAC = NAMES.index("isaac_cartpole")
-RESULTS, RESULTS_OF_EACH = 1000, 10
+RESULTS, LEAST, MOST = 1000, 10, 500
+"""In all; of each entry; and after how many an entry rests, to leave the cores to the slow."""
 NO_LIMIT = 10**6
 
 pytestmark = [
@@ -90,13 +91,14 @@ async def test_six_simulators_are_collected_as_they_answer(overrides: list[str])
         with group.auto_reset(NO_LIMIT):
             for part in batch.by_name().values():
                 group.step_async(part.respond(action=actions(part, action_spaces)))
-            while counts.total() < RESULTS or min(counts.values()) < RESULTS_OF_EACH:
+            while counts.total() < RESULTS or min(counts.values()) < LEAST:
                 batch, _ = await group.collect_async()
                 for name, part in batch.by_name().items():
                     assert {id_.rpartition("-")[0] for id_ in part.ids()} == {name}
                     check(part, spaces)
                     counts[name] += len(part)
-                    group.step_async(part.respond(action=actions(part, action_spaces)))
+                    if counts[name] < MOST:
+                        group.step_async(part.respond(action=actions(part, action_spaces)))
     assert list(counts) == NAMES
     # In lockstep it would be once for each of the four.
     assert counts["cheetah"] > 4 * counts["piper"]
