@@ -1,0 +1,29 @@
+"""Groups that come and go leave nothing behind: the short form of a benchmark."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+SCRIPT = Path(__file__).parents[2] / "benchmarks" / "soak.py"
+
+
+def test_nothing_piles_up_over_groups(tmp_path: Path) -> None:
+    """Six groups, of both kinds, one after the other: no descriptor or process more."""
+    out = tmp_path / "report.json"
+    run = subprocess.run(
+        [sys.executable, SCRIPT, "--cycles", "6", "--steps", "3000", "--json", out],
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
+    )
+    assert run.returncode == 0, run.stdout + run.stderr
+    report = json.loads(out.read_text())
+    samples = report["samples"]
+    assert [found["cycle"] for found in samples] == list(range(1, 7))
+    assert samples[-1]["steps"] >= 3000
+    assert [found["children"] for found in samples] == [0] * 6
+    assert report["growth"]["descriptors"] == report["growth"]["shared_memory"] == 0
