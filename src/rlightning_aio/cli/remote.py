@@ -169,8 +169,7 @@ def _status(served: RemoteEnvClient, address: str) -> Generator[None]:
 
     def line() -> Spinner:
         # As a text: brackets of a name or an address are no markup.
-        words = f"{served.name} at {address}: {served.state}  {_figures(served)}"
-        spinner.update(text=Text(words))
+        spinner.update(text=Text(f"{served.name}: {served.state}  {_figures(served)}"))
         return spinner
 
     with Live(

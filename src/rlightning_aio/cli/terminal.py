@@ -116,8 +116,8 @@ def count(value: float) -> str:
 
 
 def counted(how_many: int, what: str) -> str:
-    """Such as "1 env" and "16 envs"."""
-    return f"{count(how_many)} {what}{'s' if how_many > 1 else ''}"
+    """Such as "1 env", "16 envs" and "0 envs"."""
+    return f"{count(how_many)} {what}{'' if how_many == 1 else 's'}"
 
 
 def number(value: float | None) -> str:

@@ -1,0 +1,127 @@
+"""``docs/wire-format.md`` says what the code does."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any, get_args
+
+import gymnasium as gym
+import msgspec
+import numpy as np
+import pytest
+
+from rlightning_aio.protocol import wire
+from rlightning_aio.protocol.payload import Packed, SpaceLayout
+from rlightning_aio.protocol.space_description import describe, space_from
+from rlightning_aio.protocol.wire import Bye, Hello, Reader, Result, Step, Welcome, Writer
+
+PAGE = (Path(__file__).parents[2] / "docs" / "wire-format.md").read_text()
+MESSAGES = sorted(
+    {*get_args(wire.FromClient), *get_args(wire.FromServer)}, key=lambda kind: kind.__name__
+)
+OBSERVATIONS = gym.spaces.Box(-1, 1, (2,), np.float32)
+ACTIONS = gym.spaces.Discrete(2)
+
+
+def written(message: Any, space: gym.Space[Any] | None = None, value: Any = None) -> list[bytes]:
+    packed = Packed([], [])
+    if space is not None:
+        SpaceLayout(space, "value").pack(value, packed)
+    return Writer().write(message, packed.frames)
+
+
+EXAMPLES = [
+    written(
+        Hello(
+            version=wire.VERSION,
+            name="arm",
+            nonce=7,
+            observation_space=describe(OBSERVATIONS, "observation"),
+            action_space=describe(ACTIONS, "action"),
+        )
+    ),
+    written(Welcome(nonce=7, session=9, env_id="robots-0/arm", heartbeat=5.0)),
+    written(
+        Result(session=9, number=0, reward=0.0, terminated=False, truncated=False),
+        OBSERVATIONS,
+        np.array([0.5, -1], np.float32),
+    ),
+    written(Step(session=9, number=1), ACTIONS, 1),
+    written(
+        Result(
+            session=9,
+            number=1,
+            busy_ns=1000,
+            reward=1.0,
+            terminated=False,
+            truncated=True,
+            info={"seconds": 0.5, "force": np.array([1, 2], np.float32)},
+        ),
+        OBSERVATIONS,
+        np.array([0.25, 1], np.float32),
+    ),
+    written(Bye(session=9, reason="done")),
+]
+
+
+def examples_of_the_page() -> list[list[bytes]]:
+    """The parts of each message that the page shows byte by byte."""
+    messages: list[list[bytes]] = []
+    for block in re.findall(r"^```hex\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL):
+        parts = re.split(r"^# part \d+, (\d+) bytes\n", block, flags=re.MULTILINE)[1:]
+        message: list[bytes] = []
+        for length, lines in zip(parts[::2], parts[1::2], strict=True):
+            part = bytes.fromhex(" ".join(line.partition("|")[0] for line in lines.splitlines()))
+            assert len(part) == int(length)
+            message.append(part)
+        messages.append(message)
+    return messages
+
+
+def test_the_bytes_are_those_that_are_written() -> None:
+    """Each message of the example, header and frames."""
+    assert examples_of_the_page() == EXAMPLES
+
+
+def test_the_bytes_are_read() -> None:
+    """Each message of the example is one to its receiver."""
+    for parts in examples_of_the_page():
+        kind = msgspec.msgpack.decode(parts[0])["type"]
+        side = wire.FromServer if kind in ("welcome", "step") else wire.FromClient
+        reader: Reader[Any] = Reader(side)
+        message, _ = reader.read(parts)
+        assert message.__struct_config__.tag == kind
+
+
+@pytest.mark.parametrize("kind", MESSAGES)
+def test_every_field_is_named(kind: Any) -> None:
+    """A message's section lists its fields, and no others."""
+    tag = kind.__struct_config__.tag
+    titles = [title for title in re.findall(r"^### (.*)$", PAGE, re.MULTILINE) if tag in title]
+    section = (
+        PAGE.partition(f"### {titles[0]}\n")[2].partition("\n#")[0].split("| `code` | `retry` |")[0]
+    )
+    rows = re.findall(r"^\| (`.*?) \|", section, re.MULTILINE)
+    assert re.findall(r"`(\w+)`", " ".join(rows)) == [*kind.__struct_fields__]
+
+
+@pytest.mark.parametrize("dtype", wire.DTYPES)
+def test_every_dtype_is_named(dtype: str) -> None:
+    """Whatever an array may consist of."""
+    assert f"`{dtype}`" in PAGE
+
+
+def test_the_limits_are_those_of_the_code() -> None:
+    """In mebibytes, and in parts."""
+    assert f"| header | {wire.MAX_HEADER_BYTES >> 20} MiB |" in PAGE
+    assert f"| frame | {wire.MAX_FRAME_BYTES >> 20} MiB |" in PAGE
+    assert f"| parts of a message | {wire.MAX_PARTS:,} |" in PAGE
+
+
+def test_the_described_space_is_one() -> None:
+    """The JSON example describes a space, which describes itself in the same way."""
+    (text,) = re.findall(r"^```json\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
+    description = json.loads(text)
+    assert describe(space_from(description), "space") == description
