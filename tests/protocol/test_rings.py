@@ -42,7 +42,6 @@ class RingsMachine(RuleBasedStateMachine):
         self.trainer, self.worker = TrainerRings(memory, rows), WorkerRings(memory, rows)
         self.number = 0
         self.requested: deque[int] = deque()
-        self.executing: deque[int] = deque()
         self.reported: deque[int] = deque()
         self.frames = [0, 0]
         self.asleep = False
@@ -59,24 +58,28 @@ class RingsMachine(RuleBasedStateMachine):
 
     def room(self) -> int:
         """Each env may have one request in flight, and no more."""
-        return self.rows - len(self.requested) - len(self.executing) - len(self.reported)
+        return self.rows - len(self.requested) - len(self.reported)
 
     @precondition(lambda self: not self.asleep)
-    @rule()
-    def take_requests(self) -> None:
-        assert self.worker.requests() == list(self.requested)
-        self.executing.extend(self.requested)
-        self.requested.clear()
+    @rule(data=st.data())
+    def serve(self, data: st.DataObject) -> None:
+        bells: list[int] = []
+        executed: list[int] = []
+        in_rows = [data.draw(st.booleans()) for _ in self.requested]
 
-    @precondition(lambda self: self.executing)
-    @rule()
-    def report(self) -> None:
-        done = self.executing.popleft()
-        self.reported.append(done)
-        rung = self.worker.report(done)
+        def execute(request: int) -> bool:
+            executed.append(request)
+            return in_rows[len(executed) - 1]
+
+        served = self.worker.serve(execute, lambda: bells.append(len(executed)))
+        assert served == bool(self.requested)
+        assert executed == list(self.requested)
+        self.reported += [done for done, in_row in zip(executed, in_rows, strict=True) if in_row]
+        self.requested.clear()
+        # One bell for each order, once there is enough; never for what nobody waits for.
         enough = self.ordered is not None and len(self.reported) >= self.ordered
-        assert rung == enough
-        if rung:
+        assert len(bells) == (served and enough)
+        if bells:
             self.ordered = None
 
     @rule()
@@ -168,9 +171,8 @@ def test_the_trainer_sees_what_the_worker_executes_and_since_when() -> None:
 def _work(rings: WorkerRings, channel: socket.socket) -> None:
     """What a worker does, without envs: ends with its trainer's end of the channel."""
     while True:
-        for request in rings.requests():
-            if rings.report(request):
-                channel.send(b"!")
+        if rings.serve(lambda _: True, lambda: channel.send(b"!")):
+            continue
         if rings.fall_asleep():
             if not channel.recv(1 << 16):
                 return

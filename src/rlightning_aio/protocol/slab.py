@@ -79,7 +79,10 @@ class RowLayout:
         offset = 0
         for shape, dtype in self._arrays():
             count = rows * prod(shape)
-            yield np.frombuffer(buffer, dtype, count, offset).reshape(rows, *shape)
+            # A dtype that was pickled is not the one that arrays have, only equal to it;
+            # made anew it is, and can be compared by identity (see `columns.row_writer`).
+            own = np.dtype(dtype.str)
+            yield np.frombuffer(buffer, own, count, offset).reshape(rows, *shape)
             offset += _aligned(count * dtype.itemsize)
 
 
