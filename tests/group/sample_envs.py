@@ -163,8 +163,11 @@ class ProbedSimulator(gym.Wrapper[Any, Any, Any, Any]):
 class Gated(Probe):
     """Each step waits until the test opens the gate, a FIFO in the folder ``gates``."""
 
-    def step(self, policy_resp: PolicyResponse) -> EnvRet:
+    def wait_at_gate(self) -> None:
         Gate(self.config.env_kwargs["gates"], self.env_id).wait()
+
+    def step(self, policy_resp: PolicyResponse) -> EnvRet:
+        self.wait_at_gate()
         return super().step(policy_resp)
 
 
