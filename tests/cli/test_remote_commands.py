@@ -161,6 +161,14 @@ def test_keys_that_can_not_be_read_leave_no_env_behind(tmp_path: Path) -> None:
     assert (tmp_path / "closed").exists()
 
 
+def test_a_name_that_no_server_would_read(tmp_path: Path) -> None:
+    """It is refused here, where somebody sees it; the env is closed."""
+    done = invoke("client", finishing(tmp_path, 1), "--connect", NOBODY, "--name", 129 * "n")
+    assert done.exit_code == 2
+    assert "128" in done.stderr
+    assert (tmp_path / "closed").exists()
+
+
 def test_keygen_says_what_goes_where(tmp_path: Path) -> None:
     """Each directory is named and holds keys that can be read; secrets are their owner's alone."""
     top = tmp_path / "keys"

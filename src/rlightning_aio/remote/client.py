@@ -33,7 +33,7 @@ from rlightning_aio.protocol.client_session import (
 from rlightning_aio.protocol.columns import Misfit
 from rlightning_aio.protocol.server_session import PATIENCE
 from rlightning_aio.protocol.space_description import UnsupportedSpace
-from rlightning_aio.protocol.wire import MAX_FRAME_BYTES
+from rlightning_aio.protocol.wire import MAX_FRAME_BYTES, MAX_NAME_LENGTH
 from rlightning_aio.remote.keys import read_client_keys
 from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
 
@@ -79,7 +79,8 @@ class RemoteEnvClient:
         num_sessions: how often it was let in.
 
     Raises:
-        ConfigError: the env's spaces can't be announced, or the keys can't be read.
+        ConfigError: the name is too long, the env's spaces can't be announced, or the keys
+            can't be read.
     """
 
     def __init__(
@@ -93,6 +94,10 @@ class RemoteEnvClient:
         heartbeat: float = 5.0,
     ) -> None:
         self.name = name or f"{socket.gethostname()}-{os.getpid()}"
+        if len(self.name) > MAX_NAME_LENGTH:
+            raise ConfigError(
+                f"a client's name has {len(self.name)} characters; {MAX_NAME_LENGTH} are allowed"
+            )
         self.num_steps = 0
         self.num_sessions = 0
         self._env = env
