@@ -12,7 +12,6 @@ that has grown on by more than a few MiB.
 from __future__ import annotations
 
 import argparse
-import gc
 import json
 import sys
 import time
@@ -68,8 +67,7 @@ async def cycle_async(steps: int, rng: np.random.Generator) -> int:
 
 
 def sample() -> dict[str, float]:
-    """What this process holds now; what merely awaits the collector is in nobody's hands."""
-    gc.collect()
+    """What this process holds now, without any help to the garbage collector."""
     children = [
         pid
         for path in Path("/proc/self/task").glob("*/children")
