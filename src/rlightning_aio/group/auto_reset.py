@@ -85,7 +85,7 @@ class AutoReset:
         if any(own is not None and own != limit for own in configured):
             warnings.warn(
                 f"auto_reset(max_episode_steps={limit}) overrides the limits that are configured",
-                stacklevel=5,
+                stacklevel=4,
             )
         return np.full(len(table), limit, np.int64)
 
