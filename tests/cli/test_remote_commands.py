@@ -92,11 +92,15 @@ def test_keys_let_a_client_in_until_its_env_is_finished(tmp_path: Path) -> None:
     assert json.loads(server_stdout)["steps"] == 5
 
 
-def test_ctrl_c_closes_the_env_while_nobody_answers(tmp_path: Path) -> None:
-    """A client without a server waits for one; interrupted, it leaves its env in order."""
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_closes_the_env_while_nobody_answers(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    """A client without a server waits for one; interrupted, by a person or by a service
+    manager, it leaves its env in order."""
     with start("client", finishing(tmp_path, 1), "--connect", NOBODY, "--json") as client:
         line_with(client, " dials ")
-        client.send_signal(signal.SIGINT)
+        client.send_signal(number)
         stdout, stderr = client.communicate(timeout=30)
     assert client.returncode == 130, stderr
     assert "Traceback" not in stderr

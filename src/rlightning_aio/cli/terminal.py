@@ -79,13 +79,16 @@ def guarded(command: Callable[..., None]) -> Callable[..., None]:
 def interruptible() -> Generator[None]:
     """Ctrl-C raises KeyboardInterrupt in here, where there is something to clean up.
 
-    Anywhere else it ends the command on the spot (see `cli.main`).
+    So does SIGTERM, with which a service manager stops a robot's client. Anywhere else both
+    end the command on the spot (see `cli.main`).
     """
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, signal.default_int_handler) for number in numbers]
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
 
 
 def _in_words(error: RLightningError) -> str:
