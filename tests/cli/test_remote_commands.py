@@ -97,7 +97,8 @@ def test_an_interrupt_closes_the_env_while_nobody_answers(
     tmp_path: Path, number: signal.Signals
 ) -> None:
     """A client without a server waits for one; interrupted, by a person or by a service
-    manager, it leaves its env in order."""
+    manager, it leaves its env in order.
+    """
     with start("client", finishing(tmp_path, 1), "--connect", NOBODY, "--json") as client:
         line_with(client, " dials ")
         client.send_signal(number)
