@@ -302,3 +302,36 @@ def test_plain_batches_are_answered_alike() -> None:
         ["server", "server"], [EnvRet(env_id=f"s/{k}", observation=k) for k in (1, 2)]
     )
     assert [r.env_id for r in batch.respond(action=[1, 2]).values()] == ["s/1", "s/2"]
+
+
+def test_values_without_a_fixed_size_come_as_a_list() -> None:
+    """However long each is, also where they happen to be of one length."""
+    space = spaces.Dict(
+        items=spaces.Sequence(spaces.Discrete(9)), pair=spaces.Tuple([spaces.Discrete(9)] * 2)
+    )
+    values = [{"items": (1, 2), "pair": (3, 4)}, {"items": (5, 6), "pair": (7, 8)}]
+    part = columns([0, 1], None, rests=dict(enumerate({"observation": v} for v in values)))
+    part.observation_space = space
+    observation = results(part).observation
+    assert observation["items"] == [(1, 2), (5, 6)]
+    assert [column.tolist() for column in observation["pair"]] == [[3, 7], [4, 8]]
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ({"a": 1}, {"b": 1}),
+        ({"a": 1}, 1),
+        ((1, 2), (1, 2, 3)),
+        ((1, 2), 5),
+        (np.zeros(2), np.zeros(3)),
+    ],
+)
+def test_what_differs_in_structure_does_not_stack(one: Any, other: Any) -> None:
+    """It is said what to do, whatever the difference."""
+    batch = BatchedData(
+        ["a-0", "b-0"],
+        [EnvRet(env_id="a-0", observation=one), EnvRet(env_id="b-0", observation=other)],
+    )
+    with pytest.raises(ValueError, match=r"by_name\(\)"):
+        batch.observation  # noqa: B018

@@ -17,13 +17,14 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 import numpy as np
 
 from rlightning_aio.errors import BadAction
-from rlightning_aio.protocol.columns import Tree, index, mapped
+from rlightning_aio.protocol.columns import Tree, index, is_dict, is_tuple, leaves, mapped
 from rlightning_aio.protocol.info import NO_INFO, PICKLED, InfoSchema
 from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
+    import gymnasium as gym
     from numpy.typing import NDArray
 
 __all__ = ["BatchedData", "EnvTable", "Origin", "ResultColumns"]
@@ -64,6 +65,7 @@ class ResultColumns:
         episode_return, episode_length: valid where an episode has ended; None if nowhere.
         done_ns: when each result was ready (monotonic); busy_ns: time the env took.
         agents: names of a multi-agent env's agents.
+        observation_space: of one env; None if it isn't known.
     """
 
     slots: NDArray[np.intp]
@@ -83,6 +85,7 @@ class ResultColumns:
     done_ns: NDArray[np.int64]
     busy_ns: NDArray[np.int64]
     agents: tuple[str, ...] = ()
+    observation_space: gym.Space[Any] | None = None
 
     def __len__(self) -> int:
         return len(self.slots)
@@ -147,8 +150,9 @@ class ResultColumns:
     def ret(self, row: int) -> EnvRet | MultiAgentEnvRet:
         """One env's result as a value of its own."""
         rest = self.rest(row) if self.rests else {}
-        if "ret" in rest and not self._episode(row):
-            return rest["ret"]
+        if "ret" in rest:
+            episode = {"info": self.info_of(row)} if self._episode(row) else {}
+            return rest["ret"].model_copy(update=episode) if episode else rest["ret"]
         fields = {
             "env_id": self.table.ids(self.slots[row : row + 1])[0],
             "observation": self.observation_of(row),
@@ -302,11 +306,17 @@ class BatchedData:
     def observation(self) -> Any:
         """Observations stacked: ``[n, *obs]``, or dicts and tuples of such arrays.
 
+        What has no fixed size (Text, Sequence, Graph) comes as a list of n values.
+
         Raises:
             ValueError: the envs have different observation spaces; use `by_name`.
         """
-        if len(self._parts) == 1 and self._parts[0].observation is not None:
-            return self._parts[0].observation
+        if len(self._parts) == 1 and not self._parts[0].holds_whole_results:
+            part = self._parts[0]
+            if part.observation is not None:
+                return part.observation
+            values = [part.observation_of(row) for row in range(len(part))]
+            return _columns(part.observation_space, values)
         if self._parts:
             places = _by_position(self._parts, len(self))
             return _stacked([part.observation_of(row) for part, row in places])
@@ -469,14 +479,38 @@ def _subset(part: ResultColumns, rows: list[int], positions: list[int]) -> Resul
     )
 
 
+def _columns(space: gym.Space[Any] | None, values: list[Any]) -> Any:
+    """`values` of `space` as columns."""
+    if space is not None and is_dict(space):
+        parts = space.spaces.items()
+        return {key: _columns(inner, [value[key] for value in values]) for key, inner in parts}
+    if space is not None and is_tuple(space):
+        return tuple(
+            _columns(inner, [value[k] for value in values]) for k, inner in enumerate(space.spaces)
+        )
+    return values if space is not None and leaves(space) is None else _stacked(values)
+
+
 def _stacked(values: list[Any]) -> Any:
-    """`values` as columns: arrays, torch tensors, and dicts and tuples of them."""
+    """`values` as columns: arrays, torch tensors, and dicts and tuples of them.
+
+    Raises:
+        ValueError: they differ in structure or shape.
+    """
     first = values[0] if values else None
     if isinstance(first, dict):
-        keys = list(cast("dict[Any, Any]", first))
+        keys = cast("dict[Any, Any]", first).keys()
+        if not all(isinstance(value, dict) and value.keys() == keys for value in values):
+            raise _differing()
         return {key: _stacked([value[key] for value in values]) for key in keys}
     if isinstance(first, tuple):
-        return tuple(_stacked(list(parts)) for parts in zip(*values, strict=True))
+        if not all(isinstance(value, tuple) for value in values):
+            raise _differing()
+        tuples = cast("list[tuple[Any, ...]]", values)
+        length = len(tuples[0])
+        if any(len(value) != length for value in tuples):
+            raise _differing()
+        return tuple(_stacked([value[k] for value in tuples]) for k in range(length))
     if isinstance(first, str):
         return values
     if type(first).__module__.partition(".")[0] == "torch":
@@ -484,7 +518,11 @@ def _stacked(values: list[Any]) -> Any:
         return sys.modules["torch"].stack(values)
     arrays = [np.asarray(value) for value in values]
     if len({array.shape for array in arrays}) > 1:
-        raise ValueError(
-            "envs of this batch have different shapes, so their values don't stack; use by_name()"
-        )
+        raise _differing()
     return np.stack(arrays) if arrays else np.empty(0)
+
+
+def _differing() -> ValueError:
+    return ValueError(
+        "envs of this batch have different shapes, so their values don't stack; use by_name()"
+    )

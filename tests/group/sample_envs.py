@@ -1,13 +1,14 @@
 """Envs of the tests' own, which workers import by this module's name.
 
 Of Gymnasium's kind: `Tree-v0` has observations and actions of every space that travels in
-rows, `Words-v0` of every kind that doesn't. Each observation is drawn anew, so that seeds
-matter. The others are registered backends; see each.
+rows, `Words-v0` observations and `Speech-v0` actions of spaces that don't. Each observation
+is drawn anew, so that seeds matter. The others are registered backends; see each.
 """
 
 from __future__ import annotations
 
 import os
+import signal
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -70,8 +71,13 @@ def words() -> DrawnEnv:
     return DrawnEnv(WORDS, spaces.Discrete(3))
 
 
+def speech() -> DrawnEnv:
+    return DrawnEnv(spaces.Box(-1, 1, (2,)), spaces.Tuple([spaces.Text(9), spaces.Discrete(2)]))
+
+
 gym.register("Tree-v0", entry_point=tree)
 gym.register("Words-v0", entry_point=words)
+gym.register("Speech-v0", entry_point=speech)
 
 
 # -- envs of this package's own kind
@@ -130,6 +136,9 @@ class Probe(BaseEnv):
             info={"extras": policy_resp.extras} if policy_resp.extras else {},
             _extra={"steps": self.steps},
         )
+
+    def die(self) -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
 
     def double(self, value: Any, *, times: int = 2) -> Any:
         return value * times
@@ -202,6 +211,19 @@ class Chunked(Probe):
         chunk = action["chunk"] if isinstance(action, dict) else action
         self.steps += len(chunk)
         return self._result(last_reward=float(np.sum(chunk)), info={"type": type(action).__name__})
+
+
+@ENVS.register("sloppy")
+class Sloppy(Probe):
+    """Its step returns what its action says, whatever its spaces promise."""
+
+    transforms_actions = True
+
+    def step(self, policy_resp: PolicyResponse) -> Any:
+        result = self._result()
+        for name, value in policy_resp.action.items():
+            setattr(result, name, value)
+        return result if policy_resp.action else None
 
 
 @ENVS.register("batched")

@@ -334,6 +334,7 @@ async def test_zero_copy_lends_read_only_views(start: Any) -> None:
     assert lent[:, 2].tolist() == [1] * 4, "it is a view of the rows"
     owned, _ = await group.step(responses(["probe-3", "probe-0"], 1, 2))
     assert owned.observation[:, 0].tolist() == [3, 0]
+    assert len((await group.step(BatchedData()))[0]) == 0
 
 
 async def test_what_a_group_has_measured(start: Any, capsys: pytest.CaptureFixture[str]) -> None:

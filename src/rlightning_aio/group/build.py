@@ -105,7 +105,8 @@ def _preprocess_fns(
             "envs; give one, one for each entry, or one for each env"
         )
     for config, fns in zip(configs, chosen, strict=True):
-        for fn in set(fns) - {None}:
+        # By identity: a callable need not be hashable.
+        for fn in {id(fn): fn for fn in fns if fn is not None}.values():
             _check_preprocess(config, fn)
     return chosen
 

@@ -122,6 +122,7 @@ def _part(
         done_ns=_copy(slab.done_ns, rows),
         busy_ns=_copy(slab.busy_ns, rows),
         agents=slab.layout.agents,
+        observation_space=slab.layout.observation_space,
     )
 
 
@@ -151,6 +152,8 @@ def _observations(core: Core, slab: Slab, rows: Rows) -> Any:
 def _contiguous(rows: Rows) -> slice | None:
     if isinstance(rows, slice):
         return rows
+    if not len(rows):
+        return None
     first, last = int(rows[0]), int(rows[-1])
     if last - first + 1 == len(rows) and (np.diff(rows) == 1).all():
         return slice(first, last + 1)

@@ -1,0 +1,353 @@
+"""What goes into an env and what comes out of it: actions, extras and values of all kinds."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+from group import sample_envs
+from gymnasium import spaces
+
+from rlightning_aio import (
+    BadAction,
+    BatchedData,
+    ConfigError,
+    EnvRaised,
+    MultiAgentEnvRet,
+    PolicyResponse,
+    build_env_group,
+)
+
+PROBE = {"name": "probe", "backend": "probe", "task": "x", "num_workers": 2}
+CARTPOLE = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1", "num_workers": 2}
+
+
+def gym_entry(task: str, **fields: Any) -> dict[str, Any]:
+    return {
+        "name": "e",
+        "backend": "gymnasium",
+        "task": task,
+        "num_workers": 2,
+        "imports": ["group.sample_envs"],
+        **fields,
+    }
+
+
+def same(one: Any, other: Any) -> bool:
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(one[k], other[k]) for k in one)
+    if isinstance(one, tuple):
+        return type(one) is type(other) and len(one) == len(other) and all(map(same, one, other))
+    if isinstance(one, np.ndarray | np.generic):
+        return one.dtype == other.dtype and np.array_equal(one, other)
+    return type(one) is type(other) and one == other
+
+
+# -- preprocess functions
+
+
+def scaled(factor: float, response: PolicyResponse) -> Any:
+    return np.array([0.0, response.action * factor])
+
+
+class Adder:
+    """A callable that can't be hashed."""
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __init__(self, number: float) -> None:
+        self.number = number
+
+    def __call__(self, response: PolicyResponse) -> Any:
+        return [0.0, response.action + self.number]
+
+
+async def test_one_function_serves_every_env(start: Any) -> None:
+    """A lambda with a captured variable; its action may have any shape."""
+    offset = 100.0
+    two = {**PROBE, "name": "two", "num_workers": 1}
+    group = await start([PROBE, two], preprocess_fn=lambda r: [0, r.action.sum() + offset])
+    batch, _ = await group.reset()
+    batch, _ = await group.step(batch.respond(action=np.ones((3, 4, 5))))
+    assert batch.reward.tolist() == [120.0] * 3
+
+
+async def test_functions_are_given_by_entry_or_by_env(start: Any) -> None:
+    """An entry's function is each of its envs'; None stands for the default."""
+    two = {**PROBE, "name": "two", "num_workers": 1}
+    group = await start([PROBE, two], preprocess_fn=[partial(scaled, 2.0), Adder(0.5)])
+    batch, _ = await group.reset()
+    batch, _ = await group.step(batch.respond(action=np.array([1.0, 2.0, 3.0])))
+    assert batch.reward.tolist() == [2.0, 4.0, 3.5]
+    group = await start([PROBE, two], preprocess_fn=[partial(scaled, 3.0), None, Adder(7)])
+    batch, _ = await group.reset()
+    actions = [1.0, [0, 50.0], 3.0]
+    batch, _ = await group.step(batch.respond(action=actions))
+    assert batch.reward.tolist() == [3.0, 50.0, 10.0]
+
+
+async def test_a_function_serves_built_in_backends(start: Any) -> None:
+    """It makes the simulator's action of whatever the policy gives, here of logits."""
+    group = await start(CARTPOLE, preprocess_fn=lambda response: int(np.argmax(response.logits)))
+    plain = await start(CARTPOLE)
+    batch, _ = await group.reset(seed=3)
+    await plain.reset(seed=3)
+    for left in (0, 1, 1):
+        logits = np.eye(2)[[left, 1 - left]]
+        batch, _ = await group.step(batch.respond(action=[None, None], logits=logits))
+        expected, _ = await plain.step(
+            BatchedData(
+                plain.env_ids, [PolicyResponse(f"pole-{k}", [left, 1 - left][k]) for k in (0, 1)]
+            )
+        )
+        assert (batch.observation == expected.observation).all()
+
+
+def test_a_function_that_cannot_travel_is_named_before_anything_starts() -> None:
+    """With what it captures, or how many there should have been."""
+    lock = threading.Lock()
+
+    def locked(response: PolicyResponse) -> Any:
+        with lock:
+            return response.action
+
+    with pytest.raises(ConfigError, match=r"'probe'.*locked.*captures 'lock'"):
+        build_env_group(PROBE, preprocess_fn=locked)
+    with pytest.raises(ConfigError, match="3 preprocess functions for 1 entries with 2 envs"):
+        build_env_group(PROBE, preprocess_fn=[locked] * 3)
+    with pytest.raises(ConfigError, match="must be callable, not int"):
+        build_env_group(PROBE, preprocess_fn=[1])
+    inline = {**PROBE, "placement": "inline"}
+    assert build_env_group(inline, preprocess_fn=locked).size() == 2
+
+
+# -- extras
+
+
+@dataclass
+class Thought:
+    """Something that only the policy understands."""
+
+    depth: int
+
+
+async def test_extras_reach_the_function_and_the_step(start: Any) -> None:
+    """From columns and from single responses, with actions that fit their rows."""
+    group = await start(PROBE, preprocess_fn=lambda r: [0, r.action[1] * r.weight])
+    batch, _ = await group.reset()
+    columns = batch.respond(action=np.array([[0, 2.0], [0, 3.0]]), weight=np.array([10.0, 20.0]))
+    batch, _ = await group.step(columns)
+    assert batch.reward.tolist() == [20.0, 60.0]
+    assert batch.info == [{"extras": {"weight": 10.0}}, {"extras": {"weight": 20.0}}]
+    one = PolicyResponse("probe-1", np.array([0, 4.0]), weight=2.0, thought=Thought(3))
+    group.step_async(BatchedData(["probe-1"], [one]))
+    batch, _ = await group.collect_async()
+    assert batch.reward.tolist() == [8.0]
+    assert batch.info[0]["extras"]["thought"].depth == 3
+
+
+async def test_extras_that_nothing_can_read_are_not_sent(start: Any) -> None:
+    """A built-in backend with the default function: what is attached stays with the policy."""
+    group = await start(CARTPOLE)
+    batch, _ = await group.reset(seed=0)
+    unpicklable = [threading.Lock(), threading.Lock()]
+    batch, _ = await group.step(batch.respond(action=np.array([0, 1]), lock=unpicklable))
+    ids = batch.ids()
+    responses = [
+        PolicyResponse(id_, 1, lock=lock) for id_, lock in zip(ids, unpicklable, strict=True)
+    ]
+    batch, _ = await group.step(BatchedData(ids, responses))
+    assert batch.ids() == ids
+
+
+# -- actions
+
+
+async def test_actions_of_every_space_that_travels_in_rows(start: Any) -> None:
+    """Box, Discrete, MultiBinary and MultiDiscrete in Dict and Tuple; the env checks each."""
+    from gymnasium.vector.utils import batch_space
+
+    group = await start(gym_entry("Tree-v0"))
+    batch, _ = await group.reset(seed=0)
+    drawn = batch_space(sample_envs.MOVES, 2)
+    for _ in range(3):
+        batch, _ = await group.step(batch.respond(action=drawn.sample()))
+    ids = batch.ids()
+    single = [PolicyResponse(id_, sample_envs.MOVES.sample()) for id_ in ids]
+    batch, _ = await group.step(BatchedData(ids, single))
+    partly = sample_envs.MOVES.sample()
+    del partly["jump"]
+    with pytest.raises(BadAction, match=r"no part \['jump'\]"):
+        await group["e-0"].step(partly)
+    wrong = sample_envs.MOVES.sample()
+    wrong["hands"] = (wrong["hands"][0], np.zeros(3, int))
+    with pytest.raises(BadAction, match=r"\['hands'\]\[1\].*\(2,\).*\(3,\)"):
+        await group["e-0"].step(wrong)
+
+
+async def test_actions_without_a_fixed_size_travel_as_well(start: Any) -> None:
+    """Text in a tuple, say."""
+    group = await start(gym_entry("Speech-v0"))
+    batch, _ = await group.reset(seed=0)
+    batch, _ = await group.step(batch.respond(action=[("hello", 1), ("you", 0)]))
+    assert batch.observation.shape == (2, 2)
+    with pytest.raises(EnvRaised, match=r"'e-1'.*AssertionError"):
+        await group["e-1"].step(("far too long a text", 1))
+
+
+async def test_an_env_that_transforms_actions_takes_any(start: Any) -> None:
+    """Chunks of any length, dicts, and what would have fitted its rows."""
+    chunked = {**PROBE, "name": "chunked", "backend": "chunked"}
+    group = await start(chunked)
+    batch, _ = await group.reset()
+    batch, _ = await group.step(batch.respond(action=[[1.0] * 9, {"chunk": np.ones((2, 2))}]))
+    assert batch.reward.tolist() == [9.0, 4.0]
+    assert [info["type"] for info in batch.info] == ["list", "dict"]
+    batch, _ = await group.step(batch.respond(action=np.full((2, 2), 3.0)))
+    assert batch.reward.tolist() == [6.0, 6.0]
+    group.step_async(batch.respond(action=np.ones((2, 7, 3))))
+    batch, _ = await group.collect_async(wait_all=True)
+    assert batch.reward.tolist() == [21.0, 21.0]
+
+
+# -- observations
+
+
+async def test_observations_without_a_fixed_size_come_as_the_env_gave_them(start: Any) -> None:
+    """Text, Sequence and Graph, wherever they are, equal those of the bare env."""
+    group = await start(gym_entry("Words-v0"))
+    bare = [sample_envs.words(), sample_envs.words()]
+    batch, _ = await group.reset(seed=4)
+    expected = [env.reset(seed=4 + k)[0] for k, env in enumerate(bare)]
+    for _ in range(5):
+        assert all(map(same, [v.observation for v in batch.values()], expected))
+        assert batch.observation["text"] == [value["text"] for value in expected]
+        batch, _ = await group.step(batch.respond(action=np.array([0, 2])))
+        expected = [env.step(action)[0] for env, action in zip(bare, (0, 2), strict=True)]
+        assert batch["e-1"].observation["graph"].nodes.dtype == np.float32
+
+
+@pytest.mark.parametrize(
+    ("result", "said"),
+    [
+        ({"observation": np.zeros(3)}, r"observation.*expected shape \(4,\).*found shape \(3,\)"),
+        ({"observation": np.zeros(4, complex)}, "float64.*complex128"),
+        ({"last_reward": [1.0, 2.0]}, r"reward of env 'probe-0' has shape \(2,\), expected \(\)"),
+        ({}, "must return an EnvRet.*not NoneType"),
+    ],
+)
+async def test_results_that_break_the_envs_promise_are_refused(result: Any, said: str) -> None:
+    """The env is told apart from the policy: it is its error, by name, shape and dtype."""
+    async with build_env_group(
+        {**PROBE, "backend": "sloppy", "placement": "inline", "num_workers": 1}
+    ) as group:
+        await group.reset()
+        with pytest.raises(EnvRaised, match=said):
+            await group["probe-0"].step(result)
+        good = await group["probe-0"].step({"last_reward": 3})
+        assert good.last_reward == 3.0
+
+
+# -- several sub-environments, several agents, several kinds of env
+
+
+async def test_sub_environments_have_an_axis_of_their_own(start: Any) -> None:
+    """And seeds of their own, counted through the group."""
+    batched = {**PROBE, "name": "b", "backend": "batched", "num_envs": 3}
+    group = await start(batched)
+    assert [meta.num_envs for meta in await group.init()] == [3, 3]
+    batch, _ = await group.reset(seed=10)
+    assert batch.observation[:, :, 0].tolist() == [[10, 11, 12], [13, 14, 15]]
+    assert batch.reward.shape == batch.terminated.shape == (2, 3)
+    actions = np.array([[1, 2, 3], [4, 5, 6]])
+    for _ in range(2):
+        batch, _ = await group.step(batch.respond(action=actions))
+    assert batch.reward.tolist() == [[2, 4, 6], [8, 10, 12]]
+    assert batch.terminated.tolist() == [[False] * 3, [False, True, True]]
+    assert batch.ended.tolist() == [False, False]
+    value = batch["b-1"]
+    assert value.last_reward.tolist() == [8, 10, 12]
+    assert value.info["episode"]["ended"].tolist() == [False, True, True]
+    assert value.info["episode"]["r"][1:].tolist() == [15, 18]
+    one, _ = await group.reset(seed=10, env_ids=["b-1"])
+    assert one.observation[0, :, 0].tolist() == [13, 14, 15]
+    with pytest.raises(BadAction, match=r"\(2, 3\).*\(2, 2\)"):
+        await group.step(batch.respond(action=np.ones((2, 2), int)))
+
+
+async def test_agents_have_columns_of_their_own(start: Any) -> None:
+    """With different spaces; an episode has ended when it has for all of them."""
+    group = await start({**PROBE, "name": "c", "backend": "crowd", "max_episode_steps": 9})
+    metas = await group.init()
+    assert metas[0].agents == ("tall", "small")
+    batch, _ = await group.reset()
+    assert batch.observation["tall"].shape == (2, 3)
+    actions = {"tall": np.array([[0.5], [0.25]], np.float32), "small": np.array([1, 0])}
+    with group.auto_reset():
+        for step in (1, 2, 3):
+            batch, _ = await group.step(batch.respond(action=actions))
+            assert batch.observation["small"].tolist() == [step, step]
+            assert batch.terminated["tall"].tolist() == [step >= 2] * 2
+        assert {agent: r.tolist() for agent, r in batch.reward.items()} == {
+            "tall": [0.5, 0.25],
+            "small": [1.0, 0.0],
+        }
+        value = batch["c-1"]
+        assert isinstance(value, MultiAgentEnvRet)
+        assert value.last_reward == {"tall": 0.25, "small": 0.0}
+        assert value.last_terminated == {"tall": True, "small": True}
+        batch, _ = await group.step(batch.respond(action=actions))
+        assert batch.observation["small"].tolist() == [0, 0]
+
+
+async def test_envs_of_different_observations_work_as_one_group(start: Any) -> None:
+    """Each entry's batch stacks, and is answered by itself."""
+    wide = {"name": "e", "backend": "gymnasium", "task": "Acrobot-v1"}
+    poles = {**CARTPOLE, "name": "pole"}
+    group = await start([wide, poles])
+    batch, _ = await group.reset(seed=0)
+    assert [space.shape for space in group.get_observation_spaces()] == [(6,), (4,), (4,)]
+    with pytest.raises(ValueError, match=r"by_name\(\)"):
+        batch.observation  # noqa: B018
+    split = batch.by_name()
+    assert split["e"].observation.shape == (1, 6)
+    assert split["pole"].observation.shape == (2, 4)
+    group.step_async(split["pole"].respond(action=np.array([1, 0])))
+    group.step_async(split["e"].respond(action=np.array([2])))
+    batch, _ = await group.collect_async(wait_all=True)
+    assert sorted(batch.by_name()) == ["e", "pole"]
+    batch, _ = await group.step(batch.respond(action=np.zeros(3, int)))
+    assert len(batch.info) == 3
+
+
+async def test_actions_of_different_shapes_are_refused_unless_meant(place: Any, start: Any) -> None:
+    """Both envs are named; the axis of sub-environments doesn't count; nothing is left running."""
+    wide = {**PROBE, "name": "wide", "env_kwargs": {"action_shape": [3]}}
+    with pytest.raises(ValueError, match=r"'probe-0' and 'wide-0'.*\(2,\).*\(3,\).*mixed_actions"):
+        await start([PROBE, wide])
+    group = await start([PROBE, wide], mixed_actions=True)
+    batch, _ = await group.reset()
+    ids = ["wide-1", "probe-0"]
+    batch, _ = await group.step(
+        BatchedData(ids, [PolicyResponse("wide-1", [0, 1, 2]), PolicyResponse("probe-0", [0, 3])])
+    )
+    assert (batch.ids(), batch.reward.tolist()) == (ids, [1, 3])
+    two, three = (
+        {**PROBE, "name": f"b{n}", "backend": "batched", "num_envs": n, "num_workers": 1}
+        for n in (2, 3)
+    )
+    group = await start([two, three])
+    assert [space.shape for space in group.get_action_spaces()] == [(2,), (3,)]
+
+
+def test_spaces_cross_processes_as_they_are() -> None:
+    """What a worker reports equals what the simulator has."""
+    from rlightning_aio import sync
+
+    with sync.build_env_group(gym_entry("Words-v0", num_workers=1)) as group:
+        assert group.get_observation_spaces() == [sample_envs.WORDS]
+        assert group.get_action_spaces() == [spaces.Discrete(3)]
