@@ -1,0 +1,300 @@
+"""How groups begin and end, where env classes may come from, and in which surroundings."""
+
+from __future__ import annotations
+
+import asyncio
+import subprocess
+import sys
+import threading
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import uvloop
+
+import rlightning_aio
+from rlightning_aio import BatchedData, GroupClosed, PolicyResponse, StartFailed, sync
+
+PROBE = {"name": "probe", "backend": "probe", "task": "x", "num_workers": 3}
+
+
+def children() -> set[str]:
+    found: set[str] = set()
+    for path in Path("/proc/self/task").glob("*/children"):
+        found |= set(path.read_text().split())
+    return found
+
+
+# -- beginning and end
+
+
+def test_building_a_group_starts_nothing() -> None:
+    """Processes come with `init`; a group that is dropped before leaves no trace."""
+    before = children()
+    group = sync.build_env_group(PROBE)
+    assert (len(group), group.size(), group.env_ids[2]) == (3, 3, "probe-2")
+    assert children() == before
+    group.init()
+    assert children() > before
+    group.close()
+    assert children() == before
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        del group
+        sync.build_env_group(PROBE)
+
+
+async def test_a_context_initialises_and_closes(place: Any) -> None:
+    """Also when its body raises."""
+    group = place.build(PROBE)
+
+    async def use() -> None:
+        async with group as entered:
+            assert entered is group
+            assert (await group.reset())[0].ids() == group.env_ids
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        await use()
+    with pytest.raises(GroupClosed):
+        await group.reset()
+
+
+async def test_an_env_that_cannot_be_built_fails_the_start(place: Any) -> None:
+    """With what it raised; all others are closed, and the group with them."""
+    group = place.build([PROBE, {**PROBE, "name": "bad", "env_kwargs": {"fails": 1}}])
+    before = children()
+    with pytest.raises(StartFailed, match=r"'bad-1'.*RuntimeError: no simulator here") as caught:
+        await group.init()
+    assert caught.value.env_id == "bad-1"
+    assert "raise RuntimeError" in str(caught.value.__cause__)
+    assert children() == before
+    with pytest.raises(GroupClosed):
+        await group.init()
+    await group.close()
+
+
+@pytest.mark.parametrize("moment", ["before init", "after close"])
+async def test_outside_of_its_life_a_group_says_so(place: Any, moment: str) -> None:
+    """To whatever is asked, with what to do; it can be closed any number of times."""
+    group = place.build(PROBE)
+    if moment == "after close":
+        await group.init()
+        batch, _ = await group.reset()
+        group.step_async(batch.respond(action=np.zeros((3, 2))))
+        await group.close()
+    said = "init" if moment == "before init" else "build a new one"
+    step = BatchedData(["probe-0"], [PolicyResponse("probe-0", [0, 0])])
+    for request in (
+        group.reset,
+        lambda: group.step(step),
+        group.collect_async,
+        group.offload,
+        lambda: group["probe-0"].call("double", 1),
+        lambda: group["probe-0"].get_attr("label"),
+    ):
+        with pytest.raises(GroupClosed, match=said):
+            await request()
+    for plain in (
+        lambda: group.step_async(step),
+        group.get_observation_spaces,
+        group.get_action_spaces,
+    ):
+        with pytest.raises(GroupClosed, match=said):
+            plain()
+    await group.close()
+    await group.close()
+    with pytest.raises(GroupClosed, match="build a new one"):
+        await group.init()
+
+
+def test_a_group_that_is_dropped_open_is_ended_with_a_warning() -> None:
+    """The collector lets go of its workers."""
+    before = children()
+    group = sync.build_env_group({**PROBE, "placement": "inline"})
+    group.init()
+    with pytest.warns(ResourceWarning, match="was not closed"):
+        del group
+    assert children() == before
+
+
+# -- surroundings
+
+
+def use(group: Any) -> list[float]:
+    batch, _ = group.reset(seed=1)
+    group.step_async(batch.respond(action=np.array([[0, 4.0]] * 3)))
+    batch, _ = group.collect_async(wait_all=True)
+    return batch.reward.tolist()
+
+
+def test_a_group_may_outlive_the_thread_that_started_it() -> None:
+    """Workers belong to the process; any one thread at a time may use the group."""
+    group = sync.build_env_group(PROBE)
+    found: list[list[float]] = []
+    starter = threading.Thread(target=lambda: (group.init(), found.append(use(group))))
+    starter.start()
+    starter.join()
+    found.append(use(group))
+    user = threading.Thread(target=lambda: (found.append(use(group)), group.close()))
+    user.start()
+    user.join()
+    assert found == [[4.0] * 3] * 3
+
+
+def test_an_async_group_runs_in_a_loop_of_any_thread() -> None:
+    """Also in one that is not the main one."""
+    found: list[float] = []
+
+    async def main() -> None:
+        async with rlightning_aio.build_env_group(PROBE) as group:
+            batch, _ = await group.reset()
+            batch, _ = await group.step(batch.respond(action=np.array([[0, 2.0]] * 3)))
+            found.extend(batch.reward.tolist())
+
+    thread = threading.Thread(target=lambda: asyncio.run(main()))
+    thread.start()
+    thread.join()
+    assert found == [2.0] * 3
+
+
+def test_run_picks_the_faster_loop() -> None:
+    """And returns what the coroutine does."""
+
+    async def main() -> str:
+        return type(asyncio.get_running_loop()).__module__
+
+    assert rlightning_aio.run(main()) == uvloop.__name__
+
+
+async def test_groups_of_both_kinds_side_by_side() -> None:
+    """Two async and a sync one in one loop, each with its own workers."""
+    async with (
+        rlightning_aio.build_env_group(PROBE) as one,
+        rlightning_aio.build_env_group({**PROBE, "name": "other"}) as other,
+    ):
+        with sync.build_env_group({**PROBE, "name": "third"}) as third:
+            batches = await asyncio.gather(one.reset(seed=1), other.reset(seed=2))
+            assert [batch.observation[0, 3] for batch, _ in batches] == [1, 2]
+            assert use(third) == [4.0] * 3
+            crossed = batches[0][0].respond(action=np.zeros((3, 2)))
+            with pytest.raises(rlightning_aio.UnknownEnv, match="'probe-0'"):
+                await other.step(crossed)
+
+
+# -- where env classes come from
+
+MODULE = """
+import numpy as np
+from gymnasium import spaces
+from rlightning_aio import ENVS, BaseEnv, EnvRet
+
+class Counter(BaseEnv):
+    observation_space = spaces.Discrete(1000)
+
+    def get_observation_space(self): return spaces.Discrete(1000)
+    def get_action_space(self): return spaces.Discrete(1000)
+    def reset(self, *, seed=None, options=None):
+        self.total = seed or 0
+        return EnvRet(env_id=self.env_id, observation=self.total)
+    def step(self, policy_resp):
+        self.total += self._preprocess_fn(policy_resp)
+        return EnvRet(env_id=self.env_id, observation=self.total, last_reward=1.0)
+"""
+
+SCRIPT = (
+    MODULE
+    + """
+from dataclasses import dataclass
+from rlightning_aio import BatchedData, PolicyResponse, sync
+
+ENVS.register("counter")(Counter)
+
+@dataclass
+class Thought:
+    weight: int
+
+def weigh(response):
+    return int(response.action) * getattr(response, "thought", Thought(1)).weight
+
+if __name__ == "__main__":
+    for placement in ("process", "inline"):
+        entry = {"name": "c", "backend": "counter", "task": "x", "num_workers": 2,
+                 "placement": placement}
+        with sync.build_env_group(entry, preprocess_fn=weigh) as group:
+            batch, _ = group.reset(seed=5)
+            batch, _ = group.step(batch.respond(action=np.array([1, 2])))
+            response = PolicyResponse("c-1", 3, thought=Thought(10))
+            batch, _ = group.step(BatchedData(["c-1"], [response]))
+            print(placement, batch.observation.tolist(), group["c-0"].step(1).observation)
+"""
+)
+
+
+def test_a_script_may_define_its_own_envs(tmp_path: Path) -> None:
+    """With the classes and functions it uses, in `__main__`, for both placements."""
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT)
+    done = subprocess.run(
+        [sys.executable, str(script)], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == ["process [38] 7", "inline [38] 7"]
+    assert done.stderr == ""
+
+
+async def test_a_module_that_only_workers_import_may_define_them(
+    place: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Named in `imports`, it registers its backend where the env is built."""
+    module = f"own_envs_{place.name.replace(' ', '_')}_{place.synchronous}"
+    path = tmp_path / f"{module}.py"
+    path.write_text(MODULE + f"\nENVS.register({module!r})(Counter)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    entry = {"name": "c", "backend": module, "task": "x", "imports": [module]}
+    async with place.build(entry) as group:
+        batch, _ = await group.reset(seed=3)
+        batch, _ = await group.step(batch.respond(action=np.array([4])))
+        assert batch.observation.tolist() == [7]
+    assert (module in sys.modules) == place.inline
+
+
+def test_an_installed_package_may_announce_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By an entry point; nothing has to be imported by name."""
+    info = tmp_path / "counters-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: counters\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[rlightning_aio.envs]\nannounced = counters:Counter\n")
+    (tmp_path / "counters.py").write_text(MODULE)
+    monkeypatch.syspath_prepend(tmp_path)
+    with sync.build_env_group({"name": "c", "backend": "announced", "task": "x"}) as group:
+        assert group.reset(seed=2)[0].observation.tolist() == [2]
+        assert group["c-0"].step(3).observation == 5
+    assert "counters" not in sys.modules
+
+
+def test_a_class_registered_here_reaches_workers_by_value() -> None:
+    """Defined in a function, where no worker could import it from."""
+
+    class Local(rlightning_aio.BaseEnv):
+        def get_observation_space(self) -> Any:
+            from gymnasium import spaces
+
+            return spaces.Discrete(100)
+
+        get_action_space = get_observation_space
+
+        def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+            return rlightning_aio.EnvRet(env_id=self.env_id, observation=1)
+
+        def step(self, policy_resp: Any) -> Any:
+            return rlightning_aio.EnvRet(env_id=self.env_id, observation=policy_resp.action)
+
+    rlightning_aio.ENVS.register("local")(Local)
+    with sync.build_env_group({"name": "l", "backend": "local", "task": "x"}) as group:
+        group.reset()
+        assert group["l-0"].step(42).observation == 42
