@@ -146,9 +146,8 @@ def _letters(
         slot = int(slots[k])
         extras = _extras(batch, k) if table.reads_extras[slot] else {}
         action = actions[k]
-        # A client's actions never lie in a row.
-        slab = slabs[int(table.slab[slot])] if slot < len(table.all) else None
-        if slab is not None and slab.action is not None and _fits(action, slab):
+        slab = slabs[int(table.slab[slot])]
+        if slab.action is not None and _fits(action, slab):
             if not extras:
                 continue
             _write_one(action, slab, int(table.row[slot]))

@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from rlightning_aio.hosts.server import ServerHost
     from rlightning_aio.hosts.worker import ErrorText
     from rlightning_aio.protocol.info import InfoSchema
+    from rlightning_aio.protocol.server_session import Manners
     from rlightning_aio.types import EnvMeta
 
 __all__ = ["Core"]
@@ -153,7 +154,9 @@ class Core:
     ) -> None:
         table = self.slots
         if self.fleet.elastic:
-            batch, slots = self._without_returned(batch, slots)
+            self.absorb()
+            if self._ready_count:
+                batch, slots = self._without_returned(batch, slots)
             if not len(slots):
                 return
         self._check_sendable(slots, "step")
@@ -326,14 +329,18 @@ class Core:
         self.slots.schemas[host.first_slot][number] = schema
         self.info_width = max(self.info_width, schema.size)
 
-    def on_client(self, host: Host, row: int, meta: EnvMeta) -> int:
+    def on_client(self, host: Host, row: int, meta: EnvMeta, manners: Manners) -> int:
         """See `base.Inbox.on_client`."""
-        slot = host.first_slot + row
-        self.slots.christen(slot, meta.env_id)
-        self.slots.resets_itself[slot] = meta.autoreset != "disabled"
-        if self.slots.state[slot] == IDLE:
+        table, slot = self.slots, host.first_slot + row
+        table.christen(slot, meta.env_id)
+        table.resets_itself[slot] = meta.autoreset != "disabled"
+        has_row = self.fleet.slabs[int(table.slab[slot])].action is not None
+        table.by_frame[slot] = manners.free_actions or not has_row
+        table.reads_extras[slot] = manners.reads_extras
+        table.note_letters()
+        if table.state[slot] == IDLE:
             self._mark_sent(np.array([slot]), JOINED, 0, 0.0)
-        return self.slots.number(slot)
+        return table.number(slot)
 
     def on_withdrawn(self, host: Host, row: int, number: int) -> None:
         """See `base.Inbox.on_withdrawn`."""
@@ -628,28 +635,29 @@ class Core:
     ) -> Operation[tuple[BatchedData, Flags]]:
         table = self.slots
         if self.fleet.elastic:
+            self.absorb()
             self.fleet.rank_clients()
         seeds = self._seeds(seed, slots)
         joined = self._has_joined(slots)
         self._check_sendable(slots[~joined], "reset")
-        by_letter = options is not None or self.fleet.elastic
+        by_letter = options is not None
         packed = self._pack_resets(slots, seeds, options) if by_letter else []
         self.fleet.forget_lost(slots)
         ticket = self._new_ticket(slots)
         asked = slots
         if joined.any():
-            plain = seed is None and options is None
-            self._take_first_results(slots[joined], ticket, enough=plain)
-            if plain:
-                asked, packed = slots[~joined], [packed[k] for k in np.flatnonzero(~joined)]
+            enough = seed is None and options is None
+            self._take_first_results(slots[joined], ticket, enough=enough)
+            if enough:
+                asked, seeds = slots[~joined], seeds[~joined]
         self._mark_sent(asked, RESET, ticket.owner, now)
         if by_letter:
             for slot, one in zip(asked.tolist(), packed, strict=True):
                 host = self.fleet.host_of(slot)
                 host.request_reset(slot - host.first_slot, table.number(slot), one)
         else:
-            self.fleet.write_seeds(slots, seeds)
-            self._post(slots, table.entry[slots] + _OPS[RESET])
+            self.fleet.write_seeds(asked, seeds)
+            self._post(asked, table.entry[asked] + _OPS[RESET])
         yield from self._await_ticket(ticket)
         return self._settled(ticket, slots)
 

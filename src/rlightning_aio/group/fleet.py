@@ -30,10 +30,11 @@ from rlightning_aio.errors import (
 from rlightning_aio.group.hint import hint
 from rlightning_aio.group.lookout import Lookout
 from rlightning_aio.group.seating import check_actions, order_for, seat
-from rlightning_aio.group.slots import BUSY, READY
+from rlightning_aio.group.slots import BUSY, IDLE, READY
 from rlightning_aio.group.wait import Operation, Wait, earliest
 from rlightning_aio.hosts.base import Death, Host
 from rlightning_aio.hosts.process import END_SECONDS
+from rlightning_aio.hosts.runner import NO_ACTION
 from rlightning_aio.hosts.server import ServerHost
 from rlightning_aio.hosts.worker import ErrorText, Started
 from rlightning_aio.protocol.info import NO_INFO, PICKLED
@@ -306,9 +307,7 @@ class Fleet:
         if not self._mixed_actions:
             check_actions(self.metas)
         self.slabs, places = seat(started, self.slots, self._arena)
-        self.slots.take_letters(
-            slice(host.first_slot, host.first_slot + host.rows) for host in self._elastic
-        )
+        self.slots.note_letters()
         for member in self._members:
             member.order = order_for(member.host, self.slots, places)
 
@@ -336,11 +335,22 @@ class Fleet:
             )
 
     def check_step(self, slot: int, action: Any) -> None:
-        """Raises `BadAction` if a client can't take `action`."""
-        if slot >= len(self.slots.all):
+        """Raises `BadAction` if a client can't take `action`, which is not in its row."""
+        if slot >= len(self.slots.all) and action is not NO_ACTION:
             host = self.host_of(slot)
             assert isinstance(host, ServerHost)
             host.check_step(slot - host.first_slot, action)
+
+    def on_slab(self, host: Host, slab: Slab) -> None:
+        """See `base.Inbox.on_slab`."""
+        rows = slice(host.first_slot, host.first_slot + slab.rows)
+        self.slots.slab[rows] = len(self.slabs)
+        self.slots.row[rows] = np.arange(slab.rows)
+        self.slabs.append(slab)
+
+    def is_idle(self, host: Host, row: int) -> bool:
+        """See `base.Inbox.is_idle`."""
+        return self.slots.state[host.first_slot + row] == IDLE
 
     def listener(self, server_id: str) -> ServerHost | None:
         """The env_server of that id, if there is one."""
@@ -376,10 +386,7 @@ class Fleet:
         return min((host.remote.settings.connect_timeout for host in lacking), default=None)
 
     def write_seeds(self, slots: NDArray[np.intp], seeds: NDArray[np.int64]) -> None:
-        """Put the seeds of resets into the rows; clients have none."""
-        if self.elastic:
-            local = slots < len(self.slots.all)
-            slots, seeds = slots[local], seeds[local]
+        """Put the seeds of resets into the rows."""
         if len(self.slabs) == 1:
             self.slabs[0].seed[self.slots.row[slots]] = seeds
             return

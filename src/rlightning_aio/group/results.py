@@ -8,13 +8,11 @@ import numpy as np
 
 from rlightning_aio.batch import BatchedData, Origin, ResultColumns
 from rlightning_aio.protocol.columns import Rows, gather, mapped
-from rlightning_aio.protocol.info import PICKLED
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio.group.core import Core
-    from rlightning_aio.group.slots import Slots
     from rlightning_aio.protocol.slab import Slab
 
 __all__ = ["collected"]
@@ -23,9 +21,7 @@ __all__ = ["collected"]
 def collected(core: Core, slots: NDArray[np.intp], rests: dict[int, Any]) -> BatchedData:
     """A batch of the results of `slots`, which lie in their rows, in the order of `slots`."""
     fleet, table = core.fleet, core.slots
-    if fleet.elastic and (slots >= len(table.all)).any():
-        parts = _mixed_parts(core, slots, rests)
-    elif len(fleet.slabs) == 1:
+    if len(fleet.slabs) == 1:
         parts = [_part(core, fleet.slabs[0], slots, None, rests)]
     else:
         slabs = table.slab[slots]
@@ -36,58 +32,6 @@ def collected(core: Core, slots: NDArray[np.intp], rests: dict[int, Any]) -> Bat
             for places in (np.flatnonzero(slabs == slab),)
         ]
     return BatchedData.of_results(parts, Origin(core, slots, table))
-
-
-def _mixed_parts(core: Core, slots: NDArray[np.intp], rests: dict[int, Any]) -> list[ResultColumns]:
-    """Parts of a batch that holds results of clients, which lie in no slab."""
-    table = core.slots
-    remote = slots >= len(table.all)
-    # Clients of one server are of one kind, and so stack.
-    kinds = np.where(remote, -1 - table.host[slots], table.slab[slots])
-    parts: list[ResultColumns] = []
-    present: list[int] = np.unique(kinds).tolist()
-    for kind in present:
-        places = np.flatnonzero(kinds == kind)
-        if kind < 0:
-            parts.append(_remote_part(table, slots[places], places, rests))
-        else:
-            parts.append(_part(core, core.fleet.slabs[kind], slots[places], places, rests))
-    return parts
-
-
-def _remote_part(
-    table: Slots, slots: NDArray[np.intp], positions: NDArray[np.intp], rests: dict[int, Any]
-) -> ResultColumns:
-    """Columns of the results of one server's clients."""
-    found = [rests.pop(slot) for slot in slots.tolist()]
-    reward, terminated, truncated = (
-        np.stack([rest["head"][k] for rest in found]) for k in range(3)
-    )
-    returns = lengths = None
-    if any(rest["sums"] is not None for rest in found):
-        returns, lengths = np.zeros_like(reward), np.zeros(reward.shape, np.int64)
-        for row, rest in enumerate(found):
-            if rest["sums"] is not None:
-                returns[row], lengths[row] = rest["sums"]
-    return ResultColumns(
-        slots=slots,
-        table=table,
-        positions=positions,
-        observation=None,
-        reward=reward,
-        terminated=terminated,
-        truncated=truncated,
-        ended=terminated | truncated,
-        info_marks=np.full(len(slots), PICKLED, np.uint8),
-        info=None,
-        schemas=(),
-        rests=dict(enumerate(found)),
-        episode_return=returns,
-        episode_length=lengths,
-        done_ns=np.array([rest["times"][0] for rest in found]),
-        busy_ns=np.array([rest["times"][1] for rest in found]),
-        agents=found[0]["agents"],
-    )
 
 
 def _part(

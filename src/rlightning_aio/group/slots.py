@@ -14,7 +14,7 @@ from rlightning_aio.errors import UnknownEnv
 from rlightning_aio.protocol.rings import NUMBER_SHIFT, OP_BITS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
@@ -98,14 +98,13 @@ class Slots:
         return len(self.configs)
 
     def christen(self, slot: int, env_id: str) -> None:
-        """Name the client that has taken a server's slot."""
+        """Name the client that has taken a server's slot, perhaps from another."""
+        self._index.pop(self.env_ids[slot], None)
         self.env_ids[slot] = env_id
         self._index[env_id] = slot
 
-    def take_letters(self, clients: Iterable[slice]) -> None:
-        """Say which slots are clients', whose requests never lie in a row."""
-        for slots in clients:
-            self.by_frame[slots] = self.reads_extras[slots] = True
+    def note_letters(self) -> None:
+        """Take note of whether any request may not fit its row."""
         self.letters = bool(self.by_frame.any() or self.reads_extras.any())
 
     def number(self, slot: int) -> int:

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from rlightning_aio.errors import EnvFault
     from rlightning_aio.hosts.worker import AttachOrder, ErrorText, Started
     from rlightning_aio.protocol.info import InfoSchema
+    from rlightning_aio.protocol.server_session import Manners
+    from rlightning_aio.protocol.slab import Slab
     from rlightning_aio.types import EnvMeta
 
 __all__ = ["Death", "Host", "Inbox", "Source", "Watcher"]
@@ -198,8 +200,16 @@ class Inbox(Protocol):
         """A request has raised."""
         ...
 
-    def on_client(self, host: Host, row: int, meta: EnvMeta) -> int:
+    def on_slab(self, host: Host, slab: Slab) -> None:
+        """The envs of an elastic host have rows from now on: those of `slab`."""
+        ...
+
+    def on_client(self, host: Host, row: int, meta: EnvMeta, manners: Manners) -> int:
         """An env has joined, and its first result follows; the number to give it."""
+        ...
+
+    def is_idle(self, host: Host, row: int) -> bool:
+        """Whether nothing was asked of an env, and nothing of it waits to be collected."""
         ...
 
     def on_withdrawn(self, host: Host, row: int, number: int) -> None:

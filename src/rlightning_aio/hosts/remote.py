@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from rlightning_aio.config import EnvConfig
-    from rlightning_aio.protocol.server_session import RemoteResult
+    from rlightning_aio.protocol.server_session import Manners, RemoteResult
     from rlightning_aio.protocol.wire import Part
     from rlightning_aio.types import EnvMeta
 
@@ -283,6 +283,14 @@ class RemoteHost:
         if not self._has_more:
             self._has_more = True
             os.eventfd_write(self._more, 1)
+
+    def manners(self, client: str) -> Manners:
+        """What a client that is here makes of requests."""
+        return self._sessions.manners(client)
+
+    def dismiss(self, client: str, cause: str) -> None:
+        """Send a client away that is here; it is told `cause`."""
+        self._sessions.dismiss(client, cause)
 
     def check(self, client: str, action: Any) -> None:
         """Raises `BadAction` if `client` can't take `action`; nothing is sent."""

@@ -1,21 +1,30 @@
 """`ServerHost`: the clients of one env_server, as rows of a host like any other.
 
-A client takes a row when it first joins and keeps it, by its name, for as long as the
-group lives. Its first result comes unasked; a request to a client that is known to be
-away is withdrawn, and its next first result is the answer.
+A client takes a row when it first joins and keeps it, by its name, until the rows run
+out. Its first result comes unasked; a request to a client that is known to be away is
+withdrawn, and its next first result is the answer. Clients of one server are of one
+kind, so they share one slab, made when the first of them joins.
 """
 
 from __future__ import annotations
 
+import mmap
 import time
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
 from rlightning_aio.hosts.episodes import EpisodeSums
-from rlightning_aio.protocol.rings import NUMBER_SHIFT, OP_BITS, SLOT_MASK
+from rlightning_aio.hosts.runner import NO_ACTION
+from rlightning_aio.protocol.columns import row_reader, row_writer
+from rlightning_aio.protocol.info import NO_INFO, PICKLED
+from rlightning_aio.protocol.rings import NUMBER_SHIFT, OP_BITS, OP_MASK, SLOT_MASK, STEP
+from rlightning_aio.protocol.slab import NO_SEED, RowLayout, Slab
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import gymnasium as gym
     from numpy.typing import NDArray
 
     from rlightning_aio.hosts.base import Inbox, Watcher
@@ -23,11 +32,39 @@ if TYPE_CHECKING:
     from rlightning_aio.hosts.runner import Rest
     from rlightning_aio.hosts.worker import AttachOrder
     from rlightning_aio.protocol.server_session import RemoteResult
+    from rlightning_aio.types import EnvMeta
 
 __all__ = ["MAX_CLIENTS", "ServerHost"]
 
 MAX_CLIENTS: Final = 1024
-"""Rows of a server; the sessions refuse clients beyond."""
+"""Rows of a server at most; twice as many as it lets in at once."""
+_SLAB_BYTES: Final = 1 << 32
+"""So large may a slab be; of what no client uses, the system takes nothing."""
+
+
+class _Row:
+    """One client's place in the slab.
+
+    Attributes:
+        name: of the client.
+        sums: of its episode.
+        resetting: what it owes is a reset.
+        write_observation, read_action: None where that doesn't fit the row.
+    """
+
+    def __init__(self, slab: Slab, row: int) -> None:
+        layout = slab.layout
+        self.name = ""
+        self.sums = EpisodeSums(layout.head, "disabled")
+        self.resetting = False
+        self.write_observation: Callable[[Any], None] | None = None
+        self.read_action: Callable[[], Any] | None = None
+        if slab.observation is not None:
+            self.write_observation = row_writer(
+                layout.observation_space, slab.observation, row, "observation"
+            )
+        if slab.action is not None:
+            self.read_action = row_reader(layout.action_space, slab.action, row)
 
 
 class ServerHost:
@@ -47,10 +84,9 @@ class ServerHost:
         self.remote = remote
         self._inbox = inbox
         self._watcher = watcher
-        self._names: list[str] = []
-        self._rows: dict[str, int] = {}
-        self._sums: dict[int, EpisodeSums] = {}
-        self._resetting: set[int] = set()
+        self._slab: Slab | None = None
+        self._places: list[_Row] = []
+        self._row_of: dict[str, int] = {}
         self._open = False
 
     # -- life ---------------------------------------------------------------------
@@ -87,28 +123,63 @@ class ServerHost:
     def clients(self) -> list[int]:
         """Rows of the clients that are here, in the order of their names."""
         # One that has joined this very moment may not have its row yet.
-        return [self._rows[name] for name in sorted(self.remote.clients) if name in self._rows]
+        return [self._row_of[n] for n in sorted(self.remote.clients) if n in self._row_of]
 
     def num_envs(self, row: int) -> int:
         """Sub-environments of the client of `row`, which is here."""
-        return self.remote.clients[self._names[row]].num_envs
+        return self.remote.clients[self._places[row].name].num_envs
 
     def check_step(self, row: int, action: Any) -> None:
         """Raises `BadAction` if the client of `row` can't take `action`."""
-        self.remote.check(self._names[row], action)
+        self.remote.check(self._places[row].name, action)
 
     @property
     def missing(self) -> int:
         """Clients that a reset has still to wait for."""
         return max(0, self.remote.settings.min_clients - len(self.remote.clients))
 
+    def _seat(self, name: str, meta: EnvMeta) -> int | None:
+        """The row of a client that joins; None if all are taken."""
+        slab = self._slab
+        if slab is None:
+            slab = self._slab = _slab_for(meta)
+            self._inbox.on_slab(self, slab)
+        row = self._row_of.get(name)
+        if row is None:
+            row = self._free_row(slab)
+            if row is None:
+                return None
+            place = self._places[row]
+            self._row_of.pop(place.name, None)
+            place.name = name
+            self._row_of[name] = row
+        self._places[row].sums = EpisodeSums(slab.layout.head, meta.autoreset)
+        return row
+
+    def _free_row(self, slab: Slab) -> int | None:
+        row = len(self._places)
+        if row < slab.rows:
+            self._places.append(_Row(slab, row))
+            return row
+        for row, place in enumerate(self._places):
+            if place.name not in self.remote.clients and self._inbox.is_idle(self, row):
+                return row
+        return None
+
     # -- requests -----------------------------------------------------------------
 
     def request(self, entries: NDArray[np.int64]) -> None:
-        """Resets without arguments: a client's steps never fit a row."""
-        for entry in entries.tolist():
+        """See `base.Host.request`."""
+        slab, now = cast("Slab", self._slab), time.monotonic()
+        numbers: list[int] = entries.tolist()
+        for entry in numbers:
             row = ((entry >> OP_BITS) & SLOT_MASK) - self.first_slot
-            self.request_reset(row, entry >> NUMBER_SHIFT, (None, None))
+            if entry & OP_MASK == STEP:
+                self._step(row, entry >> NUMBER_SHIFT, NO_ACTION, {}, now)
+            else:
+                seed = int(slab.seed[row])
+                chosen = None if seed == NO_SEED else seed
+                self._reset(row, entry >> NUMBER_SHIFT, chosen, None, now)
 
     def pack(self, content: Any) -> Any:
         """The wire format packs; nothing is pickled."""
@@ -116,14 +187,27 @@ class ServerHost:
 
     def request_step(self, row: int, number: int, packed: Any) -> None:
         """See `base.Host.request_step`."""
-        now, (action, extras) = time.monotonic(), packed
-        self._asked(row, number, self.remote.submit(self._names[row], number, action, extras, now))
+        action, extras = packed
+        self._step(row, number, action, extras, time.monotonic())
 
     def request_reset(self, row: int, number: int, packed: Any) -> None:
         """See `base.Host.request_reset`."""
-        now, name, (seed, options) = time.monotonic(), self._names[row], packed
-        self._resetting.add(row)
-        self._asked(row, number, self.remote.submit_reset(name, number, seed, options, now))
+        seed, options = packed
+        self._reset(row, number, seed, options, time.monotonic())
+
+    def _step(self, row: int, number: int, action: Any, extras: dict[str, Any], now: float) -> None:
+        place = self._places[row]
+        if action is NO_ACTION and place.read_action is not None:
+            action = place.read_action()
+        self._asked(row, number, self.remote.submit(place.name, number, action, extras, now))
+
+    def _reset(
+        self, row: int, number: int, seed: int | None, options: dict[str, Any] | None, now: float
+    ) -> None:
+        place = self._places[row]
+        place.resetting = True
+        answered = self.remote.submit_reset(place.name, number, seed, options, now)
+        self._asked(row, number, answered)
 
     def _asked(self, row: int, number: int, will_answer: bool) -> None:
         if will_answer:
@@ -151,55 +235,92 @@ class ServerHost:
     def tick(self, now: float) -> None:
         """Take in what clients have sent; find those that are gone."""
         self.remote.pump(now)
+        done: list[int] = []
         for result in self.remote.take():
-            self._deliver(result)
+            self._deliver(result, done)
+        if done:
+            self._inbox.on_reports(np.array(done, np.int64))
 
     def deadline(self) -> float | None:
         """When `tick` is due at the latest."""
         return self.remote.deadline()
 
-    def _deliver(self, result: RemoteResult) -> None:
-        row = self._rows.get(result.client)
-        if row is None:
-            row = self._rows[result.client] = len(self._names)
-            self._names.append(result.client)
+    def _deliver(self, result: RemoteResult, done: list[int]) -> None:
+        """Put a result into its row; `done` takes the entry of one that fits there."""
         number = result.number
         if number is None:
-            meta = self.remote.clients[result.client]
-            agents = (len(meta.agents),) if meta.agents else ()
-            sub_envs = (meta.num_envs,) if meta.num_envs > 1 else ()
-            self._sums[row] = EpisodeSums((*agents, *sub_envs), meta.autoreset)
-            number = self._inbox.on_client(self, row, meta)
+            joined = self._join(result.client)
+            if joined is None:
+                return
+            row, number = joined
         else:
+            row = self._row_of[result.client]
             self.in_flight -= 1
         if result.error is not None:
             self._inbox.on_fault(self, row, number, result.error)
             return
-        self._inbox.on_rest(self, row, number, self._rest(row, result))
-
-    def _rest(self, row: int, result: RemoteResult) -> Rest:
-        agents = _agents(result.reward)
-        reward = _head(result.reward, agents).astype(np.float64)
-        terminated, truncated = _head(result.terminated, agents), _head(result.truncated, agents)
-        sums = None
-        if result.number is None or row in self._resetting:
-            self._resetting.discard(row)
-            self._sums[row].forget()
+        rest = self._write(row, result)
+        if rest:
+            self._inbox.on_rest(self, row, number, rest)
         else:
-            sums = self._sums[row].add(reward, terminated | truncated)
-        return {
-            "observation": result.observation,
-            "info": result.info,
-            "extra": result.extra,
-            "head": (reward, terminated, truncated),
-            "sums": sums,
-            "agents": agents,
-            "times": (time.monotonic_ns(), result.busy_ns),
-        }
+            done.append((number << NUMBER_SHIFT) | ((self.first_slot + row) << OP_BITS))
+
+    def _join(self, name: str) -> tuple[int, int] | None:
+        """Row of a client that has joined, and the number to give its first result."""
+        meta = self.remote.clients.get(name)
+        if meta is None:
+            return None  # It has left again already.
+        row = self._seat(name, meta)
+        if row is None:
+            self.remote.dismiss(name, "the server has no place for another client")
+            return None
+        return row, self._inbox.on_client(self, row, meta, self.remote.manners(name))
+
+    def _write(self, row: int, result: RemoteResult) -> Rest:
+        """Put `result` into its row; what doesn't fit."""
+        slab, place = cast("Slab", self._slab), self._places[row]
+        rest: Rest = {}
+        if place.write_observation is not None:
+            place.write_observation(result.observation)
+        else:
+            rest["observation"] = result.observation
+        slab.info_mark[row] = PICKLED if result.info else NO_INFO
+        if result.info:
+            rest["info"] = result.info
+        if result.extra:
+            rest["extra"] = result.extra
+        slab.busy_ns[row] = result.busy_ns
+        slab.done_ns[row] = time.monotonic_ns()
+        self._write_head(slab, row, result)
+        return rest
+
+    def _write_head(self, slab: Slab, row: int, result: RemoteResult) -> None:
+        agents = slab.layout.agents
+        for column, value in (
+            (slab.reward, result.reward),
+            (slab.terminated, result.terminated),
+            (slab.truncated, result.truncated),
+        ):
+            column[row] = [value[agent] for agent in agents] if agents else value
+        place = self._places[row]
+        if result.number is None or place.resetting or result.is_loss:
+            # An episode that the client's going has cut short is no whole one.
+            place.resetting = False
+            place.sums.forget()
+            slab.episode_length[row] = 0
+            return
+        ended = slab.terminated[row] | slab.truncated[row]
+        sums = place.sums.add(slab.reward[row], ended)
+        if sums is not None:
+            slab.episode_return[row], slab.episode_length[row] = sums
 
     def order(self, count: int) -> bool:
         """Whatever comes wakes the driver."""
         del count
+        return False
+
+    def has_news(self) -> bool:
+        """Whatever comes wakes the driver."""
         return False
 
     def withdraw(self) -> None:
@@ -221,10 +342,16 @@ class ServerHost:
         return 0, 0
 
 
-def _agents(reward: Any) -> tuple[str, ...]:
-    return tuple(cast("dict[str, Any]", reward)) if isinstance(reward, dict) else ()
-
-
-def _head(value: Any, agents: tuple[str, ...]) -> NDArray[Any]:
-    """A reward or a flag as an array: agents, then sub-environments, where there are any."""
-    return np.array([value[agent] for agent in agents]) if agents else np.array(value)
+def _slab_for(meta: EnvMeta) -> Slab:
+    """Rows for clients of one kind, in memory of this process alone."""
+    agents = (len(meta.agents),) if meta.agents else ()
+    sub_envs = (meta.num_envs,) if meta.num_envs > 1 else ()
+    layout = RowLayout(
+        cast("gym.Space[Any]", meta.observation_space),
+        cast("gym.Space[Any]", meta.action_space),
+        (*agents, *sub_envs),
+        meta.agents,
+    )
+    rows = max(1, min(MAX_CLIENTS, _SLAB_BYTES // layout.size(1)))
+    memory = mmap.mmap(-1, layout.size(rows), mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    return Slab(layout, memoryview(memory), rows)

@@ -48,12 +48,12 @@ from rlightning_aio.types import EnvMeta
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-__all__ = ["PATIENCE", "Outgoing", "RemoteResult", "ServerSessions"]
+__all__ = ["PATIENCE", "Manners", "Outgoing", "RemoteResult", "ServerSessions"]
 
 PATIENCE: Final = 8
 """Parts of the heartbeat limit: one between pings, two until a broken connection is given up."""
 
-_MAX_SESSIONS: Final = 1024
+_MAX_SESSIONS: Final = 512
 _MAX_SEATS: Final = 4096
 _MAX_BAD_RESULTS: Final = 3
 _LATE: Final = -1
@@ -81,6 +81,7 @@ class RemoteResult:
         info, extra: as the env gave them; ``info["client_lost"]`` says why a client is gone.
         busy_ns: how long the env took, by the client's clock.
         error: set instead of all that, if the env raised.
+        is_loss: no result of the env's, but the mark that the client was lost.
     """
 
     client: str
@@ -93,6 +94,7 @@ class RemoteResult:
     extra: dict[str, Any] = field(default_factory=dict[str, Any])
     busy_ns: int = 0
     error: EnvRaised | None = None
+    is_loss: bool = False
 
 
 class Outgoing(NamedTuple):
@@ -100,6 +102,18 @@ class Outgoing(NamedTuple):
 
     route: bytes
     parts: list[bytes]
+
+
+class Manners(NamedTuple):
+    """What a client makes of requests.
+
+    Attributes:
+        free_actions: its actions need not fit its action space.
+        reads_extras: something there reads what the policy attaches beside the action.
+    """
+
+    free_actions: bool
+    reads_extras: bool
 
 
 @dataclass(slots=True)
@@ -428,9 +442,22 @@ class ServerSessions:
         seat.unreported = seat.request = None
         outcome = last.results.cut_short(last.observation)
         info = {"client_lost": f"client {seat.name!r}: {cause}"}
-        self._results.append(RemoteResult(seat.name, number, *outcome, info=info))
+        self._results.append(RemoteResult(seat.name, number, *outcome, info=info, is_loss=True))
 
     # Requests
+
+    def dismiss(self, client: str, cause: str) -> None:
+        """Send a client away that is here; it is told `cause`."""
+        session = self._seats[client].session
+        if session is not None:
+            self._dismiss(session, cause)
+
+    def manners(self, client: str) -> Manners:
+        """What a client that is here makes of requests."""
+        session = self._seats[client].session
+        if session is None:
+            raise UnknownEnv(f"no client named {client!r} is connected to {self._server_id}")
+        return Manners(session.free_actions, session.reads_extras)
 
     def check(self, client: str, action: Any) -> None:
         """Raises `BadAction` if `client` is here and can't take `action`; nothing is sent."""
