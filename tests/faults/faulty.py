@@ -89,6 +89,21 @@ def _exhaust_memory() -> None:
         resource.setrlimit(resource.RLIMIT_AS, before)
 
 
+def _tell_and_sleep() -> None:
+    sys.stderr.write("asleep\n")
+    sys.stderr.flush()
+    time.sleep(3600)
+
+
+def _interrupt_trainer() -> None:
+    """Send the trainer Ctrl-C, once it has gone to sleep to wait for this very reply."""
+    server = Path(f"/proc/{os.getppid()}/stat").read_text().rpartition(")")[2].split()
+    trainer = int(server[1])
+    while Path(f"/proc/{trainer}/stat").read_text().rpartition(")")[2].split()[0] != "S":
+        os.sched_yield()
+    os.kill(trainer, signal.SIGINT)
+
+
 def _deadlock() -> None:
     lock = threading.Lock()
     lock.acquire()
@@ -130,6 +145,8 @@ FAULTS: dict[str, Callable[[], object]] = {
     "deadlock": _deadlock,
     "deadlock with the GIL": _deadlock_with_the_gil,
     "stop": _signal(signal.SIGSTOP),
+    "tell and sleep": _tell_and_sleep,
+    "interrupt the trainer": _interrupt_trainer,
     # Exceptions.
     "raise": _raise(ValueError("as asked for")),
     "odd constructor": _raise(OddConstructor(7, where="step")),
@@ -238,6 +255,9 @@ class FaultyEnv(BaseEnv):
     def returns(self, make: Callable[[], Any]) -> Any:
         """What `make`, called here, returns."""
         return make()
+
+    def on_disconnect(self) -> None:
+        sys.stderr.write(f"{self.env_id} is left alone\n")
 
     def close(self) -> None:
         self._break("closing")

@@ -1,5 +1,8 @@
 """Hangs whoever imports it."""
 
+import sys
 import threading
 
+sys.stderr.write("asleep\n")
+sys.stderr.flush()
 threading.Event().wait()

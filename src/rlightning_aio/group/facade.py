@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 import warnings
 import weakref
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 
     import gymnasium as gym
 
+    from rlightning_aio.group.fleet import Fleet
     from rlightning_aio.group.wait import Operation
     from rlightning_aio.hosts.base import Watcher
     from rlightning_aio.hosts.server import ServerHost
@@ -102,7 +104,7 @@ class Facade:
         self._driver = self._new_driver()
         self._fleet = build_fleet(plan, self._driver)
         self._core = Core(self._fleet, zero_copy=plan.zero_copy)
-        self._finalizer = weakref.finalize(self, self._fleet.abandon)
+        self._finalizer = weakref.finalize(self, _abandon, self._fleet, os.getpid())
 
     @staticmethod
     def _new_driver() -> Watcher:
@@ -226,6 +228,12 @@ class Facade:
         errors = list(self._fleet.close_errors)
         self._fleet.close_errors.clear()  # Told once, however often it is closed.
         _warn_of(errors)
+
+
+def _abandon(fleet: Fleet, owner_pid: int) -> None:
+    """End what nobody can close any more, unless this is a child that its owner has forked."""
+    if os.getpid() == owner_pid:
+        fleet.abandon()
 
 
 def _warn_of(errors: Sequence[tuple[str, Any]]) -> None:

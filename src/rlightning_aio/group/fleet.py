@@ -227,6 +227,8 @@ class Fleet:
             if self._start_fault is not None:
                 raise self._start_fault
             self._now = yield Wait(earliest(*(m.start_by for m in self._members)))
+            if self.closed:
+                raise GroupClosed("the group was closed while it was starting")
             self._check_start_times()
         if self._start_fault is not None:
             raise self._start_fault
@@ -703,7 +705,8 @@ class Fleet:
         try:
             yield from self._until_closed(alive, now + _CLOSE_SECONDS)
         finally:
-            self._let_go(_KILL_SECONDS)
+            stuck = any(m.stage not in (_Stage.NEW, _Stage.CLOSED) for m in self._members)
+            self._let_go(_KILL_SECONDS if stuck else END_SECONDS)
 
     def _let_go(self, seconds: float) -> None:
         for member in self._members:

@@ -58,6 +58,8 @@ _GRACE_SECONDS: Final = 1.2
 _DUMP_SECONDS: Final = 0.3
 _MESSAGE_BYTES: Final = 1 << 16
 _OUTLET_BYTES: Final = 1 << 20
+_READ_SECONDS: Final = 0.2
+"""Who hasn't read anything for so long reads nothing."""
 _STDERR: Final = 2
 
 
@@ -144,6 +146,13 @@ class _Outlet:
     def write(self, data: bytes) -> None:
         self._waiting += data
         self.flush()
+
+    def empty(self, until: float) -> None:
+        """Write what is left, as long as somebody reads it."""
+        reader = select.poll()
+        reader.register(_STDERR, select.POLLOUT)
+        while self._waiting and time.monotonic() < until and reader.poll(_READ_SECONDS * 1000):
+            self.flush()
 
     def flush(self) -> None:
         """Write what can be written now; have the poll tell when more can."""
@@ -365,6 +374,7 @@ class _ForkServer:
             self._wait_for_children(until)
         for pid in self._children:
             os.kill(pid, signal.SIGKILL)
+        self._outlet.empty(until)
 
     def _wait_for_children(self, until: float) -> None:
         for descriptor, _ in self._poll.poll(max(0.0, until - time.monotonic()) * 1000):

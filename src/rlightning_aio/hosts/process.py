@@ -49,7 +49,7 @@ _ONE_THREAD = dict.fromkeys(
 
 
 END_SECONDS = 1.5
-"""How long a fork server that is let go may take; it gives its workers a little less."""
+"""How long a fork server that is let go may take to end its workers and pass on their words."""
 
 
 class ForkServer:
@@ -183,11 +183,11 @@ class ForkServer:
         """The fork server is gone, and by the kernel's care so are its workers."""
         hosts = list(self._hosts.values())
         self._hosts.clear()
-        self.release()
+        self.release(0.0)
         for host in hosts:
             host.on_fork_server_lost(self._failure)
 
-    def release(self, seconds: float = END_SECONDS) -> None:
+    def release(self, seconds: float) -> None:
         """Let the fork server go; it ends what workers it still has, within `seconds`."""
         if self._socket is None:
             return

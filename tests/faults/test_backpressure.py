@@ -1,0 +1,129 @@
+"""Who is slow to read or stopped for a while holds up nobody else, and loses nothing."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+from faults.faulty import Driven, Tokens, marked
+from faults.test_deaths import kill, pid_of, two_workers
+from faults.test_shutdown import read_until, trainer
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    Start: TypeAlias = Callable[..., Driven]
+
+MEGABYTES = 8 * 2**20
+"""More than any pipe or socket buffers."""
+
+
+def unpacked(response: Any) -> Any:
+    """The action of a response that brings a large array along."""
+    assert response.cargo.sum() == MEGABYTES
+    return response.action
+
+
+def loaded(batch: Any) -> Any:
+    """`batch`, with megabytes for each env."""
+    for response in batch.values():
+        response.cargo = np.ones(MEGABYTES, np.uint8)
+    return batch
+
+
+def test_worker_that_is_stopped_for_a_while_loses_nothing(start: Start) -> None:
+    """What it was asked before, meanwhile and after is all answered, each by its own reply."""
+    group, tokens = start(two_workers()), Tokens()
+    pid = pid_of(group, "faulty-0")
+    for _ in range(20):
+        group.step_async(tokens.steps(["faulty-0"]))
+        os.kill(pid, signal.SIGSTOP)
+        group.step_async(tokens.steps(["faulty-1", "faulty-2", "faulty-3"]))
+        found: list[str] = []
+        while not {"faulty-2", "faulty-3"} <= set(found):
+            batch, _ = group.collect_async()
+            tokens.check(batch)
+            found += batch.ids()
+        assert "faulty-1" not in found
+        os.kill(pid, signal.SIGCONT)
+        while len(found) < 4:
+            batch, _ = group.collect_async()
+            tokens.check(batch)
+            found += batch.ids()
+        assert sorted(found) == group.group.env_ids
+
+
+def test_megabytes_for_a_stopped_worker_do_not_block_the_trainer(start: Start) -> None:
+    """They wait until it reads; meanwhile the other worker is asked and answers."""
+    group, tokens = start(two_workers(), preprocess_fn=unpacked), Tokens()
+    pid = pid_of(group, "faulty-0")
+    os.kill(pid, signal.SIGSTOP)
+    group.step_async(loaded(tokens.steps(["faulty-0", "faulty-1"])))
+    for _ in range(10):
+        group.step_async(loaded(tokens.steps(["faulty-2", "faulty-3"])))
+        batch, _ = group.collect_async(min_results=2)
+        tokens.check(batch)
+        assert sorted(batch.ids()) == ["faulty-2", "faulty-3"]
+    os.kill(pid, signal.SIGCONT)
+    batch, _ = group.collect_async(wait_all=True)
+    assert sorted(batch.ids()) == ["faulty-0", "faulty-1"]
+    tokens.check(batch)
+
+
+def test_megabytes_for_a_worker_that_dies_go_with_it(start: Start) -> None:
+    """Its replacement is not handed the rest of what the dead one was being sent."""
+    group, tokens = start(two_workers(), preprocess_fn=unpacked), Tokens()
+    pid = pid_of(group, "faulty-0")
+    os.kill(pid, signal.SIGSTOP)
+    group.step_async(loaded(tokens.steps(["faulty-0", "faulty-1"])))
+    kill(pid)
+    batch, _ = group.collect_async(wait_all=True)
+    assert [marked(ret) for ret in batch.values()] == [True, True]
+    tokens.check(group.step(loaded(tokens.steps(group.group.env_ids)))[0])
+
+
+def test_megabytes_for_a_trainer_that_is_busy_wait_in_the_worker(start: Start) -> None:
+    """Every env has more to tell than the channel takes; all of it arrives when it is read."""
+    group, tokens = start(two_workers()), Tokens()
+    for env_id in group.group.env_ids:
+        group.call(env_id, "answer_with", info=lambda: {"cargo": np.ones(MEGABYTES, np.uint8)})
+    group.step_async(tokens.steps(group.group.env_ids))
+    for host in group.group._fleet.hosts:
+        # The first reply of each has begun to fill its channel, which nobody reads yet.
+        assert select.select([host.fileno()], [], [], 10)[0]
+    batch, _ = group.collect_async(wait_all=True)
+    assert len(batch) == 4
+    for ret in batch.values():
+        assert ret.info["cargo"].sum() == MEGABYTES
+    tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
+
+
+def test_stderr_that_nobody_reads_hides_no_death() -> None:
+    """The env that prints into it waits; deaths are noticed; and nothing printed is lost."""
+    script = """
+        import logging
+        logging.disable()
+        group = build(); group.init(); group.reset()
+        group.step_async(tokens.steps(["faulty-0"], {"faulty-0": "print"}))
+        for _ in range(3):
+            batch, _ = group.step(tokens.steps(["faulty-3"], {"faulty-3": "exit 3"}))
+            say(batch["faulty-3"].info["worker_restarted"])
+            tokens.check(group.step(tokens.steps(["faulty-3"]))[0])
+        say("read me")
+        batch, _ = group.collect_async()
+        tokens.check(batch)
+        say("printed by " + batch.ids()[0])
+        group.close()
+        say("closed")
+    """
+    with trainer(script) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        assert sum("exited with code 3" in line for line in read_until(process.stdout, "read")) == 3
+        written = process.stderr.read()
+        read_until(process.stdout, "printed by faulty-0")
+        read_until(process.stdout, "closed")
+    assert written.count("e" * 1023 + "\n") == 3000

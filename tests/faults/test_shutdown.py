@@ -1,0 +1,410 @@
+"""However a group or its trainer ends, no worker outlives it by two seconds."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import gc
+import os
+import select
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import pytest
+from faults.faulty import Driven, Tokens
+from faults.test_deaths import kill, pid_of, two_workers
+
+import rlightning_aio
+from rlightning_aio.errors import GroupClosed
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    Start: TypeAlias = Callable[..., Driven]
+
+SECONDS = 2.0
+"""What the contract gives workers."""
+
+SCRIPT = """
+import os, signal, sys, time
+from faults.faulty import Tokens, entry
+from faults.test_deaths import kill, pid_of, two_workers
+import rlightning_aio, rlightning_aio.sync
+def build(**fields):
+    return rlightning_aio.sync.build_env_group(two_workers(**fields))
+def say(text):
+    print(text, flush=True)
+def say_asleep():
+    print("asleep", file=sys.stderr, flush=True)
+tokens = Tokens()
+"""
+
+
+def descendants(pid: int) -> set[int]:
+    """Children of a process, and theirs."""
+    found: set[int] = set()
+    with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+        for children in Path(f"/proc/{pid}/task").glob("*/children"):
+            for child in map(int, children.read_text().split()):
+                found |= {child} | descendants(child)
+    return found
+
+
+@contextlib.contextmanager
+def watched(pids: set[int]) -> Iterator[Callable[[float], None]]:
+    """A function that fails unless all of `pids` end within some seconds."""
+    watches: dict[int, int] = {}
+    for pid in pids:
+        with contextlib.suppress(ProcessLookupError):  # It has ended already.
+            watches[pid] = os.pidfd_open(pid)
+
+    def ended(seconds: float) -> None:
+        left = dict(watches)
+        until = time.monotonic() + seconds
+        while left:
+            ready, _, _ = select.select(left.values(), [], [], max(0.0, until - time.monotonic()))
+            assert ready, f"still alive after {seconds} s: {sorted(left)}"
+            left = {pid: watch for pid, watch in left.items() if watch not in ready}
+
+    try:
+        yield ended
+    finally:
+        for watch in watches.values():
+            with contextlib.suppress(ProcessLookupError):
+                signal.pidfd_send_signal(watch, signal.SIGKILL)
+            os.close(watch)
+
+
+@contextlib.contextmanager
+def trainer(script: str, *arguments: str, **options: Any) -> Iterator[subprocess.Popen[str]]:
+    """A trainer in a process of its own."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", SCRIPT + textwrap.dedent(script), *arguments],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        text=True,
+        stdin=subprocess.PIPE,
+        **{"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **options},
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        for stream in (process.stdin, process.stdout, process.stderr):
+            if stream is not None:
+                stream.close()
+        process.wait()
+
+
+def read_until(stream: Any, text: str) -> list[str]:
+    """Lines until one holds `text`."""
+    lines: list[str] = []
+    for line in stream:
+        lines.append(line)
+        if text in line:
+            return lines
+    raise AssertionError(f"no {text!r} in {lines}")
+
+
+MOMENTS = {
+    "idle": """
+        group = build(); group.init(); group.reset()
+        say_asleep()
+        signal.pause()
+    """,
+    "stepping": """
+        group = build(); group.init(); group.reset()
+        group.step_async(tokens.steps(group.env_ids, {"faulty-1": "tell and sleep"}))
+        group.collect_async(wait_all=True)
+    """,
+    "looping in C": """
+        group = build(); group.init(); group.reset()
+        group.step_async(tokens.steps(group.env_ids, {"faulty-1": "loop in C"}))
+        say_asleep()
+        group.collect_async(wait_all=True)
+    """,
+    "starting": """
+        build(env_kwargs={"faults": {"building": "tell and sleep"}, "only": 3}).init()
+    """,
+    "importing": """
+        from rlightning_aio import registry
+        registry.BACKENDS["faulty"] = registry.Backend(
+            "faulty", "faults.faulty:FaultyEnv", "faults", "faults",
+            preload=("faults.hanging_import",),
+        )
+        build().init()
+    """,
+    "closing": """
+        group = build(); group.init()
+        group["faulty-2"].call("arm", "closing", "tell and sleep")
+        group.close()
+    """,
+    "restarting": """
+        faults = {"faults": {"building": "tell and sleep"}, "while_exists": sys.argv[1]}
+        group = build(env_kwargs=faults); group.init(); group.reset()
+        open(sys.argv[1], "w").close()
+        group.step_async(tokens.steps(group.env_ids, {"faulty-1": "sigkill"}))
+        group.collect_async(wait_all=True)
+    """,
+    "with a child of its own": """
+        group = build(); group.init(); group.reset()
+        child = os.fork()
+        if child == 0:
+            sys.stdin.read()  # It holds what descriptors the trainer held.
+            os._exit(0)
+        print(child, flush=True)
+        say_asleep()
+        signal.pause()
+    """,
+}
+
+
+@pytest.mark.parametrize("moment", MOMENTS)
+def test_killed_trainer_takes_its_workers_along(moment: str, tmp_path: Path) -> None:
+    """SIGKILL gives it no chance to say anything; all notice, at whatever moment it is."""
+    with trainer(MOMENTS[moment], str(tmp_path / "switch")) as process:
+        assert process.stderr is not None
+        assert process.stdout is not None
+        assert process.stdin is not None
+        read_until(process.stderr, "asleep")
+        workers = descendants(process.pid)
+        if moment == "with a child of its own":
+            workers.remove(int(process.stdout.readline()))
+        # The others may have closed already.
+        assert len(workers) in {"importing": (1,), "closing": (2, 3)}.get(moment, (3,))
+        for pid in workers:
+            assert "/dev/shm/" not in Path(f"/proc/{pid}/maps").read_text()
+        with watched(workers) as ended:
+            process.kill()
+            ended(SECONDS)
+        process.stdin.close()
+        last_words = process.stderr.read()
+    if moment in ("idle", "with a child of its own"):
+        # A robot's safe stop: every env heard of it in time.
+        assert last_words.count("is left alone") == 4
+
+
+LEFT_OPEN = {
+    "the end of the script": "",
+    "sys.exit": "sys.exit(3)",
+    "an exception": "raise ValueError('the end')",
+    "os._exit": "os._exit(4)",
+    "forgetting the group": "del group; say('forgotten'); sys.stdin.read()",
+    "an interrupt": "import signal; signal.raise_signal(signal.SIGINT)",
+    "a termination": "import signal; signal.raise_signal(signal.SIGTERM)",
+}
+
+
+@pytest.mark.parametrize("end", LEFT_OPEN)
+def test_group_that_nobody_closes_is_ended_with_its_owner(end: str) -> None:
+    """No way of leaving a program leaves workers behind, nor keeps the program from ending."""
+    script = f"""
+        group = build(); group.init(); group.reset()
+        group.step_async(tokens.steps(group.env_ids))
+        say("ready")
+        sys.stdin.readline()
+        {LEFT_OPEN[end]}
+    """
+    with trainer(script) as process:
+        assert process.stdout is not None
+        assert process.stdin is not None
+        read_until(process.stdout, "ready")
+        with watched(descendants(process.pid)) as ended:
+            process.stdin.write("go\n")
+            process.stdin.flush()
+            ended(SECONDS)
+        process.stdin.close()
+        assert process.wait(10) == {
+            "sys.exit": 3,
+            "an exception": 1,
+            "os._exit": 4,
+            "an interrupt": -signal.SIGINT,
+            "a termination": -signal.SIGTERM,
+        }.get(end, 0)
+
+
+def test_forgotten_group_warns_and_leaves_nothing(build: Start) -> None:
+    """The collector ends what nobody can close any more."""
+    group = build(two_workers())
+    group.init()
+
+    def forget() -> None:
+        group.group = build(two_workers()).group
+        gc.collect()
+
+    with watched(descendants(os.getpid())) as ended:
+        with pytest.warns(ResourceWarning, match="not closed"):
+            forget()
+        ended(SECONDS)
+
+
+@pytest.mark.parametrize("end", ["os._exit(0)", "sys.exit(0)", "del group; os._exit(0)"])
+def test_child_of_the_trainer_does_not_end_its_group(end: str) -> None:
+    """A forked child that drops its copy of the group leaves the parent's alone."""
+    script = f"""
+        group = build(); group.init(); group.reset()
+        child = os.fork()
+        if child == 0:
+            {end}
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+        for _ in range(3):
+            tokens.check(group.step(tokens.steps(group.env_ids))[0])
+        kill(group["faulty-0"].call("returns", os.getpid))
+        batch, _ = group.step(tokens.steps(group.env_ids))
+        say(batch["faulty-0"].info["worker_restarted"])
+        group.close()
+        say("closed")
+    """
+    with trainer(script, stderr=None) as process:
+        assert process.stdout is not None
+        assert "SIGKILL" in "".join(read_until(process.stdout, "closed"))
+        assert process.wait(10) == 0
+
+
+@pytest.mark.parametrize("moment", ["new", "up", "busy", "ready", "dead"])
+def test_close_works_at_any_moment_and_twice(build: Start, moment: str) -> None:
+    """Results that nobody has collected are gone; nothing else is left of the group."""
+    group, tokens = build(two_workers()), Tokens()
+    if moment != "new":
+        group.init()
+        group.reset()
+    if moment in ("busy", "ready"):
+        group.call("faulty-0", "step_takes", 0.1 if moment == "busy" else 0.0)
+        group.step_async(tokens.steps(group.group.env_ids))
+    if moment == "ready":
+        group.collect_async(min_results=4, max_results=4, wait_all=True)
+        group.step_async(tokens.steps(group.group.env_ids))
+    if moment == "dead":
+        kill(pid_of(group, "faulty-0"))
+    # A dead worker's envs can't be closed any more, which is told.
+    told = pytest.warns(UserWarning, match="SIGKILL")
+    with told if moment == "dead" else contextlib.nullcontext():
+        group.close()
+    for _ in range(2):
+        group.close()
+
+
+def test_env_that_hangs_in_close_is_killed(start: Start) -> None:
+    """`close` takes less than the two seconds, and says which env would not."""
+    group = start(two_workers())
+    group.call("faulty-1", "arm", "closing", "deadlock")
+    began = time.monotonic()
+    with pytest.warns(UserWarning, match=r"faulty-1.*did not close in time and was killed"):
+        group.close()
+    assert time.monotonic() - began < SECONDS
+
+
+def test_env_that_hangs_in_a_step_does_not_hold_up_close(start: Start) -> None:
+    """Whatever its own timeout says."""
+    group, tokens = start(two_workers(step_timeout=60)), Tokens()
+    group.step_async(tokens.steps(["faulty-1"], {"faulty-1": "loop in C"}))
+    while not group.group._fleet.hosts[0].executing()[0]:
+        os.sched_yield()
+    began = time.monotonic()
+    with pytest.warns(UserWarning, match="did not close in time and was killed"):
+        group.close()
+    assert time.monotonic() - began < SECONDS
+
+
+def test_stopped_fork_server_does_not_hold_up_close(start: Start) -> None:
+    """Who would kill the workers can't; so it is killed, and the kernel kills them."""
+    group = start(two_workers())
+    (server,) = group.group._fleet.servers
+    os.kill(pid_of(group, "faulty-0"), signal.SIGSTOP)
+    os.kill(server._process.pid, signal.SIGSTOP)
+    with watched(descendants(os.getpid())) as ended:
+        began = time.monotonic()
+        group.close()
+        assert time.monotonic() - began < SECONDS + 0.5
+        ended(0.5)
+
+
+async def test_close_ends_a_collect_that_waits() -> None:
+    """The collector learns that there is nothing more to come."""
+    tokens = Tokens()
+    group = rlightning_aio.build_env_group(two_workers())
+    await group.init()
+    await group.reset()
+    await group["faulty-0"].call("step_takes", 0.3)
+    group.step_async(tokens.steps(["faulty-0"]))
+    collecting = asyncio.ensure_future(group.collect_async())
+    await asyncio.sleep(0)
+    await asyncio.gather(group.close(), group.close())
+    with pytest.raises(GroupClosed):
+        await collecting
+
+
+async def test_cancelled_close_still_closes() -> None:
+    """Nobody is left to finish it later."""
+    group = rlightning_aio.build_env_group(two_workers())
+    await group.init()
+    await group["faulty-0"].call("arm", "closing", "sleep")
+    with watched(descendants(os.getpid())) as ended:
+        with pytest.raises(TimeoutError):
+            await asyncio.wait_for(group.close(), 0.05)
+        ended(SECONDS)
+    await group.close()
+
+
+async def test_start_can_be_closed_from_another_task() -> None:
+    """Whoever starts it is told."""
+    group = rlightning_aio.build_env_group(two_workers())
+    starting = asyncio.ensure_future(group.init())
+    await asyncio.sleep(0)
+    await group.close()
+    with pytest.raises(GroupClosed):
+        await starting
+
+
+INTERRUPTED: dict[str, Callable[[Any, Tokens], Any]] = {
+    "step": lambda group, tokens: group.step(
+        tokens.steps(group.env_ids, {"faulty-1": "interrupt the trainer"})
+    ),
+    "collect_async": lambda group, tokens: (
+        group.step_async(tokens.steps(group.env_ids, {"faulty-1": "interrupt the trainer"})),
+        group.collect_async(wait_all=True),
+    ),
+    "call": lambda group, tokens: group["faulty-1"].call("do", "interrupt the trainer"),
+}
+
+
+@pytest.mark.parametrize("waiting", INTERRUPTED)
+def test_interrupted_wait_loses_nothing(waiting: str) -> None:
+    """KeyboardInterrupt comes out of the wait, and the next results are right."""
+    group, tokens = Driven("sync", two_workers()), Tokens()
+    group.init()
+    group.reset()
+    with pytest.raises(KeyboardInterrupt):
+        INTERRUPTED[waiting](group.group, tokens)
+    if waiting != "call":
+        batch, _ = group.collect_async(wait_all=True)
+        assert sorted(batch.ids()) == group.group.env_ids
+        tokens.check(batch)
+    group.call("faulty-0", "do", "nothing")  # The same worker: the other call is over.
+    for _ in range(3):
+        tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
+    group.end()
+
+
+def test_replaced_workers_leave_no_zombies(start: Start) -> None:
+    """Whoever has died is buried, and its descriptors are given back."""
+    group, tokens = start(two_workers(max_restarts=100)), Tokens()
+    (server,) = group.group._fleet.servers
+
+    def held() -> tuple[int, int, int]:
+        return (
+            len(descendants(os.getpid())),
+            len(list(Path("/proc/self/fd").iterdir())),
+            len(list(Path(f"/proc/{server._process.pid}/fd").iterdir())),
+        )
+
+    before = held()
+    for _ in range(20):
+        group.step(tokens.steps(group.group.env_ids, {"faulty-1": "exit 3"}))
+    group.reset()
+    tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
+    assert held() == before
