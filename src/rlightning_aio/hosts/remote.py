@@ -216,6 +216,10 @@ class RemoteHost:
         """Readable, and staying so, while there is something for `pump` to do."""
         return self._epoll.fileno()
 
+    def is_readable(self) -> bool:
+        """Whether `pump` would find anything; asking may silence the descriptor."""
+        return self._has_more or _is_readable(self._router)
+
     def deadline(self) -> float | None:
         """When `pump` is due even if nothing comes (monotonic seconds); None if never."""
         return self._sessions.deadline()

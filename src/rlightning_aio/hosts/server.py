@@ -77,8 +77,7 @@ class ServerHost:
         self.first_slot = first_slot
         self.rows = MAX_CLIENTS
         self.in_flight = 0
-        # Its descriptor tells of everything, so there is never anything to sweep.
-        self.ordered = 1
+        self.ordered = 0
         self.inline = False
         self.elastic = True
         self.remote = remote
@@ -315,9 +314,9 @@ class ServerHost:
             slab.episode_return[row], slab.episode_length[row] = sums
 
     def order(self, count: int) -> bool:
-        """Whatever comes wakes the driver."""
+        """Whatever comes from now on wakes the driver."""
         del count
-        return False
+        return self.remote.is_readable()
 
     def has_news(self) -> bool:
         """Whatever comes wakes the driver."""
@@ -327,11 +326,13 @@ class ServerHost:
         """Nothing is ever ordered here."""
 
     def unread(self) -> int:
-        """Nothing waits to be swept here."""
-        return 0
+        """As many as there may be, if there is anything."""
+        return self.in_flight if self.remote.is_readable() else 0
 
     def sweep(self) -> None:
-        """Whatever comes wakes the driver."""
+        """See `base.Host.sweep`."""
+        if self.remote.is_readable():
+            self.tick(time.monotonic())
 
     def run_one(self) -> bool:
         """Nothing runs here."""

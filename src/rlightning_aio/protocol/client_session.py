@@ -340,23 +340,31 @@ class ClientSession:
     # What the env did
 
     def finish(self, number: int, ret: EnvRet | MultiAgentEnvRet, busy_ns: int = 0) -> None:
-        """Answer request `number` with `ret`, which the env took `busy_ns` to make.
+        """Answer request `number` with `ret`; see `answer`."""
+        outcome = Outcome(ret.observation, ret.last_reward, ret.last_terminated, ret.last_truncated)
+        # The contract gives this field its name.
+        extra = ret._extra  # pyright: ignore[reportPrivateUsage]
+        self.answer(number, outcome, ret.info, extra, busy_ns)
 
-        What of its info can't travel is left out; one warning names each such key.
+    def answer(
+        self,
+        number: int,
+        outcome: Outcome,
+        info: dict[str, Any],
+        extra: dict[str, Any],
+        busy_ns: int,
+    ) -> None:
+        """Answer request `number` with what the env took `busy_ns` to make.
+
+        What of `info` and `extra` can't travel is left out; one warning names each such key.
 
         Raises:
-            Misfit: it doesn't fit the announced spaces; nothing was sent.
+            Misfit: the outcome doesn't fit the announced spaces; nothing was sent.
         """
         if self._session is None:
             return
-        outcome = Outcome(ret.observation, ret.last_reward, ret.last_terminated, ret.last_truncated)
         result = Result(
-            session=self._session,
-            number=number,
-            busy_ns=busy_ns,
-            info=ret.info,
-            # The contract gives this field its name.
-            extra=ret._extra,  # pyright: ignore[reportPrivateUsage]
+            session=self._session, number=number, busy_ns=busy_ns, info=info, extra=extra
         )
         packed = Packed([], result.texts)
         header = self._results.pack(outcome, packed)

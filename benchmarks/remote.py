@@ -1,0 +1,278 @@
+"""What does an env server add to the network? Steps of 1 and of 8 clients without work.
+
+Beside it, what ZMQ asks for the same messages: a ROUTER and as many DEALERs in processes
+of their own that send each other messages of the same sizes and look at none of them;
+with and without encryption. The figure is the time per step: with one client a round
+trip, with eight the share of each while all are kept busy.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import multiprocessing as mp
+import signal
+import statistics
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import no_work
+import numpy as np
+import zmq
+from harness import Contender, Question, Target, main
+
+import rlightning_aio
+from rlightning_aio import sync
+from rlightning_aio.config import EnvConfig
+from rlightning_aio.envs.gymnasium import GymnasiumEnv
+from rlightning_aio.protocol.wire import Result, Step, Writer
+from rlightning_aio.remote import RemoteEnvClient, make_keys
+from rlightning_aio.remote.keys import read_client_keys, read_server_keys
+
+TASK = "benchmarks/CheetahSized-v0"
+WARM_UP_CALLS = 100
+LOOPBACK = "tcp://127.0.0.1"
+
+
+class CheetahSized(no_work.NoWork):
+    """Does nothing, with the spaces of HalfCheetah-v5."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (17,), np.float64)
+    action_space = gym.spaces.Box(-1.0, 1.0, (6,), np.float32)
+
+    def __init__(self) -> None:
+        self._observation = np.zeros(17)
+
+
+gym.register(TASK, CheetahSized, disable_env_checker=True, order_enforce=False)
+
+
+def request() -> list[bytes]:
+    """A message of a step's size."""
+    return Writer().write(Step(session=2**62, number=2**20), [bytes(6 * 4)])
+
+
+def reply() -> list[bytes]:
+    """A message of a result's size."""
+    result = Result(
+        session=2**62, number=2**20, busy_ns=2**15, reward=0.0, terminated=False, truncated=False
+    )
+    return Writer().write(result, [bytes(17 * 8)])
+
+
+@dataclass
+class _Clients(Contender):
+    """Some processes that dial in.
+
+    Attributes:
+        num_clients: so many.
+        encrypted: with CURVE keys.
+    """
+
+    name: str
+    num_clients: int
+    encrypted: bool
+
+    def setup(self) -> None:
+        self._keys = tempfile.TemporaryDirectory()
+        make_keys(self._keys.name, ["client"])
+        self._processes: list[Any] = []
+        self.listen()
+
+    def keys(self, whose: str) -> str | None:
+        return str(Path(self._keys.name) / whose) if self.encrypted else None
+
+    def dial(self, target: Any, port: int) -> None:
+        context = mp.get_context("spawn")
+        for k in range(self.num_clients):
+            args = (port, self.keys("client"), f"c{k}")
+            self._processes.append(context.Process(target=target, args=args))
+            self._processes[-1].start()
+
+    def listen(self) -> None:
+        raise NotImplementedError
+
+    def call(self) -> int:
+        """One turn; how many steps it has brought."""
+        raise NotImplementedError
+
+    def round(self, seconds: float) -> float:
+        return us_per_step(self.call, seconds)
+
+    def teardown(self) -> None:
+        for process in self._processes:
+            process.kill()
+            process.join()
+        self._keys.cleanup()
+
+
+def us_per_step(call: Any, seconds: float) -> float:
+    clock = time.perf_counter_ns
+    for _ in range(WARM_UP_CALLS):
+        call()
+    times: list[float] = []
+    began = now = clock()
+    until = began + int(seconds * 1e9)
+    while now < until:
+        steps = call()
+        ended = clock()
+        times.append((ended - now) / steps)
+        now = ended
+    return statistics.median(times) / 1e3
+
+
+def _echo(port: int, keys: str | None, name: str) -> None:
+    del name
+    with zmq.Context() as context, context.socket(zmq.DEALER) as dealer:
+        if keys is not None:
+            own = read_client_keys(keys)
+            dealer.curve_serverkey = own.server
+            dealer.curve_publickey, dealer.curve_secretkey = own.public, own.secret
+        dealer.connect(f"{LOOPBACK}:{port}")
+        parts = reply()
+        dealer.send_multipart(parts)
+        while True:
+            dealer.recv_multipart()
+            dealer.send_multipart(parts)
+
+
+@dataclass
+class Echo(_Clients):
+    """Bare ZMQ."""
+
+    def listen(self) -> None:
+        self._context = zmq.Context()
+        self._router = self._context.socket(zmq.ROUTER)
+        if (keys := self.keys("server")) is not None:
+            self._router.curve_server = True
+            self._router.curve_secretkey = read_server_keys(keys).secret
+        self.dial(_echo, self._router.bind_to_random_port(LOOPBACK))
+        self._parts = request()
+        waiting = [self._router.recv_multipart()[0] for _ in range(self.num_clients)]
+        # One fewer than there are: each call answers the one that comes, and sends it on.
+        for route in waiting[1:]:
+            self._router.send_multipart([route, *self._parts])
+        self._route = waiting[0]
+
+    def call(self) -> int:
+        self._router.send_multipart([self._route, *self._parts])
+        self._route = self._router.recv_multipart()[0]
+        return 1
+
+    def teardown(self) -> None:
+        super().teardown()
+        self._context.destroy(linger=0)
+
+
+def _serve(port: int, keys: str | None, name: str) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    env = GymnasiumEnv(EnvConfig(name="env", backend="gymnasium", task=TASK))
+    with RemoteEnvClient(env, "127.0.0.1", port, keys=keys, name=name) as client:
+        client.run()
+
+
+@dataclass
+class _Group(_Clients):
+    @property
+    def config(self) -> dict[str, Any]:
+        kwargs = {"min_clients": self.num_clients, "keys": self.keys("server")}
+        return {"name": "remote", "backend": "env_server", "env_kwargs": kwargs}
+
+    def dial_group(self, group: Any) -> None:
+        self.dial(_serve, int(group["remote-0"].address.rpartition(":")[2]))
+
+    def action(self, batch: Any) -> np.ndarray[Any, Any]:
+        return np.zeros((len(batch), 6), np.float32)
+
+
+@dataclass
+class Sync(_Group):
+    """A synchronous group."""
+
+    def listen(self) -> None:
+        self._group = sync.build_env_group(self.config)
+        self._group.init()
+        self.dial_group(self._group)
+        self._batch, _ = self._group.reset()
+
+    def call(self) -> int:
+        self._group.step_async(self._batch.respond(action=self.action(self._batch)))
+        self._batch, _ = self._group.collect_async()
+        return len(self._batch)
+
+    def teardown(self) -> None:
+        self._group.close()
+        super().teardown()
+
+
+@dataclass
+class Async(_Group):
+    """An asynchronous group under uvloop."""
+
+    def listen(self) -> None:
+        import uvloop
+
+        self._runner = asyncio.Runner(loop_factory=uvloop.new_event_loop)
+        self._runner.run(self._join())
+
+    async def _join(self) -> None:
+        self._group = rlightning_aio.build_env_group(self.config)
+        await self._group.init()
+        self.dial_group(self._group)
+        self._batch, _ = await self._group.reset()
+
+    async def _measure(self, seconds: float) -> float:
+        clock = time.perf_counter_ns
+        times: list[float] = []
+        now = clock()
+        until = now + int(seconds * 1e9)
+        while now < until:
+            self._group.step_async(self._batch.respond(action=self.action(self._batch)))
+            self._batch, _ = await self._group.collect_async()
+            ended = clock()
+            times.append((ended - now) / len(self._batch))
+            now = ended
+        return statistics.median(times[WARM_UP_CALLS:]) / 1e3
+
+    def round(self, seconds: float) -> float:
+        return self._runner.run(self._measure(seconds))
+
+    def teardown(self) -> None:
+        self._runner.run(self._group.close())
+        self._runner.close()
+        super().teardown()
+
+
+def name(what: str, clients: int, encrypted: bool) -> str:
+    return f"{what}, {clients} client{'s' * (clients > 1)}{', CURVE' * encrypted}"
+
+
+SETTINGS = [(1, False), (1, True), (8, False), (8, True)]
+
+QUESTION = Question(
+    name="remote",
+    title="A step of env clients without work",
+    unit="µs per step",
+    contenders=[
+        kind(name(what, clients, encrypted), clients, encrypted)
+        for clients, encrypted in SETTINGS
+        for what, kind in (
+            ("rlightning_aio sync", Sync),
+            ("rlightning_aio async, uvloop", Async),
+            ("bare pyzmq echo", Echo),
+        )
+    ],
+    targets=[
+        Target(name(what, 1, encrypted), name("bare pyzmq echo", 1, encrypted), 1.5, at_most=True)
+        for encrypted in (False, True)
+        for what in ("rlightning_aio sync", "rlightning_aio async, uvloop")
+    ],
+    seconds=1.0,
+    counts_steps=False,
+)
+
+if __name__ == "__main__":
+    main(QUESTION, __doc__)
