@@ -15,12 +15,19 @@ from typing import TYPE_CHECKING
 import pytest
 import pytest_asyncio
 import uvloop
+from hypothesis import HealthCheck, settings
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator
 
 # For the loops that tests make themselves; pytest-asyncio has an option for its own.
 os.environ["PYTHONASYNCIODEBUG"] = "1"
+
+# How fast examples come says something of the machine, and nothing of the code.
+settings.register_profile(
+    "any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.load_profile("any machine")
 
 
 def pytest_asyncio_loop_factories() -> dict[str, Callable[[], asyncio.AbstractEventLoop]]:

@@ -138,6 +138,7 @@ def test_a_dead_worker_is_code_1(tmp_path: Path) -> None:
     assert "exited with code 7" in done.stderr
 
 
+@pytest.mark.filterwarnings("ignore:close.. of env 'frail-0' raised WorkerDied")
 def test_a_worker_that_is_replaced_ends_nothing(tmp_path: Path) -> None:
     """By default a dead worker is replaced, and the rollout goes on."""
     dying = {"name": "frail", "backend": "dying", "task": "any", "max_restarts": 10**6}

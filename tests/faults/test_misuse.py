@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -211,11 +212,19 @@ async def test_second_collector_is_refused_and_the_first_goes_on() -> None:
     tokens = Tokens()
     async with rlightning_aio.build_env_group(two_workers()) as group:
         await group.reset()
-        group.step_async(tokens.steps(group.env_ids))
-        first = asyncio.ensure_future(group.collect_async(wait_all=True))
-        await asyncio.sleep(0)  # It has begun to wait.
-        with pytest.raises(RLightningError, match="one collector at a time"):
-            await group.collect_async()
+        # Workers that are stopped keep the first collector waiting.
+        pids = [host.pid for host in group._core.fleet.hosts]
+        for pid in pids:
+            os.kill(pid, signal.SIGSTOP)
+        try:
+            group.step_async(tokens.steps(group.env_ids))
+            first = asyncio.ensure_future(group.collect_async(wait_all=True))
+            await asyncio.sleep(0)  # It has begun to wait.
+            with pytest.raises(RLightningError, match="one collector at a time"):
+                await group.collect_async()
+        finally:
+            for pid in pids:
+                os.kill(pid, signal.SIGCONT)
         batch, _ = await first
         tokens.check(batch)
         assert len(batch) == 4
