@@ -73,9 +73,9 @@ class NotAnException(BaseException):
     """What ``except Exception`` lets through."""
 
 
-def _raise(error: BaseException) -> Callable[[], None]:
+def _raise(kind: type[BaseException], *args: Any, **kwargs: Any) -> Callable[[], None]:
     def fault() -> None:
-        raise error
+        raise kind(*args, **kwargs)
 
     return fault
 
@@ -144,24 +144,25 @@ FAULTS: dict[str, Callable[[], object]] = {
     "loop in C": lambda: sum(iter(int, 1)),
     "deadlock": _deadlock,
     "deadlock with the GIL": _deadlock_with_the_gil,
+    "close descriptors": lambda: os.closerange(3, 1000),
     "stop": _signal(signal.SIGSTOP),
     "tell and sleep": _tell_and_sleep,
     "interrupt the trainer": _interrupt_trainer,
     # Exceptions.
-    "raise": _raise(ValueError("as asked for")),
-    "odd constructor": _raise(OddConstructor(7, where="step")),
-    "unpicklable": _raise(Unpicklable()),
-    "unprintable": _raise(Unprintable()),
-    "unspeakable": _raise(Unspeakable()),
-    "not an exception": _raise(NotAnException("but raised")),
-    "system exit": _raise(SystemExit(5)),
-    "keyboard interrupt": _raise(KeyboardInterrupt()),
+    "raise": _raise(ValueError, "as asked for"),
+    "odd constructor": _raise(OddConstructor, 7, where="step"),
+    "unpicklable": _raise(Unpicklable),
+    "unprintable": _raise(Unprintable),
+    "unspeakable": _raise(Unspeakable),
+    "not an exception": _raise(NotAnException, "but raised"),
+    "system exit": _raise(SystemExit, 5),
+    "keyboard interrupt": _raise(KeyboardInterrupt),
     "interrupt": lambda: (os.kill(os.getpid(), signal.SIGINT), time.sleep(60)),
-    "generator exit": _raise(GeneratorExit()),
-    "stop iteration": _raise(StopIteration(1)),
-    "surrogates": _raise(ValueError("\udcff")),
-    "a megabyte": _raise(ValueError("x" * 2**20)),
-    "broken pipe": _raise(BrokenPipeError("the simulator's, not ours")),
+    "generator exit": _raise(GeneratorExit),
+    "stop iteration": _raise(StopIteration, 1),
+    "surrogates": _raise(ValueError, "\udcff"),
+    "a megabyte": _raise(ValueError, "x" * 2**20),
+    "broken pipe": _raise(BrokenPipeError, "the simulator's, not ours"),
     "recursion": _recurse,
     "memory": _exhaust_memory,
     # Noise.

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import logging
 import os
+import resource
 import select
 import signal
 import warnings
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import pytest
@@ -16,7 +18,6 @@ from rlightning_aio.errors import EnvRaised, StartFailed, WorkerDied
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     Start: TypeAlias = Callable[..., Driven]
 
@@ -332,6 +333,42 @@ def test_fork_server_that_is_killed_is_replaced_with_its_workers(start: Start) -
         assert marked(group.step(tokens.steps(["faulty-1"]))[0]["faulty-1"])
     batch, _ = group.step(tokens.steps(["faulty-0", "faulty-2", "faulty-3"]))
     assert all(map(marked, batch.values()))
+    tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
+
+
+def test_failed_fork_costs_one_worker_and_tells_why(start: Start) -> None:
+    """A machine that is out of descriptors can't replace a worker; the others live on."""
+    group, tokens = start(two_workers(max_restarts=2)), Tokens()
+    (server,) = group.group._fleet.servers
+    pid = server._process.pid
+    held = len(list(Path(f"/proc/{pid}/fd").iterdir()))
+    kept = resource.prlimit(pid, resource.RLIMIT_NOFILE)
+    resource.prlimit(pid, resource.RLIMIT_NOFILE, (held - 1, kept[1]))
+    with pytest.raises(WorkerDied, match="2 restarts in a row") as caught:
+        group.step(tokens.steps(group.group.env_ids, {"faulty-0": "sigkill"}))
+    assert "no worker could be forked" in caught.value.stderr_tail
+    resource.prlimit(pid, resource.RLIMIT_NOFILE, kept)
+    tokens.check(group.step(tokens.steps(["faulty-2", "faulty-3"]))[0])
+
+
+def test_worker_that_loses_its_channel_is_replaced(start: Start) -> None:
+    """An env that closes what it hasn't opened ends its worker, and nothing else."""
+    group, tokens = start(two_workers()), Tokens()
+    first, _ = group.step(tokens.steps(["faulty-0"], {"faulty-0": "close descriptors"}))
+    second, _ = group.step(tokens.steps(group.group.env_ids))
+    # It may have told its result before it had to speak through the channel.
+    assert marked(first["faulty-0"]) != marked(second["faulty-0"])
+    assert marked(second["faulty-1"])
+    tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
+
+
+def test_worker_that_is_interrupted_while_idle_is_replaced(start: Start) -> None:
+    """The interrupt struck the runtime, not an env: nobody can tell what was lost."""
+    group, tokens = start(two_workers()), Tokens()
+    os.kill(pid_of(group, "faulty-0"), signal.SIGINT)
+    batch, _ = group.step(tokens.steps(group.group.env_ids))
+    assert [ret.env_id for ret in batch.values()] == group.group.env_ids
+    group.reset()
     tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 

@@ -74,7 +74,9 @@ class InlineHost:
             try:
                 env = build_env(order.config, order.env_class, index, fn)
                 self._runners.append(EnvRunner(env, keeps_tensors=True))
-            except Exception as error:
+            except KeyboardInterrupt:
+                raise
+            except BaseException as error:
                 self._inbox.on_start_error(self, row, ErrorText.of(error))
                 return
         self._inbox.on_started(self, [Started.of(runner) for runner in self._runners])
@@ -144,8 +146,10 @@ class InlineHost:
     def _guarded(self, row: int, number: int, run: Callable[[], None]) -> None:
         try:
             run()
-        except Exception as error:
+        except BaseException as error:
             self._inbox.on_error(self, row, number, ErrorText.of(error))
+            if isinstance(error, KeyboardInterrupt):
+                raise  # It was meant for the program; the request that it struck ends all the same.
 
     def order(self, count: int) -> bool:
         """Nothing gets ready by itself here."""
@@ -183,7 +187,7 @@ class InlineHost:
         for row, runner in enumerate(self._runners):
             try:
                 runner.env.close()
-            except Exception as error:
+            except BaseException as error:
                 errors.append((row, ErrorText.of(error)))
         self.release()
         self._inbox.on_closed(self, errors)
