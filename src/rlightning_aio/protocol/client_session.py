@@ -151,6 +151,7 @@ class ClientSession:
             num_envs=meta.num_envs,
             agents=[*meta.agents],
             max_episode_steps=meta.max_episode_steps,
+            autoreset=meta.autoreset,
             free_actions=free_actions,
             reads_extras=reads_extras,
         )

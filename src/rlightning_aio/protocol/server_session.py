@@ -382,6 +382,7 @@ class ServerSessions:
                 num_envs=hello.num_envs,
                 agents=kind.agents,
                 max_episode_steps=hello.max_episode_steps,
+                autoreset=hello.autoreset,
             ),
             results=ResultLayout(observation_space, hello.num_envs, hello.agents),
             actions=SpaceLayout(action_space, "action"),

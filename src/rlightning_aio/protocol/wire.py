@@ -17,6 +17,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from rlightning_aio.protocol.columns import as_array
+from rlightning_aio.types import Autoreset
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -98,6 +99,8 @@ class Hello(Struct, tag="hello", tag_field="type", kw_only=True):
     num_envs: Annotated[int, Meta(ge=1, le=1 << 20)] = 1
     agents: Annotated[list[Name], Meta(max_length=256)] = []
     max_episode_steps: Annotated[int, Meta(ge=1, le=2**63 - 1)] | None = None
+    autoreset: Autoreset = "disabled"
+    """What sub-environments do after an episode's end; see `EnvMeta`."""
     free_actions: bool = False
     """Actions need not fit the action space: the client transforms them."""
     reads_extras: bool = False
