@@ -42,17 +42,14 @@ def columns(
         "positions": None if positions is None else np.array(positions, np.intp),
         "observation": observation,
         "reward": np.arange(np.prod(head)).reshape(head) + 0.5,
-        "terminated": np.zeros(head, bool),
-        "truncated": np.zeros(head, bool),
-        "ended": np.zeros(head, bool),
+        "ends": np.zeros((*head, 2), bool),
         "info_marks": np.zeros(n, np.uint8),
         "info": None,
         "schemas": [{} for _ in IDS],
         "rests": {},
         "episode_return": None,
         "episode_length": None,
-        "done_ns": np.arange(n),
-        "busy_ns": np.arange(n),
+        "times": np.arange(2 * n).reshape(n, 2),
         "agents": agents,
     }
     return ResultColumns(**{**values, **fields})
@@ -191,13 +188,12 @@ def test_infos_are_decoded_for_the_env_they_are_of() -> None:
 
 def test_an_episode_that_ended_is_told_with_its_last_result() -> None:
     """Its return and length lie in the info of that result alone."""
-    ended = np.array([False, True])
+    ends = np.array([[False, False], [True, False]])
     batch = results(
         columns(
             [0, 1],
             np.zeros((2, 2)),
-            terminated=ended,
-            ended=ended,
+            ends=ends,
             episode_return=np.array([9.0, 4.5]),
             episode_length=np.array([7, 3]),
         )

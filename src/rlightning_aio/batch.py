@@ -58,12 +58,13 @@ class ResultColumns:
         slots: the env of each row, a slot of `table`.
         positions: the place of each row in the batch; None for 0, 1, 2, …
         observation: tree of arrays, or None where observations came one by one (`rests`).
-        reward, terminated, truncated: ``[n, *head]``; ended is the latter two's union.
-        info_marks, info: see `protocol.info`; info is None where no env has sent any.
+        reward: ``[n, *head]``; ends: ``[n, *head, 2]``, terminated and truncated.
+        info_marks, info: see `protocol.info`; None where no env has put any into its row.
         schemas: by slot, its worker's schemas by number.
         rests: what did not fit a row, by row, pickled or plain.
         episode_return, episode_length: valid where an episode has ended; None if nowhere.
-        done_ns: when each result was ready (monotonic); busy_ns: time the env took.
+        times: ``[n, 2]``: when each result was ready (monotonic), and the time the env took,
+            in ns.
         agents: names of a multi-agent env's agents.
         observation_space: of one env; None if it isn't known.
     """
@@ -73,22 +74,39 @@ class ResultColumns:
     positions: NDArray[np.intp] | None
     observation: Tree | None
     reward: NDArray[np.float64]
-    terminated: NDArray[np.bool_]
-    truncated: NDArray[np.bool_]
-    ended: NDArray[np.bool_]
-    info_marks: NDArray[np.uint8]
+    ends: NDArray[np.bool_]
+    info_marks: NDArray[np.uint8] | None
     info: NDArray[np.uint8] | None
     schemas: Sequence[Mapping[int, InfoSchema]]
     rests: dict[int, Any]
     episode_return: NDArray[np.float64] | None
     episode_length: NDArray[np.int64] | None
-    done_ns: NDArray[np.int64]
-    busy_ns: NDArray[np.int64]
+    times: NDArray[np.int64]
     agents: tuple[str, ...] = ()
     observation_space: gym.Space[Any] | None = None
 
     def __len__(self) -> int:
         return len(self.slots)
+
+    @property
+    def terminated(self) -> NDArray[np.bool_]:
+        """``[n, *head]``."""
+        return self.ends[..., 0]
+
+    @property
+    def truncated(self) -> NDArray[np.bool_]:
+        """``[n, *head]``."""
+        return self.ends[..., 1]
+
+    @property
+    def ended(self) -> NDArray[np.bool_]:
+        """Terminated or truncated: ``[n, *head]``."""
+        return self.terminated | self.truncated
+
+    @property
+    def busy_ns(self) -> NDArray[np.int64]:
+        """The time each env took: ``[n]``."""
+        return self.times[:, 1]
 
     def rest(self, row: int) -> dict[str, Any]:
         """What did not fit `row`; empty if it all did."""
@@ -125,13 +143,16 @@ class ResultColumns:
 
     def reports(self, row: int, keys: Iterable[str]) -> bool:
         """Whether the info of `row` may hold any of `keys`; tells without decoding it."""
-        mark = int(self.info_marks[row])
+        mark = self._mark(row)
         if mark in (NO_INFO, PICKLED):
             return row in self.rests
         return not set(keys).isdisjoint(self.schemas[int(self.slots[row])][mark].keys)
 
+    def _mark(self, row: int) -> int:
+        return NO_INFO if self.info_marks is None else int(self.info_marks[row])
+
     def _info_in_row(self, row: int) -> dict[str, Any]:
-        mark = int(self.info_marks[row])
+        mark = self._mark(row)
         if self.info is None or mark in (NO_INFO, PICKLED):
             return {}
         return self.schemas[int(self.slots[row])][mark].decode(memoryview(self.info[row]))
@@ -139,7 +160,7 @@ class ResultColumns:
     def _episode(self, row: int) -> dict[str, Any]:
         if self.episode_return is None or self.episode_length is None:
             return {}
-        ended = self.ended[row]
+        ended = self.ends[row].any(axis=-1)
         if not np.any(ended) or not np.any(self.episode_length[row]):
             return {}
         returns, lengths = self.episode_return[row], self.episode_length[row]
@@ -160,7 +181,7 @@ class ResultColumns:
             "last_terminated": self._head(self.terminated, row),
             "last_truncated": self._head(self.truncated, row),
             "info": self.info_of(row),
-            "ts_env_sent_ns": int(self.done_ns[row]) + _EPOCH_NS,
+            "ts_env_sent_ns": int(self.times[row, 0]) + _EPOCH_NS,
         }
         return (MultiAgentEnvRet if self.agents else EnvRet)(_extra=rest.get("extra"), **fields)
 
@@ -466,16 +487,13 @@ def _subset(part: ResultColumns, rows: list[int], positions: list[int]) -> Resul
         positions=np.asarray(positions, np.intp),
         observation=None if part.observation is None else mapped(taken, part.observation),
         reward=taken(part.reward),
-        terminated=taken(part.terminated),
-        truncated=taken(part.truncated),
-        ended=taken(part.ended),
+        ends=taken(part.ends),
         info_marks=taken(part.info_marks),
         info=taken(part.info),
         rests={k: part.rests[row] for k, row in enumerate(rows) if row in part.rests},
         episode_return=taken(part.episode_return),
         episode_length=taken(part.episode_length),
-        done_ns=taken(part.done_ns),
-        busy_ns=taken(part.busy_ns),
+        times=taken(part.times),
     )
 
 

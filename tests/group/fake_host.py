@@ -207,7 +207,7 @@ class FakeHost:
 
     def _reply(self, row: int, entry: int, info: dict[str, Any], *, by_frame: bool) -> Reply:
         if not info and not by_frame:
-            return Reply(entry & ~rings.OP_MASK)
+            return Reply(entry)
         rest = {"info": info} if info else {}
         number = entry >> rings.NUMBER_SHIFT
         return Reply(0, lambda: self.inbox.on_rest(self, row, number, rest))

@@ -1,7 +1,8 @@
 """The asynchronous `EnvGroup` and the driver that waits on an asyncio event loop.
 
-Waiting is `asyncio.wait(..., return_when=FIRST_COMPLETED)` over one future for each
-source (a worker, a fork server, a server socket), never one for each env.
+Waiting is `asyncio.wait(..., return_when=FIRST_COMPLETED)` on one future, which any source
+(a worker, a fork server, a server socket) fulfils: with one for each, a collect would cost
+the more the more workers there are, and with one env to a worker, the more envs.
 Absent on purpose: rules. Every one of them is in the core.
 """
 
@@ -34,37 +35,37 @@ class AioDriver:
     """Watches sources with `loop.add_reader` and waits for operations to end."""
 
     def __init__(self) -> None:
-        self._futures: dict[Source, asyncio.Future[None]] = {}
-        self._writing: set[Source] = set()
+        # Invariant: the future of those who wait now; None while nobody does. Whoever starts
+        # to wait gets one that is not done: what was told before is in the core already.
+        self._told: asyncio.Future[None] | None = None
+        self._loops: dict[Source, asyncio.AbstractEventLoop] = {}
         self._descriptors: dict[Source, int] = {}
+        self._writing: set[Source] = set()
         self._broken: BaseException | None = None
 
     def watch(self, source: Source) -> None:
         """See `base.Watcher.watch`."""
-        loop = asyncio.get_running_loop()
-        self._futures[source] = loop.create_future()
+        loop = self._loops[source] = asyncio.get_running_loop()
         self._descriptors[source] = source.fileno()
         loop.add_reader(source.fileno(), self._readable, source)
 
     def unwatch(self, source: Source) -> None:
         """See `base.Watcher.unwatch`. Whoever waits for `source` wakes."""
-        future = self._futures.pop(source, None)
-        if future is None:
+        loop = self._loops.pop(source, None)
+        if loop is None:
             return
         descriptor = self._descriptors.pop(source)
-        loop = future.get_loop()
         if not loop.is_closed():
             loop.remove_reader(descriptor)
             if source in self._writing:
                 loop.remove_writer(descriptor)
         self._writing.discard(source)
-        if not future.done():
-            future.set_result(None)
+        self.wake()
 
     def watch_writable(self, source: Source, wanted: bool) -> None:
         """See `base.Watcher.watch_writable`."""
         # Not the running loop: `step_async` may be called from anywhere.
-        loop = self._futures[source].get_loop()
+        loop = self._loops[source]
         if wanted:
             self._writing.add(source)
             loop.add_writer(source.fileno(), source.on_writable)
@@ -74,25 +75,16 @@ class AioDriver:
 
     def wake(self) -> None:
         """See `base.Watcher.wake`."""
-        for source in self._futures:
-            # Whoever waits, waits for all of them.
-            self._tell(source)
-            return
+        told, self._told = self._told, None
+        if told is not None and not told.done():
+            told.set_result(None)
 
     def _readable(self, source: Source) -> None:
         try:
             source.on_readable()
         except BaseException as error:  # An event loop would log it and let the waiter hang.
             self._broken = error
-        self._tell(source)
-
-    def _tell(self, source: Source) -> None:
-        future = self._futures.get(source)
-        if future is not None:
-            # Invariant: whoever starts to wait from now on gets a future that is not done;
-            # what has just been told is in the core already.
-            self._futures[source] = future.get_loop().create_future()
-            future.set_result(None)
+        self.wake()
 
     async def run(self, operation: Operation[T]) -> T:
         """Wait until `operation` ends; its result. It gets to clean up if it is cancelled."""
@@ -115,10 +107,10 @@ class AioDriver:
         timeout = None if until is None else until - time.monotonic()
         if timeout is not None and timeout <= 0:
             await asyncio.sleep(0)
-        elif self._futures:
-            await asyncio.wait(
-                self._futures.values(), timeout=timeout, return_when=asyncio.FIRST_COMPLETED
-            )
+        elif self._loops:
+            if self._told is None:
+                self._told = asyncio.get_running_loop().create_future()
+            await asyncio.wait((self._told,), timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
         else:
             await asyncio.sleep(timeout or 0)
 

@@ -3,6 +3,9 @@
 An env's counter is 0 after a reset and one more after each completed step. Inside the
 context the step that reaches the limit is flagged, and the next step of that env is
 replaced by a reset; so a limit of L gives a period of L + 1 calls.
+
+Nothing is counted step by step: a counter is the number of the env's request less that of
+its last reset, and limits are looked at only when one can have been reached.
 """
 
 from __future__ import annotations
@@ -13,9 +16,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from rlightning_aio.protocol.rings import STEP
+from rlightning_aio.group.slots import IDLE
+from rlightning_aio.protocol.rings import NUMBER_SHIFT, STEP
 
 if TYPE_CHECKING:
+    from types import EllipsisType
+
     from numpy.typing import NDArray
 
     from rlightning_aio.batch import BatchedData
@@ -25,10 +31,6 @@ __all__ = ["NO_RESETS", "AutoReset", "whole"]
 
 NO_RESETS: Final[NDArray[np.bool_]] = np.zeros(1, np.bool_)
 """No env is due; broadcasts to any number of slots."""
-
-# 0-d arrays: NumPy takes twice as long over a Python int.
-_ONE: Final = np.array(1)
-_STEP: Final = np.array(STEP, np.int8)
 
 
 def whole(value: Any) -> int | None:
@@ -46,8 +48,13 @@ class AutoReset:
 
     def __init__(self, slots: Slots) -> None:
         self._slots = slots
-        self._counts = np.zeros(len(slots), np.int64)
+        # Numbers of the last resets, and one more for each later request that was no step.
+        self._base = np.zeros(len(slots), np.int64)
         self._due = np.zeros(len(slots), np.bool_)
+        self._any_due = False
+        self._resets_out = False
+        # For so many batches no env can reach its limit.
+        self._margin = 0
         self._limits: NDArray[np.int64] | None = None
         self._on_done = True
 
@@ -66,6 +73,7 @@ class AutoReset:
         if self.active:
             raise RuntimeError("auto_reset contexts don't nest; leave the open one first")
         self._limits = self._chosen_limits(max_episode_steps)
+        self._margin = 0
         self._on_done = on_done
 
     def _chosen_limits(self, given: int | None) -> NDArray[np.int64]:
@@ -93,21 +101,53 @@ class AutoReset:
         """Close the context: steps are plain again."""
         self._limits = None
         self._due[:] = False
+        self._any_due = False
 
     def due(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Which of `slots` are to be reset in place of their step."""
-        return NO_RESETS if self._limits is None else self._due[slots]
+        return self._due[slots] if self._any_due else NO_RESETS
+
+    def resets_sent(self) -> None:
+        """Take note that not everything that is asked for is a step."""
+        self._resets_out = True
+
+    def not_completed(self, slots: NDArray[np.intp]) -> None:
+        """Leave the counters of `slots` as they are, though their request has a number."""
+        self._base[slots] += 1
 
     def account(self, slots: NDArray[np.intp], batch: BatchedData) -> list[bool]:
         """Count results as they are handed out; the flags that go with them."""
-        stepped = self._slots.op[slots] == _STEP
-        counts = (self._counts[slots] + _ONE) * stepped
-        self._counts[slots] = counts
+        if self._resets_out:
+            self._note_resets(slots)
         if self._limits is None:
             return [False] * len(slots)
-        reached = counts >= self._limits[slots]
-        due = reached
+        self._margin -= 1
+        if self._margin > 0:
+            reached = None
+        else:
+            self._margin = int((self._limits - self._counts(...)).min())
+            reached = self._counts(slots) >= self._limits[slots]
+        ended = None
         if self._on_done and batch.any_ended:
-            due = reached | (batch.ended & stepped & ~self._slots.resets_itself[slots])
-        self._due[slots] = due
-        return reached.tolist()
+            ended = batch.ended & ~self._slots.resets_itself[slots]
+            ended &= self._slots.ops(slots) == STEP
+        if reached is not None or ended is not None:
+            due = NO_RESETS if reached is None else reached
+            self._due[slots] |= due if ended is None else due | ended
+            self._any_due = np.count_nonzero(self._due) > 0
+        return [False] * len(slots) if reached is None else reached.tolist()
+
+    def _counts(self, slots: NDArray[np.intp] | EllipsisType) -> NDArray[np.int64]:
+        """Counters of `slots`; too high by 1 where a request is in flight."""
+        return (self._slots.entry[slots] >> NUMBER_SHIFT) - self._base[slots]
+
+    def _note_resets(self, slots: NDArray[np.intp]) -> None:
+        """Start the counters of those that were reset anew."""
+        table = self._slots
+        begun = slots[table.ops(slots) != STEP]
+        self._base[begun] = table.entry[begun] >> NUMBER_SHIFT
+        if self._any_due:
+            self._due[begun] = False
+            self._any_due = np.count_nonzero(self._due) > 0
+        pending = table.ops(...) != STEP
+        self._resets_out = np.count_nonzero(pending & (table.state != IDLE)) > 0

@@ -33,7 +33,7 @@ from rlightning_aio.group.results import collected
 from rlightning_aio.group.slots import BUSY, IDLE, READY
 from rlightning_aio.group.stats import Stats
 from rlightning_aio.group.wait import Operation, Wait, earliest
-from rlightning_aio.protocol.rings import OP_BITS, OP_MASK, RESET, SLOT_MASK, STEP
+from rlightning_aio.protocol.rings import OP_BITS, RESET, SLOT_MASK, STEP
 from rlightning_aio.protocol.slab import NO_SEED
 
 if TYPE_CHECKING:
@@ -59,10 +59,8 @@ NOBODY: Final = -1
 """Owner of a call that was given up."""
 
 # 0-d arrays: NumPy takes twice as long over a Python int.
-_WITHOUT_OP: Final = np.array(~OP_MASK)
 _OP_BITS: Final = np.array(OP_BITS)
 _SLOT_MASK: Final = np.array(SLOT_MASK)
-_OPS: Final = {STEP: np.array(STEP), RESET: np.array(RESET)}
 Flags: TypeAlias = "list[bool]"
 
 
@@ -199,7 +197,7 @@ class Core:
 
     def _has_joined(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Which of `slots` have a first result that nobody has collected."""
-        return (self.slots.op[slots] == JOINED) & (self.slots.state[slots] == READY)
+        return (self.slots.ops(slots) == JOINED) & (self.slots.state[slots] == READY)
 
     def _pack_letters(self, slots: NDArray[np.intp], letters: Letters) -> list[Any]:
         """What the channel will carry, pickled before anything is sent."""
@@ -227,11 +225,13 @@ class Core:
         self, slots: NDArray[np.intp], resets: NDArray[np.bool_], owner: int, now: float
     ) -> None:
         """Send steps, and resets in place of some, whose arguments lie in the rows."""
-        op = _OPS[STEP]
+        entries = self._mark_sent(slots, STEP, owner, now)
         if resets is not NO_RESETS and np.count_nonzero(resets):
-            op = STEP + resets  # RESET == STEP + 1
+            entries += resets  # RESET == STEP + 1
+            self.slots.entry[slots] = entries
+            self.auto.resets_sent()
             self.fleet.write_seeds(slots[resets], np.full(np.count_nonzero(resets), NO_SEED))
-        self._post(slots, self._mark_sent(slots, op, owner, now) + op)
+        self._post(slots, entries)
 
     def _post(self, slots: NDArray[np.intp], entries: NDArray[np.int64]) -> None:
         """Hand entries to their hosts, with one call for each run of slots of one host."""
@@ -250,18 +250,19 @@ class Core:
             start = end
 
     def _mark_sent(
-        self, slots: NDArray[np.intp], op: int | NDArray[Any], owner: int, now: float
+        self, slots: NDArray[np.intp], op: int, owner: int, now: float
     ) -> NDArray[np.int64]:
-        """Number the next requests of `slots`; their ring entries, without the operation."""
+        """Number the next requests of `slots`; their ring entries."""
         table = self.slots
-        entries = table.renumber(slots)
+        entries = table.renumber(slots, op)
         table.state[slots] = BUSY
-        table.op[slots] = op
         table.sent_ns[slots] = int(now * 1e9)
         if owner:
             table.owner[slots] = owner
         else:
             self._in_flight += len(slots)
+        if op != STEP:
+            self.auto.resets_sent()
         return entries
 
     # -- replies (called by the fleet) --------------------------------------------
@@ -275,7 +276,7 @@ class Core:
         reports = self._reports
         if not reports:
             return
-        entries = (reports[0] if len(reports) == 1 else np.concatenate(reports)) & _WITHOUT_OP
+        entries = reports[0] if len(reports) == 1 else np.concatenate(reports)
         reports.clear()
         slots = (entries >> _OP_BITS) & _SLOT_MASK
         current = self.slots.entry[slots] == entries
@@ -311,7 +312,7 @@ class Core:
         slot = host.first_slot + row
         if not self._is_current(slot, number):
             return
-        doing = {STEP: "step", RESET: "reset", CALL: "call"}[int(self.slots.op[slot])]
+        doing = {STEP: "step", RESET: "reset", CALL: "call"}[self.slots.op(slot)]
         death = self.fleet.restarting.pop(slot, None)
         after = f" (its worker {death.cause}, and was replaced)" if death else ""
         raised = EnvRaised(
@@ -352,6 +353,7 @@ class Core:
             self._fail_one(slot, EnvAway(self._away(slot), env_id=self.slots.env_ids[slot]))
             return
         self.slots.state[slot] = IDLE
+        self.auto.not_completed(np.array([slot]))
         self._in_flight -= 1
 
     def _away(self, slot: int) -> str:
@@ -411,6 +413,7 @@ class Core:
         """End the outstanding requests of `slots` with one error for each caller."""
         table = self.slots
         self._news = True
+        self.auto.not_completed(slots[table.ops(slots) != CALL])
         for owner in set(table.owner[slots].tolist()):
             mine = slots[table.owner[slots] == owner]
             table.state[mine] = IDLE
@@ -539,7 +542,7 @@ class Core:
         flags = self.auto.account(slots, batch)
         self.stats.account(batch.parts, synchronous=synchronous)
         if len(slots):
-            sample = batch.parts[0].busy_ns.item(0)
+            sample = batch.parts[0].times.item(1)
             self.fleet.lookout.step_ns += 0.1 * (sample - self.fleet.lookout.step_ns)
             self._handed_out += 1
             if self._handed_out == HINT_AFTER_BATCHES:
@@ -657,7 +660,7 @@ class Core:
                 host.request_reset(slot - host.first_slot, table.number(slot), one)
         else:
             self.fleet.write_seeds(asked, seeds)
-            self._post(asked, table.entry[asked] + _OPS[RESET])
+            self._post(asked, table.entry[asked])
         yield from self._await_ticket(ticket)
         return self._settled(ticket, slots)
 
@@ -757,6 +760,7 @@ class Core:
         ]
         ticket = self._new_ticket(slots, calls=True)
         self._mark_sent(slots, CALL, ticket.owner, now)
+        self.auto.not_completed(slots)
         for slot, one in zip(chosen, packed, strict=True):
             host = self.fleet.host_of(slot)
             host.request_call(slot - host.first_slot, self.slots.number(slot), one)

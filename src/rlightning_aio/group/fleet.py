@@ -38,7 +38,7 @@ from rlightning_aio.hosts.runner import NO_ACTION
 from rlightning_aio.hosts.server import ServerHost
 from rlightning_aio.hosts.worker import ErrorText, Started
 from rlightning_aio.protocol.info import NO_INFO, PICKLED
-from rlightning_aio.protocol.rings import OP_BITS, OP_MASK, RESET, SLOT_MASK, STEP
+from rlightning_aio.protocol.rings import NUMBER_SHIFT, OP_BITS, RESET, SLOT_MASK, STEP
 from rlightning_aio.protocol.slab import NO_SEED
 from rlightning_aio.types import EnvMeta
 
@@ -310,6 +310,7 @@ class Fleet:
             check_actions(self.metas)
         self.slabs, places = seat(started, self.slots, self._arena)
         self.slots.note_letters()
+        self.slots.note_rows()
         for member in self._members:
             member.order = order_for(member.host, self.slots, places)
 
@@ -348,6 +349,7 @@ class Fleet:
         rows = slice(host.first_slot, host.first_slot + slab.rows)
         self.slots.slab[rows] = len(self.slabs)
         self.slots.row[rows] = np.arange(slab.rows)
+        self.slots.note_rows()
         self.slabs.append(slab)
 
     def is_idle(self, host: Host, row: int) -> bool:
@@ -446,7 +448,7 @@ class Fleet:
             # A stopped process does nothing at all, for all that it was asked to.
             idle = member.idle == self._progress(member)
             return (member.idle_since if idle else self._now) + shortest
-        op = int(self.slots.op[self._slot(entry)])
+        op = self.slots.op(self._slot(entry))
         limit = limits[0] if op == STEP else limits[1] if op == RESET else None
         # What has no limit is looked at again: what comes after it may have one.
         return self._now + shortest if limit is None else since_ns / 1e9 + limit
@@ -543,7 +545,7 @@ class Fleet:
             return
         _log.warning("%s", str(error_for(owed)))
         # A replacement answers for steps and resets, but not for calls.
-        calls = owed[~np.isin(self.slots.op[owed], (STEP, RESET))]
+        calls = owed[~np.isin(self.slots.ops(owed), (STEP, RESET))]
         self._core.fail(calls, error_for)
         self._replace(member, replace(death, cause=cause), np.setdiff1d(owed, calls))
 
@@ -553,7 +555,7 @@ class Fleet:
             return member.hung_slot
         for entry in death.requests:
             slot = self._slot(entry)
-            if slot in owed and self.slots.entry[slot] == entry & ~OP_MASK:
+            if slot in owed and self.slots.number(slot) == entry >> NUMBER_SHIFT:
                 return slot
         return int(owed[0]) if len(owed) else _NOBODY
 
@@ -606,15 +608,15 @@ class Fleet:
             return
         host.attach(member.order)
         if len(owed):
-            entries = table.renumber(owed) + RESET
-            table.op[owed] = RESET
+            entries = table.renumber(owed, RESET)
+            self._core.auto.resets_sent()
             self.write_seeds(owed, np.full(len(owed), NO_SEED))
             for slot in owed.tolist():
                 self.restarting[slot] = self.lost.pop(slot)
             host.request(entries)
 
     def _doing(self, slot: int) -> str:
-        return {STEP: "a step", RESET: "a reset"}.get(int(self.slots.op[slot]), "a call")
+        return {STEP: "a step", RESET: "a reset"}.get(self.slots.op(slot), "a call")
 
     def _death_error(
         self, member: _Member, death: Death, outcome: str
@@ -627,7 +629,7 @@ class Fleet:
         last = f"request {number}, {doing}" if number else "none"
         if member.hung_slot is not None:
             config = member.config
-            limit = config.step_timeout if table.op[slot] == STEP else config.reset_timeout
+            limit = config.step_timeout if table.op(slot) == STEP else config.reset_timeout
             what = f"{table.describe(slot)} took longer than {limit} s for {doing} and was killed"
         else:
             what = f"the worker of {table.describe(slot)} {death.cause}"
@@ -653,7 +655,7 @@ class Fleet:
             death = self.restarting.pop(slot, None)
             if death is not None:
                 self._mark(slot, death, rests)
-            elif self.slots.op[slot] == STEP:
+            elif self.slots.op(slot) == STEP:
                 deaths = self._members[int(self.slots.host[slot])].deaths
                 deaths.pop(slot, None)
                 deaths.pop(_NOBODY, None)

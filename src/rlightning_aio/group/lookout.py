@@ -39,6 +39,7 @@ class Lookout:
         self._inline: deque[Host] = deque()
         self._spinner = Spinner(enabled=True)
         self._spun = False
+        self._last: Host | None = None
 
     def add_inline(self, host: Host) -> None:
         """Let an inline host have its turns."""
@@ -65,18 +66,32 @@ class Lookout:
     def order(self, wanted: int) -> bool:
         """Ask hosts to wake us when `wanted` results may be ready; True if some are already.
 
-        Each of H busy hosts is asked for the H-th part, rounded up: when `wanted` results
-        are ready in all, at least one host has its part, so nobody wakes us too late. Where
-        a step takes less than waking up does, each is asked for one more: then one wake-up
-        mostly does, and is late by one such step at most.
+        Where all results are wanted, one host is asked for all of its own: that which was the
+        last to be done before. Else each of H busy hosts is asked for the H-th part, rounded
+        up: when `wanted` results are ready in all, at least one host has its part, so nobody
+        wakes us too late. Where steps take less than waking up does, each is asked for as many
+        more as it does meanwhile, but kept busy: then one wake-up does, and brings more.
         """
         busy = [host for host in self._hosts if host.in_flight]
+        if wanted >= sum([host.in_flight for host in busy]):
+            return self._order_of_last(busy)
         part = ceil(wanted / len(busy)) if busy else 0
-        if len(busy) > 1 and wanted > 1 and self.step_ns < _WAKE_UP_NS:
-            part += 1
+        slack = int(_WAKE_UP_NS / self.step_ns) if wanted > 1 else 0
         came = False
         for host in busy:
-            came = host.order(min(part, host.in_flight)) or came
+            left = max(host.in_flight - part, 0)
+            came = host.order(min(part, host.in_flight) + min(slack, left // 2)) or came
+        return came
+
+    def _order_of_last(self, busy: list[Host]) -> bool:
+        if self._last not in busy:
+            self._last = busy[-1] if busy else None
+        came = False
+        for host in busy:
+            if host is self._last:
+                came = host.order(host.in_flight)
+            else:
+                host.withdraw()
         return came
 
     def sweep(self) -> None:

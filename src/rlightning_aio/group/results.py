@@ -42,29 +42,27 @@ def _part(
     rests: dict[int, Any],
 ) -> ResultColumns:
     table = core.slots
-    rows: Rows = table.row[slots]
+    rows: Rows
     if slots is table.all:
         rows = slice(0, slab.rows)
-    terminated, truncated = _copy(slab.terminated, rows), _copy(slab.truncated, rows)
-    ended = terminated | truncated
-    any_ended = np.count_nonzero(ended) > 0
+    else:
+        rows = slots if table.row_is_slot else table.row[slots]
+    ends = gather(slab.ends, rows)
+    any_ended = np.count_nonzero(ends) > 0
     return ResultColumns(
         slots=slots,
         table=table,
         positions=positions,
         observation=_observations(core, slab, rows),
         reward=_copy(slab.reward, rows),
-        terminated=terminated,
-        truncated=truncated,
-        info_marks=_copy(slab.info_mark, rows),
+        ends=ends,
+        info_marks=_copy(slab.info_mark, rows) if core.info_width else None,
         info=_copy(slab.info[:, : core.info_width], rows) if core.info_width else None,
         schemas=table.schemas,
         rests=_rests(slots, rests) if rests else {},
-        ended=ended,
         episode_return=_copy(slab.episode_return, rows) if any_ended else None,
         episode_length=_copy(slab.episode_length, rows) if any_ended else None,
-        done_ns=_copy(slab.done_ns, rows),
-        busy_ns=_copy(slab.busy_ns, rows),
+        times=gather(slab.times, rows),
         agents=slab.layout.agents,
         observation_space=slab.layout.observation_space,
     )

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from rlightning_aio.errors import UnknownEnv
-from rlightning_aio.protocol.rings import NUMBER_SHIFT, OP_BITS
+from rlightning_aio.protocol.rings import NUMBER_SHIFT, OP_BITS, OP_MASK
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from types import EllipsisType
 
     from numpy.typing import NDArray
 
@@ -30,8 +31,11 @@ BUSY: Final = 1
 READY: Final = 2
 
 
-# A 0-d array: NumPy takes twice as long over a Python int.
-_NEXT_NUMBER: Final = np.array(1 << NUMBER_SHIFT)
+# 0-d arrays: NumPy takes twice as long over a Python int.
+_WITHOUT_OP: Final = np.array(~OP_MASK)
+_OP: Final = np.array(OP_MASK)
+_NEXT: Final = {op: np.array((1 << NUMBER_SHIFT) + op) for op in range(1, 5)}
+"""To be added to an entry without an operation."""
 
 
 class Slots:
@@ -48,11 +52,11 @@ class Slots:
         local_ids, server_ids: of the local envs, and of the env_servers.
         all: slots of the local envs.
         host: host id.
-        entry: ring entry of the current request, without its operation; so it also holds the
-            request's number.
-        state, op: of the current request; owner: 0 for `collect_async`, else the id of the
+        entry: ring entry of the current request: its number, the slot and the operation.
+        state: of the current request; owner: 0 for `collect_async`, else the id of the
             call that waits for it; sent_ns: when it was sent.
-        slab, row: where its results lie.
+        slab, row: where its results lie; row_is_slot: of every slot, for which `row` need
+            not be asked then.
         by_frame: actions may not fit the row; reads_extras: responses' extras are read there;
             letters: either is true of any env.
         seed_offset: sub-environments before it; num_seeds: those of all local envs.
@@ -81,11 +85,11 @@ class Slots:
         self.host = np.zeros(size, np.int64)
         self.entry = np.arange(size) << OP_BITS
         self.state = np.zeros(size, np.int8)
-        self.op = np.zeros(size, np.int8)
         self.owner = np.zeros(size, np.int64)
         self.sent_ns = np.zeros(size, np.int64)
         self.slab = np.zeros(size, np.intp)
         self.row = np.zeros(size, np.intp)
+        self.row_is_slot = False
         self.by_frame = np.zeros(size, np.bool_)
         self.reads_extras = np.zeros(size, np.bool_)
         self.letters = False
@@ -103,6 +107,10 @@ class Slots:
         self.env_ids[slot] = env_id
         self._index[env_id] = slot
 
+    def note_rows(self) -> None:
+        """Take note of rows that were given to slots."""
+        self.row_is_slot = bool((self.row == np.arange(len(self))).all())
+
     def note_letters(self) -> None:
         """Take note of whether any request may not fit its row."""
         self.letters = bool(self.by_frame.any() or self.reads_extras.any())
@@ -111,9 +119,19 @@ class Slots:
         """Number of the current request; 0 before the first."""
         return int(self.entry[slot]) >> NUMBER_SHIFT
 
-    def renumber(self, slots: NDArray[np.intp]) -> NDArray[np.int64]:
+    def op(self, slot: int) -> int:
+        """Operation of the current request; 0 before the first."""
+        return int(self.entry[slot]) & OP_MASK
+
+    def ops(self, slots: NDArray[np.intp] | EllipsisType) -> NDArray[np.int64]:
+        """Operations of the current requests of `slots`, or of all."""
+        return self.entry[slots] & _OP
+
+    def renumber(self, slots: NDArray[np.intp], op: int) -> NDArray[np.int64]:
         """Give the next request of each of `slots` its number; the new entries."""
-        entries = self.entry[slots] + _NEXT_NUMBER
+        entries = self.entry[slots]
+        entries &= _WITHOUT_OP
+        entries += _NEXT[op]
         self.entry[slots] = entries
         return entries
 

@@ -36,8 +36,7 @@ class _Sample:
     at_ns: int
     slots: NDArray[np.intp]
     sent_ns: NDArray[np.int64]
-    done_ns: NDArray[np.int64]
-    busy_ns: NDArray[np.int64]
+    times: NDArray[np.int64]
     synchronous: bool
 
 
@@ -77,29 +76,46 @@ class Stats:
         sent_ns = self._table.sent_ns
         for part in parts:
             slots = part.slots
-            self._samples.append(
-                _Sample(now, slots, sent_ns[slots], part.done_ns, part.busy_ns, synchronous)
-            )
+            self._samples.append(_Sample(now, slots, sent_ns[slots], part.times, synchronous))
             if part.episode_return is not None and part.episode_length is not None:
                 self._note_episodes(part, part.episode_return, part.episode_length)
 
     def _note_episodes(
         self, part: ResultColumns, returns: NDArray[np.float64], lengths: NDArray[np.int64]
     ) -> None:
-        slots = part.slots
         ended = part.ended & (lengths > 0)
-        for k in np.flatnonzero(ended.reshape(len(slots), -1).any(axis=1)).tolist():
-            slot, mask = slots[k], ended[k]
-            own_returns, own_lengths = np.atleast_1d(returns[k][mask]), lengths[k][mask]
-            self._episodes[slot] += own_returns.size
-            self._returns[slot] += own_returns.sum()
-            self._lengths[slot] += own_lengths.sum()
-            self._last_return[slot] = own_returns.ravel()[-1]
-            self._last_length[slot] = np.ravel(own_lengths)[-1]
+        if ended.ndim == 1:
+            slots, returns, lengths = part.slots[ended], returns[ended], lengths[ended]
+            self._episodes[slots] += 1
+            self._returns[slots] += returns
+            self._lengths[slots] += lengths
+            self._last_return[slots] = returns
+            self._last_length[slots] = lengths
+        else:
+            self._note_nested_episodes(part, ended, returns, lengths)
+        if part.info_marks is None and not part.rests:
+            return
+        for k in _rows(ended).tolist():
             if part.reports(k, _VERDICTS):
-                self._note_verdicts(slot, part.info_of(k), mask)
+                self._note_verdicts(int(part.slots[k]), part.info_of(k), ended[k])
 
-    def _note_verdicts(self, slot: np.intp, info: dict[str, Any], ended: NDArray[np.bool_]) -> None:
+    def _note_nested_episodes(
+        self,
+        part: ResultColumns,
+        ended: NDArray[np.bool_],
+        returns: NDArray[np.float64],
+        lengths: NDArray[np.int64],
+    ) -> None:
+        """Those of sub-environments and agents, several of which may end in one result."""
+        for k in _rows(ended).tolist():
+            slot, mask = part.slots[k], ended[k]
+            self._episodes[slot] += np.count_nonzero(mask)
+            self._returns[slot] += returns[k][mask].sum()
+            self._lengths[slot] += lengths[k][mask].sum()
+            self._last_return[slot] = returns[k][mask][-1]
+            self._last_length[slot] = lengths[k][mask][-1]
+
+    def _note_verdicts(self, slot: int, info: dict[str, Any], ended: NDArray[np.bool_]) -> None:
         """Count what the env says of the episodes that have `ended`."""
         for name, verdicts in self._verdicts.items():
             given: Any = info.get(name)
@@ -146,8 +162,7 @@ class Stats:
 
     @staticmethod
     def _latencies(samples: list[_Sample]) -> dict[str, dict[str, float]]:
-        busy = np.concatenate([s.busy_ns for s in samples])
-        done = np.concatenate([s.done_ns for s in samples])
+        done, busy = np.concatenate([s.times for s in samples]).T
         sent = np.concatenate([s.sent_ns for s in samples])
         taken = np.concatenate([np.full(len(s.slots), s.at_ns) for s in samples])
         kinds = {"step": busy, "wait": done - busy - sent, "transfer": taken - done}
@@ -190,3 +205,8 @@ class Stats:
             sums[:] = 0
         self._last_return[:] = np.nan
         self._requests_before[:] = [self._table.number(slot) for slot in range(len(self._table))]
+
+
+def _rows(mask: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Those with any True in them."""
+    return np.flatnonzero(mask.reshape(len(mask), -1).any(axis=1))

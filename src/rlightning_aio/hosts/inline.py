@@ -98,10 +98,9 @@ class InlineHost:
         """See `base.Host.request`."""
         for entry in cast("list[int]", entries.tolist()):
             row = ((entry >> ring_entries.OP_BITS) & ring_entries.SLOT_MASK) - self.first_slot
-            number = entry >> ring_entries.NUMBER_SHIFT
             runner = self._runners[row]
             stepped = entry & ring_entries.OP_MASK == ring_entries.STEP
-            self._enqueue(row, number, runner.step if stepped else runner.reset_from_row)
+            self._enqueue(row, entry, runner.step if stepped else runner.reset_from_row)
 
     def pack(self, content: Any) -> Any:
         """See `base.Host.pack`."""
@@ -110,14 +109,16 @@ class InlineHost:
     def request_step(self, row: int, number: int, packed: tuple[Any, dict[str, Any]]) -> None:
         """See `base.Host.request_step`."""
         runner = self._runners[row]
-        self._enqueue(row, number, lambda: runner.step_with(*packed))
+        entry = ring_entries.entry(number, self.first_slot + row, ring_entries.STEP)
+        self._enqueue(row, entry, lambda: runner.step_with(*packed))
 
     def request_reset(
         self, row: int, number: int, packed: tuple[int | None, dict[str, Any]]
     ) -> None:
         """See `base.Host.request_reset`."""
         runner = self._runners[row]
-        self._enqueue(row, number, lambda: runner.reset(*packed))
+        entry = ring_entries.entry(number, self.first_slot + row, ring_entries.RESET)
+        self._enqueue(row, entry, lambda: runner.reset(*packed))
 
     def request_call(
         self, row: int, number: int, packed: tuple[str, tuple[Any, ...], dict[str, Any]]
@@ -131,12 +132,13 @@ class InlineHost:
         self.in_flight += 1
         self._queue.append(lambda: self._guarded(row, number, call))
 
-    def _enqueue(self, row: int, number: int, execute: Callable[[], Rest | None]) -> None:
+    def _enqueue(self, row: int, entry: int, execute: Callable[[], Rest | None]) -> None:
+        number = entry >> ring_entries.NUMBER_SHIFT
+
         def run() -> None:
             rest = execute()
             if rest is None:
-                done = ring_entries.entry(number, self.first_slot + row, 0)
-                self._inbox.on_reports(np.array([done], np.int64))
+                self._inbox.on_reports(np.array([entry], np.int64))
             else:
                 self._inbox.on_rest(self, row, number, _owned(rest))
 

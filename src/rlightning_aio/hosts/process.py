@@ -48,6 +48,8 @@ _ONE_THREAD = dict.fromkeys(
 )
 
 
+_CHUNK = 1 << 16
+"""Bytes to read at a time; the C library maps fresh memory for much more than that."""
 END_SECONDS = 1.5
 """How long a fork server that is let go may take to end its workers and pass on their words."""
 
@@ -415,7 +417,6 @@ class ProcessHost:
 
     def on_readable(self) -> None:
         """See `base.Source.on_readable`."""
-        self.ordered = 0
         self._read_channel()
         self.sweep()
 
@@ -440,9 +441,11 @@ class ProcessHost:
         self._inbox.on_reports(entries)
 
     def _read_channel(self) -> None:
+        # A bell may be among what is read, and it rings once for each order.
+        self.ordered = 0
         while self._socket is not None:
             try:
-                data = self._socket.recv(1 << 18)
+                data = self._socket.recv(_CHUNK)
             except BlockingIOError:
                 return
             except ConnectionResetError:
@@ -457,7 +460,7 @@ class ProcessHost:
             for frame in self._frames.feed(data):
                 self._frames_received += 1
                 self._receive(frame)
-            if len(data) < 1 << 18:
+            if len(data) < _CHUNK:
                 return
 
     def _receive(self, frame: Frame) -> None:

@@ -16,7 +16,7 @@ import socket
 import time
 import traceback
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from rlightning_aio.hosts.arena import map_shared
 from rlightning_aio.hosts.pickling import dumped, dumped_with_code
@@ -43,6 +43,9 @@ if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.envs.base import BaseEnv
     from rlightning_aio.types import EnvMeta
+
+_CHUNK: Final = 1 << 16
+"""Bytes to read at a time; the C library maps fresh memory for much more than that."""
 
 __all__ = ["AttachOrder", "ErrorText", "StartOrder", "Started", "Worker", "main"]
 
@@ -232,7 +235,7 @@ class Worker:
 
     def _receive(self, flags: int) -> None:
         try:
-            data = self._channel.recv(1 << 18, flags)
+            data = self._channel.recv(_CHUNK, flags)
         except BlockingIOError:
             return
         except ConnectionResetError:  # It died with something of ours unread.

@@ -64,10 +64,13 @@ class RowLayout:
     def _arrays(self) -> Iterator[tuple[tuple[int, ...], np.dtype[Any]]]:
         for leaf in (*(self.observation_leaves or ()), *(self.action_leaves or ())):
             yield leaf.shape, leaf.dtype
-        for dtype in (np.float64, np.bool_, np.bool_, np.float64, np.int64):
-            yield self.head, np.dtype(dtype)
-        for dtype in (np.uint8, np.int64, np.int64, np.int64):
-            yield (), np.dtype(dtype)
+        yield self.head, np.dtype(np.float64)
+        yield (*self.head, 2), np.dtype(np.bool_)
+        yield self.head, np.dtype(np.float64)
+        yield self.head, np.dtype(np.int64)
+        yield (), np.dtype(np.uint8)
+        yield (), np.dtype(np.int64)
+        yield (2,), np.dtype(np.int64)
         yield (INFO_BYTES,), np.dtype(np.uint8)
 
     def size(self, rows: int) -> int:
@@ -96,13 +99,14 @@ class Slab:
     Attributes:
         observation, action: trees of ``[rows, ...]``; None where they travel pickled.
         action_columns: the arrays of `action`, each with its leaf.
-        reward: ``[rows, *head]`` float64; terminated, truncated: ``[rows, *head]`` bool.
+        reward: ``[rows, *head]`` float64.
+        ends: ``[rows, *head, 2]`` bool; terminated and truncated are its halves.
         episode_return: ``[rows, *head]`` float64, episode_length: ``[rows, *head]`` int64;
             valid where an episode has just ended.
         info_mark: ``[rows]`` uint8, see `info`; info: ``[rows, INFO_BYTES]`` uint8.
         seed: ``[rows]`` int64, of a reset; `NO_SEED` for none.
-        done_ns: ``[rows]`` int64, monotonic time at which the reply was ready.
-        busy_ns: ``[rows]`` int64, time that the env itself took.
+        times: ``[rows, 2]`` int64; its halves are done_ns, the monotonic time at which the
+            reply was ready, and busy_ns, the time that the env itself took.
     """
 
     def __init__(self, layout: RowLayout, buffer: memoryview, rows: int) -> None:
@@ -118,12 +122,12 @@ class Slab:
             self.action = assemble(layout.action_space, arrays)
             self.action_columns = list(leaf_of(action_leaves, self.action))
         self.reward = next(arrays)
-        self.terminated = next(arrays)
-        self.truncated = next(arrays)
+        self.ends = next(arrays)
+        self.terminated, self.truncated = self.ends[..., 0], self.ends[..., 1]
         self.episode_return = next(arrays)
         self.episode_length = next(arrays)
         self.info_mark = next(arrays)
         self.seed = next(arrays)
-        self.done_ns = next(arrays)
-        self.busy_ns = next(arrays)
+        self.times = next(arrays)
+        self.done_ns, self.busy_ns = self.times[:, 0], self.times[:, 1]
         self.info = next(arrays)
