@@ -17,8 +17,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Lookout"]
 
-_WAKE_UP_NS = 80_000
-"""What it takes to wake the trainer, about."""
+_WAKE_UP_NS = 160_000
+"""What it costs to wake the trainer, about: what it needs itself, and what the worker whose
+core it takes needs to get back into its stride."""
 
 
 class Lookout:
@@ -69,7 +70,7 @@ class Lookout:
         Where all results are wanted, one host is asked for all of its own: that which was the
         last to be done before. Else each of H busy hosts is asked for the H-th part, rounded
         up: when `wanted` results are ready in all, at least one host has its part, so nobody
-        wakes us too late. Where steps take less than waking up does, each is asked for as many
+        wakes us too late. Where steps take less than waking us up, each is asked for as many
         more as it does meanwhile, but kept busy: then one wake-up does, and brings more.
         """
         busy = [host for host in self._hosts if host.in_flight]
