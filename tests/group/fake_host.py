@@ -26,7 +26,7 @@ from rlightning_aio.hosts.runner import NO_ACTION
 from rlightning_aio.hosts.worker import AttachOrder, ErrorText, Started
 from rlightning_aio.protocol import rings
 from rlightning_aio.protocol.info import NO_INFO, PICKLED
-from rlightning_aio.protocol.slab import NO_SEED, RowLayout, Slab
+from rlightning_aio.protocol.slab import RowLayout, Slab
 from rlightning_aio.types import EnvMeta
 
 if TYPE_CHECKING:
@@ -190,9 +190,8 @@ class FakeHost:
 
     def _reset(self, row: int, entry: int, *, by_frame: bool = False) -> Reply:
         self.envs[row].reset()
-        at = self.row_of[row]
-        seed = int(self.slab.seed[at])
-        info = {"seed": [seed]} if seed != NO_SEED and not by_frame else {}
+        seed = None if by_frame else self.slab.take_seed(self.row_of[row])
+        info = {} if seed is None else {"seed": [seed]}
         self._write(row, 0.0, False, False, info)
         return self._reply(row, entry, info, by_frame=by_frame)
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
 
 __all__ = [
+    "BareReset",
     "BareStep",
     "BaseEnv",
     "PreprocessFn",
@@ -30,6 +31,7 @@ __all__ = [
 
 PreprocessFn = Callable[[PolicyResponse], Any]
 Result = EnvRet | MultiAgentEnvRet | list[EnvRet]
+BareReset = Callable[..., tuple[Any, dict[str, Any]]]
 BareStep = Callable[[Any], tuple[Any, Any, Any, Any, dict[str, Any]]]
 
 
@@ -115,6 +117,13 @@ class BaseEnv(abc.ABC):
 
         Return it only if `step` adds nothing to it; None (the default) has the runtime
         call `step`.
+        """
+        return None
+
+    def bare_reset(self) -> BareReset | None:
+        """The simulator's own ``(seed=, options=) -> (obs, info)``, if `reset` adds nothing.
+
+        Used where `bare_step` is.
         """
         return None
 

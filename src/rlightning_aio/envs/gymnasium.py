@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 
 from rlightning_aio.envs.base import (
+    BareReset,
     BareStep,
     BaseEnv,
     PreprocessFn,
@@ -67,6 +68,9 @@ class GymnasiumEnv(BaseEnv):
     def bare_step(self) -> BareStep | None:
         plain = type(self).step is GymnasiumEnv.step
         return self.env.step if plain and self._preprocess_fn is default_env_preprocess_fn else None
+
+    def bare_reset(self) -> BareReset | None:
+        return self.env.reset if type(self).reset is GymnasiumEnv.reset else None
 
     def close(self) -> None:
         self.env.close()

@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from rlightning_aio.group.slots import IDLE
-from rlightning_aio.protocol.rings import NUMBER_SHIFT, STEP
+from rlightning_aio.protocol.rings import NUMBER_SHIFT, OP_MASK, STEP
 
 if TYPE_CHECKING:
     from types import EllipsisType
@@ -31,6 +30,10 @@ __all__ = ["NO_RESETS", "AutoReset", "whole"]
 
 NO_RESETS: Final[NDArray[np.bool_]] = np.zeros(1, np.bool_)
 """No env is due; broadcasts to any number of slots."""
+
+# 0-d arrays: NumPy takes twice as long over a Python int.
+_OP: Final = np.array(OP_MASK)
+_STEP: Final = np.array(STEP)
 
 
 def whole(value: Any) -> int | None:
@@ -52,7 +55,9 @@ class AutoReset:
         self._base = np.zeros(len(slots), np.int64)
         self._due = np.zeros(len(slots), np.bool_)
         self._any_due = False
-        self._resets_out = False
+        # Invariant: true of every env whose current request is a reset.
+        self._resetting = np.zeros(len(slots), np.bool_)
+        self._any_resetting = False
         # For so many batches no env can reach its limit.
         self._margin = 0
         self._limits: NDArray[np.int64] | None = None
@@ -107,9 +112,10 @@ class AutoReset:
         """Which of `slots` are to be reset in place of their step."""
         return self._due[slots] if self._any_due else NO_RESETS
 
-    def resets_sent(self) -> None:
-        """Take note that not everything that is asked for is a step."""
-        self._resets_out = True
+    def resets_sent(self, slots: NDArray[np.intp]) -> None:
+        """Take note that `slots` were asked for a reset, or for their first result."""
+        self._resetting[slots] = True
+        self._any_resetting = True
 
     def not_completed(self, slots: NDArray[np.intp]) -> None:
         """Leave the counters of `slots` as they are, though their request has a number."""
@@ -117,23 +123,23 @@ class AutoReset:
 
     def account(self, slots: NDArray[np.intp], batch: BatchedData) -> list[bool]:
         """Count results as they are handed out; the flags that go with them."""
-        if self._resets_out:
-            self._note_resets(slots)
+        stepped = self._note_resets(slots) if self._any_resetting else None
         if self._limits is None:
             return [False] * len(slots)
         self._margin -= 1
-        if self._margin > 0:
-            reached = None
-        else:
+        due = reached = None
+        if self._margin <= 0:
             self._margin = int((self._limits - self._counts(...)).min())
-            reached = self._counts(slots) >= self._limits[slots]
-        ended = None
+            due = reached = self._counts(slots) >= self._limits[slots]
         if self._on_done and batch.any_ended:
-            ended = batch.ended & ~self._slots.resets_itself[slots]
-            ended &= self._slots.ops(slots) == STEP
-        if reached is not None or ended is not None:
-            due = NO_RESETS if reached is None else reached
-            self._due[slots] |= due if ended is None else due | ended
+            ended = batch.ended
+            if self._slots.any_resets_itself:
+                ended &= ~self._slots.resets_itself[slots]
+            if stepped is not None:
+                ended &= stepped
+            due = ended if due is None else due | ended
+        if due is not None:
+            self._due[slots] |= due
             self._any_due = np.count_nonzero(self._due) > 0
         return [False] * len(slots) if reached is None else reached.tolist()
 
@@ -141,13 +147,15 @@ class AutoReset:
         """Counters of `slots`; too high by 1 where a request is in flight."""
         return (self._slots.entry[slots] >> NUMBER_SHIFT) - self._base[slots]
 
-    def _note_resets(self, slots: NDArray[np.intp]) -> None:
-        """Start the counters of those that were reset anew."""
-        table = self._slots
-        begun = slots[table.ops(slots) != STEP]
-        self._base[begun] = table.entry[begun] >> NUMBER_SHIFT
-        if self._any_due:
-            self._due[begun] = False
+    def _note_resets(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Start the counters of those that were reset anew; which of `slots` were not."""
+        entries = self._slots.entry[slots]
+        stepped = entries & _OP == _STEP
+        begun = ~stepped
+        places = slots[begun]
+        if len(places):
+            self._base[places] = entries[begun] >> NUMBER_SHIFT
+            self._due[places] = self._resetting[places] = False
             self._any_due = np.count_nonzero(self._due) > 0
-        pending = table.ops(...) != STEP
-        self._resets_out = np.count_nonzero(pending & (table.state != IDLE)) > 0
+            self._any_resetting = np.count_nonzero(self._resetting) > 0
+        return stepped

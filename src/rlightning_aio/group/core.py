@@ -229,8 +229,7 @@ class Core:
         if resets is not NO_RESETS and np.count_nonzero(resets):
             entries += resets  # RESET == STEP + 1
             self.slots.entry[slots] = entries
-            self.auto.resets_sent()
-            self.fleet.write_seeds(slots[resets], np.full(np.count_nonzero(resets), NO_SEED))
+            self.auto.resets_sent(slots[resets])
         self._post(slots, entries)
 
     def _post(self, slots: NDArray[np.intp], entries: NDArray[np.int64]) -> None:
@@ -261,8 +260,8 @@ class Core:
             table.owner[slots] = owner
         else:
             self._in_flight += len(slots)
-        if op != STEP:
-            self.auto.resets_sent()
+        if op in (RESET, JOINED):
+            self.auto.resets_sent(slots)
         return entries
 
     # -- replies (called by the fleet) --------------------------------------------
@@ -338,10 +337,10 @@ class Core:
         has_row = self.fleet.slabs[int(table.slab[slot])].action is not None
         table.by_frame[slot] = manners.free_actions or not has_row
         table.reads_extras[slot] = manners.reads_extras
-        table.note_letters()
+        table.note_envs()
         if table.state[slot] == IDLE:
             self._mark_sent(np.array([slot]), JOINED, 0, 0.0)
-        return table.number(slot)
+        return int(table.entry[slot])
 
     def on_withdrawn(self, host: Host, row: int, number: int) -> None:
         """See `base.Inbox.on_withdrawn`."""
@@ -388,7 +387,10 @@ class Core:
         table.state[slots] = READY
         if self.fleet.recovering:
             self.fleet.note_restarted(slots, self._rests)
-        if self._tickets:
+        if len(self._tickets) == 1 and not self._in_flight:
+            (ticket,) = self._tickets.values()
+            ticket.remaining -= len(slots)
+        elif self._tickets:
             owners = table.owner[slots]
             for owner in set(owners.tolist()):
                 mine = owners == owner
@@ -396,8 +398,8 @@ class Core:
                     self._tickets[owner].remaining -= int(np.count_nonzero(mine))
                 else:
                     self._queue(slots[mine])
-            return
-        self._queue(slots)
+        else:
+            self._queue(slots)
 
     def _queue(self, slots: NDArray[np.intp]) -> None:
         self._ready.append(slots)

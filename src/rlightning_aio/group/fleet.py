@@ -309,7 +309,7 @@ class Fleet:
         if not self._mixed_actions:
             check_actions(self.metas)
         self.slabs, places = seat(started, self.slots, self._arena)
-        self.slots.note_letters()
+        self.slots.note_envs()
         self.slots.note_rows()
         for member in self._members:
             member.order = order_for(member.host, self.slots, places)
@@ -390,12 +390,12 @@ class Fleet:
         return min((host.remote.settings.connect_timeout for host in lacking), default=None)
 
     def write_seeds(self, slots: NDArray[np.intp], seeds: NDArray[np.int64]) -> None:
-        """Put the seeds of resets into the rows."""
+        """Put the seeds of resets into the rows; `NO_SEED` for none."""
         if len(self.slabs) == 1:
-            self.slabs[0].seed[self.slots.row[slots]] = seeds
+            self.slabs[0].seed[self.slots.row[slots]] = seeds + 1
             return
         for k, slot in enumerate(slots.tolist()):
-            self.slabs[self.slots.slab[slot]].seed[self.slots.row[slot]] = seeds[k]
+            self.slabs[self.slots.slab[slot]].seed[self.slots.row[slot]] = seeds[k] + 1
 
     def claim_lost(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Which of `slots` were replaced without anybody being told; the next reply tells."""
@@ -609,7 +609,7 @@ class Fleet:
         host.attach(member.order)
         if len(owed):
             entries = table.renumber(owed, RESET)
-            self._core.auto.resets_sent()
+            self._core.auto.resets_sent(owed)
             self.write_seeds(owed, np.full(len(owed), NO_SEED))
             for slot in owed.tolist():
                 self.restarting[slot] = self.lost.pop(slot)

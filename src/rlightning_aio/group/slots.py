@@ -60,7 +60,7 @@ class Slots:
         by_frame: actions may not fit the row; reads_extras: responses' extras are read there;
             letters: either is true of any env.
         seed_offset: sub-environments before it; num_seeds: those of all local envs.
-        resets_itself: it needs no reset after an end.
+        resets_itself: it needs no reset after an end; any_resets_itself: true of any env.
         schemas: of its worker.
     """
 
@@ -96,6 +96,7 @@ class Slots:
         self.seed_offset = np.zeros(size, np.int64)
         self.num_seeds = 0
         self.resets_itself = np.zeros(size, np.bool_)
+        self.any_resets_itself = False
         self.schemas: list[dict[int, InfoSchema]] = [{} for _ in range(size)]
 
     def __len__(self) -> int:
@@ -111,9 +112,10 @@ class Slots:
         """Take note of rows that were given to slots."""
         self.row_is_slot = bool((self.row == np.arange(len(self))).all())
 
-    def note_letters(self) -> None:
-        """Take note of whether any request may not fit its row."""
+    def note_envs(self) -> None:
+        """Take note of what any env does: its requests may not fit a row; it resets itself."""
         self.letters = bool(self.by_frame.any() or self.reads_extras.any())
+        self.any_resets_itself = bool(self.resets_itself.any())
 
     def number(self, slot: int) -> int:
         """Number of the current request; 0 before the first."""

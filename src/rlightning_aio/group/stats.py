@@ -62,11 +62,10 @@ class Stats:
     def __init__(self, slots: Slots) -> None:
         self._table = slots
         self._samples: deque[_Sample] = deque(maxlen=_WINDOW_BATCHES)
-        self._episodes = np.zeros(len(slots), np.int64)
-        self._returns = np.zeros(len(slots))
-        self._lengths = np.zeros(len(slots), np.int64)
-        self._last_return = np.full(len(slots), np.nan)
-        self._last_length = np.zeros(len(slots), np.int64)
+        # By slot: episodes, the sum of their returns, that of their lengths.
+        self._sums = np.zeros((len(slots), 3))
+        # Return and length of the last episode.
+        self._last = np.zeros((len(slots), 2))
         self._requests_before = np.zeros(len(slots), np.int64)
         self._verdicts = {name: _Verdicts.of(len(slots)) for name in _VERDICTS}
 
@@ -84,36 +83,26 @@ class Stats:
         self, part: ResultColumns, returns: NDArray[np.float64], lengths: NDArray[np.int64]
     ) -> None:
         ended = part.ended & (lengths > 0)
-        if ended.ndim == 1:
-            slots, returns, lengths = part.slots[ended], returns[ended], lengths[ended]
-            self._episodes[slots] += 1
-            self._returns[slots] += returns
-            self._lengths[slots] += lengths
-            self._last_return[slots] = returns
-            self._last_length[slots] = lengths
-        else:
-            self._note_nested_episodes(part, ended, returns, lengths)
-        if part.info_marks is None and not part.rests:
+        rows = np.flatnonzero(ended if ended.ndim == 1 else ended.reshape(len(part), -1).any(1))
+        if not len(rows):
             return
-        for k in _rows(ended).tolist():
-            if part.reports(k, _VERDICTS):
-                self._note_verdicts(int(part.slots[k]), part.info_of(k), ended[k])
-
-    def _note_nested_episodes(
-        self,
-        part: ResultColumns,
-        ended: NDArray[np.bool_],
-        returns: NDArray[np.float64],
-        lengths: NDArray[np.int64],
-    ) -> None:
-        """Those of sub-environments and agents, several of which may end in one result."""
-        for k in _rows(ended).tolist():
-            slot, mask = part.slots[k], ended[k]
-            self._episodes[slot] += np.count_nonzero(mask)
-            self._returns[slot] += returns[k][mask].sum()
-            self._lengths[slot] += lengths[k][mask].sum()
-            self._last_return[slot] = returns[k][mask][-1]
-            self._last_length[slot] = lengths[k][mask][-1]
+        slots = part.slots[rows]
+        if ended.ndim == 1:
+            outcomes = np.ones((len(rows), 3))
+            outcomes[:, 1], outcomes[:, 2] = returns[rows], lengths[rows]
+            self._sums[slots] += outcomes
+            self._last[slots] = outcomes[:, 1:]
+        else:
+            for slot, row in zip(slots.tolist(), rows.tolist(), strict=True):
+                # Several sub-environments or agents may end in one result.
+                mask = ended[row]
+                own_returns, own_lengths = returns[row][mask], lengths[row][mask]
+                self._sums[slot] += (len(own_returns), own_returns.sum(), own_lengths.sum())
+                self._last[slot] = own_returns[-1], own_lengths[-1]
+        if part.info_marks is not None or part.rests:
+            for slot, row in zip(slots.tolist(), rows.tolist(), strict=True):
+                if part.reports(row, _VERDICTS):
+                    self._note_verdicts(slot, part.info_of(row), ended[row])
 
     def _note_verdicts(self, slot: int, info: dict[str, Any], ended: NDArray[np.bool_]) -> None:
         """Count what the env says of the episodes that have `ended`."""
@@ -180,14 +169,15 @@ class Stats:
         for slot, env_id in enumerate(self._table.env_ids):
             if not env_id:
                 continue
-            episodes = int(self._episodes[slot])
+            episodes, total_return, total_length = self._sums[slot].tolist()
+            last_return, last_length = self._last[slot].tolist()
             found[env_id] = {
                 "requests": self._table.number(slot) - int(self._requests_before[slot]),
-                "episodes": episodes,
-                "mean_return": float(self._returns[slot]) / episodes if episodes else None,
-                "mean_length": int(self._lengths[slot]) / episodes if episodes else None,
-                "last_return": float(self._last_return[slot]) if episodes else None,
-                "last_length": int(self._last_length[slot]) if episodes else None,
+                "episodes": int(episodes),
+                "mean_return": total_return / episodes if episodes else None,
+                "mean_length": total_length / episodes if episodes else None,
+                "last_return": last_return if episodes else None,
+                "last_length": int(last_length) if episodes else None,
                 **{f"{name}_rate": v.rate(slot) for name, v in self._verdicts.items()},
             }
         return found
@@ -195,18 +185,10 @@ class Stats:
     def reset_envs(self) -> None:
         """Start the sums over episodes anew."""
         for sums in (
-            self._episodes,
-            self._returns,
-            self._lengths,
-            self._last_length,
+            self._sums,
+            self._last,
             *(v.count for v in self._verdicts.values()),
             *(v.true for v in self._verdicts.values()),
         ):
             sums[:] = 0
-        self._last_return[:] = np.nan
         self._requests_before[:] = [self._table.number(slot) for slot in range(len(self._table))]
-
-
-def _rows(mask: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Those with any True in them."""
-    return np.flatnonzero(mask.reshape(len(mask), -1).any(axis=1))

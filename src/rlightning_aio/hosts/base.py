@@ -205,7 +205,7 @@ class Inbox(Protocol):
         ...
 
     def on_client(self, host: Host, row: int, meta: EnvMeta, manners: Manners) -> int:
-        """An env has joined, and its first result follows; the number to give it."""
+        """An env has joined, and its first result follows; the entry of what that answers."""
         ...
 
     def is_idle(self, host: Host, row: int) -> bool:

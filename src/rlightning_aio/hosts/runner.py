@@ -12,12 +12,18 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from rlightning_aio.envs.base import BaseEnv, default_env_preprocess_fn, result_of
+from rlightning_aio.envs.base import (
+    BareReset,
+    BareStep,
+    BaseEnv,
+    default_env_preprocess_fn,
+    result_of,
+)
 from rlightning_aio.envs.tensors import as_numpy, holds_tensor
 from rlightning_aio.hosts.episodes import EpisodeSums
 from rlightning_aio.protocol.columns import row_reader, row_writer
 from rlightning_aio.protocol.info import NO_INFO, PICKLED, InfoSchema, InfoWriter
-from rlightning_aio.protocol.slab import NO_SEED, RowLayout, Slab
+from rlightning_aio.protocol.slab import RowLayout, Slab
 from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
 
 if TYPE_CHECKING:
@@ -47,6 +53,7 @@ class EnvRunner:
         self.meta: EnvMeta = env.init()
         self._keeps_tensors = keeps_tensors
         self.step: Callable[[], Rest | None] = self._not_attached
+        self.reset_from_row: Callable[[], Rest | None] = self._not_attached
 
     @property
     def layout(self) -> RowLayout:
@@ -93,6 +100,7 @@ class EnvRunner:
             self._read_action = row_reader(layout.action_space, slab.action, row)
         self._info_writer = InfoWriter(memoryview(slab.info[row]), announce)
         self._episodes = EpisodeSums(self._episode_shape(layout.head), self.meta.autoreset)
+        self.reset_from_row = self._reset_from_row
         self.step = self._stepper()
 
     def _action_in_row(self) -> Any:
@@ -132,14 +140,18 @@ class EnvRunner:
                 self._row,
                 self._count_step,
             )
-        self.reset_episode, step = _bare_stepper(
+        bare_reset = self.env.bare_reset()
+        self.reset_episode, step, reset = _bare_stepper(
             bare,
+            bare_reset,
             read_action,
             self._write_observation,
             self._info_writer.write,
             self._slab,
             self._row,
         )
+        if bare_reset is not None:
+            self.reset_from_row = reset
         return step
 
     @property
@@ -177,10 +189,9 @@ class EnvRunner:
             self._episodes.forget(begun=np.asarray(result.info["env_id"]))
         return self._store(result, began, stepped=False)
 
-    def reset_from_row(self) -> Rest | None:
+    def _reset_from_row(self) -> Rest | None:
         """Start a new episode with the seed that the row holds."""
-        seed = int(self._slab.seed[self._row])
-        return self.reset(None if seed == NO_SEED else seed, None)
+        return self.reset(self._slab.take_seed(self._row), None)
 
     def _store(self, result: Any, began_ns: int, *, stepped: bool) -> Rest | None:
         done_ns = time.monotonic_ns()
@@ -253,14 +264,15 @@ class EnvRunner:
 
 
 def _bare_stepper(
-    bare: Callable[[Any], tuple[Any, Any, Any, Any, dict[str, Any]]],
+    bare: BareStep,
+    bare_reset: BareReset | None,
     read_action: Callable[[], Any],
     write_observation: Callable[[Any], None],
     write_info: Callable[[dict[str, Any]], int],
     slab: Slab,
     row: int,
-) -> tuple[Callable[[], None], Callable[[], Rest | None]]:
-    """The hot path of plain Gymnasium envs: (forget the episode, step).
+) -> tuple[Callable[[], None], Callable[[], Rest | None], Callable[[], Rest | None]]:
+    """The hot path of plain Gymnasium envs: (forget the episode, step, reset).
 
     Closures over memoryviews: assigning an element of one costs a fifth of assigning an
     element of an array.
@@ -296,11 +308,25 @@ def _bare_stepper(
         marks[row] = mark = write_info(info) if info else NO_INFO
         return {"info": info} if mark == PICKLED else None
 
-    return forget, step
+    def reset() -> Rest | None:
+        assert bare_reset is not None
+        began = clock()
+        observation, info = bare_reset(seed=slab.take_seed(row), options=None)
+        done = clock()
+        forget()
+        done_times[row] = done
+        busy_times[row] = done - began
+        write_observation(observation)
+        rewards[row] = 0.0
+        terminations[row] = truncations[row] = False
+        marks[row] = mark = write_info(info) if info else NO_INFO
+        return {"info": info} if mark == PICKLED else None
+
+    return forget, step, reset
 
 
 def _bare_batch_stepper(
-    bare: Callable[[Any], tuple[Any, Any, Any, Any, dict[str, Any]]],
+    bare: BareStep,
     read_action: Callable[[], Any],
     write_observation: Callable[[Any], None],
     write_info: Callable[[dict[str, Any]], int],

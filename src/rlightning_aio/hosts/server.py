@@ -18,8 +18,16 @@ from rlightning_aio.hosts.episodes import EpisodeSums
 from rlightning_aio.hosts.runner import NO_ACTION
 from rlightning_aio.protocol.columns import row_reader, row_writer
 from rlightning_aio.protocol.info import NO_INFO, PICKLED
-from rlightning_aio.protocol.rings import NUMBER_SHIFT, OP_BITS, OP_MASK, SLOT_MASK, STEP
-from rlightning_aio.protocol.slab import NO_SEED, RowLayout, Slab
+from rlightning_aio.protocol.rings import (
+    NUMBER_SHIFT,
+    OP_BITS,
+    OP_MASK,
+    RESET,
+    SLOT_MASK,
+    STEP,
+    entry,
+)
+from rlightning_aio.protocol.slab import RowLayout, Slab
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -48,7 +56,7 @@ class _Row:
     Attributes:
         name: of the client.
         sums: of its episode.
-        resetting: what it owes is a reset.
+        resetting: what it owes is a reset; entry: the entry of what it owes.
         write_observation, read_action: None where that doesn't fit the row.
     """
 
@@ -57,6 +65,7 @@ class _Row:
         self.name = ""
         self.sums = EpisodeSums(layout.head, "disabled")
         self.resetting = False
+        self.entry = 0
         self.write_observation: Callable[[Any], None] | None = None
         self.read_action: Callable[[], Any] | None = None
         if slab.observation is not None:
@@ -170,15 +179,13 @@ class ServerHost:
     def request(self, entries: NDArray[np.int64]) -> None:
         """See `base.Host.request`."""
         slab, now = cast("Slab", self._slab), time.monotonic()
-        numbers: list[int] = entries.tolist()
-        for entry in numbers:
-            row = ((entry >> OP_BITS) & SLOT_MASK) - self.first_slot
-            if entry & OP_MASK == STEP:
-                self._step(row, entry >> NUMBER_SHIFT, NO_ACTION, {}, now)
+        asked: list[int] = entries.tolist()
+        for one in asked:
+            row, number = ((one >> OP_BITS) & SLOT_MASK) - self.first_slot, one >> NUMBER_SHIFT
+            if one & OP_MASK == STEP:
+                self._step(row, number, NO_ACTION, {}, now)
             else:
-                seed = int(slab.seed[row])
-                chosen = None if seed == NO_SEED else seed
-                self._reset(row, entry >> NUMBER_SHIFT, chosen, None, now)
+                self._reset(row, number, slab.take_seed(row), None, now)
 
     def pack(self, content: Any) -> Any:
         """The wire format packs; nothing is pickled."""
@@ -196,6 +203,7 @@ class ServerHost:
 
     def _step(self, row: int, number: int, action: Any, extras: dict[str, Any], now: float) -> None:
         place = self._places[row]
+        place.entry = entry(number, self.first_slot + row, STEP)
         if action is NO_ACTION and place.read_action is not None:
             action = place.read_action()
         self._asked(row, number, self.remote.submit(place.name, number, action, extras, now))
@@ -205,6 +213,7 @@ class ServerHost:
     ) -> None:
         place = self._places[row]
         place.resetting = True
+        place.entry = entry(number, self.first_slot + row, RESET)
         answered = self.remote.submit_reset(place.name, number, seed, options, now)
         self._asked(row, number, answered)
 
@@ -262,7 +271,7 @@ class ServerHost:
         if rest:
             self._inbox.on_rest(self, row, number, rest)
         else:
-            done.append((number << NUMBER_SHIFT) | ((self.first_slot + row) << OP_BITS))
+            done.append(self._places[row].entry)
 
     def _join(self, name: str) -> tuple[int, int] | None:
         """Row of a client that has joined, and the number to give its first result."""
@@ -273,7 +282,9 @@ class ServerHost:
         if row is None:
             self.remote.dismiss(name, "the server has no place for another client")
             return None
-        return row, self._inbox.on_client(self, row, meta, self.remote.manners(name))
+        owed = self._inbox.on_client(self, row, meta, self.remote.manners(name))
+        self._places[row].entry = owed
+        return row, owed >> NUMBER_SHIFT
 
     def _write(self, row: int, result: RemoteResult) -> Rest:
         """Put `result` into its row; what doesn't fit."""

@@ -104,7 +104,7 @@ class Slab:
         episode_return: ``[rows, *head]`` float64, episode_length: ``[rows, *head]`` int64;
             valid where an episode has just ended.
         info_mark: ``[rows]`` uint8, see `info`; info: ``[rows, INFO_BYTES]`` uint8.
-        seed: ``[rows]`` int64, of a reset; `NO_SEED` for none.
+        seed: ``[rows]`` int64, of the reset that was sent, plus 1; 0 for none.
         times: ``[rows, 2]`` int64; its halves are done_ns, the monotonic time at which the
             reply was ready, and busy_ns, the time that the env itself took.
     """
@@ -131,3 +131,9 @@ class Slab:
         self.times = next(arrays)
         self.done_ns, self.busy_ns = self.times[:, 0], self.times[:, 1]
         self.info = next(arrays)
+
+    def take_seed(self, row: int) -> int | None:
+        """The seed of the reset that was sent to `row`; it is good for that one alone."""
+        seed = int(self.seed[row])
+        self.seed[row] = 0
+        return seed - 1 if seed else None
