@@ -15,4 +15,4 @@ def test_spoilt_messages_do_no_harm(seed: int) -> None:
     tally = fuzz(FRAMES, seed)
     assert tally.steps >= FRAMES // 25
     assert tally.malformed > FRAMES // 2
-    assert tally.grown < 200_000
+    assert tally.grown < 200_000  # pytest keeps what was logged.

@@ -17,12 +17,14 @@ from remote.counting import ClientThread, CountingEnv
 
 import rlightning_aio
 from rlightning_aio import sync
-from rlightning_aio.errors import EnvRaised
+from rlightning_aio.errors import ClientRefused, EnvRaised
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
 HEARTBEAT = 0.8
+TRAJECTORY_STEPS = int(os.environ.get("RLIGHTNING_AIO_TRAJECTORY_STEPS", "800"))
+"""Steps to compare, of all clients together."""
 
 
 def entry(name: str = "robots", **env_kwargs: Any) -> dict[str, Any]:
@@ -100,6 +102,18 @@ def test_lengths_count_each_server_once() -> None:
         group.reset()
         assert (len(group), group.size()) == (3, 2)
         assert group.env_ids == ["pole-0", "pole-1", "robots-0"]
+        group.close()
+
+
+def test_a_client_with_other_actions_than_the_local_envs_is_refused() -> None:
+    """It is told why; the group waits for one that fits."""
+    with sync.build_env_group([CARTPOLE, entry(connect_timeout=1.0)]) as group:
+        with (
+            pytest.raises(ClientRefused, match="different action spaces"),
+            clients(group, CountingEnv()),
+            pytest.raises(TimeoutError, match="0 of 1 clients"),
+        ):
+            group.reset()
         group.close()
 
 
@@ -311,37 +325,49 @@ def client_processes(address: str, count: int, task: str) -> Iterator[list[int]]
         process.stdout.close()
 
 
-def test_trajectories_of_clients_equal_local_ones() -> None:
-    """Eight simulators in other processes: same seeds and actions, same bits."""
+def local_path(task: str, seed: int, actions: np.ndarray[Any, Any]) -> list[Any]:
+    """Observations of a plain env, reset in place of the step after an end."""
     import gymnasium as gym
 
-    count, steps = 8, 100
-    action_of = np.random.default_rng(0).uniform(-1, 1, (steps, count, 6)).astype(np.float32)
-    expected: dict[str, list[Any]] = {}
-    for k in range(count):
-        env = gym.make("HalfCheetah-v5")
-        path = [env.reset(seed=40 + k)[0]]
-        path += [env.step(action_of[t, k])[0] for t in range(steps)]
-        expected[f"robots-0/c{k}"] = path
-        env.close()
-    with (
-        sync.build_env_group(entry(min_clients=count, heartbeat=5)) as group,
-        client_processes(group["robots-0"].address, count, "HalfCheetah-v5"),
-    ):
-        batch, _ = group.reset(seed=40)
-        seen = dict.fromkeys(expected, 0)
-        while min(seen.values()) < steps:
-            ongoing = []
-            for env_id, ret in zip(batch.env_ids(), batch.values(), strict=True):
-                t = seen[env_id]
-                assert np.array_equal(ret.observation, expected[env_id][t])
-                if t < steps:
-                    seen[env_id] = t + 1
-                    action = action_of[t, int(env_id[-1])]
-                    ongoing.append(rlightning_aio.PolicyResponse(env_id, action))
-            group.step_async(rlightning_aio.BatchedData(["robots-0"] * len(ongoing), ongoing))
-            batch, _ = group.collect_async(deadline=60)
-        group.close()
+    env = gym.make(task)
+    path = [env.reset(seed=seed)[0]]
+    ended = False
+    for action in actions:
+        if ended:
+            observation, ended = env.reset()[0], False
+        else:
+            observation, _, terminated, truncated, _ = env.step(action)
+            ended = terminated or truncated
+        path.append(observation)
+    env.close()
+    return path
+
+
+async def test_trajectories_of_clients_equal_local_ones() -> None:
+    """Eight simulators in other processes: same seeds and actions, same bits."""
+    count, steps = 8, TRAJECTORY_STEPS // 8
+    actions_of = np.random.default_rng(0).uniform(-1, 1, (count, steps, 6)).astype(np.float32)
+    expected = {
+        f"robots-0/c{k}": local_path("HalfCheetah-v5", 40 + k, actions_of[k]) for k in range(count)
+    }
+    async with rlightning_aio.build_env_group(entry(min_clients=count, heartbeat=5)) as group:
+        with client_processes(group["robots-0"].address, count, "HalfCheetah-v5"):
+            batch, _ = await group.reset(seed=40)
+            seen = dict.fromkeys(expected, 0)
+            with group.auto_reset(10**9):
+                while min(seen.values()) < steps:
+                    ongoing = []
+                    for env_id, ret in zip(batch.env_ids(), batch.values(), strict=True):
+                        t = seen[env_id]
+                        assert np.array_equal(ret.observation, expected[env_id][t])
+                        if t < steps:
+                            seen[env_id] = t + 1
+                            action = actions_of[int(env_id[-1]), t]
+                            ongoing.append(rlightning_aio.PolicyResponse(env_id, action))
+                    ids = ["robots-0"] * len(ongoing)
+                    group.step_async(rlightning_aio.BatchedData(ids, ongoing))
+                    batch, _ = await group.collect_async(deadline=60)
+            await group.close()
 
 
 @pytest.mark.parametrize("signal_name", ["SIGKILL", "SIGSTOP"])

@@ -79,6 +79,11 @@ def _check_server(config: EnvConfig, *, ignored: bool) -> None:
             f"entry {config.name!r}, num_workers: an env_server is one; its clients are as many as "
             "connect (env_kwargs.min_clients)"
         )
+    if config.on_worker_death == "raise":
+        raise ConfigError(
+            f"entry {config.name!r}, on_worker_death: 'raise' is for workers; what a client owes "
+            "that is gone is answered by a truncated result, and it may come back"
+        )
     if ignored:
         warnings.warn(
             f"entry {config.name!r}: preprocess_fn is ignored for an env_server; it runs at the "
@@ -200,6 +205,7 @@ def _server_host(
         server_settings(config),
         step_timeout=config.step_timeout,
         reset_timeout=config.reset_timeout,
+        objection=fleet.objection,
     )
     return ServerHost(host_id, first_slot, listener, fleet, watcher)
 

@@ -352,6 +352,17 @@ class Fleet:
         self.slots.note_rows()
         self.slabs.append(slab)
 
+    def objection(self, meta: EnvMeta) -> str | None:
+        """Why a client's env may not join: all actions must have one shape here."""
+        known = [m for m in self.metas if m.action_space is not None]
+        known += [m for host in self._elastic for m in host.remote.clients.values()]
+        try:
+            if not self._mixed_actions:
+                check_actions([*known[:1], meta])
+        except ConfigError as error:
+            return str(error)
+        return None
+
     def is_idle(self, host: Host, row: int) -> bool:
         """See `base.Inbox.is_idle`."""
         return self.slots.state[host.first_slot + row] == IDLE

@@ -49,10 +49,12 @@ class Lookout:
     def spin(self, wanted: int) -> bool:
         """Whether `wanted` results have come within a moment of looking for them.
 
-        Tried only while there are more cores than workers at work: theirs come first.
+        Tried only while there are more cores than workers at work: theirs come first. So do
+        those of clients, which may be processes of this machine, too.
         """
         busy = [host for host in self._hosts if host.in_flight]
-        self._spun = 0 < len(busy) < self.num_cores
+        at_work = sum([host.in_flight if host.elastic else 1 for host in busy])
+        self._spun = 0 < at_work < self.num_cores
         if not self._spun:
             return False
         for host in busy:

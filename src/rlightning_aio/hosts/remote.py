@@ -26,7 +26,7 @@ from rlightning_aio.protocol.wire import MAX_FRAME_BYTES
 from rlightning_aio.remote.keys import PUBLIC_SUFFIX, read_keys, read_server_keys
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.protocol.server_session import Manners, RemoteResult
@@ -120,6 +120,7 @@ class RemoteHost:
         settings: see `ServerSettings`.
         step_timeout, reset_timeout: seconds after which a client that owes a step or a
             reset counts as lost; None for never.
+        objection: why an env may not join, if there is a reason.
 
     Raises:
         ConfigError: the keys can't be read.
@@ -132,6 +133,7 @@ class RemoteHost:
         *,
         step_timeout: float | None = None,
         reset_timeout: float | None = None,
+        objection: Callable[[EnvMeta], str | None] = lambda _: None,
     ) -> None:
         self.server_id = server_id
         self.settings = settings
@@ -140,6 +142,7 @@ class RemoteHost:
             heartbeat=settings.heartbeat,
             step_timeout=step_timeout,
             reset_timeout=reset_timeout,
+            objection=objection,
         )
         self._gate = None if settings.keys is None else _Gate(settings.keys)
         self._users: dict[bytes, str | None] = {}

@@ -192,6 +192,7 @@ class ServerSessions:
         heartbeat: seconds within which a dead client is found.
         step_timeout, reset_timeout: seconds after which a client that owes a step or a
             reset counts as lost; None for never.
+        objection: why an env may not join, if there is a reason.
         new_token: makes session tokens.
 
     Attributes:
@@ -208,6 +209,7 @@ class ServerSessions:
         heartbeat: float,
         step_timeout: float | None = None,
         reset_timeout: float | None = None,
+        objection: Callable[[EnvMeta], str | None] = lambda _: None,
         new_token: Callable[[], int] = random_token,
     ) -> None:
         self.clients: dict[str, EnvMeta] = {}
@@ -218,6 +220,7 @@ class ServerSessions:
         self._heartbeat = heartbeat
         self._step_timeout = step_timeout
         self._reset_timeout = reset_timeout
+        self._objection_to = objection
         self._new_token = new_token
         self._reader: Reader[FromClient] = Reader(FromClient)
         self._writer = Writer()
@@ -391,6 +394,8 @@ class ServerSessions:
             heard_at=now,
             asked_at=now,
         )
+        if (objection := self._objection_to(session.meta)) is not None:
+            raise WireError(objection)
         self._seats[hello.name] = seat
         seat.session = self._sessions[session.token] = session
         if self._next_tick is None:
