@@ -12,8 +12,7 @@ import logging
 import pickle
 import warnings
 from collections import Counter
-from dataclasses import dataclass, field, replace
-from enum import Enum, auto
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -21,14 +20,21 @@ import numpy as np
 
 from rlightning_aio.errors import (
     ConfigError,
-    EnvHung,
     GroupClosed,
     RemoteTraceback,
     StartFailed,
-    WorkerDied,
 )
 from rlightning_aio.group.hint import hint
 from rlightning_aio.group.lookout import Lookout
+from rlightning_aio.group.member import NOBODY, Member, Stage
+from rlightning_aio.group.obituary import (
+    cause_of,
+    culprit_of,
+    death_error,
+    late_fault,
+    slot_of,
+    start_fault,
+)
 from rlightning_aio.group.seating import check_actions, order_for, seat
 from rlightning_aio.group.slots import BUSY, IDLE, READY
 from rlightning_aio.group.wait import Operation, Wait, earliest
@@ -38,12 +44,12 @@ from rlightning_aio.hosts.runner import NO_ACTION
 from rlightning_aio.hosts.server import ServerHost
 from rlightning_aio.hosts.worker import ErrorText, Started
 from rlightning_aio.protocol.info import NO_INFO, PICKLED
-from rlightning_aio.protocol.rings import NUMBER_SHIFT, OP_BITS, RESET, SLOT_MASK, STEP
+from rlightning_aio.protocol.rings import RESET, STEP
 from rlightning_aio.protocol.slab import NO_SEED
 from rlightning_aio.types import EnvMeta
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
 
     from numpy.typing import NDArray
 
@@ -53,7 +59,6 @@ if TYPE_CHECKING:
     from rlightning_aio.hosts.arena import Arena
     from rlightning_aio.hosts.base import Watcher
     from rlightning_aio.hosts.process import ForkServer
-    from rlightning_aio.hosts.worker import AttachOrder
     from rlightning_aio.protocol.slab import Slab
 
 __all__ = ["Fleet"]
@@ -66,53 +71,8 @@ _LOOK_SECONDS = 0.02
 """How often a trainer that never has to wait looks for what has hung."""
 _DUMP_SECONDS = 1.0
 """How long a worker that is late may take to write its stacks and die."""
-_NOBODY = -1
 
 _log = logging.getLogger("rlightning_aio")
-
-
-class _Stage(Enum):
-    NEW = auto()
-    BUILDING = auto()
-    BUILT = auto()
-    ATTACHING = auto()
-    UP = auto()
-    FAILED = auto()
-    CLOSED = auto()
-
-
-@dataclass
-class _Member:
-    """What the fleet knows of one host.
-
-    Attributes:
-        start_by: when it must be up; late: it wasn't, and is being killed.
-        deaths: by slot, of workers that died while they executed that env, since the env
-            last completed a step; culprit: the slot of the last one.
-        hung_slot: the env for which it is being killed.
-        idle: how far it had got when it was last seen to do nothing (`Fleet._progress`).
-    """
-
-    host: Host
-    config: EnvConfig
-    stage: _Stage = _Stage.NEW
-    started: list[Started] = field(default_factory=list[Started])
-    order: AttachOrder | None = None
-    start_by: float | None = None
-    late: bool = False
-    deaths: dict[int, int] = field(default_factory=dict[int, int])
-    culprit: int = _NOBODY
-    hung_slot: int | None = None
-    idle: tuple[int, ...] = ()
-    idle_since: float = 0.0
-    rebuild_error: ErrorText | None = None
-    failure: Callable[[], WorkerDied] | None = None
-
-    @property
-    def timed(self) -> bool:
-        return not self.host.elastic and (
-            self.config.step_timeout is not None or self.config.reset_timeout is not None
-        )
 
 
 class Fleet:
@@ -146,7 +106,7 @@ class Fleet:
         self.lookout = Lookout(self.hosts)
         self._arena = arena
         self._mixed_actions = mixed_actions
-        self._members: list[_Member] = []
+        self._members: list[Member] = []
         self._elastic: list[ServerHost] = []
         self._start_fault: Exception | None = None
         self._now = 0.0
@@ -174,7 +134,7 @@ class Fleet:
         if isinstance(host, ServerHost):
             self._elastic.append(host)
             self.elastic = True
-        self._members.append(_Member(host, config))
+        self._members.append(Member(host, config))
         self._timed = self._timed or self._members[-1].timed
 
     # -- start --------------------------------------------------------------------
@@ -189,14 +149,14 @@ class Fleet:
             self._now = now
             for member in self._members:
                 self._launch(member, now)
-            yield from self._until(_Stage.BUILT)
+            yield from self._until(Stage.BUILT)
             self._seat()
             for member in self._members:
                 assert member.order is not None
-                member.stage = _Stage.ATTACHING
+                member.stage = Stage.ATTACHING
                 member.start_by = self._now + member.config.start_timeout
                 member.host.attach(member.order)
-            yield from self._until(_Stage.UP)
+            yield from self._until(Stage.UP)
         except BaseException:
             yield from self.close(self._now)
             # Its traceback leads to the group, which would never be collected.
@@ -209,8 +169,8 @@ class Fleet:
         ]
         return self.metas
 
-    def _launch(self, member: _Member, now: float) -> None:
-        member.stage = _Stage.BUILDING
+    def _launch(self, member: Member, now: float) -> None:
+        member.stage = Stage.BUILDING
         member.start_by = now + member.config.start_timeout
         member.late = False
         try:
@@ -222,7 +182,7 @@ class Fleet:
                 env_id=self._first_id(member),
             ) from error
 
-    def _until(self, stage: _Stage) -> Operation[None]:
+    def _until(self, stage: Stage) -> Operation[None]:
         while any(m.stage.value < stage.value for m in self._members):
             if self._start_fault is not None:
                 raise self._start_fault
@@ -243,24 +203,9 @@ class Fleet:
                 member.late = True
                 member.host.kill(dump=True)
             elif not self.open:
-                self._start_fault = self._start_fault or self._late_fault(member, Death(""))
+                self._start_fault = self._start_fault or late_fault(self.slots, member, Death(""))
 
-    def _late_fault(self, member: _Member, death: Death) -> StartFailed:
-        slot = self._starting(member, death)
-        # How it was killed says nothing; what it went down with may say all.
-        why = f" (it {death.cause})" if death.cause and death.exit_code is None else ""
-        return StartFailed(
-            f"{self.slots.describe(slot)} did not start within {member.config.start_timeout} s"
-            f"{why}; raise start_timeout if it needs longer" + _said(death.stderr_tail),
-            env_id=self.slots.env_ids[slot],
-        )
-
-    def _starting(self, member: _Member, death: Death) -> int:
-        """The env that a worker was building when it died."""
-        slot = self._slot(death.requests[0]) if death.requests else 0
-        return max(slot, member.host.first_slot)
-
-    def _first_id(self, member: _Member) -> str:
+    def _first_id(self, member: Member) -> str:
         return self.slots.env_ids[member.host.first_slot]
 
     def on_started(self, host: Host, started: list[Started]) -> None:
@@ -268,7 +213,7 @@ class Fleet:
         member = self._members[host.host_id]
         if member.order is None:
             member.started = started
-            member.stage = _Stage.BUILT
+            member.stage = Stage.BUILT
             member.start_by = None
         elif [s.layout.key for s in started] != [s.layout.key for s in member.started]:
             self.on_start_error(
@@ -299,7 +244,7 @@ class Fleet:
     def on_attached(self, host: Host) -> None:
         """See `base.Inbox.on_attached`."""
         member = self._members[host.host_id]
-        member.stage = _Stage.UP
+        member.stage = Stage.UP
         member.start_by = None
 
     def _seat(self) -> None:
@@ -448,9 +393,9 @@ class Fleet:
         times += [host.deadline() for host in self._elastic]
         return earliest(*times)
 
-    def _expiry(self, member: _Member) -> float | None:
+    def _expiry(self, member: Member) -> float | None:
         """When what a worker executes now will have taken too long."""
-        if member.stage is not _Stage.UP or member.hung_slot is not None:
+        if member.stage is not Stage.UP or member.hung_slot is not None:
             return None
         entry, since_ns = member.host.executing()
         limits = (member.config.step_timeout, member.config.reset_timeout)
@@ -459,20 +404,16 @@ class Fleet:
             # A stopped process does nothing at all, for all that it was asked to.
             idle = member.idle == self._progress(member)
             return (member.idle_since if idle else self._now) + shortest
-        op = self.slots.op(self._slot(entry))
+        op = self.slots.op(slot_of(entry))
         limit = limits[0] if op == STEP else limits[1] if op == RESET else None
         # What has no limit is looked at again: what comes after it may have one.
         return self._now + shortest if limit is None else since_ns / 1e9 + limit
 
-    def _progress(self, member: _Member) -> tuple[int, ...]:
+    def _progress(self, member: Member) -> tuple[int, ...]:
         """Changes with every request and with every reply."""
         first = member.host.first_slot
         entries = self.slots.entry[first : first + member.host.rows]
         return (member.host.in_flight, int(entries.sum()))
-
-    @staticmethod
-    def _slot(entry: int) -> int:
-        return (entry >> OP_BITS) & SLOT_MASK
 
     def check(self, now: float) -> None:
         """Find what has hung, in steps and in restarts."""
@@ -501,7 +442,7 @@ class Fleet:
         if self.overdue(now):
             self.check(now)
 
-    def _check_hung(self, member: _Member) -> None:
+    def _check_hung(self, member: Member) -> None:
         entry, _ = member.host.executing()
         progress = self._progress(member)
         if not entry and progress != member.idle:
@@ -515,10 +456,10 @@ class Fleet:
             member.host.on_readable()
             if self._progress(member) != progress or member.host.executing()[0]:
                 return
-        member.hung_slot = self._slot(entry) if entry else self._first_busy(member)
+        member.hung_slot = slot_of(entry) if entry else self._first_busy(member)
         member.host.kill(dump=True)
 
-    def _first_busy(self, member: _Member) -> int:
+    def _first_busy(self, member: Member) -> int:
         first, last = member.host.first_slot, member.host.first_slot + member.host.rows
         busy = self.slots.state[first:last] == BUSY
         return first + int(busy.argmax())
@@ -526,20 +467,22 @@ class Fleet:
     def on_death(self, host: Host, death: Death) -> None:
         """See `base.Inbox.on_death`."""
         member = self._members[host.host_id]
-        if (member.stage.value < _Stage.UP.value and member.order is None) or not self.open:
-            self._died_starting(member, death)
+        if (member.stage.value < Stage.UP.value and member.order is None) or not self.open:
+            member.stage = Stage.CLOSED
+            fault = start_fault(self.slots, member, death)
+            self._start_fault = self._start_fault or fault
             return
         self._core.absorb()
         slots = np.arange(host.first_slot, host.first_slot + host.rows)
         states = self.slots.state[slots]
         owed = slots[states == BUSY]
         self._core.detach_infos(slots[states == READY])
-        if member.stage is _Stage.UP:
+        if member.stage is Stage.UP:
             # A replacement that fails to come up falls to the env that made it necessary.
-            member.culprit = self._culprit(member, death, owed)
+            member.culprit = culprit_of(self.slots, member, death, owed)
         deaths = member.deaths[member.culprit] = member.deaths.get(member.culprit, 0) + 1
         self.recovering = True
-        cause = self._cause(member, death)
+        cause = cause_of(self.slots, member, death)
         raises = member.config.on_worker_death == "raise"
         if raises:
             outcome = "on_worker_death is 'raise', so it is not replaced"
@@ -547,7 +490,7 @@ class Fleet:
             outcome = f"it is not replaced after {deaths - 1} restarts in a row (max_restarts)"
         else:
             outcome = f"restart {deaths} of {member.config.max_restarts} in a row"
-        error_for = self._death_error(member, replace(death, cause=cause), outcome)
+        error_for = death_error(self.slots, member, replace(death, cause=cause), outcome)
         member.hung_slot = member.rebuild_error = None
         if raises or deaths > member.config.max_restarts:
             self._give_up(member)
@@ -560,28 +503,8 @@ class Fleet:
         self._core.fail(calls, error_for)
         self._replace(member, replace(death, cause=cause), np.setdiff1d(owed, calls))
 
-    def _culprit(self, member: _Member, death: Death, owed: NDArray[np.intp]) -> int:
-        """The env that a worker was executing when it died, as far as can be known."""
-        if member.hung_slot is not None:
-            return member.hung_slot
-        for entry in death.requests:
-            slot = self._slot(entry)
-            if slot in owed and self.slots.number(slot) == entry >> NUMBER_SHIFT:
-                return slot
-        return int(owed[0]) if len(owed) else _NOBODY
-
-    def _cause(self, member: _Member, death: Death) -> str:
-        if member.hung_slot is not None:
-            return f"hung in {self._doing(member.hung_slot)} and was killed"
-        if member.rebuild_error is not None:
-            error = member.rebuild_error
-            return f"could not be rebuilt: {error.type_name}: {error.text}"
-        if member.late:
-            return f"did not start again within {member.config.start_timeout} s and was killed"
-        return death.cause
-
-    def _give_up(self, member: _Member) -> None:
-        member.stage = _Stage.FAILED
+    def _give_up(self, member: Member) -> None:
+        member.stage = Stage.FAILED
         member.start_by = None
         self._unavailable = True
         for slot in range(member.host.first_slot, member.host.first_slot + member.host.rows):
@@ -589,20 +512,7 @@ class Fleet:
             self.restarting.pop(slot, None)
         self._note_recovery()
 
-    def _died_starting(self, member: _Member, death: Death) -> None:
-        member.stage = _Stage.CLOSED
-        if member.late:
-            fault = self._late_fault(member, death)
-        else:
-            slot = self._starting(member, death)
-            fault = StartFailed(
-                f"the worker of {self.slots.describe(slot)} {death.cause} while it started"
-                + _said(death.stderr_tail),
-                env_id=self.slots.env_ids[slot],
-            )
-        self._start_fault = self._start_fault or fault
-
-    def _replace(self, member: _Member, death: Death, owed: NDArray[np.intp]) -> None:
+    def _replace(self, member: Member, death: Death, owed: NDArray[np.intp]) -> None:
         """Start a new worker in place of a dead one, and let it answer for what was owed."""
         table, host = self.slots, member.host
         schemas: dict[int, Any] = {}
@@ -626,40 +536,6 @@ class Fleet:
                 self.restarting[slot] = self.lost.pop(slot)
             host.request(entries)
 
-    def _doing(self, slot: int) -> str:
-        return {STEP: "a step", RESET: "a reset"}.get(self.slots.op(slot), "a call")
-
-    def _death_error(
-        self, member: _Member, death: Death, outcome: str
-    ) -> Callable[[NDArray[np.intp]], WorkerDied]:
-        """Makes the error for those of the slots that owed a reply, as things are now."""
-        slot = member.host.first_slot if member.culprit == _NOBODY else member.culprit
-        table = self.slots
-        doing = self._doing(slot)
-        number = table.number(slot)
-        last = f"request {number}, {doing}" if number else "none"
-        if member.hung_slot is not None:
-            config = member.config
-            limit = config.step_timeout if table.op(slot) == STEP else config.reset_timeout
-            what = f"{table.describe(slot)} took longer than {limit} s for {doing} and was killed"
-        else:
-            what = f"the worker of {table.describe(slot)} {death.cause}"
-        kind = WorkerDied if member.hung_slot is None else EnvHung
-
-        def error_for(owed: NDArray[np.intp]) -> WorkerDied:
-            names = ", ".join(table.ids(owed)) or "none"
-            error = kind(
-                f"{what} (last request: {last}; envs that owed a reply: {names}); {outcome}"
-                + _said(death.stderr_tail),
-                env_id=table.env_ids[slot],
-                exit_code=death.exit_code,
-                stderr_tail=death.stderr_tail,
-            )
-            error.env_ids = tuple(table.ids(owed))
-            return error
-
-        return error_for
-
     def note_restarted(self, slots: NDArray[np.intp], rests: dict[int, Any]) -> None:
         """Mark replies that come from a replacement; count what shows that it works."""
         for slot in slots.tolist():
@@ -669,12 +545,12 @@ class Fleet:
             elif self.slots.op(slot) == STEP:
                 deaths = self._members[int(self.slots.host[slot])].deaths
                 deaths.pop(slot, None)
-                deaths.pop(_NOBODY, None)
+                deaths.pop(NOBODY, None)
         self._note_recovery()
 
     def _note_recovery(self) -> None:
         self.recovering = bool(self.restarting) or any(
-            member.deaths for member in self._members if member.stage is not _Stage.FAILED
+            member.deaths for member in self._members if member.stage is not Stage.FAILED
         )
 
     def _mark(self, slot: int, death: Death, rests: dict[int, Any]) -> None:
@@ -709,16 +585,16 @@ class Fleet:
             return
         self.closed = True
         self.open = False
-        alive = [m for m in self._members if m.stage not in (_Stage.NEW, _Stage.CLOSED)]
+        alive = [m for m in self._members if m.stage not in (Stage.NEW, Stage.CLOSED)]
         for member in alive:
-            if member.stage is _Stage.FAILED:
-                member.stage = _Stage.CLOSED
+            if member.stage is Stage.FAILED:
+                member.stage = Stage.CLOSED
             else:
                 member.host.close()
         try:
             yield from self._until_closed(alive, now + _CLOSE_SECONDS)
         finally:
-            stuck = any(m.stage not in (_Stage.NEW, _Stage.CLOSED) for m in self._members)
+            stuck = any(m.stage not in (Stage.NEW, Stage.CLOSED) for m in self._members)
             self._let_go(_KILL_SECONDS if stuck else END_SECONDS)
 
     def _let_go(self, seconds: float) -> None:
@@ -735,7 +611,7 @@ class Fleet:
             return
         self.closed = True
         self.open = False
-        started = any(m.stage is not _Stage.NEW for m in self._members)
+        started = any(m.stage is not Stage.NEW for m in self._members)
         self._let_go(END_SECONDS)
         if started:
             # The collector calls this: no caller's line would say anything.
@@ -743,9 +619,9 @@ class Fleet:
                 "an EnvGroup was not closed; its envs were killed", ResourceWarning, stacklevel=1
             )
 
-    def _until_closed(self, members: list[_Member], by: float) -> Operation[None]:
+    def _until_closed(self, members: list[Member], by: float) -> Operation[None]:
         killed = False
-        while any(m.stage is not _Stage.CLOSED for m in members):
+        while any(m.stage is not Stage.CLOSED for m in members):
             now = yield Wait(by)
             if now < by:
                 continue
@@ -753,19 +629,14 @@ class Fleet:
                 return  # What doesn't even die is left to the end of its fork server.
             killed, by = True, by + _KILL_SECONDS
             for member in members:
-                if member.stage is not _Stage.CLOSED:
+                if member.stage is not Stage.CLOSED:
                     member.host.kill(dump=False)
 
     def on_closed(self, host: Host, errors: list[tuple[int, ErrorText]]) -> None:
         """See `base.Inbox.on_closed`."""
         member = self._members[host.host_id]
-        was_built = member.stage is not _Stage.BUILDING
-        member.stage = _Stage.CLOSED
+        was_built = member.stage is not Stage.BUILDING
+        member.stage = Stage.CLOSED
         # One that is killed while it starts has been told of already.
         for row, error in errors if was_built else ():
             self.close_errors.append((self.slots.env_ids[host.first_slot + row], error))
-
-
-def _said(stderr_tail: str) -> str:
-    lines = stderr_tail.strip().splitlines()[-20:]
-    return ("\nThe last lines it wrote:\n  " + "\n  ".join(lines)) if lines else ""
