@@ -116,6 +116,8 @@ def group_config(work: Work, envs_per_process: int | str) -> dict[str, Any]:
         "num_workers": work.num_envs,
         "max_episode_steps": work.episode_limit(),
         "envs_per_process": envs_per_process,
+        # One worker on each core is best kept there.
+        "cpu_affinity": envs_per_process == "auto",
         "imports": list(work.modules),
     }
 
