@@ -370,7 +370,7 @@ class BatchedData:
     @property
     def any_ended(self) -> bool:
         """Whether any episode has ended, of a sub-environment or agent included."""
-        return any([part.episode_return is not None for part in self._parts])
+        return any(part.episode_return is not None for part in self._parts)
 
     @property
     def ended(self) -> NDArray[np.bool_]:

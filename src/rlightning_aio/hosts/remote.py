@@ -24,6 +24,7 @@ from rlightning_aio.errors import ConfigError, StartFailed
 from rlightning_aio.protocol.server_session import PATIENCE, ServerSessions
 from rlightning_aio.protocol.wire import MAX_FRAME_BYTES
 from rlightning_aio.remote.keys import PUBLIC_SUFFIX, read_keys, read_server_keys
+from rlightning_aio.remote.parts import receive_parts, send_parts
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -40,8 +41,6 @@ _MESSAGES_A_PUMP: Final = 1000
 _UNSENT_A_CLIENT: Final = 100
 _LINGER_MS: Final = 200
 _HANDSHAKE_MS: Final = 5000
-_COPIED_BYTES: Final = 4096
-"""Larger frames are not copied out of ZMQ's memory."""
 _ROUTES_REMEMBERED: Final = 4096
 _SECONDS_BETWEEN_WARNINGS: Final = 10.0
 
@@ -249,10 +248,8 @@ class RemoteHost:
         route = frame.bytes
         user = self._user(route, frame)
         parts: list[Part] = []
-        while frame.more:
-            frame = self._router.recv(zmq.NOBLOCK, copy=False)
-            small = len(frame) < _COPIED_BYTES
-            parts.append(frame.bytes if small else frame.buffer.toreadonly())
+        if frame.more:
+            parts = receive_parts(self._router, self._router.recv(zmq.NOBLOCK, copy=False))
         self._sessions.receive(route, user, parts, now)
 
     def _user(self, route: bytes, frame: zmq.Frame) -> str | None:
@@ -273,7 +270,7 @@ class RemoteHost:
         while outbox:
             route, parts = outbox.popleft()
             try:
-                self._router.send_multipart([route, *parts], zmq.NOBLOCK, copy=False)
+                send_parts(self._router, [route, *parts])
             except zmq.Again:
                 # It reads nothing, or slowly; what is lost here is asked for again.
                 continue

@@ -319,8 +319,7 @@ class ServerHost:
             place.sums.forget()
             slab.episode_length[row] = 0
             return
-        ended = slab.terminated[row] | slab.truncated[row]
-        sums = place.sums.add(slab.reward[row], ended)
+        sums = place.sums.add(slab.reward[row], slab.ends[row].any(axis=-1))
         if sums is not None:
             slab.episode_return[row], slab.episode_length[row] = sums
 

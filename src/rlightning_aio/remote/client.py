@@ -36,6 +36,7 @@ from rlightning_aio.protocol.server_session import PATIENCE
 from rlightning_aio.protocol.space_description import UnsupportedSpace
 from rlightning_aio.protocol.wire import MAX_FRAME_BYTES, MAX_NAME_LENGTH
 from rlightning_aio.remote.keys import read_client_keys
+from rlightning_aio.remote.parts import receive_parts, send_parts
 from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
 
 if TYPE_CHECKING:
@@ -236,7 +237,8 @@ class RemoteEnvClient:
         wait_ms = None if due is None else ceil(1000 * max(0.0, due - time.monotonic()))
         for source, _ in self._poller.poll(wait_ms):
             if source is self._dealer:
-                parts = self._dealer.recv_multipart(zmq.NOBLOCK)
+                first = self._dealer.recv(zmq.NOBLOCK, copy=False)
+                parts = receive_parts(self._dealer, first)
                 self._obey(self._session.receive(parts, time.monotonic()))
             else:
                 self._watch()
@@ -275,7 +277,7 @@ class RemoteEnvClient:
         while outbox:
             parts = outbox.popleft()
             try:
-                self._dealer.send_multipart(parts, zmq.NOBLOCK, copy=False)
+                send_parts(self._dealer, parts)
             except zmq.Again:
                 # No connection, or a full one; what is lost is asked for again.
                 continue

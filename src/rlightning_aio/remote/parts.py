@@ -1,0 +1,47 @@
+"""Messages of several parts over a ZMQ socket, without what pyzmq adds for other uses.
+
+Small parts are copied, which takes less than keeping count of who still holds them.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+import zmq
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rlightning_aio.protocol.wire import Part
+
+__all__ = ["receive_parts", "send_parts"]
+
+_COPIED_BYTES: Final = 4096
+# Plain ints: an operation on an enum costs as much as the call itself.
+_LAST: Final = int(zmq.NOBLOCK)
+_MORE: Final = int(zmq.NOBLOCK) | int(zmq.SNDMORE)
+
+
+def send_parts(socket: zmq.Socket[Any], parts: Sequence[Part]) -> None:
+    """Hand one message over.
+
+    Raises:
+        zmq.ZMQError: nothing was handed over; `zmq.Again` where the socket is full.
+    """
+    send, last = socket.send, len(parts) - 1
+    for position, part in enumerate(parts):
+        size = len(part) if type(part) is bytes else memoryview(part).nbytes
+        send(part, _MORE if position < last else _LAST, copy=size < _COPIED_BYTES)
+
+
+def receive_parts(socket: zmq.Socket[Any], frame: zmq.Frame) -> list[Part]:
+    """The parts of a message from `frame`, which is its first or follows it, to the last."""
+    parts = [_content(frame)]
+    while frame.more:
+        frame = socket.recv(_LAST, copy=False)
+        parts.append(_content(frame))
+    return parts
+
+
+def _content(frame: zmq.Frame) -> Part:
+    return frame.bytes if len(frame) < _COPIED_BYTES else frame.buffer.toreadonly()
