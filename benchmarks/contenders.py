@@ -378,12 +378,14 @@ class Limit(Contender):
 
     Attributes:
         processes: how many; as many as there are cores if None.
+        num_envs: of each process, stepped in turn.
         steps_per_look: steps between two looks at the clock.
     """
 
     name: str
     work: Work
     processes: int | None = None
+    num_envs: int = 1
     steps_per_look: int = STEPS_PER_LOOK
 
     @property
@@ -408,7 +410,7 @@ class Limit(Contender):
         """Run in each process: a round for each number of seconds that comes."""
         for inherited in self._connections:
             inherited.close()
-        envs = InLine(self.work, 1, self.steps_per_look)
+        envs = InLine(self.work, self.num_envs, self.steps_per_look)
         connection.send(0.0)
         try:
             while True:

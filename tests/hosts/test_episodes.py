@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rlightning_aio.hosts.episodes import EpisodeSums
+from rlightning_aio.hosts.episodes import EpisodeSum, EpisodeSums
 
 if TYPE_CHECKING:
     from rlightning_aio.types import Autoreset
@@ -101,3 +101,16 @@ def test_an_episode_may_begin_with_a_later_result() -> None:
     assert found is not None
     assert found[0].tolist() == [1.0, 5.0]
     assert found[1].tolist() == [1, 2]
+
+
+@given(stream=steps)
+def test_the_sum_of_a_single_env_is_the_same(stream: list[tuple[int, bool]]) -> None:
+    """What comes after an end that nobody has reset belongs to no episode."""
+    one, expected = EpisodeSum(), naive_episodes("disabled", stream)
+    for (reward, ended), outcome in zip(stream, expected, strict=True):
+        found = one.add(float(reward), ended)
+        assert (found is None) == (not ended)
+        if found is not None:
+            assert found == (outcome or (0.0, 0))
+    one.forget()
+    assert one.add(2.0, True) == (2.0, 1)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from rlightning_aio.types import Autoreset
 
-__all__ = ["EpisodeSums"]
+__all__ = ["EpisodeSum", "EpisodeSums"]
 
 Which = EllipsisType | NDArray[np.integer[Any]]
 
@@ -72,3 +72,28 @@ class EpisodeSums:
             self._over[which] = over | ended
         self._any_over = bool(self._over.any())
         return (returns, lengths) if any_ended else None
+
+
+class EpisodeSum:
+    """The same for one env without agents or sub-environments, which doesn't reset itself."""
+
+    def __init__(self) -> None:
+        self._return = 0.0
+        self._length = 0
+        self._over = False
+
+    def forget(self) -> None:
+        """A new episode begins."""
+        self._return, self._length, self._over = 0.0, 0, False
+
+    def add(self, reward: float, ended: bool) -> tuple[float, int] | None:
+        """See `EpisodeSums.add`."""
+        if self._over:
+            return (0.0, 0) if ended else None
+        self._return += reward
+        self._length += 1
+        if not ended:
+            return None
+        sums = self._return, self._length
+        self._return, self._length, self._over = 0.0, 0, True
+        return sums

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
-from rlightning_aio.hosts.episodes import EpisodeSums
+from rlightning_aio.hosts.episodes import EpisodeSum, EpisodeSums
 from rlightning_aio.hosts.runner import NO_ACTION
 from rlightning_aio.protocol.columns import row_reader, row_writer
 from rlightning_aio.protocol.info import NO_INFO, PICKLED
@@ -63,7 +63,7 @@ class _Row:
     def __init__(self, slab: Slab, row: int) -> None:
         layout = slab.layout
         self.name = ""
-        self.sums = EpisodeSums(layout.head, "disabled")
+        self.sums: EpisodeSum | EpisodeSums = EpisodeSums(layout.head, "disabled")
         self.resetting = False
         self.entry = 0
         self.write_observation: Callable[[Any], None] | None = None
@@ -161,7 +161,9 @@ class ServerHost:
             self._row_of.pop(place.name, None)
             place.name = name
             self._row_of[name] = row
-        self._places[row].sums = EpisodeSums(slab.layout.head, meta.autoreset)
+        single = not slab.layout.head and meta.autoreset == "disabled"
+        sums = EpisodeSum() if single else EpisodeSums(slab.layout.head, meta.autoreset)
+        self._places[row].sums = sums
         return row
 
     def _free_row(self, slab: Slab) -> int | None:
@@ -319,7 +321,11 @@ class ServerHost:
             place.sums.forget()
             slab.episode_length[row] = 0
             return
-        sums = place.sums.add(slab.reward[row], slab.ends[row].any(axis=-1))
+        if isinstance(place.sums, EpisodeSum):
+            ended = bool(slab.terminated[row] or slab.truncated[row])
+            sums = place.sums.add(float(slab.reward[row]), ended)
+        else:
+            sums = place.sums.add(slab.reward[row], slab.ends[row].any(axis=-1))
         if sums is not None:
             slab.episode_return[row], slab.episode_length[row] = sums
 

@@ -176,7 +176,7 @@ class Worker:
             while not self._attached and not self._closing:
                 self._receive(0)
             while not self._closing:
-                self._run_requests()
+                self.run_requests()
                 self._wait()
         except TrainerGone as gone:
             for runner in self._runners:
@@ -188,7 +188,7 @@ class Worker:
             if not self._closing:
                 self._close_envs()
 
-    def _run_requests(self) -> None:
+    def run_requests(self) -> None:
         """Execute what the ring holds; frames in between, as they come."""
         rings = self._rings
         while not self._closing:
@@ -292,11 +292,16 @@ class Worker:
             for layout, rows, offset in order.slabs
         ]
         os.close(self._arena)
-        for runner, (slab_index, row) in zip(self._runners, order.rows, strict=True):
-            runner.attach(slabs[slab_index], row, self._schemas.announce)
-        self._steps = [runner.step for runner in self._runners]
+        self.adopt(self._runners, [(slabs[slab_index], row) for slab_index, row in order.rows])
         self._attached = True
         self._send(FrameKind.ATTACHED, frame)
+
+    def adopt(self, runners: list[EnvRunner], rows: list[tuple[Slab, int]]) -> None:
+        """Serve the envs of `runners`, each in the row of a slab that is given for it."""
+        for runner, (slab, row) in zip(runners, rows, strict=True):
+            runner.attach(slab, row, self._schemas.announce)
+        self._runners = runners
+        self._steps = [runner.step for runner in runners]
 
     def _step(self, frame: Frame) -> None:
         action, extras = pickle.loads(frame.payload)
