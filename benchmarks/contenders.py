@@ -298,9 +298,11 @@ class EnvPool(Stepped):
 
     Attributes:
         batch_size: results it hands out at a time; all envs if None (synchronous).
+        thread_affinity_offset: the core that its first thread is kept on; -1 for any.
     """
 
     batch_size: int | None = None
+    thread_affinity_offset: int = -1
 
     package = "envpool"
 
@@ -312,6 +314,7 @@ class EnvPool(Stepped):
             env_type="gymnasium",
             num_envs=self.work.num_envs,
             batch_size=self.batch_size or self.work.num_envs,
+            thread_affinity_offset=self.thread_affinity_offset,
             seed=0,
         )
         self._actions = sampled(self._envs.action_space, self.work.num_envs)

@@ -23,7 +23,7 @@ RESULTS = HERE / "results"
 README = HERE / "README.md"
 SCRIPTS = (
     "cheetah", "peers", "humanoid", "cartpole", "pong", "round_trip", "facade", "trainer_cpu",
-    "stragglers", "start", "memory", "remote", "worker",
+    "stragglers", "start", "memory", "remote", "worker", "pool",
 )  # fmt: skip
 
 

@@ -209,8 +209,23 @@ class RemoteEnvClient:
     # The connection
 
     def _dial(self) -> None:
-        self._context = zmq.Context[_Socket]()
-        dealer = self._dealer = self._context.socket(zmq.DEALER)
+        context = zmq.Context[_Socket]()
+        try:
+            self._dealer = context.socket(zmq.DEALER)
+            self._set_options(self._dealer)
+            self._monitor = self._dealer.get_monitor_socket()
+            self._poller = zmq.Poller()
+            self._poller.register(self._monitor, zmq.POLLIN)
+            self._poller.register(self._dealer, zmq.POLLIN)
+            self._dealer.connect(self._address)
+            # Invariant: there is a context as soon as all of it is there, and not before.
+            self._context = context
+        except BaseException:
+            self._context = None
+            context.destroy(linger=0)
+            raise
+
+    def _set_options(self, dealer: _Socket) -> None:
         # A message for a connection that is no more must not wait for the next one.
         dealer.set(zmq.IMMEDIATE, 1)
         dealer.set(zmq.MAXMSGSIZE, MAX_FRAME_BYTES)
@@ -225,11 +240,6 @@ class RemoteEnvClient:
             dealer.set(zmq.CURVE_SECRETKEY, self._keys.secret)
         if "[" in self._address:
             dealer.set(zmq.IPV6, 1)
-        self._monitor = dealer.get_monitor_socket()
-        self._poller = zmq.Poller()
-        self._poller.register(self._monitor, zmq.POLLIN)
-        self._poller.register(dealer, zmq.POLLIN)
-        dealer.connect(self._address)
 
     def _turn(self, until: float | None) -> None:
         """Wait for something to happen, at most `until`, and take it in."""
@@ -284,7 +294,8 @@ class RemoteEnvClient:
 
     def _leave(self, reason: str) -> None:
         self._session.leave(reason)
-        self._flush()
+        if self._context is not None:
+            self._flush()
 
     # The env
 
