@@ -1,6 +1,6 @@
 """Run every benchmark, keep the reports and plots, and renew the tables of the README.
 
-    python benchmarks/run_all.py              # all of them, about ten minutes
+    python benchmarks/run_all.py              # all of them, about twelve minutes
     python benchmarks/run_all.py cheetah pong
 
 Each script runs in an interpreter of its own, one after the other.
