@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from typing import TYPE_CHECKING
 
 import pytest
@@ -9,6 +10,7 @@ import zmq
 from remote.counting import CountingEnv
 
 from rlightning_aio.remote import RemoteEnvClient
+from rlightning_aio.remote.client import ENDING
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -31,3 +33,7 @@ def test_an_interrupt_while_dialing_closes_what_is_open(
     with pytest.raises(KeyboardInterrupt), client:
         client.run()
     assert env.closed
+    for thread in threading.enumerate():
+        if thread.name == ENDING:
+            thread.join(20)
+            assert not thread.is_alive()

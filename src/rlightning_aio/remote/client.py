@@ -15,6 +15,7 @@ import socket
 import time
 import traceback
 from math import ceil
+from threading import Thread
 from typing import TYPE_CHECKING, Any, Final, Self
 
 import zmq
@@ -57,6 +58,8 @@ _LINGER_MS: Final = 500
 _log = logging.getLogger(__name__)
 
 _Socket = zmq.Socket[bytes]
+ENDING: Final = "end of an interrupted client's sockets"
+"""Name of a thread."""
 
 
 class RemoteEnvClient:
@@ -222,7 +225,9 @@ class RemoteEnvClient:
             self._context = context
         except BaseException:
             self._context = None
-            context.destroy(linger=0)
+            # The end of a context waits until all its sockets are closed, of which one may be
+            # half made and in the hands of the error that is on its way.
+            Thread(target=context.destroy, args=(0,), name=ENDING, daemon=True).start()
             raise
 
     def _set_options(self, dealer: _Socket) -> None:
