@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from rlightning_aio.protocol.rings import NUMBER_SHIFT, OP_MASK, STEP
+from rlightning_aio.protocol.rings import NUMBER_SHIFT, STEP
 
 if TYPE_CHECKING:
     from types import EllipsisType
@@ -31,8 +31,7 @@ __all__ = ["NO_RESETS", "AutoReset", "whole"]
 NO_RESETS: Final[NDArray[np.bool_]] = np.zeros(1, np.bool_)
 """No env is due; broadcasts to any number of slots."""
 
-# 0-d arrays: NumPy takes twice as long over a Python int.
-_OP: Final = np.array(OP_MASK)
+# A 0-d array: NumPy takes twice as long over a Python int.
 _STEP: Final = np.array(STEP)
 
 
@@ -149,13 +148,11 @@ class AutoReset:
 
     def _note_resets(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Start the counters of those that were reset anew; which of `slots` were not."""
-        entries = self._slots.entry[slots]
-        stepped = entries & _OP == _STEP
-        begun = ~stepped
-        places = slots[begun]
-        if len(places):
-            self._base[places] = entries[begun] >> NUMBER_SHIFT
-            self._due[places] = self._resetting[places] = False
+        stepped = self._slots.ops(slots) == _STEP
+        begun = slots[~stepped]
+        if len(begun):
+            self._base[begun] = self._slots.entry[begun] >> NUMBER_SHIFT
+            self._due[begun] = self._resetting[begun] = False
             self._any_due = np.count_nonzero(self._due) > 0
             self._any_resetting = np.count_nonzero(self._resetting) > 0
         return stepped

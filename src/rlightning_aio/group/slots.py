@@ -15,7 +15,6 @@ from rlightning_aio.protocol.rings import NUMBER_SHIFT, OP_BITS, OP_MASK
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from types import EllipsisType
 
     from numpy.typing import NDArray
 
@@ -125,8 +124,8 @@ class Slots:
         """Operation of the current request; 0 before the first."""
         return int(self.entry[slot]) & OP_MASK
 
-    def ops(self, slots: NDArray[np.intp] | EllipsisType) -> NDArray[np.int64]:
-        """Operations of the current requests of `slots`, or of all."""
+    def ops(self, slots: NDArray[np.intp]) -> NDArray[np.int64]:
+        """Operations of the current requests of `slots`."""
         return self.entry[slots] & _OP
 
     def renumber(self, slots: NDArray[np.intp], op: int) -> NDArray[np.int64]:

@@ -25,7 +25,7 @@ from rlightning_aio.hosts.base import Death, Inbox, Watcher
 from rlightning_aio.hosts.forkserver import BOOTSTRAP, Exited, Fork, Forked, Hello, Kill, Ready
 from rlightning_aio.hosts.pickling import dumped, dumped_with_code
 from rlightning_aio.hosts.worker import ErrorText
-from rlightning_aio.protocol.frames import BELL, Frame, FrameKind, FrameReader, encode
+from rlightning_aio.protocol.frames import BELL, CHUNK_BYTES, Frame, FrameKind, FrameReader, encode
 from rlightning_aio.protocol.rings import OP_BITS, SLOT_MASK, TrainerRings, rings_size
 
 if TYPE_CHECKING:
@@ -48,8 +48,6 @@ _ONE_THREAD = dict.fromkeys(
 )
 
 
-_CHUNK = 1 << 16
-"""Bytes to read at a time; the C library maps fresh memory for much more than that."""
 END_SECONDS = 1.5
 """How long a fork server that is let go may take to end its workers and pass on their words."""
 
@@ -445,7 +443,7 @@ class ProcessHost:
         self.ordered = 0
         while self._socket is not None:
             try:
-                data = self._socket.recv(_CHUNK)
+                data = self._socket.recv(CHUNK_BYTES)
             except BlockingIOError:
                 return
             except ConnectionResetError:
@@ -460,7 +458,7 @@ class ProcessHost:
             for frame in self._frames.feed(data):
                 self._frames_received += 1
                 self._receive(frame)
-            if len(data) < _CHUNK:
+            if len(data) < CHUNK_BYTES:
                 return
 
     def _receive(self, frame: Frame) -> None:

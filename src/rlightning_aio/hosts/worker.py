@@ -16,13 +16,13 @@ import socket
 import time
 import traceback
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from rlightning_aio.hosts.arena import map_shared
 from rlightning_aio.hosts.pickling import dumped, dumped_with_code
 from rlightning_aio.hosts.runner import EnvRunner, Rest
 from rlightning_aio.hosts.spinner import Spinner
-from rlightning_aio.protocol.frames import BELL, Frame, FrameKind, FrameReader, encode
+from rlightning_aio.protocol.frames import BELL, CHUNK_BYTES, Frame, FrameKind, FrameReader, encode
 from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
 from rlightning_aio.protocol.rings import (
     NUMBER_SHIFT,
@@ -43,9 +43,6 @@ if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.envs.base import BaseEnv
     from rlightning_aio.types import EnvMeta
-
-_CHUNK: Final = 1 << 16
-"""Bytes to read at a time; the C library maps fresh memory for much more than that."""
 
 __all__ = ["AttachOrder", "ErrorText", "StartOrder", "Started", "Worker", "main"]
 
@@ -235,7 +232,7 @@ class Worker:
 
     def _receive(self, flags: int) -> None:
         try:
-            data = self._channel.recv(_CHUNK, flags)
+            data = self._channel.recv(CHUNK_BYTES, flags)
         except BlockingIOError:
             return
         except ConnectionResetError:  # It died with something of ours unread.

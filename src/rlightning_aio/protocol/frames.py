@@ -12,7 +12,7 @@ import struct
 from enum import IntEnum
 from typing import Final, NamedTuple
 
-__all__ = ["BELL", "HEADER", "Frame", "FrameKind", "FrameReader", "encode"]
+__all__ = ["BELL", "CHUNK_BYTES", "HEADER", "Frame", "FrameKind", "FrameReader", "encode"]
 
 HEADER: Final = struct.Struct("<IHHq")
 
@@ -51,6 +51,8 @@ def encode(kind: FrameKind, row: int = 0, number: int = 0, payload: bytes = b"")
 
 
 BELL: Final = encode(FrameKind.BELL)
+CHUNK_BYTES: Final = 1 << 16
+"""Bytes of a channel to read at a time; the C library maps fresh memory for much more than that."""
 
 
 class FrameReader:
