@@ -102,3 +102,12 @@ def test_clients_on_this_machine_are_left_the_cores() -> None:
     assert not client.looked_at
     client.in_flight = 1
     assert look.spin(1)
+
+
+def test_steps_that_take_no_time_are_no_trouble() -> None:
+    """A client need not tell how long its env took."""
+    workers = [Worker(16), Worker(16)]
+    look = lookout(*workers)
+    for look.step_ns in (0.0, 5e-324):
+        look.order(16)
+        assert [worker.ordered for worker in workers] == [12, 12]

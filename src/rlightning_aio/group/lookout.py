@@ -79,7 +79,7 @@ class Lookout:
         if wanted >= sum([host.in_flight for host in busy]):
             return self._order_of_last(busy)
         part = ceil(wanted / len(busy)) if busy else 0
-        slack = int(_WAKE_UP_NS / self.step_ns) if wanted > 1 else 0
+        slack = int(_WAKE_UP_NS / max(self.step_ns, 1.0)) if wanted > 1 else 0
         came = False
         for host in busy:
             left = max(host.in_flight - part, 0)
