@@ -62,6 +62,7 @@ class ResultColumns:
         info_marks, info: see `protocol.info`; None where no env has put any into its row.
         schemas: by slot, its worker's schemas by number.
         rests: what did not fit a row, by row, pickled or plain.
+        whole_results: some of these are results handed over whole, which are never pickled.
         episode_return, episode_length: valid where an episode has ended; None if nowhere.
         times: ``[n, 2]``: when each result was ready (monotonic), and the time the env took,
             in ns.
@@ -84,6 +85,7 @@ class ResultColumns:
     times: NDArray[np.int64]
     agents: tuple[str, ...] = ()
     observation_space: gym.Space[Any] | None = None
+    whole_results: bool = False
 
     def __len__(self) -> int:
         return len(self.slots)
@@ -114,11 +116,6 @@ class ResultColumns:
         if isinstance(rest, bytes):
             rest = self.rests[row] = pickle.loads(rest)
         return rest or {}
-
-    @property
-    def holds_whole_results(self) -> bool:
-        """Whether some are handed over as they are, which is never pickled."""
-        return any("ret" in rest for rest in self.rests.values() if not isinstance(rest, bytes))
 
     def observation_of(self, row: int) -> Any:
         """One env's observation."""
@@ -332,7 +329,7 @@ class BatchedData:
         Raises:
             ValueError: the envs have different observation spaces; use `by_name`.
         """
-        if len(self._parts) == 1 and not self._parts[0].holds_whole_results:
+        if len(self._parts) == 1 and not self._parts[0].whole_results:
             part = self._parts[0]
             if part.observation is not None:
                 return part.observation
@@ -359,7 +356,7 @@ class BatchedData:
         return self._head("truncated", "last_truncated")
 
     def _head(self, column: str, attribute: str) -> Any:
-        if len(self._parts) == 1 and not self._parts[0].holds_whole_results:
+        if len(self._parts) == 1 and not self._parts[0].whole_results:
             part = self._parts[0]
             array = getattr(part, column)
             if part.agents:
@@ -450,10 +447,15 @@ class BatchedData:
         """
         columns = {"action": action, **extras}
         for name, column in columns.items():
-            mapped(lambda leaf, name=name: self._check_rows(name, leaf), column)
+            self._check_rows(name, column)
         return self._response(columns)
 
-    def _check_rows(self, name: str, column: Any) -> None:
+    def _check_rows(self, name: str, column: Tree) -> None:
+        if isinstance(column, dict | tuple):
+            tree = cast("dict[str, Tree] | tuple[Tree, ...]", column)
+            for part in tree.values() if isinstance(tree, dict) else tree:
+                self._check_rows(name, part)
+            return
         try:
             rows = len(column)
         except TypeError:

@@ -78,6 +78,42 @@ class TestPoolOfOne(GroupContract):
             yield tuple(column[0] for column in outcome)
 
 
+@pytest.mark.parametrize("task", ["HalfCheetah-v5", "Pong-v5", "Blackjack-v1", "CheetahRun-v1"])
+def test_results_are_what_the_pools_own_methods_give(task: str) -> None:
+    """`send` and `recv`, down to names, dtypes and nesting; arrays and dicts of them."""
+    env = make(task, 3)
+    pool = envpool.make(task, env_type="gymnasium", num_envs=3, seed=[4, 5, 6])
+    pool.async_reset()
+    result = env.reset(seed=4)
+    space = env.get_action_space()
+    for _ in range(30):
+        observation, reward, terminated, truncated, info = pool.recv()
+        assert same((result.observation, result.info), (observation, info))
+        action = space.sample()
+        pool.send(action, info["env_id"])
+        if result.info["elapsed_step"].any():
+            outcome = outcome_of(result)
+            assert same(outcome, (observation, reward, terminated, truncated))
+            assert outcome[1].dtype == reward.dtype
+        result = env.step(PolicyResponse("pool-0", action))
+    for opened in (env, pool):
+        opened.close()
+
+
+def test_inline_results_are_handed_over_uncopied() -> None:
+    """What EnvPool has made belongs to the batch alone; a row of shared memory would copy it."""
+    config = entry("Pong-v5", 2, placement="inline")
+    with sync.build_env_group(config) as group:
+        batch, _ = group.reset(seed=1)
+        kept = batch.observation.copy()
+        results = [batch]
+        for _ in range(5):
+            results.append(group.step(results[-1].respond(action=np.zeros((1, 2), np.int64)))[0])
+        assert not any(result.observation.flags.owndata for result in results[1:])
+        assert len({result.observation.ctypes.data for result in results}) == len(results)
+        assert np.array_equal(batch.observation, kept)
+
+
 def test_asynchronous_results_are_batches_of_whoever_is_ready() -> None:
     """Spaces and num_envs are the batch's; each sub-environment's own steps are in order."""
     env = make(num_envs=6, env_kwargs={"batch_size": 2})
@@ -204,4 +240,11 @@ def test_misuse_is_named() -> None:
         env.step(PolicyResponse("pool-0", np.zeros(4, np.int64)))
     with pytest.raises(ValueError, match="takes no reset options"):
         env.reset(options={"reset_mask": [True, False, False, False]})
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"shape \(3,\) for 4 sub-environments; expected \(4,\)"):
+        env.step(PolicyResponse("pool-0", np.zeros(3, np.int64)))
+    with pytest.raises(
+        ConfigError, match=r"'pool-0'.*'IntersectionMultiAgent-v0' has several players"
+    ):
+        make("IntersectionMultiAgent-v0")
     env.close()

@@ -10,13 +10,14 @@ from __future__ import annotations
 import os
 from copy import deepcopy
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
 from rlightning_aio import ENVS, BaseEnv, EnvRet, MultiAgentEnvRet, PolicyResponse
+from rlightning_aio.envs.base import BareStep, result_of
 
 TREE = spaces.Dict(
     place=spaces.Box(-1, 1, (3,), np.float32),
@@ -220,6 +221,65 @@ class Sloppy(Probe):
         for name, value in policy_resp.action.items():
             setattr(result, name, value)
         return result if policy_resp.action else None
+
+
+@ENVS.register("halved")
+class Halved(BaseEnv):
+    """Adds up its actions, in steps of two halves; it keeps no hand on its results.
+
+    Attributes:
+        log: the halves that were executed.
+    """
+
+    RAISE_IN_START, RAISE_IN_WAIT, INTERRUPT = 9, 8, 7
+
+    fresh_results = True
+    log: ClassVar[list[str]] = []
+
+    def get_observation_space(self) -> gym.Space[Any]:
+        return spaces.Box(-np.inf, np.inf, (2,), np.float64)
+
+    def get_action_space(self) -> gym.Space[Any]:
+        return spaces.Discrete(10)
+
+    def _observation(self) -> Any:
+        return np.array([self.seed, self.total], float)
+
+    def reset(
+        self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
+    ) -> EnvRet:
+        self.seed, self.total = (-1 if seed is None else seed), 0
+        info = {"nested": {"options": options}}
+        return EnvRet(env_id=self.env_id, observation=self._observation(), info=info)
+
+    def step(self, policy_resp: PolicyResponse) -> EnvRet:
+        return result_of(self.env_id, self.bare_step()(policy_resp.action))
+
+    def bare_step(self) -> BareStep:
+        def step(action: Any) -> Any:
+            self._start(action)
+            return self._wait()
+
+        return step
+
+    def bare_step_async(self) -> Any:
+        return self._start, self._wait
+
+    def _start(self, action: Any) -> None:
+        self.log.append("start")
+        self.action = int(action)
+        if self.action == self.RAISE_IN_START:
+            raise ValueError("no start")
+
+    def _wait(self) -> Any:
+        self.log.append("wait")
+        if self.action == self.RAISE_IN_WAIT:
+            raise ValueError("no end")
+        if self.action == self.INTERRUPT:
+            raise KeyboardInterrupt
+        self.total += self.action
+        info = {"nested": {"total": self.total}, "success": self.total == 20}
+        return self._observation(), float(self.action), self.total >= 20, False, info
 
 
 @ENVS.register("batched")

@@ -12,6 +12,8 @@ from hypothesis import strategies as st
 from rlightning_aio.hosts.episodes import EpisodeSum, EpisodeSums
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from rlightning_aio.types import Autoreset
 
 MODES: list[Autoreset] = ["disabled", "next_step", "same_step"]
@@ -35,6 +37,11 @@ def naive_episodes(mode: Autoreset, stream: list[tuple[int, bool]]) -> list[Any]
     return found
 
 
+def ends_of(ended: Any) -> NDArray[np.bool_]:
+    """Episodes that end by truncation."""
+    return np.stack((np.zeros_like(ended, bool), np.asarray(ended)), axis=-1)
+
+
 @pytest.mark.parametrize("mode", MODES)
 @given(streams=st.lists(steps, min_size=1, max_size=4))
 def test_sums_are_those_of_each_stream_alone(
@@ -47,7 +54,7 @@ def test_sums_are_those_of_each_stream_alone(
     for t in range(length):
         rewards = np.array([float(stream[t][0]) for stream in streams])
         ended = np.array([stream[t][1] for stream in streams])
-        found = sums.add(rewards, ended)
+        found = sums.add(rewards, ends_of(ended))
         if found is None:
             assert not ended.any()
             assert all(one[t] is None for one in expected)
@@ -69,9 +76,9 @@ def test_sub_environments_that_take_turns_keep_their_own_sums(
         which = np.array(data.draw(st.permutations(range(4)))[:2], np.int32)
         rewards = np.array(data.draw(st.tuples(*[st.integers(-9, 9)] * 2)), float)
         ended = np.array(data.draw(st.tuples(*[st.booleans()] * 2)))
-        found = together.add(rewards, ended, which)
+        found = together.add(rewards, ends_of(ended), which)
         for row, index in enumerate(which):
-            single = alone[index].add(rewards[row], ended[row])
+            single = alone[index].add(rewards[row], ends_of(ended[row]))
             if single is not None:
                 assert found is not None
                 assert (found[0][row], found[1][row]) == single
@@ -83,9 +90,9 @@ def test_sub_environments_that_take_turns_keep_their_own_sums(
 def test_a_reset_forgets_the_episodes_under_way(mode: Autoreset) -> None:
     """What came before it is in no sum after it."""
     sums = EpisodeSums((2,), mode)
-    sums.add(np.array([5.0, 5.0]), np.array([True, False]))
+    sums.add(np.array([5.0, 5.0]), ends_of([True, False]))
     sums.forget()
-    found = sums.add(np.array([1.0, 2.0]), np.array([True, True]))
+    found = sums.add(np.array([1.0, 2.0]), ends_of([True, True]))
     assert found is not None
     assert found[0].tolist() == [1.0, 2.0]
     assert found[1].tolist() == [1, 1]
@@ -96,8 +103,8 @@ def test_an_episode_may_begin_with_a_later_result() -> None:
     sums = EpisodeSums((3,), "next_step")
     sums.forget(begun=np.array([2]))
     both = np.array([0, 2])
-    sums.add(np.array([0.0, 4.0]), np.array([False, False]), both)
-    found = sums.add(np.array([1.0, 1.0]), np.array([True, True]), both)
+    sums.add(np.array([0.0, 4.0]), ends_of([False, False]), both)
+    found = sums.add(np.array([1.0, 1.0]), ends_of([True, True]), both)
     assert found is not None
     assert found[0].tolist() == [1.0, 5.0]
     assert found[1].tolist() == [1, 2]

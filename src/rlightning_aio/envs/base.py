@@ -21,7 +21,10 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BareReset",
+    "BareResult",
     "BareStep",
+    "BareStepAsync",
+    "BareStepWait",
     "BaseEnv",
     "PreprocessFn",
     "Result",
@@ -32,10 +35,13 @@ __all__ = [
 PreprocessFn = Callable[[PolicyResponse], Any]
 Result = EnvRet | MultiAgentEnvRet | list[EnvRet]
 BareReset = Callable[..., tuple[Any, dict[str, Any]]]
-BareStep = Callable[[Any], tuple[Any, Any, Any, Any, dict[str, Any]]]
+BareResult = tuple[Any, Any, Any, Any, dict[str, Any]]
+BareStep = Callable[[Any], BareResult]
+BareStepAsync = Callable[[Any], None]
+BareStepWait = Callable[[], BareResult]
 
 
-def result_of(env_id: str, outcome: tuple[Any, Any, Any, Any, dict[str, Any]]) -> EnvRet:
+def result_of(env_id: str, outcome: BareResult) -> EnvRet:
     """The result that the five values of a Gymnasium step make."""
     observation, reward, terminated, truncated, info = outcome
     # Not validated: that would cost more than everything else here.
@@ -74,9 +80,12 @@ class BaseEnv(abc.ABC):
         num_envs: sub-environments in each result. Where it is below the config's, results
             come from some of them at a time, and ``info["env_id"]`` says from which.
         autoreset: what sub-environments do after their episode's end; see `EnvMeta`.
+        fresh_results: nothing of a result is touched again once it was returned; inline
+            placement copies infos otherwise.
     """
 
     transforms_actions: ClassVar[bool] = False
+    fresh_results: ClassVar[bool] = False
 
     env: Any = None
     agents: tuple[str, ...] = ()
@@ -117,6 +126,14 @@ class BaseEnv(abc.ABC):
 
         Return it only if `step` adds nothing to it; None (the default) has the runtime
         call `step`.
+        """
+        return None
+
+    def bare_step_async(self) -> tuple[BareStepAsync, BareStepWait] | None:
+        """`bare_step` in two halves: one starts a step, the other waits for its end.
+
+        Return them if the simulator computes by itself in between: with inline placement a
+        step starts when it is sent then, not when it is collected.
         """
         return None
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import gymnasium as gym
 
     from rlightning_aio.config import EnvConfig
-    from rlightning_aio.envs.base import BaseEnv
+    from rlightning_aio.envs.base import BareResult, BareStep, BaseEnv
 
 __all__ = ["EnvContract", "Outcome", "outcome_of", "same"]
 
@@ -162,11 +162,17 @@ class EnvContract:
 
     def test_bare_steps_are_steps(self) -> None:
         """`bare_step`, where there is one, gives what `step` gives."""
-        if not self._has_bare_step():
-            raise SkipTest("no bare_step")
+        self._compare_steps(lambda env: env.bare_step())
+
+    def test_bare_halves_are_steps(self) -> None:
+        """So do the two halves of `bare_step_async`, where there are any."""
+        self._compare_steps(_joined_halves)
+
+    def _compare_steps(self, bare_of: Callable[[BaseEnv], BareStep | None]) -> None:
         with self.opened() as env, self.opened() as other:
-            bare = other.bare_step()
-            assert bare is not None
+            bare = bare_of(other)
+            if bare is None:
+                raise SkipTest("not offered")
             env.reset(seed=self.seed)
             other.reset(seed=self.seed)
             for action in self.actions(env):
@@ -174,10 +180,6 @@ class EnvContract:
                 assert same(outcome, tuple(map(as_numpy, bare(action)[:4])))
                 if _awaits_reset(env, outcome):
                     break
-
-    def _has_bare_step(self) -> bool:
-        with self.opened() as env:
-            return env.bare_step() is not None
 
     def test_torch_actions_are_taken(self) -> None:
         """An action may be a torch tensor; it does what the array does."""
@@ -249,6 +251,19 @@ def _check_columns(outcome: Outcome, agents: tuple[str, ...], shape: tuple[int, 
         assert {one.shape for one in arrays} == {shape}, f"{name}: {value}"
         if name != "reward":
             assert {one.dtype.kind for one in arrays} == {"b"}, f"{name} is not boolean: {value}"
+
+
+def _joined_halves(env: BaseEnv) -> BareStep | None:
+    halves = env.bare_step_async()
+    if halves is None:
+        return None
+    start, wait = halves
+
+    def bare(action: Any) -> BareResult:
+        start(action)
+        return wait()
+
+    return bare
 
 
 def _step(env: BaseEnv, action: Any) -> Any:

@@ -8,13 +8,16 @@ Absent on purpose: EnvPool's tasks with several players, whose batches vary in s
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from gymnasium.vector.utils import batch_space
 
 from rlightning_aio.envs.base import (
+    BareResult,
     BareStep,
+    BareStepAsync,
+    BareStepWait,
     BaseEnv,
     PreprocessFn,
     default_env_preprocess_fn,
@@ -27,6 +30,7 @@ from rlightning_aio.types import EnvRet, PolicyResponse
 
 if TYPE_CHECKING:
     import gymnasium as gym
+    from numpy.typing import NDArray
 
     from rlightning_aio.config import EnvConfig
 
@@ -37,6 +41,9 @@ envpool: Any = import_module("envpool")
 
 # Largest int32: EnvPool's seeds lie below it, and as a step limit it means none.
 UNLIMITED = 2**31 - 1
+
+Places: TypeAlias = "int | dict[str, Places]"
+"""Where a value lies among a pool's arrays, or the parts of it do."""
 
 
 class EnvPoolEnv(BaseEnv):
@@ -52,6 +59,7 @@ class EnvPoolEnv(BaseEnv):
     """
 
     autoreset = "next_step"
+    fresh_results = True
 
     def __init__(
         self,
@@ -93,6 +101,12 @@ class EnvPoolEnv(BaseEnv):
             **({} if limit is None else {"max_episode_steps": limit}),
             **self.config.env_kwargs,
         )
+        if self.env._action_keys != ["env_id", "players.env_id", "action"]:
+            raise ConfigError(
+                f"env {self.env_id!r}: EnvPool's task {self.config.task!r} has several players; "
+                "choose one for a single player"
+            )
+        self._arrays = _PoolArrays(self.env)
         self._ready: Any = None  # The sub-environments that wait for actions.
 
     def _reopen(self, seeds: list[int]) -> None:
@@ -124,19 +138,30 @@ class EnvPoolEnv(BaseEnv):
         return result_of(self.env_id, self._step(self._preprocess_fn(policy_resp)))
 
     def bare_step(self) -> BareStep | None:
-        plain = type(self).step is EnvPoolEnv.step
-        return self._step if plain and self._preprocess_fn is default_env_preprocess_fn else None
+        return self._step if self._is_bare else None
 
-    def _step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Answer the last result, and wait for the next."""
-        if self._ready is None:
-            raise RuntimeError(f"env {self.env_id!r} was stepped before its first reset")
-        action = np.asarray(as_numpy(action))
-        self.env.send(action if self.num_envs > 1 else action[None], self._ready)
+    def bare_step_async(self) -> tuple[BareStepAsync, BareStepWait] | None:
+        return (self._send, self._receive) if self._is_bare else None
+
+    @property
+    def _is_bare(self) -> bool:
+        plain = type(self).step is EnvPoolEnv.step
+        return plain and self._preprocess_fn is default_env_preprocess_fn
+
+    def _step(self, action: Any) -> BareResult:
+        self._send(action)
         return self._receive()
 
-    def _receive(self) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        result = self.env.recv()
+    def _send(self, action: Any) -> None:
+        """Answer the last result."""
+        if self._ready is None:
+            raise RuntimeError(f"env {self.env_id!r} was stepped before its first reset")
+        if type(action) is not np.ndarray:
+            action = np.asarray(as_numpy(action))
+        self._arrays.send(action if self.num_envs > 1 else action[None], self._ready)
+
+    def _receive(self) -> BareResult:
+        result = self._arrays.receive()
         self._ready = result[-1]["env_id"]
         return result if self.num_envs > 1 else index(result, 0)
 
@@ -151,3 +176,70 @@ class EnvPoolEnv(BaseEnv):
 
     def close(self) -> None:
         self.env.close()
+
+
+class _PoolArrays:
+    """What a pool's `send` and `recv` do, prepared once for all steps.
+
+    They lay out and name the arrays that `_send` and `_recv` take and give, at every step
+    anew; next to short steps that takes long.
+    """
+
+    def __init__(self, pool: Any) -> None:
+        self._pool = pool
+        action = pool.spec.action_array_spec["action"]
+        self._action_dtype = action.dtype
+        self._action_shape = tuple(action.shape[1:] if action.shape[:1] == [-1] else action.shape)
+        places = _nested(pool._state_keys)
+        self._observation: Places = places["obs"]
+        while isinstance(self._observation, dict) and len(self._observation) == 1:
+            (self._observation,) = self._observation.values()
+        info: Any = places["info"]
+        self._info: Places = {**info, "elapsed_step": places["elapsed_step"]}
+        self._reward, self._done, self._truncated = map(
+            pool._state_keys.index, ("reward", "done", "trunc")
+        )
+
+    def send(self, action: Any, env_ids: NDArray[np.int32]) -> None:
+        """As the pool's `send`."""
+        action = np.ascontiguousarray(action, self._action_dtype)
+        if action.shape != (len(env_ids), *self._action_shape):
+            raise ValueError(
+                f"an action of shape {action.shape} for {len(env_ids)} sub-environments; "
+                f"expected {(len(env_ids), *self._action_shape)}"
+            )
+        self._pool._send([env_ids, env_ids, action])
+
+    def receive(self) -> BareResult:
+        """As the pool's `recv`."""
+        arrays = self._pool._recv()
+        truncated = arrays[self._truncated]
+        return (
+            _filled(self._observation, arrays),
+            arrays[self._reward],
+            arrays[self._done] > truncated,
+            truncated,
+            _filled(self._info, arrays),
+        )
+
+
+def _nested(keys: list[str]) -> dict[str, Places]:
+    """The positions of `keys` as the tree that they name: ``info:players.env_id``, say."""
+    tree: dict[str, Places] = {}
+    for position, key in enumerate(keys):
+        *path, name = key.replace(":", ".").split(".")
+        node: Any = tree
+        for part in path:
+            node = node.setdefault(part, {})
+        node[name] = position
+    return tree
+
+
+def _filled(places: Places, arrays: list[NDArray[Any]]) -> Any:
+    """`places` with the arrays that lie there."""
+    if isinstance(places, int):
+        return arrays[places]
+    return {
+        name: arrays[part] if isinstance(part, int) else _filled(part, arrays)
+        for name, part in places.items()
+    }

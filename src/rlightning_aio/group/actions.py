@@ -187,6 +187,8 @@ def _plain(action: Any) -> Any:
 
 
 def _as_array(value: Any) -> NDArray[Any]:
+    if type(value) is np.ndarray:
+        return value
     if hasattr(value, "detach"):
         value = value.detach().cpu()
     try:

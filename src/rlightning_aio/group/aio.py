@@ -34,6 +34,8 @@ T = TypeVar("T")
 class AioDriver:
     """Watches sources with `loop.add_reader` and waits for operations to end."""
 
+    shares_thread = True
+
     def __init__(self) -> None:
         # Invariant: the future of those who wait now; None while nobody does. Whoever starts
         # to wait gets one that is not done: what was told before is in the core already.

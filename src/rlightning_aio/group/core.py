@@ -289,7 +289,7 @@ class Core:
         if self._is_current(slot, number):
             if rest:
                 self._rests[slot] = rest
-            self._replied(np.array([slot], np.intp))
+            self._replied(self.slots.alone(slot))
 
     def on_value(self, host: Host, row: int, number: int, value: Any) -> None:
         """See `base.Inbox.on_value`."""
@@ -311,10 +311,14 @@ class Core:
         slot = host.first_slot + row
         if not self._is_current(slot, number):
             return
+        self._fail_one(slot, self._raised(slot, error))
+
+    def _raised(self, slot: int, error: ErrorText) -> EnvRaised:
+        """What the caller is told of `error`, in which the current request of `slot` ended."""
         doing = {STEP: "step", RESET: "reset", CALL: "call"}[self.slots.op(slot)]
         death = self.fleet.restarting.pop(slot, None)
         after = f" (its worker {death.cause}, and was replaced)" if death else ""
-        raised = EnvRaised(
+        return EnvRaised(
             f"{self.slots.describe(slot)} raised in {doing}: {error.type_name}: {error.text}"
             f"{after}; the remote traceback is above; reset the env to go on",
             env_id=self.slots.env_ids[slot],
@@ -322,7 +326,6 @@ class Core:
             exception_text=error.text,
             traceback_text=error.traceback,
         )
-        self._fail_one(slot, raised)
 
     def on_schema(self, host: Host, number: int, schema: InfoSchema) -> None:
         """See `base.Inbox.on_schema`."""
@@ -339,7 +342,7 @@ class Core:
         table.reads_extras[slot] = manners.reads_extras
         table.note_envs()
         if table.state[slot] == IDLE:
-            self._mark_sent(np.array([slot]), JOINED, 0, 0.0)
+            self._mark_sent(self.slots.alone(slot), JOINED, 0, 0.0)
         return int(table.entry[slot])
 
     def on_withdrawn(self, host: Host, row: int, number: int) -> None:
@@ -352,7 +355,7 @@ class Core:
             self._fail_one(slot, EnvAway(self._away(slot), env_id=self.slots.env_ids[slot]))
             return
         self.slots.state[slot] = IDLE
-        self.auto.not_completed(np.array([slot]))
+        self.auto.not_completed(self.slots.alone(slot))
         self._in_flight -= 1
 
     def _away(self, slot: int) -> str:
@@ -407,7 +410,7 @@ class Core:
         self._in_flight -= len(slots)
 
     def _fail_one(self, slot: int, fault: EnvFault) -> None:
-        self.fail(np.array([slot], np.intp), lambda _: fault)
+        self.fail(self.slots.alone(slot), lambda _: fault)
 
     def fail(
         self, slots: NDArray[np.intp], error_for: Callable[[NDArray[np.intp]], EnvFault]
@@ -512,7 +515,12 @@ class Core:
             # Whoever else waits meanwhile must be woken as early as it asked for.
             fleet, first = self.fleet, min(self._wanted)
             look = fleet.lookout
-            if look.run_inline(wanted) or look.spin(first) or look.order(first):
+            if look.inline_waits():
+                now = yield Wait(0.0)  # Others have their turn while it computes, if it does.
+                look.run_inline(wanted)
+                fleet.look(now)
+                return now
+            if look.spin(first) or look.order(first):
                 now = yield Wait(0.0)
                 fleet.look(now)
                 return now
@@ -739,7 +747,7 @@ class Core:
         self, now: float, slot: int, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]
     ) -> Operation[Any]:
         """Call a method of one env; its value."""
-        return (yield from self._call(now, np.array([slot], np.intp), name, args, kwargs))
+        return (yield from self._call(now, self.slots.alone(slot), name, args, kwargs))
 
     def call_all(self, now: float, name: str) -> Operation[None]:
         """Call a method of every env, all at once."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.group.build import Plan, build_fleet
-from rlightning_aio.group.core import Core
+from rlightning_aio.group.lone import core_of
 from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
 
 if TYPE_CHECKING:
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     import gymnasium as gym
 
+    from rlightning_aio.group.core import Core
     from rlightning_aio.group.fleet import Fleet
     from rlightning_aio.group.wait import Operation
     from rlightning_aio.hosts.base import Watcher
@@ -103,7 +104,7 @@ class Facade:
     def __init__(self, plan: Plan) -> None:
         self._driver = self._new_driver()
         self._fleet = build_fleet(plan, self._driver)
-        self._core = Core(self._fleet, zero_copy=plan.zero_copy)
+        self._core = core_of(self._fleet, zero_copy=plan.zero_copy)
         self._finalizer = weakref.finalize(self, _abandon, self._fleet, os.getpid())
 
     @staticmethod

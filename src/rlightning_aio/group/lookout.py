@@ -104,16 +104,18 @@ class Lookout:
             if host.in_flight and host.ordered != 1:
                 host.sweep()
 
-    def run_inline(self, wanted: int) -> bool:
+    def inline_waits(self) -> bool:
+        """Whether something is asked of inline hosts."""
+        return sum([host.in_flight for host in self._inline]) > 0
+
+    def run_inline(self, wanted: int) -> None:
         """Execute waiting requests of inline hosts, one, or as many as nothing else can give."""
-        if not any(host.in_flight for host in self._inline):
-            return False
-        if any(host.in_flight for host in self._hosts if not host.inline):
+        waiting = sum([host.in_flight for host in self._inline])
+        if sum([host.in_flight for host in self._hosts]) > waiting:
             wanted = 1
         for _ in range(wanted):
             if not self._run_next_inline():
                 break
-        return True
 
     def _run_next_inline(self) -> bool:
         """One request of the next inline host in turn, so that none waits for ever."""

@@ -49,22 +49,24 @@ def _part(
         rows = slots if table.row_is_slot else table.row[slots]
     ends = gather(slab.ends, rows)
     any_ended = np.count_nonzero(ends) > 0
+    own_rests, whole = _rests(slots, rests) if rests else ({}, False)
     return ResultColumns(
         slots=slots,
         table=table,
         positions=positions,
-        observation=_observations(core, slab, rows),
+        observation=_observations(core, slab, rows, own_rests),
         reward=_copy(slab.reward, rows),
         ends=ends,
         info_marks=_copy(slab.info_mark, rows) if core.info_width else None,
         info=_copy(slab.info[:, : core.info_width], rows) if core.info_width else None,
         schemas=table.schemas,
-        rests=_rests(slots, rests) if rests else {},
+        rests=own_rests,
         episode_return=_copy(slab.episode_return, rows) if any_ended else None,
         episode_length=_copy(slab.episode_length, rows) if any_ended else None,
         times=gather(slab.times, rows),
         agents=slab.layout.agents,
         observation_space=slab.layout.observation_space,
+        whole_results=whole,
     )
 
 
@@ -73,9 +75,14 @@ def _copy(column: NDArray[Any], rows: Rows) -> NDArray[Any]:
     return column[rows].copy() if type(rows) is slice else column[rows]
 
 
-def _observations(core: Core, slab: Slab, rows: Rows) -> Any:
-    """Fresh columns; read-only views where the group hands those out and the rows allow it."""
+def _observations(core: Core, slab: Slab, rows: Rows, rests: dict[int, Any]) -> Any:
+    """Fresh columns; read-only views where the group hands those out and the rows allow it.
+
+    What one env has handed over as it is becomes a column without a copy.
+    """
     if slab.observation is None:
+        if len(rests) == 1 and slab.layout.observations_apart and "observation" in rests[0]:
+            return mapped(lambda array: array[None], rests[0].pop("observation"))
         return None
     if not core.zero_copy:
         return gather(slab.observation, rows)
@@ -102,11 +109,13 @@ def _contiguous(rows: Rows) -> slice | None:
     return None
 
 
-def _rests(slots: NDArray[np.intp], rests: dict[int, Any]) -> dict[int, Any]:
-    """Take what belongs to `slots`, by row of the batch."""
+def _rests(slots: NDArray[np.intp], rests: dict[int, Any]) -> tuple[dict[int, Any], bool]:
+    """Take what belongs to `slots`, by row of the batch; and whether some is a whole result."""
     found: dict[int, Any] = {}
+    whole = False
     for row, slot in enumerate(slots.tolist()):
         rest = rests.pop(slot, None)
         if rest is not None:
             found[row] = rest
-    return found
+            whole = whole or (type(rest) is dict and "ret" in rest)
+    return found, whole

@@ -80,7 +80,8 @@ class Slots:
         size = len(self.configs)
         self.env_ids = [*env_ids, *[""] * (size - len(env_ids))]
         self._index = {env_id: slot for slot, env_id in enumerate(env_ids)}
-        self.all = np.arange(len(env_ids))
+        self._each = np.arange(size)
+        self.all = self._each[: len(env_ids)]
         self.host = np.zeros(size, np.int64)
         self.entry = np.arange(size) << OP_BITS
         self.state = np.zeros(size, np.int8)
@@ -107,9 +108,13 @@ class Slots:
         self.env_ids[slot] = env_id
         self._index[env_id] = slot
 
+    def alone(self, slot: int) -> NDArray[np.intp]:
+        """One slot as an array of slots."""
+        return self._each[slot : slot + 1]
+
     def note_rows(self) -> None:
         """Take note of rows that were given to slots."""
-        self.row_is_slot = bool((self.row == np.arange(len(self))).all())
+        self.row_is_slot = bool((self.row == self._each).all())
 
     def note_envs(self) -> None:
         """Take note of what any env does: its requests may not fit a row; it resets itself."""
@@ -130,6 +135,11 @@ class Slots:
 
     def renumber(self, slots: NDArray[np.intp], op: int) -> NDArray[np.int64]:
         """Give the next request of each of `slots` its number; the new entries."""
+        if len(slots) == 1:
+            slot = slots.item()
+            entry = self.entry.item(slot)
+            self.entry[slot] = (entry & ~OP_MASK) + (1 << NUMBER_SHIFT) + op
+            return self.entry[slots]
         entries = self.entry[slots]
         entries &= _WITHOUT_OP
         entries += _NEXT[op]

@@ -32,6 +32,8 @@ T = TypeVar("T")
 class SyncDriver:
     """Watches sources with one persistent epoll and waits for operations to end."""
 
+    shares_thread = False
+
     def __init__(self) -> None:
         self._epoll: select.epoll | None = None
         self._sources: dict[int, Source] = {}
@@ -83,11 +85,11 @@ class SyncDriver:
             return stop.value
 
     def _block(self, until: float | None) -> None:
-        timeout = -1.0 if until is None else max(0.0, until - time.monotonic())
         if self._epoll is None:
-            if timeout > 0:
-                time.sleep(timeout)
+            if until:
+                time.sleep(max(0.0, until - time.monotonic()))
             return
+        timeout = -1.0 if until is None else max(0.0, until - time.monotonic())
         for descriptor, events in self._epoll.poll(timeout):
             source = self._sources.get(descriptor)
             if source is not None and events & select.EPOLLOUT:

@@ -61,7 +61,13 @@ class Source(Protocol):
 
 
 class Watcher(Protocol):
-    """What a driver does for sources."""
+    """What a driver does for sources.
+
+    Attributes:
+        shares_thread: there are tasks beside the operation that runs; it lets them have turns.
+    """
+
+    shares_thread: bool
 
     def watch(self, source: Source) -> None:
         """Call `source.on_readable` whenever its descriptor is readable, from now on."""

@@ -33,6 +33,8 @@ class EpisodeSums:
         self._autoreset = autoreset
         self._returns = np.zeros(shape)
         self._lengths = np.zeros(shape, np.int64)
+        # Lengths lack so many steps as all sub-environments have made together since.
+        self._steps_together = 0
         self._over = np.zeros(shape, np.bool_)
         self._any_over = False
 
@@ -40,24 +42,37 @@ class EpisodeSums:
         """All episodes begin anew; those that `begun` leaves out, when next heard of."""
         self._returns[...] = 0.0
         self._lengths[...] = 0
+        self._steps_together = 0
         self._over[...] = True
         self._over[begun] = False
         self._any_over = bool(self._over.any())
 
     def add(
-        self, reward: NDArray[np.float64], ended: NDArray[np.bool_], which: Which = ...
+        self, reward: NDArray[np.float64], ends: NDArray[np.bool_], which: Which = ...
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]] | None:
         """Count one step of all sub-environments, or of those that `which` names.
 
+        Args:
+            reward: of each.
+            ends: whether each has terminated and whether it was truncated, on the last axis.
+            which: unlike one another.
+
         Returns:
             Returns and lengths of the episodes that ended in this step, in the shape of
-            `ended`, with length 0 elsewhere; None if `ended` is true of none.
+            `reward`, with length 0 elsewhere; None if none has ended.
         """
-        any_ended = bool(ended.any())
+        any_ended = np.count_nonzero(ends) > 0
         if not any_ended and not self._any_over:
-            self._returns[which] += reward
-            self._lengths[which] += 1
+            if which is ...:
+                self._returns += reward
+                self._steps_together += 1
+            else:
+                self._returns[which] += reward
+                self._lengths[which] += 1
             return None
+        ended = ends[..., 0] | ends[..., 1]
+        self._lengths += self._steps_together
+        self._steps_together = 0
         over = self._over[which]
         self._returns[which] += np.where(over, 0.0, reward)
         self._lengths[which] += ~over

@@ -8,7 +8,8 @@ while it steps; nothing protects the trainer from an env that crashes.
 from __future__ import annotations
 
 from collections import deque
-from typing import TYPE_CHECKING, Any, cast
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 
@@ -21,8 +22,8 @@ from rlightning_aio.hosts.worker import (
     StartOrder,
     build_env,
 )
-from rlightning_aio.protocol import rings as ring_entries
 from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
+from rlightning_aio.protocol.rings import NUMBER_SHIFT, OP_BITS, OP_MASK, SLOT_MASK, STEP
 from rlightning_aio.protocol.slab import Slab
 
 if TYPE_CHECKING:
@@ -33,6 +34,10 @@ if TYPE_CHECKING:
     from rlightning_aio.hosts.base import Inbox
 
 __all__ = ["InlineHost"]
+
+Execute: TypeAlias = "Callable[[], Any]"
+Tell: TypeAlias = "Callable[[int, int, Any], None]"
+"""Takes the row, the request's number, and what executing it gave."""
 
 
 class InlineHost:
@@ -52,7 +57,7 @@ class InlineHost:
         self._arena = arena
         self._inbox = inbox
         self._runners: list[EnvRunner] = []
-        self._queue: deque[Callable[[], None]] = deque()
+        self._queue: deque[tuple[int, int, Execute, Tell]] = deque()
         self._schemas = InfoSchemas(self._announce)
 
     def fileno(self) -> int:
@@ -73,7 +78,7 @@ class InlineHost:
         ):
             try:
                 env = build_env(order.config, order.env_class, index, fn)
-                self._runners.append(EnvRunner(env, keeps_tensors=True))
+                self._runners.append(EnvRunner(env, inline=True))
             except KeyboardInterrupt:
                 raise
             except BaseException as error:
@@ -97,10 +102,10 @@ class InlineHost:
     def request(self, entries: NDArray[np.int64]) -> None:
         """See `base.Host.request`."""
         for entry in cast("list[int]", entries.tolist()):
-            row = ((entry >> ring_entries.OP_BITS) & ring_entries.SLOT_MASK) - self.first_slot
+            row, number = ((entry >> OP_BITS) & SLOT_MASK) - self.first_slot, entry >> NUMBER_SHIFT
             runner = self._runners[row]
-            stepped = entry & ring_entries.OP_MASK == ring_entries.STEP
-            self._enqueue(row, entry, runner.step if stepped else runner.reset_from_row)
+            execute = _begun(runner) if entry & OP_MASK == STEP else runner.reset_from_row
+            self._enqueue(row, number, execute, self._tell_result)
 
     def pack(self, content: Any) -> Any:
         """See `base.Host.pack`."""
@@ -109,49 +114,39 @@ class InlineHost:
     def request_step(self, row: int, number: int, packed: tuple[Any, dict[str, Any]]) -> None:
         """See `base.Host.request_step`."""
         runner = self._runners[row]
-        entry = ring_entries.entry(number, self.first_slot + row, ring_entries.STEP)
-        self._enqueue(row, entry, lambda: runner.step_with(*packed))
+        self._enqueue(row, number, lambda: runner.step_with(*packed), self._tell_result)
 
     def request_reset(
         self, row: int, number: int, packed: tuple[int | None, dict[str, Any]]
     ) -> None:
         """See `base.Host.request_reset`."""
         runner = self._runners[row]
-        entry = ring_entries.entry(number, self.first_slot + row, ring_entries.RESET)
-        self._enqueue(row, entry, lambda: runner.reset(*packed))
+        self._enqueue(row, number, lambda: runner.reset(*packed), self._tell_result)
 
     def request_call(
         self, row: int, number: int, packed: tuple[str, tuple[Any, ...], dict[str, Any]]
     ) -> None:
         """See `base.Host.request_call`."""
+        runner = self._runners[row]
+        self._enqueue(row, number, lambda: runner.call(*packed), self._tell_value)
 
-        def call() -> None:
-            value = self._runners[row].call(*packed)
-            self._inbox.on_value(self, row, number, value)
-
+    def _enqueue(self, row: int, number: int, execute: Execute, tell: Tell) -> None:
         self.in_flight += 1
-        self._queue.append(lambda: self._guarded(row, number, call))
+        self._queue.append((row, number, execute, tell))
 
-    def _enqueue(self, row: int, entry: int, execute: Callable[[], Rest | None]) -> None:
-        number = entry >> ring_entries.NUMBER_SHIFT
+    def _tell_result(self, row: int, number: int, rest: Rest | None) -> None:
+        self._inbox.on_rest(self, row, number, self._given(row, rest) or {})
 
-        def run() -> None:
-            rest = execute()
-            if rest is None:
-                self._inbox.on_reports(np.array([entry], np.int64))
-            else:
-                self._inbox.on_rest(self, row, number, _owned(rest))
+    def _tell_value(self, row: int, number: int, value: Any) -> None:
+        self._inbox.on_value(self, row, number, value)
 
-        self.in_flight += 1
-        self._queue.append(lambda: self._guarded(row, number, run))
+    def step_now(self, row: int) -> Rest | None:
+        """Step with the action in `row`, past the queue, which holds nothing for this env."""
+        return self._given(row, self._runners[row].step())
 
-    def _guarded(self, row: int, number: int, run: Callable[[], None]) -> None:
-        try:
-            run()
-        except BaseException as error:
-            self._inbox.on_error(self, row, number, ErrorText.of(error))
-            if isinstance(error, KeyboardInterrupt):
-                raise  # It was meant for the program; the request that it struck ends all the same.
+    def _given(self, row: int, rest: Rest | None) -> Rest | None:
+        """`rest` as the trainer may keep it."""
+        return rest if rest is None or self._runners[row].hands_over else _owned(rest)
 
     def order(self, count: int) -> bool:
         """Nothing gets ready by itself here."""
@@ -173,7 +168,13 @@ class InlineHost:
         if not self._queue:
             return False
         self.in_flight -= 1
-        self._queue.popleft()()
+        row, number, execute, tell = self._queue.popleft()
+        try:
+            tell(row, number, execute())
+        except BaseException as error:
+            self._inbox.on_error(self, row, number, ErrorText.of(error))
+            if isinstance(error, KeyboardInterrupt):
+                raise  # It was meant for the program; the request that it struck ends all the same.
         return True
 
     def executing(self) -> tuple[int, int]:
@@ -199,6 +200,20 @@ class InlineHost:
         self._runners.clear()
         self._queue.clear()
         self.in_flight = 0
+
+
+def _begun(runner: EnvRunner) -> Callable[[], Rest | None]:
+    """Start a step where the simulator computes by itself; what will end it."""
+    if runner.begin_step is None:
+        return runner.step
+    try:
+        return runner.begin_step()
+    except BaseException as error:
+        return partial(_reraise, error)  # When its result is asked for.
+
+
+def _reraise(error: BaseException) -> Rest | None:
+    raise error
 
 
 def _owned(value: Any) -> Any:

@@ -14,6 +14,7 @@ import numpy as np
 
 from rlightning_aio.envs.base import (
     BareReset,
+    BareResult,
     BareStep,
     BaseEnv,
     default_env_preprocess_fn,
@@ -44,15 +45,21 @@ class EnvRunner:
 
     Args:
         env: built, not yet initialised.
-        keeps_tensors: results that hold torch tensors are handed over whole and untouched
-            (inline placement); otherwise tensors become NumPy arrays on the CPU.
+        inline: results stay in this process. Those that hold torch tensors are handed over
+            whole and untouched then (elsewhere tensors become NumPy arrays on the CPU), and
+            of an env with fresh results observation and info are, too.
+
+    Attributes:
+        hands_over: observations and infos are handed over untouched.
     """
 
-    def __init__(self, env: BaseEnv, *, keeps_tensors: bool = False) -> None:
+    def __init__(self, env: BaseEnv, *, inline: bool = False) -> None:
         self.env = env
         self.meta: EnvMeta = env.init()
-        self._keeps_tensors = keeps_tensors
+        self._inline = inline
+        self.hands_over = inline and env.fresh_results
         self.step: Callable[[], Rest | None] = self._not_attached
+        self.begin_step: Callable[[], Callable[[], Rest | None]] | None = None
         self.reset_from_row: Callable[[], Rest | None] = self._not_attached
 
     @property
@@ -67,7 +74,11 @@ class EnvRunner:
                 f"{'observation' if meta.observation_space is None else 'action'} space"
             )
         return RowLayout(
-            meta.observation_space, meta.action_space, (*agents, *sub_envs), meta.agents
+            meta.observation_space,
+            meta.action_space,
+            (*agents, *sub_envs),
+            meta.agents,
+            observations_apart=self.hands_over,
         )
 
     @property
@@ -99,7 +110,10 @@ class EnvRunner:
         if slab.action is not None:
             self._read_action = row_reader(layout.action_space, slab.action, row)
         self._info_writer = InfoWriter(memoryview(slab.info[row]), announce)
-        self._episodes = EpisodeSums(self._episode_shape(layout.head), self.meta.autoreset)
+        # Whether results come from some of the sub-environments at a time.
+        self._takes_turns = self.env.config.num_envs > self.meta.num_envs
+        episodes = (self.env.config.num_envs,) if self._takes_turns else layout.head
+        self._episodes = EpisodeSums(episodes, self.meta.autoreset)
         self.reset_from_row = self._reset_from_row
         self.step = self._stepper()
 
@@ -128,24 +142,18 @@ class EnvRunner:
         read_action = self._read_action
         if read_action is None:
             return lambda: self.step_with(None, {})
-        if bare is None or self._write_observation is None:
+        write_observation = self._write_observation
+        if bare is None or (write_observation is None and not self.hands_over):
             return lambda: self.step_with(read_action(), {})
-        if self._slab.layout.head or self.meta.autoreset != "disabled":
-            return _bare_batch_stepper(
-                bare,
-                read_action,
-                self._write_observation,
-                self._info_writer.write,
-                self._slab,
-                self._row,
-                self._count_step,
-            )
+        resets_itself = self.meta.autoreset != "disabled"
+        if write_observation is None or self._slab.layout.head or resets_itself:
+            return self._batch_stepper(bare, read_action)
         bare_reset = self.env.bare_reset()
         self.reset_episode, step, reset = _bare_stepper(
             bare,
             bare_reset,
             read_action,
-            self._write_observation,
+            write_observation,
             self._info_writer.write,
             self._slab,
             self._row,
@@ -154,13 +162,47 @@ class EnvRunner:
             self.reset_from_row = reset
         return step
 
-    @property
-    def _takes_turns(self) -> bool:
-        """Whether results come from some of the sub-environments at a time."""
-        return self.env.config.num_envs > self.meta.num_envs
+    def _batch_stepper(
+        self, bare: BareStep, read_action: Callable[[], Any]
+    ) -> Callable[[], Rest | None]:
+        """A step of bare simulators whose episodes take more than a sum, or which hand over."""
+        slab, row, clock = self._slab, self._row, time.monotonic_ns
+        # With an ellipsis an entry of a plain column is a view, too.
+        reward, terminated, truncated = (
+            column[row, ...] for column in (slab.reward, slab.terminated, slab.truncated)
+        )
+        done_times, busy_times = _view(slab.done_ns), _view(slab.busy_ns)
+        store_data = self._store_data
+        count_step = self._count_step
 
-    def _episode_shape(self, head: tuple[int, ...]) -> tuple[int, ...]:
-        return (self.env.config.num_envs,) if self._takes_turns else head
+        def store(outcome: BareResult, began: int) -> Rest | None:
+            observation, reward[...], terminated[...], truncated[...], info = outcome
+            done_times[row] = done = clock()
+            busy_times[row] = done - began
+            count_step(info)
+            return store_data(observation, info)
+
+        def step() -> Rest | None:
+            began = clock()
+            return store(bare(read_action()), began)
+
+        def begin_step() -> Callable[[], Rest | None]:
+            began = clock()
+            start(read_action())
+            return lambda: store(wait(), began)
+
+        if (halves := self.env.bare_step_async()) is not None:
+            start, wait = halves
+            self.begin_step = begin_step
+        return step
+
+    def _store_data(self, observation: Any, info: dict[str, Any]) -> Rest | None:
+        """Put them into the row, or hand them over."""
+        if self._write_observation is None:
+            return {"observation": observation, "info": info}
+        self._write_observation(observation)
+        mark = self._slab.info_mark[self._row] = self._info_writer.write(info)
+        return {"info": info} if mark == PICKLED else None
 
     def reset_episode(self) -> None:
         """Forget what was summed up of the current episode."""
@@ -204,7 +246,7 @@ class EnvRunner:
             )
         rest: Rest = {}
         if holds_tensor(result.observation):
-            if self._keeps_tensors:
+            if self._inline:
                 rest["ret"] = result
             observation = as_numpy(result.observation)
         else:
@@ -238,8 +280,7 @@ class EnvRunner:
         """Add the step that the row holds to its episodes."""
         slab, row = self._slab, self._row
         which = np.asarray(info["env_id"]) if self._takes_turns else ...
-        ended = slab.terminated[row] | slab.truncated[row]
-        sums = self._episodes.add(slab.reward[row], ended, which)
+        sums = self._episodes.add(slab.reward[row], slab.ends[row], which)
         if sums is not None:
             slab.episode_return[row], slab.episode_length[row] = sums
 
@@ -257,7 +298,7 @@ class EnvRunner:
         column[self._row] = array
 
     def _store_info(self, info: dict[str, Any], rest: Rest) -> None:
-        mark = self._info_writer.write(info)
+        mark = PICKLED if self.hands_over else self._info_writer.write(info)
         if mark == PICKLED:
             rest["info"] = as_numpy(info)
         self._slab.info_mark[self._row] = mark
@@ -323,34 +364,6 @@ def _bare_stepper(
         return {"info": info} if mark == PICKLED else None
 
     return forget, step, reset
-
-
-def _bare_batch_stepper(
-    bare: BareStep,
-    read_action: Callable[[], Any],
-    write_observation: Callable[[Any], None],
-    write_info: Callable[[dict[str, Any]], int],
-    slab: Slab,
-    row: int,
-    count_step: Callable[[dict[str, Any]], None],
-) -> Callable[[], Rest | None]:
-    """The same for bare simulators whose episodes take more than a sum."""
-    # With an ellipsis an entry of a plain column is a view, too.
-    reward, terminated, truncated = (
-        column[row, ...] for column in (slab.reward, slab.terminated, slab.truncated)
-    )
-
-    def step() -> Rest | None:
-        began = time.monotonic_ns()
-        observation, reward[...], terminated[...], truncated[...], info = bare(read_action())
-        done = time.monotonic_ns()
-        slab.done_ns[row], slab.busy_ns[row] = done, done - began
-        write_observation(observation)
-        count_step(info)
-        mark = slab.info_mark[row] = write_info(info)
-        return {"info": info} if mark == PICKLED else None
-
-    return step
 
 
 def _view(array: NDArray[Any]) -> memoryview[Any]:

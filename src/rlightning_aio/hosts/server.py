@@ -325,7 +325,7 @@ class ServerHost:
             ended = bool(slab.terminated[row] or slab.truncated[row])
             sums = place.sums.add(float(slab.reward[row]), ended)
         else:
-            sums = place.sums.add(slab.reward[row], slab.ends[row].any(axis=-1))
+            sums = place.sums.add(slab.reward[row], slab.ends[row])
         if sums is not None:
             slab.episode_return[row], slab.episode_length[row] = sums
 

@@ -1,0 +1,210 @@
+"""A group of one inline env: its steps are executed on the spot, and nothing else is different."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from group import sample_envs
+from hypothesis import given
+from hypothesis import strategies as st
+
+import rlightning_aio
+import rlightning_aio.sync
+from rlightning_aio import BatchedData, PolicyResponse
+from rlightning_aio.errors import EnvRaised
+from rlightning_aio.group.core import Core
+from rlightning_aio.group.lone import LoneCore
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+HALVED = {"name": "one", "backend": "halved", "task": "-", "placement": "inline"}
+PROBE = HALVED | {"backend": "probe"}
+CARTPOLE = HALVED | {"backend": "gymnasium", "task": "CartPole-v1"}
+
+
+def action_of(backend: str, number: int) -> Any:
+    """Numbers up to 9 mean something to every backend: steps, ends, errors."""
+    if backend == "probe":
+        return np.array([number % 4, number], float)
+    return number % 2 if backend == "gymnasium" else number
+
+
+class Used:
+    """A group and what is done with it; each deed gives what can be told of its outcome."""
+
+    def __init__(self, entry: dict[str, Any], core: type[Core]) -> None:
+        with patch("rlightning_aio.group.facade.core_of", core):
+            self.group = rlightning_aio.sync.build_env_group(entry)
+        self.group.init()
+        self.backend = entry["backend"]
+        self.batch, _ = self.group.reset(seed=1)
+        self.context = ExitStack()
+
+    def told(self, deed: str, number: int) -> Any:
+        try:
+            return getattr(self, deed)(number)
+        except (rlightning_aio.RLightningError, ValueError, RuntimeError) as error:
+            return type(error), str(error)
+
+    def _results(self, results: tuple[BatchedData, Any]) -> Any:
+        self.batch, flags = results
+        (value,) = self.batch.values()
+        told = value.model_dump(exclude={"ts_env_sent_ns"})
+        columns = (self.batch.observation, self.batch.reward, self.batch.terminated)
+        return repr((told, value._extra, columns, flags))
+
+    def step(self, number: int) -> Any:
+        action = np.array([action_of(self.backend, number)])
+        return self._results(self.group.step(self.batch.respond(action=action)))
+
+    def step_by_hand(self, number: int) -> Any:
+        response = PolicyResponse("one-0", action_of(self.backend, number), log_prob=0.5)
+        return self._results(self.group.step(BatchedData(["one-0"], [response])))
+
+    def send(self, number: int) -> Any:
+        action = np.array([action_of(self.backend, number)])
+        self.group.step_async(self.batch.respond(action=action))
+
+    def collect(self, number: int) -> Any:
+        return self._results(self.group.collect_async())
+
+    def reset(self, number: int) -> Any:
+        return self._results(self.group.reset(seed=number, options={"n": 1} if number else None))
+
+    def misfit(self, number: int) -> Any:
+        return self._results(self.group.step(self.batch.respond(action=np.zeros((1, 3, 3)))))
+
+    def of_nobody(self, number: int) -> Any:
+        return len(self.group.step(BatchedData())[0])
+
+    def call(self, number: int) -> Any:
+        return self.group["one-0"].get_attr("spec")
+
+    def open_context(self, number: int) -> Any:
+        self.context.enter_context(self.group.auto_reset(max_episode_steps=1 + number))
+
+    def close_context(self, number: int) -> Any:
+        self.context.close()
+
+    def close(self) -> Any:
+        stats = self.group.get_env_stats()
+        self.context.close()
+        self.group.close()
+        return stats
+
+
+@pytest.fixture
+def halved() -> Iterator[rlightning_aio.sync.EnvGroup]:
+    sample_envs.Halved.log.clear()
+    with rlightning_aio.sync.build_env_group(HALVED) as group:
+        yield group
+
+
+# An interrupt has a test of its own.
+NUMBERS = st.integers(0, 9).filter(lambda number: number != sample_envs.Halved.INTERRUPT)
+DEEDS = [name for name in vars(Used) if name[0] != "_" and name not in ("told", "close")]
+
+
+@pytest.mark.parametrize("entry", [HALVED, PROBE, CARTPOLE], ids=lambda entry: entry["backend"])
+@given(deeds=st.lists(st.tuples(st.sampled_from(["step", *DEEDS]), NUMBERS), max_size=25))
+def test_nothing_but_the_time_is_different(
+    entry: dict[str, Any], deeds: list[tuple[str, int]]
+) -> None:
+    """Results, errors, flags and sums are those of the general core."""
+    lone, general = Used(entry, LoneCore), Used(entry, Core)
+    for deed, number in deeds:
+        assert lone.told(deed, number) == general.told(deed, number), deed
+    assert lone.close() == general.close()
+
+
+def test_a_step_that_raises_counts_towards_no_limit(halved: rlightning_aio.sync.EnvGroup) -> None:
+    """The limit is one of steps that were made."""
+    batch, _ = halved.reset()
+    with halved.auto_reset(max_episode_steps=3):
+        with pytest.raises(EnvRaised):
+            halved.step(batch.respond(action=np.array([8])))
+        for expected in (False, False, True):
+            batch, flags = halved.step(batch.respond(action=np.array([1])))
+            assert flags == [expected]
+
+
+def test_it_is_used_for_one_inline_env_alone() -> None:
+    """Not for two, nor for a worker's."""
+    for fields, core in (
+        ({}, LoneCore),
+        ({"num_workers": 2}, Core),
+        ({"placement": "process"}, Core),
+    ):
+        group = rlightning_aio.sync.build_env_group(HALVED | fields)
+        assert type(group._core) is core
+
+
+def test_an_interrupt_ends_the_step_that_it_strikes(halved: rlightning_aio.sync.EnvGroup) -> None:
+    """The program gets it, and the group goes on."""
+    batch, _ = halved.reset()
+    with pytest.raises(KeyboardInterrupt):
+        halved.step(batch.respond(action=np.array([sample_envs.Halved.INTERRUPT])))
+    batch, _ = halved.step(batch.respond(action=np.array([3])))
+    assert batch.reward.tolist() == [3]
+
+
+def test_a_step_of_halves_starts_when_it_is_sent(halved: rlightning_aio.sync.EnvGroup) -> None:
+    """The simulator computes while the trainer does something else."""
+    batch, _ = halved.reset()
+    halved.step_async(batch.respond(action=np.array([5])))
+    assert sample_envs.Halved.log == ["start"]
+    batch, _ = halved.collect_async()
+    assert sample_envs.Halved.log == ["start", "wait"]
+    assert batch.observation.tolist() == [[-1, 5]]
+    assert batch.info == [{"nested": {"total": 5}, "success": False}]
+
+
+@pytest.mark.parametrize("action", [9, 8])
+def test_an_error_of_either_half_is_the_steps(
+    halved: rlightning_aio.sync.EnvGroup, action: int
+) -> None:
+    """It is raised where the result would have come."""
+    batch, _ = halved.reset()
+    halved.step_async(batch.respond(action=np.array([action])))
+    with pytest.raises(EnvRaised, match=r"'one-0'.* raised in step: ValueError: no (start|end)"):
+        halved.collect_async()
+    batch, _ = halved.reset()
+    assert batch.observation.tolist() == [[-1, 0]]
+
+
+async def test_other_tasks_have_their_turns() -> None:
+    """A loop over an env that never waits doesn't keep the event loop to itself."""
+    turns = 0
+
+    async def count() -> None:
+        nonlocal turns
+        while True:
+            turns += 1
+            await asyncio.sleep(0)
+
+    async with rlightning_aio.build_env_group(HALVED) as group:
+        batch, _ = await group.reset()
+        task = asyncio.create_task(count())
+        for _ in range(50):
+            batch, _ = await group.step(batch.respond(action=np.array([0])))
+        task.cancel()
+    assert turns >= 50
+
+
+async def test_a_step_that_is_cancelled_before_its_turn_has_not_happened() -> None:
+    """Nothing was sent then, and nothing is left to collect."""
+    async with rlightning_aio.build_env_group(HALVED) as group:
+        batch, _ = await group.reset()
+        step = asyncio.create_task(group.step(batch.respond(action=np.array([4]))))
+        await asyncio.sleep(0)
+        step.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await step
+        batch, _ = await group.step(batch.respond(action=np.array([1])))
+        assert batch.observation.tolist() == [[-1, 1]]
