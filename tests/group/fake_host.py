@@ -140,8 +140,8 @@ class FakeHost:
 
     def request(self, entries: np.ndarray) -> None:
         for entry in entries.tolist():
-            row = ((entry >> rings.OP_BITS) & rings.SLOT_MASK) - self.first_slot
-            if entry & rings.OP_MASK == rings.RESET:
+            row = rings.slot_of(entry) - self.first_slot
+            if rings.op_of(entry) == rings.RESET:
                 self._take(row, entry, lambda row=row, entry=entry: self._reset(row, entry))
             else:
                 self._take(row, entry, lambda row=row, entry=entry: self._step(row, entry, None))
@@ -179,7 +179,7 @@ class FakeHost:
     # -- what an env does
 
     def _step(self, row: int, entry: int, action: Any, *, by_frame: bool = False) -> Reply:
-        at, number = self.row_of[row], entry >> rings.NUMBER_SHIFT
+        at, number = self.row_of[row], rings.number_of(entry)
         action = int(self.slab.action[at] if action is None else action)
         if action == RAISES:
             return self._error(row, number)
@@ -208,7 +208,7 @@ class FakeHost:
         if not info and not by_frame:
             return Reply(entry)
         rest = {"info": info} if info else {}
-        number = entry >> rings.NUMBER_SHIFT
+        number = rings.number_of(entry)
         return Reply(0, lambda: self.inbox.on_rest(self, row, number, rest))
 
     def _error(self, row: int, number: int) -> Reply:

@@ -16,15 +16,16 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from rlightning_aio.protocol.rings import (
     NUMBER_SHIFT,
-    OP_BITS,
-    OP_MASK,
     RESET,
     SLOT_MASK,
     STEP,
     TrainerRings,
     WorkerRings,
     entry,
+    number_of,
+    op_of,
     rings_size,
+    slot_of,
 )
 
 
@@ -150,11 +151,7 @@ TestRings.settings = settings(max_examples=100, stateful_step_count=40, deadline
 def test_an_entry_holds_number_slot_and_operation(number: int, slot: int, op: int) -> None:
     """All three come out as they went in, from one 64-bit word."""
     packed = int(np.int64(entry(number, slot, op)))
-    assert (packed >> NUMBER_SHIFT, (packed >> OP_BITS) & SLOT_MASK, packed & OP_MASK) == (
-        number,
-        slot,
-        op,
-    )
+    assert (number_of(packed), slot_of(packed), op_of(packed)) == (number, slot, op)
 
 
 def test_the_trainer_sees_what_the_worker_executes_and_since_when() -> None:

@@ -32,7 +32,6 @@ from rlightning_aio.group.obituary import (
     culprit_of,
     death_error,
     late_fault,
-    slot_of,
     start_fault,
 )
 from rlightning_aio.group.seating import check_actions, order_for, seat
@@ -44,7 +43,7 @@ from rlightning_aio.hosts.runner import NO_ACTION
 from rlightning_aio.hosts.server import ServerHost
 from rlightning_aio.hosts.worker import ErrorText, Started
 from rlightning_aio.protocol.info import NO_INFO, PICKLED
-from rlightning_aio.protocol.rings import RESET, STEP
+from rlightning_aio.protocol.rings import RESET, STEP, slot_of
 from rlightning_aio.protocol.slab import NO_SEED
 from rlightning_aio.types import EnvMeta
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from rlightning_aio.errors import EnvHung, StartFailed, WorkerDied
 from rlightning_aio.group.member import NOBODY
-from rlightning_aio.protocol.rings import NUMBER_SHIFT, OP_BITS, RESET, SLOT_MASK, STEP
+from rlightning_aio.protocol.rings import RESET, STEP, number_of, slot_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -18,12 +18,7 @@ if TYPE_CHECKING:
     from rlightning_aio.group.slots import Slots
     from rlightning_aio.hosts.base import Death
 
-__all__ = ["cause_of", "culprit_of", "death_error", "late_fault", "slot_of", "start_fault"]
-
-
-def slot_of(entry: int) -> int:
-    """The slot that a ring entry is about."""
-    return (entry >> OP_BITS) & SLOT_MASK
+__all__ = ["cause_of", "culprit_of", "death_error", "late_fault", "start_fault"]
 
 
 def start_fault(table: Slots, member: Member, death: Death) -> StartFailed:
@@ -62,7 +57,7 @@ def culprit_of(table: Slots, member: Member, death: Death, owed: NDArray[np.intp
         return member.hung_slot
     for entry in death.requests:
         slot = slot_of(entry)
-        if slot in owed and table.number(slot) == entry >> NUMBER_SHIFT:
+        if slot in owed and table.number(slot) == number_of(entry):
             return slot
     return int(owed[0]) if len(owed) else NOBODY
 

@@ -23,7 +23,7 @@ from rlightning_aio.hosts.worker import (
     build_env,
 )
 from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
-from rlightning_aio.protocol.rings import NUMBER_SHIFT, OP_BITS, OP_MASK, SLOT_MASK, STEP
+from rlightning_aio.protocol.rings import STEP, number_of, op_of, slot_of
 from rlightning_aio.protocol.slab import Slab
 
 if TYPE_CHECKING:
@@ -102,10 +102,10 @@ class InlineHost:
     def request(self, entries: NDArray[np.int64]) -> None:
         """See `base.Host.request`."""
         for entry in cast("list[int]", entries.tolist()):
-            row, number = ((entry >> OP_BITS) & SLOT_MASK) - self.first_slot, entry >> NUMBER_SHIFT
+            row = slot_of(entry) - self.first_slot
             runner = self._runners[row]
-            execute = _begun(runner) if entry & OP_MASK == STEP else runner.reset_from_row
-            self._enqueue(row, number, execute, self._tell_result)
+            execute = _begun(runner) if op_of(entry) == STEP else runner.reset_from_row
+            self._enqueue(row, number_of(entry), execute, self._tell_result)
 
     def pack(self, content: Any) -> Any:
         """See `base.Host.pack`."""

@@ -26,7 +26,7 @@ from rlightning_aio.hosts.forkserver import BOOTSTRAP, Exited, Fork, Forked, Hel
 from rlightning_aio.hosts.pickling import dumped, dumped_with_code
 from rlightning_aio.hosts.worker import ErrorText
 from rlightning_aio.protocol.frames import BELL, CHUNK_BYTES, Frame, FrameKind, FrameReader, encode
-from rlightning_aio.protocol.rings import OP_BITS, SLOT_MASK, TrainerRings, rings_size
+from rlightning_aio.protocol.rings import TrainerRings, rings_size, slot_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -325,7 +325,7 @@ class ProcessHost:
             return
         errors = self._close_errors
         if errors is None:
-            row = ((current >> OP_BITS) & SLOT_MASK) - self.first_slot if current else 0
+            row = slot_of(current) - self.first_slot if current else 0
             errors = [(row, ErrorText("WorkerDied", f"its worker {cause}", stderr_tail))]
         self._inbox.on_closed(self, errors)
 

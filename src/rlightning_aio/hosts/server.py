@@ -18,15 +18,7 @@ from rlightning_aio.hosts.episodes import EpisodeSum, EpisodeSums
 from rlightning_aio.hosts.runner import NO_ACTION
 from rlightning_aio.protocol.columns import row_reader, row_writer
 from rlightning_aio.protocol.info import NO_INFO, PICKLED
-from rlightning_aio.protocol.rings import (
-    NUMBER_SHIFT,
-    OP_BITS,
-    OP_MASK,
-    RESET,
-    SLOT_MASK,
-    STEP,
-    entry,
-)
+from rlightning_aio.protocol.rings import RESET, STEP, entry, number_of, op_of, slot_of
 from rlightning_aio.protocol.slab import RowLayout, Slab
 
 if TYPE_CHECKING:
@@ -183,8 +175,8 @@ class ServerHost:
         slab, now = cast("Slab", self._slab), time.monotonic()
         asked: list[int] = entries.tolist()
         for one in asked:
-            row, number = ((one >> OP_BITS) & SLOT_MASK) - self.first_slot, one >> NUMBER_SHIFT
-            if one & OP_MASK == STEP:
+            row, number = slot_of(one) - self.first_slot, number_of(one)
+            if op_of(one) == STEP:
                 self._step(row, number, NO_ACTION, {}, now)
             else:
                 self._reset(row, number, slab.take_seed(row), None, now)
@@ -286,7 +278,7 @@ class ServerHost:
             return None
         owed = self._inbox.on_client(self, row, meta, self.remote.manners(name))
         self._places[row].entry = owed
-        return row, owed >> NUMBER_SHIFT
+        return row, number_of(owed)
 
     def _write(self, row: int, result: RemoteResult) -> Rest:
         """Put `result` into its row; what doesn't fit."""

@@ -25,13 +25,13 @@ from rlightning_aio.hosts.spinner import Spinner
 from rlightning_aio.protocol.frames import BELL, CHUNK_BYTES, Frame, FrameKind, FrameReader, encode
 from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
 from rlightning_aio.protocol.rings import (
-    NUMBER_SHIFT,
     OP_BITS,
     OP_MASK,
     SLOT_MASK,
     STEP,
     WorkerRings,
     entry,
+    number_of,
     rings_size,
 )
 from rlightning_aio.protocol.slab import RowLayout, Slab
@@ -201,6 +201,7 @@ class Worker:
             self._receive(socket.MSG_DONTWAIT)
         if self._closing:
             return False
+        # `slot_of` and `op_of`, spelt out: they would be felt in every step.
         row = ((request >> OP_BITS) & SLOT_MASK) - self._first_slot
         if self._timed:
             self._rings.begin(request, time.monotonic_ns())
@@ -211,11 +212,11 @@ class Worker:
                 else self._runners[row].reset_from_row()
             )
         except BaseException as error:
-            self._send_error(row, request >> NUMBER_SHIFT, error)
+            self._send_error(row, number_of(request), error)
             return False
         if rest is None:
             return True
-        self._send_rest(row, request >> NUMBER_SHIFT, rest)
+        self._send_rest(row, number_of(request), rest)
         return False
 
     def _ring(self) -> None:

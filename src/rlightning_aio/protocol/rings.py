@@ -34,7 +34,10 @@ __all__ = [
     "WorkerRings",
     "entry",
     "fence",
+    "number_of",
+    "op_of",
     "rings_size",
+    "slot_of",
 ]
 
 # An entry is one int64: request number, slot of the env in its group, operation.
@@ -93,6 +96,21 @@ fence = _new_fence()
 def entry(number: int, slot: int, op: int) -> int:
     """One ring entry."""
     return (number << NUMBER_SHIFT) | (slot << OP_BITS) | op
+
+
+def number_of(entry: int) -> int:
+    """The number of the request that a ring entry is about."""
+    return entry >> NUMBER_SHIFT
+
+
+def slot_of(entry: int) -> int:
+    """The slot of the env that a ring entry is about."""
+    return (entry >> OP_BITS) & SLOT_MASK
+
+
+def op_of(entry: int) -> int:
+    """What a ring entry asks for."""
+    return entry & OP_MASK
 
 
 def _capacity(rows: int) -> int:
