@@ -77,7 +77,7 @@ class Reply:
     tell: Callable[[], None] | None = None
 
 
-@dataclass
+@dataclass(eq=False)
 class FakeHost:
     """See `hosts.base.Host`. Requests wait until the test has them executed (`finish`).
 

@@ -37,6 +37,12 @@ def lookout(*workers: Any) -> Lookout:
     return Lookout(list(workers))
 
 
+def note_steps(look: Any, workers: list[Worker], ns: float) -> None:
+    """Until nothing else is remembered."""
+    for worker in workers * 200:
+        look.note_step(worker, ns)
+
+
 def test_for_all_results_one_worker_is_asked_for_all_of_its_own() -> None:
     """A bell of any other would wake the trainer for nothing."""
     first, second = Worker(16), Worker(16)
@@ -73,7 +79,7 @@ def test_orders_can_be_met_and_come_in_time(
     """Where steps are long, whoever rings first rings when enough may be ready, not later."""
     workers = [Worker(count) for count in in_flight]
     look = lookout(*workers)
-    look.step_ns = step_us * 1e3
+    note_steps(look, workers, step_us * 1e3)
     wanted = min(wanted, sum(in_flight))
     look.order(wanted)
     asked = [worker for worker in workers if worker.ordered]
@@ -88,9 +94,19 @@ def test_short_steps_are_waited_for_in_larger_numbers_but_nobody_runs_dry() -> N
     """A worker that rings has at least a quarter of its steps still to do."""
     workers = [Worker(16), Worker(16)]
     look = lookout(*workers)
-    look.step_ns = 5e3
+    note_steps(look, workers, 5e3)
     look.order(16)
     assert [worker.ordered for worker in workers] == [12, 12]
+
+
+def test_long_steps_are_not_waited_for_because_others_are_short() -> None:
+    """A group may hold simulators of very different speed."""
+    quick, slow = workers = [Worker(16), Worker(16)]
+    look = lookout(*workers)
+    note_steps(look, [quick], 5e3)
+    note_steps(look, [slow], 5e6)
+    look.order(16)
+    assert (quick.ordered, slow.ordered) == (12, 8)
 
 
 def test_clients_on_this_machine_are_left_the_cores() -> None:
@@ -108,6 +124,7 @@ def test_steps_that_take_no_time_are_no_trouble() -> None:
     """A client need not tell how long its env took."""
     workers = [Worker(16), Worker(16)]
     look = lookout(*workers)
-    for look.step_ns in (0.0, 5e-324):
+    for step_ns in (0.0, 5e-324):
+        note_steps(look, workers, step_ns)
         look.order(16)
         assert [worker.ordered for worker in workers] == [12, 12]

@@ -30,13 +30,13 @@ class Lookout:
 
     Attributes:
         num_cores: cores that this process and its workers may use.
-        step_ns: what a step takes lately, about.
     """
 
     def __init__(self, hosts: list[Host]) -> None:
         self.num_cores = 0
-        self.step_ns = float(_WAKE_UP_NS)
         self._hosts = hosts
+        # What a step takes there lately, about; until anything is known, as long as waking us.
+        self._step_ns: dict[Host, float] = {}
         self._inline: deque[Host] = deque()
         self._spinner = Spinner(enabled=True)
         self._spun = False
@@ -79,12 +79,20 @@ class Lookout:
         if wanted >= sum([host.in_flight for host in busy]):
             return self._order_of_last(busy)
         part = ceil(wanted / len(busy)) if busy else 0
-        slack = int(_WAKE_UP_NS / max(self.step_ns, 1.0)) if wanted > 1 else 0
         came = False
         for host in busy:
             left = max(host.in_flight - part, 0)
-            came = host.order(min(part, host.in_flight) + min(slack, left // 2)) or came
+            more = min(self._steps_per_wake_up(host), left // 2) if wanted > 1 else 0
+            came = host.order(min(part, host.in_flight) + more) or came
         return came
+
+    def _steps_per_wake_up(self, host: Host) -> int:
+        return int(_WAKE_UP_NS / max(self._step_ns.get(host, _WAKE_UP_NS), 1.0))
+
+    def note_step(self, host: Host, ns: float) -> None:
+        """Take note of what a step has taken."""
+        before = self._step_ns.get(host, _WAKE_UP_NS)
+        self._step_ns[host] = before + 0.2 * (ns - before)
 
     def _order_of_last(self, busy: list[Host]) -> bool:
         if self._last not in busy:
