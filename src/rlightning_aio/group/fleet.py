@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio.config import EnvConfig
-    from rlightning_aio.group.core import Core
+    from rlightning_aio.group.ledger import Ledger
     from rlightning_aio.group.slots import Slots
     from rlightning_aio.hosts.arena import Arena
     from rlightning_aio.hosts.base import Watcher
@@ -113,17 +113,17 @@ class Fleet:
         self._looked_at = 0.0
         self._unavailable = False
 
-    def deliver_to(self, core: Core) -> None:
-        """Have hosts tell `core` of replies."""
-        self._core = core
-        self.on_reports = core.on_reports
-        self.on_rest = core.on_rest
-        self.on_value = core.on_value
-        self.on_error = core.on_error
-        self.on_schema = core.on_schema
-        self.on_client = core.on_client
-        self.on_withdrawn = core.on_withdrawn
-        self.on_fault = core.on_fault
+    def deliver_to(self, ledger: Ledger) -> None:
+        """Have hosts tell `ledger` of replies."""
+        self._ledger = ledger
+        self.on_reports = ledger.on_reports
+        self.on_rest = ledger.on_rest
+        self.on_value = ledger.on_value
+        self.on_error = ledger.on_error
+        self.on_schema = ledger.on_schema
+        self.on_client = ledger.on_client
+        self.on_withdrawn = ledger.on_withdrawn
+        self.on_fault = ledger.on_fault
 
     def add(self, host: Host, config: EnvConfig) -> None:
         """Take in a host, before `init`; its slots follow those of the host before."""
@@ -471,11 +471,11 @@ class Fleet:
             fault = start_fault(self.slots, member, death)
             self._start_fault = self._start_fault or fault
             return
-        self._core.absorb()
+        self._ledger.absorb()
         slots = np.arange(host.first_slot, host.first_slot + host.rows)
         states = self.slots.state[slots]
         owed = slots[states == BUSY]
-        self._core.detach_infos(slots[states == READY])
+        self._ledger.detach_infos(slots[states == READY])
         if member.stage is Stage.UP:
             # A replacement that fails to come up falls to the env that made it necessary.
             member.culprit = culprit_of(self.slots, member, death, owed)
@@ -494,12 +494,12 @@ class Fleet:
         if raises or deaths > member.config.max_restarts:
             self._give_up(member)
             member.failure = partial(error_for, owed)
-            self._core.fail(owed, error_for)
+            self._ledger.fail(owed, error_for)
             return
         _log.warning("%s", str(error_for(owed)))
         # A replacement answers for steps and resets, but not for calls.
         calls = owed[~np.isin(self.slots.ops(owed), (STEP, RESET))]
-        self._core.fail(calls, error_for)
+        self._ledger.fail(calls, error_for)
         self._replace(member, replace(death, cause=cause), np.setdiff1d(owed, calls))
 
     def _give_up(self, member: Member) -> None:
@@ -529,7 +529,7 @@ class Fleet:
         host.attach(member.order)
         if len(owed):
             entries = table.renumber(owed, RESET)
-            self._core.auto.resets_sent(owed)
+            self._ledger.auto.resets_sent(owed)
             self.write_seeds(owed, np.full(len(owed), NO_SEED))
             for slot in owed.tolist():
                 self.restarting[slot] = self.lost.pop(slot)
