@@ -114,6 +114,37 @@ def test_inline_results_are_handed_over_uncopied() -> None:
         assert np.array_equal(batch.observation, kept)
 
 
+def test_a_result_belongs_to_its_caller() -> None:
+    """Who writes to its ids changes nothing of where the next actions go."""
+    env, alone = make(num_envs=4), make(num_envs=4)
+    result, expected = env.reset(seed=2), alone.reset(seed=2)
+    for k in range(20):
+        result.info["env_id"] += 100
+        action = np.array([0, 1, 1, 0]) ^ (k % 2)
+        result, expected = (e.step(PolicyResponse("pool-0", action)) for e in (env, alone))
+        assert same(result.observation, expected.observation)
+    for opened in (env, alone):
+        opened.close()
+
+
+def test_an_action_may_be_written_over_once_it_was_sent() -> None:
+    """EnvPool reads it when the sub-environment's turn comes."""
+    pool = make("HalfCheetah-v5", 8, env_kwargs={"batch_size": 2, "num_threads": 1})
+    alone = [make("HalfCheetah-v5", 1) for _ in range(8)]
+    expected = [env.reset(seed=k) for k, env in enumerate(alone)]
+    result = pool.reset(seed=0)
+    buffer, rng = np.empty((2, 6)), np.random.default_rng(0)
+    for _ in range(200):
+        buffer[...] = rng.uniform(-1, 1, (2, 6))
+        for row, index in enumerate(result.info["env_id"]):
+            assert same(result.observation[row], expected[index].observation)
+            expected[index] = alone[index].step(PolicyResponse("pool-0", buffer[row].copy()))
+        result = pool.step(PolicyResponse("pool-0", buffer))
+        buffer[...] = 0.0
+    for env in (pool, *alone):
+        env.close()
+
+
 def test_asynchronous_results_are_batches_of_whoever_is_ready() -> None:
     """Spaces and num_envs are the batch's; each sub-environment's own steps are in order."""
     env = make(num_envs=6, env_kwargs={"batch_size": 2})
@@ -243,8 +274,7 @@ def test_misuse_is_named() -> None:
     env.reset(seed=0)
     with pytest.raises(ValueError, match=r"shape \(3,\) for 4 sub-environments; expected \(4,\)"):
         env.step(PolicyResponse("pool-0", np.zeros(3, np.int64)))
-    with pytest.raises(
-        ConfigError, match=r"'pool-0'.*'IntersectionMultiAgent-v0' has several players"
-    ):
-        make("IntersectionMultiAgent-v0")
+    for task in ("IntersectionMultiAgent-v0", "TicTacToe-v1"):
+        with pytest.raises(ConfigError, match=f"'pool-0'.*'{task}' has several players"):
+            make(task)
     env.close()

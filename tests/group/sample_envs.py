@@ -225,15 +225,14 @@ class Sloppy(Probe):
 
 @ENVS.register("halved")
 class Halved(BaseEnv):
-    """Adds up its actions, in steps of two halves; it keeps no hand on its results.
+    """Adds up its actions, in steps of two halves.
 
     Attributes:
         log: the halves that were executed.
     """
 
-    RAISE_IN_START, RAISE_IN_WAIT, INTERRUPT = 9, 8, 7
+    RAISE_IN_START, RAISE_IN_WAIT, INTERRUPT, INTERRUPT_START = 9, 8, 7, 6
 
-    fresh_results = True
     log: ClassVar[list[str]] = []
 
     def get_observation_space(self) -> gym.Space[Any]:
@@ -270,6 +269,8 @@ class Halved(BaseEnv):
         self.action = int(action)
         if self.action == self.RAISE_IN_START:
             raise ValueError("no start")
+        if self.action == self.INTERRUPT_START:
+            raise KeyboardInterrupt
 
     def _wait(self) -> Any:
         self.log.append("wait")
@@ -280,6 +281,61 @@ class Halved(BaseEnv):
         self.total += self.action
         info = {"nested": {"total": self.total}, "success": self.total == 20}
         return self._observation(), float(self.action), self.total >= 20, False, info
+
+
+@ENVS.register("fresh")
+class Fresh(BaseEnv):
+    """Hands out observations of the task's space, and keeps no hand on them.
+
+    A step gives what ``gives`` of its ``env_kwargs`` says, or a sample of the space.
+    """
+
+    SPACES: ClassVar[dict[str, gym.Space[Any]]] = {
+        "number": spaces.Discrete(5),
+        "array": spaces.Box(-1, 1, (3,), np.float32),
+        "words": spaces.Text(8),
+        "tree": TREE,
+    }
+
+    fresh_results = True
+
+    def get_observation_space(self) -> gym.Space[Any]:
+        return self.SPACES[self.config.task]
+
+    def get_action_space(self) -> gym.Space[Any]:
+        return spaces.Discrete(2)
+
+    def reset(
+        self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
+    ) -> EnvRet:
+        self.space = deepcopy(self.get_observation_space())
+        self.space.seed(3)
+        return EnvRet(env_id=self.env_id, observation=self.space.sample())
+
+    def step(self, policy_resp: PolicyResponse) -> EnvRet:
+        return result_of(self.env_id, self.bare_step()(policy_resp.action))
+
+    def bare_step(self) -> BareStep:
+        def step(action: Any) -> Any:
+            given = self.config.env_kwargs.get("gives")
+            self.given = self.space.sample() if given is None else np.array(given)
+            return self.given, 1.0, False, False, {}
+
+        return step
+
+
+@ENVS.register("stale")
+class Stale(Fresh):
+    """Its own step has results that it goes on writing to."""
+
+    def bare_step(self) -> Any:
+        return None
+
+    def step(self, policy_resp: PolicyResponse) -> EnvRet:
+        if not hasattr(self, "running"):
+            self.running = np.zeros(3, np.float32)
+        self.running += 0.25
+        return EnvRet(env_id=self.env_id, observation=self.running)
 
 
 @ENVS.register("batched")

@@ -67,6 +67,24 @@ def test_the_window_ends_for_results_that_joined_unnoticed(new_group: NewGroup) 
     assert ids_of(running) == ["fake-0", "fake-1", "fake-2"]
 
 
+def test_the_window_opens_when_an_inline_result_is_there(new_group: NewGroup) -> None:
+    """Not before the env was stepped, however long that takes."""
+    group = new_group(1, 1, inline=[True, False])
+    run_one = group.hosts[0].run_one
+
+    def run_slowly() -> bool:
+        group.now += 2.0 if group.hosts[0].waiting else 0.0
+        return run_one()
+
+    group.hosts[0].run_one = run_slowly
+    group.core.step_async(steps(0, 1), group.now)
+    running = collect(group, timeout=1.0)
+    group.pass_time(0.5)
+    assert not running.done
+    group.finish(1)
+    assert sorted(ids_of(running)) == ["fake-0", "fake-1"]
+
+
 def test_one_callers_slow_env_does_not_hold_up_another_caller(new_group: NewGroup) -> None:
     """Two calls at once, on envs of one worker: each returns when its own envs have replied."""
     group = new_group(3)

@@ -106,8 +106,9 @@ def halved() -> Iterator[rlightning_aio.sync.EnvGroup]:
         yield group
 
 
-# An interrupt has a test of its own.
-NUMBERS = st.integers(0, 9).filter(lambda number: number != sample_envs.Halved.INTERRUPT)
+# Interrupts have tests of their own.
+INTERRUPTS = (sample_envs.Halved.INTERRUPT, sample_envs.Halved.INTERRUPT_START)
+NUMBERS = st.sampled_from([number for number in range(10) if number not in INTERRUPTS])
 DEEDS = [name for name in vars(Used) if name[0] != "_" and name not in ("told", "close")]
 
 
@@ -154,30 +155,6 @@ def test_an_interrupt_ends_the_step_that_it_strikes(halved: rlightning_aio.sync.
     assert batch.reward.tolist() == [3]
 
 
-def test_a_step_of_halves_starts_when_it_is_sent(halved: rlightning_aio.sync.EnvGroup) -> None:
-    """The simulator computes while the trainer does something else."""
-    batch, _ = halved.reset()
-    halved.step_async(batch.respond(action=np.array([5])))
-    assert sample_envs.Halved.log == ["start"]
-    batch, _ = halved.collect_async()
-    assert sample_envs.Halved.log == ["start", "wait"]
-    assert batch.observation.tolist() == [[-1, 5]]
-    assert batch.info == [{"nested": {"total": 5}, "success": False}]
-
-
-@pytest.mark.parametrize("action", [9, 8])
-def test_an_error_of_either_half_is_the_steps(
-    halved: rlightning_aio.sync.EnvGroup, action: int
-) -> None:
-    """It is raised where the result would have come."""
-    batch, _ = halved.reset()
-    halved.step_async(batch.respond(action=np.array([action])))
-    with pytest.raises(EnvRaised, match=r"'one-0'.* raised in step: ValueError: no (start|end)"):
-        halved.collect_async()
-    batch, _ = halved.reset()
-    assert batch.observation.tolist() == [[-1, 0]]
-
-
 async def test_other_tasks_have_their_turns() -> None:
     """A loop over an env that never waits doesn't keep the event loop to itself."""
     turns = 0
@@ -197,14 +174,7 @@ async def test_other_tasks_have_their_turns() -> None:
     assert turns >= 50
 
 
-async def test_a_step_that_is_cancelled_before_its_turn_has_not_happened() -> None:
-    """Nothing was sent then, and nothing is left to collect."""
+async def test_an_asynchronous_group_has_the_general_core() -> None:
+    """Its other tasks may ask, cancel and collect in the middle of a step."""
     async with rlightning_aio.build_env_group(HALVED) as group:
-        batch, _ = await group.reset()
-        step = asyncio.create_task(group.step(batch.respond(action=np.array([4]))))
-        await asyncio.sleep(0)
-        step.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await step
-        batch, _ = await group.step(batch.respond(action=np.array([1])))
-        assert batch.observation.tolist() == [[-1, 1]]
+        assert type(group._core) is Core

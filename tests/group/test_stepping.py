@@ -368,3 +368,24 @@ async def test_what_a_group_has_measured(start: Any, capsys: pytest.CaptureFixtu
     printed = capsys.readouterr().out
     assert "steps per second" in printed
     assert "probe" in printed
+
+
+async def test_what_comes_after_an_end_that_nobody_reset_belongs_to_no_episode(start: Any) -> None:
+    """Whoever steps on gets results, and a single episode is counted."""
+    entry = {
+        "name": "tree",
+        "backend": "gymnasium",
+        "task": "group.sample_envs:Tree-v0",
+        "num_workers": 2,
+    }
+    group = await start(entry)
+    batch, _ = await group.reset(seed=1)
+    space = group.get_action_spaces()[0]
+    ends = np.zeros(2, int)
+    for _ in range(100):
+        values = [PolicyResponse(env_id, space.sample()) for env_id in batch.ids()]
+        batch, _ = await group.step(BatchedData(batch.ids(), values))
+        ends += batch.terminated
+    assert (ends > 1).all()
+    stats = group.get_env_stats()
+    assert [stats[env_id]["episodes"] for env_id in batch.ids()] == [1, 1]

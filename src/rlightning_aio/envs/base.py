@@ -80,8 +80,9 @@ class BaseEnv(abc.ABC):
         num_envs: sub-environments in each result. Where it is below the config's, results
             come from some of them at a time, and ``info["env_id"]`` says from which.
         autoreset: what sub-environments do after their episode's end; see `EnvMeta`.
-        fresh_results: nothing of a result is touched again once it was returned; inline
-            placement copies infos otherwise.
+        fresh_results: what `bare_step` returns consists of new arrays and dicts, which nobody
+            reads or writes again: with inline placement, observation and info are handed over
+            uncopied.
     """
 
     transforms_actions: ClassVar[bool] = False
@@ -132,8 +133,9 @@ class BaseEnv(abc.ABC):
     def bare_step_async(self) -> tuple[BareStepAsync, BareStepWait] | None:
         """`bare_step` in two halves: one starts a step, the other waits for its end.
 
-        Return them if the simulator computes by itself in between: with inline placement a
-        step starts when it is sent then, not when it is collected.
+        Return them, beside a `bare_step`, if the simulator computes by itself in between: with
+        inline placement a step whose action fits its row starts when it is sent then, not when
+        it is collected. An interrupt (Ctrl-C) of the first half comes with the result.
         """
         return None
 

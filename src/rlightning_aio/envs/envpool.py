@@ -25,7 +25,7 @@ from rlightning_aio.envs.base import (
 )
 from rlightning_aio.envs.tensors import as_numpy
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.protocol.columns import index
+from rlightning_aio.protocol.columns import index, is_dict
 from rlightning_aio.types import EnvRet, PolicyResponse
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ class EnvPoolEnv(BaseEnv):
             **({} if limit is None else {"max_episode_steps": limit}),
             **self.config.env_kwargs,
         )
-        if self.env._action_keys != ["env_id", "players.env_id", "action"]:
+        if self.env.config["max_num_players"] > 1:
             raise ConfigError(
                 f"env {self.env_id!r}: EnvPool's task {self.config.task!r} has several players; "
                 "choose one for a single player"
@@ -162,7 +162,8 @@ class EnvPoolEnv(BaseEnv):
 
     def _receive(self) -> BareResult:
         result = self._arrays.receive()
-        self._ready = result[-1]["env_id"]
+        # A copy: the other one is the caller's.
+        self._ready = result[-1]["env_id"].copy()
         return result if self.num_envs > 1 else index(result, 0)
 
     def get_observation_space(self) -> gym.Space[Any]:
@@ -179,10 +180,13 @@ class EnvPoolEnv(BaseEnv):
 
 
 class _PoolArrays:
-    """What a pool's `send` and `recv` do, prepared once for all steps.
+    """What `send` and `recv` of a pool for single players do, prepared once for all steps.
 
     They lay out and name the arrays that `_send` and `_recv` take and give, at every step
-    anew; next to short steps that takes long.
+    anew; next to short steps that takes long. As in EnvPool 1.2 (`python/envpool.py` and
+    `python/gymnasium_envpool.py`): `_send` takes ids, ids of players and the action, and
+    `_recv` gives arrays in the order of `_state_keys`, such as ``info:env_id``, ``reward``,
+    ``done``, ``trunc``, ``obs``, or ``obs:position`` for a Dict.
     """
 
     def __init__(self, pool: Any) -> None:
@@ -192,8 +196,9 @@ class _PoolArrays:
         self._action_shape = tuple(action.shape[1:] if action.shape[:1] == [-1] else action.shape)
         places = _nested(pool._state_keys)
         self._observation: Places = places["obs"]
-        while isinstance(self._observation, dict) and len(self._observation) == 1:
-            (self._observation,) = self._observation.values()
+        if not is_dict(pool.observation_space):
+            while isinstance(self._observation, dict) and len(self._observation) == 1:
+                (self._observation,) = self._observation.values()
         info: Any = places["info"]
         self._info: Places = {**info, "elapsed_step": places["elapsed_step"]}
         self._reward, self._done, self._truncated = map(
@@ -201,8 +206,8 @@ class _PoolArrays:
         )
 
     def send(self, action: Any, env_ids: NDArray[np.int32]) -> None:
-        """As the pool's `send`."""
-        action = np.ascontiguousarray(action, self._action_dtype)
+        """As the pool's `send`. The pool reads the action later, so it gets one of its own."""
+        action = np.array(action, self._action_dtype, order="C")
         if action.shape != (len(env_ids), *self._action_shape):
             raise ValueError(
                 f"an action of shape {action.shape} for {len(env_ids)} sub-environments; "

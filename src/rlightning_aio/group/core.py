@@ -142,12 +142,7 @@ class Core(Ledger):
             # Whoever else waits meanwhile must be woken as early as it asked for.
             fleet, first = self.fleet, min(self._wanted)
             look = fleet.lookout
-            if look.inline_waits():
-                now = yield Wait(0.0)  # Others have their turn while it computes, if it does.
-                look.run_inline(wanted)
-                fleet.look(now)
-                return now
-            if look.spin(first) or look.order(first):
+            if look.run_inline(wanted) or look.spin(first) or look.order(first):
                 now = yield Wait(0.0)
                 fleet.look(now)
                 return now

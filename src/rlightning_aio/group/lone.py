@@ -1,8 +1,10 @@
-"""`LoneCore`: the core of a group whose only env is inline, as a batched simulator's may be.
+"""`LoneCore`: the core of a synchronous group with a single, inline env.
 
-A step that needs nothing but an action is executed on the spot. There is nobody to wait
-for then, and no request to keep account of: the group costs half as much.
-Everything else is the core's own.
+That is what a script with one batched simulator has. A `step` that needs nothing but an
+action is executed on the spot: there is nobody to wait for, and so no request to keep
+account of, which halves what the group costs. Everything else is the core's own.
+Absent on purpose: asynchronous groups, whose other tasks may ask, cancel and collect in
+the middle of a step.
 """
 
 from __future__ import annotations
@@ -12,13 +14,13 @@ from typing import TYPE_CHECKING, cast
 from rlightning_aio.group.actions import write_actions
 from rlightning_aio.group.auto_reset import NO_RESETS
 from rlightning_aio.group.core import Core, Flags
-from rlightning_aio.group.wait import Operation, Wait
 from rlightning_aio.hosts.worker import ErrorText
 from rlightning_aio.protocol.rings import STEP
 
 if TYPE_CHECKING:
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.group.fleet import Fleet
+    from rlightning_aio.group.wait import Operation
     from rlightning_aio.hosts.inline import InlineHost
 
 __all__ = ["LoneCore", "core_of"]
@@ -28,16 +30,15 @@ def core_of(fleet: Fleet, *, zero_copy: bool) -> Core:
     """The core that suits the group."""
     configs = fleet.slots.configs
     lone = len(configs) == len(fleet.slots.local_ids) == 1 and configs[0].placement == "inline"
-    return (LoneCore if lone else Core)(fleet, zero_copy=zero_copy)
+    suited = LoneCore if lone and not fleet.watcher.shares_thread else Core
+    return suited(fleet, zero_copy=zero_copy)
 
 
 class LoneCore(Core):
-    """See the module."""
+    """A core whose slot 0 is all there is, and executes its steps at once."""
 
     def step(self, batch: BatchedData, now: float) -> Operation[tuple[BatchedData, Flags | None]]:
         """See `EnvGroup.step`."""
-        if self.fleet.watcher.shares_thread:
-            now = yield Wait(0.0)
         slots, table = self.slots_of(batch), self.slots
         self._check_sendable(slots, "step")
         letters = write_actions(batch, slots, table, self.fleet.slabs)

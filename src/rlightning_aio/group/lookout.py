@@ -112,18 +112,17 @@ class Lookout:
             if host.in_flight and host.ordered != 1:
                 host.sweep()
 
-    def inline_waits(self) -> bool:
-        """Whether something is asked of inline hosts."""
-        return sum([host.in_flight for host in self._inline]) > 0
-
-    def run_inline(self, wanted: int) -> None:
+    def run_inline(self, wanted: int) -> bool:
         """Execute waiting requests of inline hosts, one, or as many as nothing else can give."""
         waiting = sum([host.in_flight for host in self._inline])
+        if not waiting:
+            return False
         if sum([host.in_flight for host in self._hosts]) > waiting:
             wanted = 1
         for _ in range(wanted):
             if not self._run_next_inline():
                 break
+        return True
 
     def _run_next_inline(self) -> bool:
         """One request of the next inline host in turn, so that none waits for ever."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rlightning_aio.batch import BatchedData, Origin, ResultColumns
-from rlightning_aio.protocol.columns import Rows, gather, mapped
+from rlightning_aio.protocol.columns import Rows, gather, mapped, stacked
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -78,12 +78,13 @@ def _copy(column: NDArray[Any], rows: Rows) -> NDArray[Any]:
 def _observations(core: Core, slab: Slab, rows: Rows, rests: dict[int, Any]) -> Any:
     """Fresh columns; read-only views where the group hands those out and the rows allow it.
 
-    What one env has handed over as it is becomes a column without a copy.
+    What envs have handed over as it is leaves `rests`; that of one alone isn't copied.
     """
     if slab.observation is None:
-        if len(rests) == 1 and slab.layout.observations_apart and "observation" in rests[0]:
-            return mapped(lambda array: array[None], rests[0].pop("observation"))
-        return None
+        apart = slab.layout.observations_apart and rests
+        if not apart or not all("observation" in rest for rest in rests.values()):
+            return None
+        return stacked([rest.pop("observation") for rest in rests.values()])
     if not core.zero_copy:
         return gather(slab.observation, rows)
     contiguous = _contiguous(rows)

@@ -64,7 +64,7 @@ class Watcher(Protocol):
     """What a driver does for sources.
 
     Attributes:
-        shares_thread: there are tasks beside the operation that runs; it lets them have turns.
+        shares_thread: other tasks may use the group while an operation waits.
     """
 
     shares_thread: bool

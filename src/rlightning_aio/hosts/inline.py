@@ -11,9 +11,8 @@ from collections import deque
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
-import numpy as np
-
 from rlightning_aio.hosts.arena import Arena, map_shared
+from rlightning_aio.hosts.owned import owned
 from rlightning_aio.hosts.runner import EnvRunner, Rest
 from rlightning_aio.hosts.worker import (
     AttachOrder,
@@ -29,6 +28,7 @@ from rlightning_aio.protocol.slab import Slab
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    import numpy as np
     from numpy.typing import NDArray
 
     from rlightning_aio.hosts.base import Inbox
@@ -109,7 +109,7 @@ class InlineHost:
 
     def pack(self, content: Any) -> Any:
         """See `base.Host.pack`."""
-        return _owned(content)
+        return owned(content)
 
     def request_step(self, row: int, number: int, packed: tuple[Any, dict[str, Any]]) -> None:
         """See `base.Host.request_step`."""
@@ -135,18 +135,14 @@ class InlineHost:
         self._queue.append((row, number, execute, tell))
 
     def _tell_result(self, row: int, number: int, rest: Rest | None) -> None:
-        self._inbox.on_rest(self, row, number, self._given(row, rest) or {})
+        self._inbox.on_rest(self, row, number, rest or {})
 
     def _tell_value(self, row: int, number: int, value: Any) -> None:
         self._inbox.on_value(self, row, number, value)
 
     def step_now(self, row: int) -> Rest | None:
         """Step with the action in `row`, past the queue, which holds nothing for this env."""
-        return self._given(row, self._runners[row].step())
-
-    def _given(self, row: int, rest: Rest | None) -> Rest | None:
-        """`rest` as the trainer may keep it."""
-        return rest if rest is None or self._runners[row].hands_over else _owned(rest)
+        return self._runners[row].step()
 
     def order(self, count: int) -> bool:
         """Nothing gets ready by itself here."""
@@ -209,24 +205,9 @@ def _begun(runner: EnvRunner) -> Callable[[], Rest | None]:
     try:
         return runner.begin_step()
     except BaseException as error:
-        return partial(_reraise, error)  # When its result is asked for.
+        # When its result is asked for: of several requests all are to be taken first.
+        return partial(_reraise, error)
 
 
 def _reraise(error: BaseException) -> Rest | None:
     raise error
-
-
-def _owned(value: Any) -> Any:
-    """`value` with its containers and arrays copied: its maker may change them later.
-
-    Everything else is left as it is; a tensor must stay the tensor it is.
-    """
-    if isinstance(value, np.ndarray):
-        return cast("NDArray[Any]", value).copy()
-    if type(value) is dict:
-        return {key: _owned(inner) for key, inner in cast("dict[Any, Any]", value).items()}
-    if type(value) in (tuple, list):
-        return type(value)(map(_owned, value))
-    if hasattr(value, "_make") and not isinstance(value, type):
-        return value._make(map(_owned, value))  # A named tuple: a graph, for one.
-    return value

@@ -16,13 +16,16 @@ from rlightning_aio.envs.base import (
     BareReset,
     BareResult,
     BareStep,
+    BareStepAsync,
+    BareStepWait,
     BaseEnv,
     default_env_preprocess_fn,
     result_of,
 )
 from rlightning_aio.envs.tensors import as_numpy, holds_tensor
 from rlightning_aio.hosts.episodes import EpisodeSums
-from rlightning_aio.protocol.columns import row_reader, row_writer
+from rlightning_aio.hosts.owned import owned
+from rlightning_aio.protocol.columns import fitted_tree, leaves, row_reader, row_writer
 from rlightning_aio.protocol.info import NO_INFO, PICKLED, InfoSchema, InfoWriter
 from rlightning_aio.protocol.slab import RowLayout, Slab
 from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
@@ -46,18 +49,17 @@ class EnvRunner:
     Args:
         env: built, not yet initialised.
         inline: results stay in this process. Those that hold torch tensors are handed over
-            whole and untouched then (elsewhere tensors become NumPy arrays on the CPU), and
-            of an env with fresh results observation and info are, too.
+            whole and untouched then; elsewhere tensors become NumPy arrays on the CPU.
 
     Attributes:
-        hands_over: observations and infos are handed over untouched.
+        begin_step: starts a step whose simulator computes by itself, and returns what ends
+            it; None if it has none. `step` is both in one.
     """
 
     def __init__(self, env: BaseEnv, *, inline: bool = False) -> None:
         self.env = env
         self.meta: EnvMeta = env.init()
         self._inline = inline
-        self.hands_over = inline and env.fresh_results
         self.step: Callable[[], Rest | None] = self._not_attached
         self.begin_step: Callable[[], Callable[[], Rest | None]] | None = None
         self.reset_from_row: Callable[[], Rest | None] = self._not_attached
@@ -78,8 +80,13 @@ class EnvRunner:
             meta.action_space,
             (*agents, *sub_envs),
             meta.agents,
-            observations_apart=self.hands_over,
+            observations_apart=self._hands_over and leaves(meta.observation_space) is not None,
         )
+
+    @property
+    def _hands_over(self) -> bool:
+        """Whether the results of bare steps may be kept by whoever gets them."""
+        return self._inline and self.env.fresh_results and self.env.bare_step() is not None
 
     @property
     def reads_extras(self) -> bool:
@@ -98,7 +105,7 @@ class EnvRunner:
 
     def attach(self, slab: Slab, row: int, announce: Callable[[InfoSchema], int]) -> None:
         """Take `row` of `slab` for all further results."""
-        layout = self.layout
+        layout = self._layout = self.layout
         self._row = row
         self._slab = slab
         self._write_observation: Callable[[Any], None] | None = None
@@ -138,16 +145,31 @@ class EnvRunner:
         raise RuntimeError("this env has no row yet")
 
     def _stepper(self) -> Callable[[], Rest | None]:
-        bare = self.env.bare_step()
-        read_action = self._read_action
+        bare, read_action = self.env.bare_step(), self._read_action
         if read_action is None:
             return lambda: self.step_with(None, {})
-        write_observation = self._write_observation
-        if bare is None or (write_observation is None and not self.hands_over):
+        if bare is None:
             return lambda: self.step_with(read_action(), {})
-        resets_itself = self.meta.autoreset != "disabled"
-        if write_observation is None or self._slab.layout.head or resets_itself:
-            return self._batch_stepper(bare, read_action)
+        halves = self.env.bare_step_async()
+        single = not self._layout.head and self.meta.autoreset == "disabled"
+        if single and halves is None and self._write_observation is not None:
+            return self._single_stepper(bare, read_action, self._write_observation)
+        store, clock = self._bare_store(), time.monotonic_ns
+        if halves is not None:
+            self.begin_step = _step_beginner(halves, read_action, store)
+
+        def step() -> Rest | None:
+            began = clock()
+            return store(bare(read_action()), clock() - began)
+
+        return step
+
+    def _single_stepper(
+        self,
+        bare: BareStep,
+        read_action: Callable[[], Any],
+        write_observation: Callable[[Any], None],
+    ) -> Callable[[], Rest | None]:
         bare_reset = self.env.bare_reset()
         self.reset_episode, step, reset = _bare_stepper(
             bare,
@@ -155,6 +177,7 @@ class EnvRunner:
             read_action,
             write_observation,
             self._info_writer.write,
+            self._beside,
             self._slab,
             self._row,
         )
@@ -162,47 +185,48 @@ class EnvRunner:
             self.reset_from_row = reset
         return step
 
-    def _batch_stepper(
-        self, bare: BareStep, read_action: Callable[[], Any]
-    ) -> Callable[[], Rest | None]:
-        """A step of bare simulators whose episodes take more than a sum, or which hand over."""
+    def _bare_store(self) -> Callable[[BareResult, int], Rest | None]:
+        """A function that puts a bare result, which took so many ns, into the row."""
         slab, row, clock = self._slab, self._row, time.monotonic_ns
         # With an ellipsis an entry of a plain column is a view, too.
         reward, terminated, truncated = (
             column[row, ...] for column in (slab.reward, slab.terminated, slab.truncated)
         )
         done_times, busy_times = _view(slab.done_ns), _view(slab.busy_ns)
-        store_data = self._store_data
         count_step = self._count_step
+        store_data = self._hand_over if self._layout.observations_apart else self._store_data
 
-        def store(outcome: BareResult, began: int) -> Rest | None:
-            observation, reward[...], terminated[...], truncated[...], info = outcome
-            done_times[row] = done = clock()
-            busy_times[row] = done - began
+        def store(result: BareResult, busy_ns: int) -> Rest | None:
+            observation, reward[...], terminated[...], truncated[...], info = result
+            done_times[row] = clock()
+            busy_times[row] = busy_ns
             count_step(info)
-            return store_data(observation, info)
+            return store_data(observation, info) or None
 
-        def step() -> Rest | None:
-            began = clock()
-            return store(bare(read_action()), began)
+        return store
 
-        def begin_step() -> Callable[[], Rest | None]:
-            began = clock()
-            start(read_action())
-            return lambda: store(wait(), began)
+    def _hand_over(self, observation: Any, info: dict[str, Any]) -> Rest:
+        """What the row would only copy."""
+        space = self._layout.observation_space
+        return {"observation": fitted_tree(space, observation, "observation"), "info": info}
 
-        if (halves := self.env.bare_step_async()) is not None:
-            start, wait = halves
-            self.begin_step = begin_step
-        return step
-
-    def _store_data(self, observation: Any, info: dict[str, Any]) -> Rest | None:
-        """Put them into the row, or hand them over."""
+    def _store_data(self, observation: Any, info: dict[str, Any]) -> Rest:
+        """Put them into the row; what doesn't fit there."""
+        if self._layout.observations_apart:
+            return self._beside(self._hand_over(observation, info))
+        rest: Rest = {}
         if self._write_observation is None:
-            return {"observation": observation, "info": info}
-        self._write_observation(observation)
+            rest["observation"] = observation
+        else:
+            self._write_observation(observation)
         mark = self._slab.info_mark[self._row] = self._info_writer.write(info)
-        return {"info": info} if mark == PICKLED else None
+        if mark == PICKLED:
+            rest["info"] = as_numpy(info)
+        return self._beside(rest)
+
+    def _beside(self, rest: Rest) -> Rest:
+        """`rest` as the trainer may keep it; it is pickled on its way to another process."""
+        return owned(rest) if rest and self._inline else rest
 
     def reset_episode(self) -> None:
         """Forget what was summed up of the current episode."""
@@ -254,13 +278,9 @@ class EnvRunner:
         self._store_head(result, stepped=stepped)
         if "ret" in rest:
             return rest
-        if self._write_observation is None:
-            rest["observation"] = observation
-        else:
-            self._write_observation(observation)
-        self._store_info(result.info, rest)
+        rest = self._store_data(observation, result.info)
         if result._extra:  # pyright: ignore[reportPrivateUsage]
-            rest["extra"] = result._extra  # pyright: ignore[reportPrivateUsage]
+            rest |= self._beside({"extra": result._extra})  # pyright: ignore[reportPrivateUsage]
         return rest or None
 
     def _store_head(self, result: EnvRet | MultiAgentEnvRet, *, stepped: bool) -> None:
@@ -297,12 +317,6 @@ class EnvRunner:
             )
         column[self._row] = array
 
-    def _store_info(self, info: dict[str, Any], rest: Rest) -> None:
-        mark = PICKLED if self.hands_over else self._info_writer.write(info)
-        if mark == PICKLED:
-            rest["info"] = as_numpy(info)
-        self._slab.info_mark[self._row] = mark
-
 
 def _bare_stepper(
     bare: BareStep,
@@ -310,6 +324,7 @@ def _bare_stepper(
     read_action: Callable[[], Any],
     write_observation: Callable[[Any], None],
     write_info: Callable[[dict[str, Any]], int],
+    beside: Callable[[Rest], Rest],
     slab: Slab,
     row: int,
 ) -> tuple[Callable[[], None], Callable[[], Rest | None], Callable[[], Rest | None]]:
@@ -324,13 +339,14 @@ def _bare_stepper(
     clock = time.monotonic_ns
     episode_return = 0.0
     episode_length = 0
+    over = False
 
     def forget() -> None:
-        nonlocal episode_return, episode_length
-        episode_return, episode_length = 0.0, 0
+        nonlocal episode_return, episode_length, over
+        episode_return, episode_length, over = 0.0, 0, False
 
     def step() -> Rest | None:
-        nonlocal episode_return, episode_length
+        nonlocal episode_return, episode_length, over
         began = clock()
         observation, reward, terminated, truncated, info = bare(read_action())
         done = clock()
@@ -344,10 +360,11 @@ def _bare_stepper(
         episode_length += 1
         if terminated or truncated:
             slab.episode_return[row] = episode_return
-            slab.episode_length[row] = episode_length
-            episode_return, episode_length = 0.0, 0
+            # What comes after an end belongs to no episode; see `EpisodeSums`.
+            slab.episode_length[row] = 0 if over else episode_length
+            over = True
         marks[row] = mark = write_info(info) if info else NO_INFO
-        return {"info": info} if mark == PICKLED else None
+        return beside({"info": info}) if mark == PICKLED else None
 
     def reset() -> Rest | None:
         assert bare_reset is not None
@@ -361,9 +378,36 @@ def _bare_stepper(
         rewards[row] = 0.0
         terminations[row] = truncations[row] = False
         marks[row] = mark = write_info(info) if info else NO_INFO
-        return {"info": info} if mark == PICKLED else None
+        return beside({"info": info}) if mark == PICKLED else None
 
     return forget, step, reset
+
+
+def _step_beginner(
+    halves: tuple[BareStepAsync, BareStepWait],
+    read_action: Callable[[], Any],
+    store: Callable[[BareResult, int], Rest | None],
+) -> Callable[[], Callable[[], Rest | None]]:
+    """A function that starts a step and returns what ends it.
+
+    Its time is that of the two halves: in between, the trainer's own goes by.
+    """
+    start, wait = halves
+    clock = time.monotonic_ns
+
+    def begin() -> Callable[[], Rest | None]:
+        began = clock()
+        start(read_action())
+        spent = clock() - began
+
+        def end() -> Rest | None:
+            began = clock()
+            result = wait()
+            return store(result, spent + clock() - began)
+
+        return end
+
+    return begin
 
 
 def _view(array: NDArray[Any]) -> memoryview[Any]:

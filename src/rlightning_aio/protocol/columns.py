@@ -10,14 +10,14 @@ travel pickled.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard, cast
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Collection, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -29,6 +29,7 @@ __all__ = [
     "as_array",
     "assemble",
     "fitted",
+    "fitted_tree",
     "gather",
     "index",
     "is_dict",
@@ -38,6 +39,7 @@ __all__ = [
     "mapped",
     "row_reader",
     "row_writer",
+    "stacked",
 ]
 
 Tree: TypeAlias = Any
@@ -131,6 +133,16 @@ def gather(tree: _Node, rows: Rows) -> Any:
     return mapped(lambda array: gather(array, rows), tree)
 
 
+def stacked(trees: Sequence[_Node]) -> Tree:
+    """Trees of one structure along a new first axis; a single one is not copied."""
+    first = trees[0]
+    if isinstance(first, dict):
+        return {key: stacked([cast("Any", tree)[key] for tree in trees]) for key in first}
+    if isinstance(first, tuple):
+        return tuple(map(stacked, zip(*cast("Any", trees), strict=True)))
+    return first[None] if len(trees) == 1 else np.stack(cast("Any", trees))
+
+
 def index(tree: _Node, position: int) -> Tree:
     """Row `position` of each array: a view, or a NumPy scalar where a row is one number."""
     return tree[position] if isinstance(tree, np.ndarray) else mapped(lambda a: a[position], tree)
@@ -162,6 +174,40 @@ def fitted(value: Any, leaf: Leaf, what: str) -> NDArray[Any]:
             f"{leaf.dtype}, found shape {array.shape} and dtype {array.dtype}"
         )
     return array
+
+
+def fitted_tree(
+    space: gym.Space[Any], value: Any, what: str, path: tuple[str | int, ...] = ()
+) -> Tree:
+    """`value` as arrays of the shapes and dtypes of `space`; those that have them, uncopied.
+
+    Raises:
+        Misfit: as the function that `row_writer` makes.
+    """
+    if is_dict(space):
+        _check_keys(value, space.spaces.keys(), what, path)
+        parts = space.spaces.items()
+        return {key: fitted_tree(inner, value[key], what, (*path, key)) for key, inner in parts}
+    if is_tuple(space):
+        _check_length(value, len(space.spaces), what, path)
+        return tuple(
+            fitted_tree(inner, part, what, (*path, position))
+            for position, (inner, part) in enumerate(zip(space.spaces, value, strict=True))
+        )
+    assert _is_array(space)
+    if type(value) is np.ndarray and value.shape == space.shape and value.dtype == space.dtype:
+        return value
+    return fitted(value, Leaf(path, space.shape, space.dtype), what).astype(space.dtype)
+
+
+def _check_keys(value: Any, keys: Collection[str], what: str, path: tuple[str | int, ...]) -> None:
+    if not hasattr(value, "keys") or value.keys() != keys:
+        raise _misplaced(what, path, f"a dict with keys {sorted(map(str, keys))}", value)
+
+
+def _check_length(value: Any, length: int, what: str, path: tuple[str | int, ...]) -> None:
+    if not isinstance(value, tuple | list) or len(cast("list[Any]", value)) != length:
+        raise _misplaced(what, path, f"a tuple of {length}", value)
 
 
 def _misplaced(what: str, path: tuple[str | int, ...], expected: str, value: Any) -> Misfit:
@@ -214,8 +260,7 @@ def _dict_writer(
     }
 
     def write(value: Any) -> None:
-        if not hasattr(value, "keys") or value.keys() != writers.keys():
-            raise _misplaced(what, path, f"a dict with keys {sorted(map(str, writers))}", value)
+        _check_keys(value, writers.keys(), what, path)
         for key, writer in writers.items():
             writer(value[key])
 
@@ -231,8 +276,7 @@ def _tuple_writer(
     ]
 
     def write(value: tuple[Any, ...] | list[Any] | NDArray[Any]) -> None:
-        if not isinstance(value, tuple | list) or len(value) != len(writers):
-            raise _misplaced(what, path, f"a tuple of {len(writers)}", value)
+        _check_length(value, len(writers), what, path)
         for writer, part in zip(writers, value, strict=True):
             writer(part)
 

@@ -60,8 +60,15 @@ class RowLayout:
 
     @property
     def key(self) -> tuple[object, ...]:
-        """Equal for layouts whose rows are interchangeable in memory."""
-        return (self.observation_leaves, self.action_leaves, self.head, self.agents)
+        """Equal for layouts whose rows are interchangeable, and whose observations stack."""
+        observations = leaves(self.observation_space)
+        return (
+            observations,
+            self.observations_apart,
+            self.action_leaves,
+            self.head,
+            self.agents,
+        )
 
     def _arrays(self) -> Iterator[tuple[tuple[int, ...], np.dtype[Any]]]:
         for leaf in (*(self.observation_leaves or ()), *(self.action_leaves or ())):

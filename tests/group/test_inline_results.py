@@ -1,0 +1,161 @@
+"""What inline envs may do beyond a worker's: start early, and hand over what they have made."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from group import sample_envs
+
+import rlightning_aio.sync
+from rlightning_aio.envs.contract import same
+from rlightning_aio.errors import EnvRaised
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from rlightning_aio import BatchedData
+
+HALVED = {"name": "one", "backend": "halved", "task": "-", "placement": "inline"}
+
+
+def fresh(task: str, **fields: Any) -> dict[str, Any]:
+    entry = {"name": task, "backend": "fresh", "task": task, "placement": "inline"}
+    return entry | fields
+
+
+def step(group: Any, batch: BatchedData) -> BatchedData:
+    return group.step(batch.respond(action=np.zeros(len(batch), int)))[0]
+
+
+@pytest.fixture
+def halved() -> Iterator[rlightning_aio.sync.EnvGroup]:
+    sample_envs.Halved.log.clear()
+    with rlightning_aio.sync.build_env_group(HALVED) as group:
+        yield group
+
+
+def test_a_step_of_halves_starts_when_it_is_sent(halved: rlightning_aio.sync.EnvGroup) -> None:
+    """The simulator computes while the trainer does something else."""
+    batch, _ = halved.reset()
+    halved.step_async(batch.respond(action=np.array([5])))
+    assert sample_envs.Halved.log == ["start"]
+    batch, _ = halved.collect_async()
+    assert sample_envs.Halved.log == ["start", "wait"]
+    assert batch.observation.tolist() == [[-1, 5]]
+    assert batch.info == [{"nested": {"total": 5}, "success": False}]
+
+
+@pytest.mark.parametrize("action", [9, 8])
+def test_an_error_of_either_half_is_the_steps(
+    halved: rlightning_aio.sync.EnvGroup, action: int
+) -> None:
+    """It is raised where the result would have come."""
+    batch, _ = halved.reset()
+    halved.step_async(batch.respond(action=np.array([action])))
+    with pytest.raises(EnvRaised, match=r"'one-0'.* raised in step: ValueError: no (start|end)"):
+        halved.collect_async()
+    batch, _ = halved.reset()
+    assert batch.observation.tolist() == [[-1, 0]]
+
+
+def test_an_interrupt_of_the_first_half_comes_with_the_result(
+    halved: rlightning_aio.sync.EnvGroup,
+) -> None:
+    """Of several requests all are sent before anything is raised."""
+    batch, _ = halved.reset()
+    halved.step_async(batch.respond(action=np.array([sample_envs.Halved.INTERRUPT_START])))
+    with pytest.raises(KeyboardInterrupt):
+        halved.collect_async()
+
+
+def test_what_the_trainer_does_between_the_halves_is_not_the_envs_time() -> None:
+    """The time of a step is that of its two halves."""
+    clock = SimpleNamespace(now=0, monotonic_ns=lambda: clock.now)
+
+    class Timed(sample_envs.Halved):
+        def _start(self, action: Any) -> None:
+            clock.now += 5
+            super()._start(action)
+
+        def _wait(self) -> Any:
+            clock.now += 7
+            return super()._wait()
+
+    with (
+        patch.dict(rlightning_aio.ENVS._classes, {"halved": Timed}),
+        patch("rlightning_aio.hosts.runner.time", clock),
+        rlightning_aio.sync.build_env_group(HALVED) as group,
+    ):
+        batch, _ = group.reset()
+        group.step_async(batch.respond(action=np.array([1])))
+        clock.now += 1000
+        batch, _ = group.collect_async()
+        (part,) = batch.parts
+        assert part.busy_ns.tolist() == [12]
+
+
+@pytest.mark.parametrize("task", sample_envs.Fresh.SPACES)
+@pytest.mark.parametrize("num_workers", [1, 2])
+def test_fresh_observations_are_those_of_a_worker(task: str, num_workers: int) -> None:
+    """Arrays or not, one or several; what they look like doesn't depend on where the env lives."""
+    found: list[Any] = []
+    for placement in ("inline", "process"):
+        entry = fresh(task, num_workers=num_workers, placement=placement)
+        with rlightning_aio.sync.build_env_group(entry) as group:
+            batch, _ = group.reset()
+            batches = [batch, step(group, batch), step(group, batch)]
+            found.append([(b.observation, [v.observation for v in b.values()]) for b in batches])
+    assert same(*found)
+    assert repr(found[0]) == repr(found[1])
+
+
+def test_fresh_observations_are_handed_over_uncopied() -> None:
+    """The column is a view of the very array that the env has made."""
+    with rlightning_aio.sync.build_env_group(fresh("array")) as group:
+        batch = step(group, group.reset()[0])
+        assert np.shares_memory(batch.observation, group["array-0"].get_attr("given", "outer"))
+
+
+@pytest.mark.filterwarnings("ignore:.*Casting input x to numpy array:UserWarning")
+def test_envs_of_different_spaces_stack_each_for_itself() -> None:
+    """Handed over or not, what doesn't stack isn't put together."""
+    with rlightning_aio.sync.build_env_group([fresh(t) for t in sample_envs.Fresh.SPACES]) as group:
+        batch = step(group, group.reset()[0])
+        by_name = batch.by_name()
+        for task, space in sample_envs.Fresh.SPACES.items():
+            (value,) = by_name[task].values()
+            assert value.observation in space
+        assert by_name["array"].observation.shape == (1, 3)
+        assert by_name["tree"].observation["image"].shape == (1, 4, 5, 3)
+        assert isinstance(by_name["words"].observation, list)
+
+
+def test_fresh_observations_have_the_spaces_dtype_and_shape() -> None:
+    """Others are cast where that loses nothing but precision, and refused elsewhere."""
+    with rlightning_aio.sync.build_env_group(
+        fresh("array", env_kwargs={"gives": [0.5, 0.25, 0.0]})
+    ) as group:
+        batch = step(group, group.reset()[0])
+        assert (batch.observation.dtype, batch.observation.tolist()) == (
+            np.float32,
+            [[0.5, 0.25, 0.0]],
+        )
+    with rlightning_aio.sync.build_env_group(
+        fresh("array", env_kwargs={"gives": [0.5, 0.25]})
+    ) as group:
+        batch, _ = group.reset()
+        with pytest.raises(EnvRaised, match=r"Misfit: observation .* expected shape \(3,\)"):
+            step(group, batch)
+        assert group.reset()[0].observation.shape == (1, 3)
+
+
+def test_a_step_of_ones_own_promises_nothing() -> None:
+    """A subclass may write to its results again; `fresh_results` is about `bare_step`."""
+    with rlightning_aio.sync.build_env_group(fresh("array", backend="stale")) as group:
+        batch, _ = group.reset()
+        batches = [batch := step(group, batch) for _ in range(3)]
+    assert [b.observation[0, 0] for b in batches] == [0.25, 0.5, 0.75]
