@@ -126,7 +126,7 @@ class BaseEnv(abc.ABC):
         """The simulator's own ``action -> (obs, reward, terminated, truncated, info)``.
 
         Return it only if `step` adds nothing to it; None (the default) has the runtime
-        call `step`.
+        call `step`. The action is its own: nobody writes to it again.
         """
         return None
 

@@ -135,7 +135,9 @@ class EnvPoolEnv(BaseEnv):
         return EnvRet(env_id=self.env_id, observation=observation, info=info)
 
     def step(self, policy_resp: PolicyResponse) -> EnvRet:
-        return result_of(self.env_id, self._step(self._preprocess_fn(policy_resp)))
+        # The pool reads an action when it needs it; of this one the caller may make another.
+        action = np.array(as_numpy(self._preprocess_fn(policy_resp)))
+        return result_of(self.env_id, self._step(action))
 
     def bare_step(self) -> BareStep | None:
         return self._step if self._is_bare else None
@@ -153,7 +155,7 @@ class EnvPoolEnv(BaseEnv):
         return self._receive()
 
     def _send(self, action: Any) -> None:
-        """Answer the last result."""
+        """Answer the last result with an action that nobody writes to any more."""
         if self._ready is None:
             raise RuntimeError(f"env {self.env_id!r} was stepped before its first reset")
         if type(action) is not np.ndarray:
@@ -206,8 +208,8 @@ class _PoolArrays:
         )
 
     def send(self, action: Any, env_ids: NDArray[np.int32]) -> None:
-        """As the pool's `send`. The pool reads the action later, so it gets one of its own."""
-        action = np.array(action, self._action_dtype, order="C")
+        """As the pool's `send`, which would copy the action: this one is the pool's own."""
+        action = np.ascontiguousarray(action, self._action_dtype)
         if action.shape != (len(env_ids), *self._action_shape):
             raise ValueError(
                 f"an action of shape {action.shape} for {len(env_ids)} sub-environments; "

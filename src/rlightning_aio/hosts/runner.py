@@ -117,6 +117,8 @@ class EnvRunner:
         if slab.action is not None:
             self._read_action = row_reader(layout.action_space, slab.action, row)
         self._info_writer = InfoWriter(memoryview(slab.info[row]), announce)
+        # With an ellipsis an entry of a plain column is a view, too.
+        self._reward, self._ends = slab.reward[row, ...], slab.ends[row, ...]
         # Whether results come from some of the sub-environments at a time.
         self._takes_turns = self.env.config.num_envs > self.meta.num_envs
         episodes = (self.env.config.num_envs,) if self._takes_turns else layout.head
@@ -188,10 +190,7 @@ class EnvRunner:
     def _bare_store(self) -> Callable[[BareResult, int], Rest | None]:
         """A function that puts a bare result, which took so many ns, into the row."""
         slab, row, clock = self._slab, self._row, time.monotonic_ns
-        # With an ellipsis an entry of a plain column is a view, too.
-        reward, terminated, truncated = (
-            column[row, ...] for column in (slab.reward, slab.terminated, slab.truncated)
-        )
+        reward, terminated, truncated = self._reward, self._ends[..., 0], self._ends[..., 1]
         done_times, busy_times = _view(slab.done_ns), _view(slab.busy_ns)
         count_step = self._count_step
         store_data = self._hand_over if self._layout.observations_apart else self._store_data
@@ -298,10 +297,10 @@ class EnvRunner:
 
     def _count_step(self, info: dict[str, Any]) -> None:
         """Add the step that the row holds to its episodes."""
-        slab, row = self._slab, self._row
         which = np.asarray(info["env_id"]) if self._takes_turns else ...
-        sums = self._episodes.add(slab.reward[row], slab.ends[row], which)
+        sums = self._episodes.add(self._reward, self._ends, which)
         if sums is not None:
+            slab, row = self._slab, self._row
             slab.episode_return[row], slab.episode_length[row] = sums
 
     def _store_flag(self, what: str, column: Any, value: Any, agents: tuple[str, ...]) -> None:

@@ -184,6 +184,8 @@ def fitted_tree(
     Raises:
         Misfit: as the function that `row_writer` makes.
     """
+    if type(value) is np.ndarray and value.shape == space.shape and value.dtype == space.dtype:
+        return value
     if is_dict(space):
         _check_keys(value, space.spaces.keys(), what, path)
         parts = space.spaces.items()
@@ -195,8 +197,6 @@ def fitted_tree(
             for position, (inner, part) in enumerate(zip(space.spaces, value, strict=True))
         )
     assert _is_array(space)
-    if type(value) is np.ndarray and value.shape == space.shape and value.dtype == space.dtype:
-        return value
     return fitted(value, Leaf(path, space.shape, space.dtype), what).astype(space.dtype)
 
 
