@@ -6,7 +6,10 @@ import mmap
 import os
 import random
 import socket
+import sys
+import threading
 from collections import deque
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -27,6 +30,9 @@ from rlightning_aio.protocol.rings import (
     rings_size,
     slot_of,
 )
+
+if TYPE_CHECKING:
+    from types import FrameType
 
 
 class RingsMachine(RuleBasedStateMachine):
@@ -206,3 +212,56 @@ def test_two_processes_never_miss_each_other() -> None:
         assert found == entries
     ours.close()
     assert os.waitpid(pid, 0)[1] == 0
+
+
+def test_rings_of_several_threads_are_fenced_each_for_itself() -> None:
+    """A group may be used in any one thread, and several groups in several at once."""
+    failures: list[RuntimeError] = []
+
+    def work() -> None:
+        trainer = TrainerRings(memoryview(bytearray(rings_size(1))), 1)
+        try:
+            for _ in range(20_000):
+                trainer.worker_sleeps()
+        except RuntimeError as failure:
+            failures.append(failure)
+
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        threads = [threading.Thread(target=work) for _ in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    finally:
+        sys.setswitchinterval(interval)
+    assert not failures
+
+
+def test_an_interrupt_within_a_fence_leaves_the_next_one_whole() -> None:
+    """Wherever Ctrl-C strikes."""
+    trainer = TrainerRings(memoryview(bytearray(rings_size(1))), 1)
+    struck = 0
+
+    def strike(frame: FrameType, event: str, arg: Any) -> Any:
+        nonlocal lines
+        if frame.f_code.co_name != "fence":
+            return strike
+        if event == "line":
+            lines -= 1
+            if lines == 0:
+                raise KeyboardInterrupt
+        return strike
+
+    for first in range(1, 10):
+        lines = first
+        sys.settrace(strike)
+        try:
+            trainer.worker_sleeps()
+        except KeyboardInterrupt:
+            struck += 1
+        finally:
+            sys.settrace(None)
+        trainer.worker_sleeps()
+    assert 2 <= struck < 9

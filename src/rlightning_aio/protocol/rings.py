@@ -33,7 +33,6 @@ __all__ = [
     "TrainerRings",
     "WorkerRings",
     "entry",
-    "fence",
     "number_of",
     "op_of",
     "rings_size",
@@ -74,7 +73,8 @@ _STORES_STAY_IN_ORDER: Final = platform.machine() in ("x86_64", "AMD64")
 
 
 def _new_fence() -> Callable[[], None]:
-    """Releasing and retaking a held lock orders all memory accesses around it.
+    """A fence of one thread: it releases and retakes a held lock, which orders all memory
+    accesses around it.
 
     On x86 both are locked instructions; on ARM a store-release followed by a
     load-acquire of the same word.
@@ -84,13 +84,13 @@ def _new_fence() -> Callable[[], None]:
     release, acquire = lock.release, lock.acquire
 
     def fence() -> None:
-        release()
+        try:  # noqa: SIM105  # `suppress` would take longer than all the rest.
+            release()
+        except RuntimeError:
+            pass  # A Ctrl-C had struck between the two.
         acquire()
 
     return fence
-
-
-fence = _new_fence()
 
 
 def entry(number: int, slot: int, op: int) -> int:
@@ -138,6 +138,7 @@ class TrainerRings:
         self._reports: NDArray[np.int64] = np.frombuffer(reports, np.int64)
         self._capacity = _capacity(rows)
         self._mask = self._capacity - 1
+        self._fence = _new_fence()
         self._sent = 0
         self._read = 0
         self._orders = 0
@@ -154,7 +155,7 @@ class TrainerRings:
             self._requests[start:] = entries[:room]
             self._requests[: count - room] = entries[room:]
         self._sent += count
-        fence()
+        self._fence()
         self._words[_REQUESTS_SENT] = self._sent
         return self.worker_sleeps()
 
@@ -166,7 +167,7 @@ class TrainerRings:
 
     def worker_sleeps(self) -> bool:
         """Whether the worker must be rung to see what was just published."""
-        fence()
+        self._fence()
         return self._words[_WORKER_ASLEEP] != 0
 
     def count_frame(self) -> bool:
@@ -188,14 +189,14 @@ class TrainerRings:
         count = sent - self._read
         if not count:
             return self._reports[:0]
-        fence()
+        self._fence()
         start = self._read & self._mask
         room = self._capacity - start
         if count <= room:
             found = self._reports[start : start + count].copy()
         else:
             found = np.concatenate((self._reports[start:], self._reports[: count - room]))
-        fence()
+        self._fence()
         self._read = sent
         self._words[_REPORTS_READ] = sent
         return found
@@ -204,7 +205,7 @@ class TrainerRings:
         """Order one bell as soon as `count` reports are unread; True if they already are."""
         self._orders += 1
         self._words[_WANTED] = (self._orders << _WANTED_BITS) | count
-        fence()
+        self._fence()
         return self.unread() >= count
 
     def forget_want(self) -> None:
@@ -229,6 +230,7 @@ class WorkerRings:
     def __init__(self, buffer: memoryview, rows: int) -> None:
         self._words, self._requests, self._reports = _split(buffer, rows)
         self._mask = _capacity(rows) - 1
+        self._fence = _new_fence()
         self._read = 0
         self._sent = 0
         self._obeyed = 0
@@ -240,7 +242,7 @@ class WorkerRings:
         sent = self._words[_REQUESTS_SENT]
         if sent == self._read:
             return []
-        fence()
+        self._fence()
         start = self._read & self._mask
         end = start + sent - self._read
         self._read = sent
@@ -282,13 +284,13 @@ class WorkerRings:
             reports[self._sent & mask] = request
             self._sent = sent = self._sent + 1
             if not _STORES_STAY_IN_ORDER:
-                fence()
+                self._fence()
             words[_REPORTS_SENT] = sent
             # Not fenced: an order that is missed here is seen after the next entry, or below.
             wanted = words[_WANTED]
             if wanted != self._obeyed and sent - words[_REPORTS_READ] >= wanted & _WANTED_MASK:
                 self._obey(wanted, ring)
-        fence()
+        self._fence()
         wanted = words[_WANTED]
         if wanted != self._obeyed and self._sent - words[_REPORTS_READ] >= wanted & _WANTED_MASK:
             self._obey(wanted, ring)
@@ -312,7 +314,7 @@ class WorkerRings:
     def fall_asleep(self) -> bool:
         """Say that this worker sleeps; False if something came meanwhile."""
         self._words[_WORKER_ASLEEP] = 1
-        fence()
+        self._fence()
         if self.has_news():
             self._words[_WORKER_ASLEEP] = 0
             return False
