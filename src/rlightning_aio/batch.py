@@ -447,15 +447,10 @@ class BatchedData:
         """
         columns = {"action": action, **extras}
         for name, column in columns.items():
-            self._check_rows(name, column)
+            mapped(lambda leaf, name=name: self._check_rows(name, leaf), column)
         return self._response(columns)
 
-    def _check_rows(self, name: str, column: Tree) -> None:
-        if isinstance(column, dict | tuple):
-            tree = cast("dict[str, Tree] | tuple[Tree, ...]", column)
-            for part in tree.values() if isinstance(tree, dict) else tree:
-                self._check_rows(name, part)
-            return
+    def _check_rows(self, name: str, column: Any) -> None:
         try:
             rows = len(column)
         except TypeError:

@@ -14,7 +14,7 @@ import rlightning_aio
 import rlightning_aio.sync
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Iterator
 
 assert sample_envs  # Registers its envs.
 
@@ -98,3 +98,11 @@ async def start(place: Place) -> AsyncIterator[Any]:
     yield start
     while groups:
         await groups.pop().close()
+
+
+@pytest.fixture
+def halved() -> Iterator[rlightning_aio.sync.EnvGroup]:
+    """A group of one inline env whose steps have two halves."""
+    sample_envs.Halved.log.clear()
+    with rlightning_aio.sync.build_env_group(sample_envs.HALVED) as group:
+        yield group

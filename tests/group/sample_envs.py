@@ -223,6 +223,9 @@ class Sloppy(Probe):
         return result if policy_resp.action else None
 
 
+HALVED = {"name": "one", "backend": "halved", "task": "-", "placement": "inline"}
+
+
 @ENVS.register("halved")
 class Halved(BaseEnv):
     """Adds up its actions, in steps of two halves.

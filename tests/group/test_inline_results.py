@@ -9,17 +9,14 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 from group import sample_envs
+from group.sample_envs import HALVED
 
 import rlightning_aio.sync
 from rlightning_aio.envs.contract import same
 from rlightning_aio.errors import EnvRaised
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from rlightning_aio import BatchedData
-
-HALVED = {"name": "one", "backend": "halved", "task": "-", "placement": "inline"}
 
 
 def fresh(task: str, **fields: Any) -> dict[str, Any]:
@@ -29,13 +26,6 @@ def fresh(task: str, **fields: Any) -> dict[str, Any]:
 
 def step(group: Any, batch: BatchedData) -> BatchedData:
     return group.step(batch.respond(action=np.zeros(len(batch), int)))[0]
-
-
-@pytest.fixture
-def halved() -> Iterator[rlightning_aio.sync.EnvGroup]:
-    sample_envs.Halved.log.clear()
-    with rlightning_aio.sync.build_env_group(HALVED) as group:
-        yield group
 
 
 def test_a_step_of_halves_starts_when_it_is_sent(halved: rlightning_aio.sync.EnvGroup) -> None:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import asyncio
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
 import pytest
 from group import sample_envs
+from group.sample_envs import HALVED
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -20,10 +21,6 @@ from rlightning_aio.errors import EnvRaised
 from rlightning_aio.group.core import Core
 from rlightning_aio.group.lone import LoneCore
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-HALVED = {"name": "one", "backend": "halved", "task": "-", "placement": "inline"}
 PROBE = HALVED | {"backend": "probe"}
 CARTPOLE = HALVED | {"backend": "gymnasium", "task": "CartPole-v1"}
 
@@ -97,13 +94,6 @@ class Used:
         self.context.close()
         self.group.close()
         return stats
-
-
-@pytest.fixture
-def halved() -> Iterator[rlightning_aio.sync.EnvGroup]:
-    sample_envs.Halved.log.clear()
-    with rlightning_aio.sync.build_env_group(HALVED) as group:
-        yield group
 
 
 # Interrupts have tests of their own.

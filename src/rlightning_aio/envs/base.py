@@ -131,7 +131,7 @@ class BaseEnv(abc.ABC):
         return None
 
     def bare_step_async(self) -> tuple[BareStepAsync, BareStepWait] | None:
-        """`bare_step` in two halves: one starts a step, the other waits for its end.
+        """`bare_step` in two halves: one only starts a step, the other waits for its end.
 
         Return them, beside a `bare_step`, if the simulator computes by itself in between: with
         inline placement a step whose action fits its row starts when it is sent then, not when

@@ -158,8 +158,7 @@ class EnvPoolEnv(BaseEnv):
         """Answer the last result with an action that nobody writes to any more."""
         if self._ready is None:
             raise RuntimeError(f"env {self.env_id!r} was stepped before its first reset")
-        if type(action) is not np.ndarray:
-            action = np.asarray(as_numpy(action))
+        action = np.asarray(action)
         self._arrays.send(action if self.num_envs > 1 else action[None], self._ready)
 
     def _receive(self) -> BareResult:

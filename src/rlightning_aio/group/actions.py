@@ -15,7 +15,7 @@ import numpy as np
 
 from rlightning_aio.errors import BadAction
 from rlightning_aio.hosts.runner import NO_ACTION
-from rlightning_aio.protocol.columns import Leaf, Tree, index
+from rlightning_aio.protocol.columns import Leaf, Tree, as_array, index
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -187,12 +187,8 @@ def _plain(action: Any) -> Any:
 
 
 def _as_array(value: Any) -> NDArray[Any]:
-    if type(value) is np.ndarray:
-        return value
-    if hasattr(value, "detach"):
-        value = value.detach().cpu()
     try:
-        return np.asarray(value)
+        return as_array(value)
     except ValueError as error:
         raise BadAction(f"an action is no array: {error}; nothing was sent") from None
 

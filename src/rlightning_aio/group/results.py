@@ -81,8 +81,8 @@ def _observations(core: Core, slab: Slab, rows: Rows, rests: dict[int, Any]) -> 
     What envs have handed over as it is leaves `rests`; that of one alone isn't copied.
     """
     if slab.observation is None:
-        apart = slab.layout.observations_apart and rests
-        if not apart or not all("observation" in rest for rest in rests.values()):
+        handed_over = slab.layout.observations_apart and len(rests) > 0
+        if not handed_over or not all("observation" in rest for rest in rests.values()):
             return None
         return stacked([rest.pop("observation") for rest in rests.values()])
     if not core.zero_copy:
