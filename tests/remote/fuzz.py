@@ -13,7 +13,7 @@ import numpy as np
 from remote.random_spaces import mutation
 from remote.unreliable import World
 
-from rlightning_aio.protocol.client_session import Refused
+from rlightning_aio.protocol.net.client_session import Refused
 
 _KEPT = 200
 

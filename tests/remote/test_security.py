@@ -18,7 +18,7 @@ from rlightning_aio import ConfigError, sync
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.errors import StartFailed
 from rlightning_aio.hosts.remote import server_settings
-from rlightning_aio.protocol.wire import Hello, Writer
+from rlightning_aio.protocol.net.wire import Hello, Writer
 from rlightning_aio.remote import RemoteEnvClient, make_keys
 from rlightning_aio.remote.keys import read_client_keys, read_server_keys
 

@@ -11,9 +11,9 @@ import pytest
 from remote.unreliable import HEARTBEAT, OBSERVATION, Client, World
 
 from rlightning_aio.errors import BadAction, EnvBusy, EnvRaised, UnknownEnv
-from rlightning_aio.protocol.client_session import ClientSession, Ended, Phase, Refused
-from rlightning_aio.protocol.server_session import ServerSessions
-from rlightning_aio.protocol.wire import Hello, Welcome, Writer
+from rlightning_aio.protocol.net.client_session import ClientSession, Ended, Phase, Refused
+from rlightning_aio.protocol.net.server_session import ServerSessions
+from rlightning_aio.protocol.net.wire import Hello, Welcome, Writer
 from rlightning_aio.types import EnvMeta, EnvRet
 
 

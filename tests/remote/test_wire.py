@@ -15,11 +15,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from remote.random_spaces import any_info, any_space, same, sampled
 
-from rlightning_aio.protocol import wire
 from rlightning_aio.protocol.columns import Misfit
-from rlightning_aio.protocol.payload import Outcome, Packed, ResultLayout, SpaceLayout
-from rlightning_aio.protocol.space_description import UnsupportedSpace, describe, space_from
-from rlightning_aio.protocol.wire import FromClient, Reader, Result, WireError, Writer, portable
+from rlightning_aio.protocol.net import wire
+from rlightning_aio.protocol.net.payload import Outcome, Packed, ResultLayout, SpaceLayout
+from rlightning_aio.protocol.net.space_description import UnsupportedSpace, describe, space_from
+from rlightning_aio.protocol.net.wire import FromClient, Reader, Result, WireError, Writer, portable
 
 
 def through_wire(message: Any, frames: list[bytes] | None = None) -> tuple[Any, Any]:

@@ -12,10 +12,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from rlightning_aio.protocol import wire
-from rlightning_aio.protocol.payload import Packed, SpaceLayout
-from rlightning_aio.protocol.space_description import describe, space_from
-from rlightning_aio.protocol.wire import Bye, Hello, Reader, Result, Step, Welcome, Writer
+from rlightning_aio.protocol.net import wire
+from rlightning_aio.protocol.net.payload import Packed, SpaceLayout
+from rlightning_aio.protocol.net.space_description import describe, space_from
+from rlightning_aio.protocol.net.wire import Bye, Hello, Reader, Result, Step, Welcome, Writer
 
 PAGE = (Path(__file__).parents[2] / "docs" / "wire-format.md").read_text()
 MESSAGES = sorted(

@@ -8,14 +8,14 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from rlightning_aio.protocol.client_session import (
+from rlightning_aio.protocol.net.client_session import (
     ClientSession,
     Ended,
     Phase,
     ResetRequest,
     StepRequest,
 )
-from rlightning_aio.protocol.server_session import RemoteResult, ServerSessions
+from rlightning_aio.protocol.net.server_session import RemoteResult, ServerSessions
 from rlightning_aio.types import EnvMeta, EnvRet
 
 HEARTBEAT = 8.0

@@ -20,7 +20,7 @@ import numpy as np
 import rlightning_aio
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.cli.collecting import Roster, resetting, respond_to_all, responder
-from rlightning_aio.cli.tally import Tally
+from rlightning_aio.cli.rollout_statistics import RolloutStatistics
 from rlightning_aio.cli.terminal import counted
 from rlightning_aio.errors import ConfigError, RLightningError
 from rlightning_aio.registry import BACKENDS
@@ -227,8 +227,8 @@ class Stand:
         self._respond = responder(group, roster, None, 0)
         self._everyone = everyone
         self._sent_at = np.zeros(len(everyone))
-        self.tally = Tally(setting.configs)
-        self.tally.begin(roster)
+        self.statistics = RolloutStatistics(setting.configs)
+        self.statistics.begin(roster)
 
     async def measure(self, rule: Rule, limits: Limits) -> Round:
         """One measurement, of full length after a few steps that warm the caches."""
@@ -238,35 +238,35 @@ class Stand:
 
     async def _step(self, _: int, limits: Limits) -> Round:
         latencies: list[float] = []
-        first, began = self.tally.steps, time.monotonic()
+        first, began = self.statistics.steps, time.monotonic()
         now = began
-        while now - began < limits.seconds and self.tally.steps - first < limits.steps:
+        while now - began < limits.seconds and self.statistics.steps - first < limits.steps:
             responses = _joined(self._respond(self._everyone))
             sent_at = time.monotonic()
             batch, flags = await self._group.step(responses)
             now = time.monotonic()
             latencies.append(now - sent_at)
-            self.tally.add(batch, flags or ())
-        return _as_round(self.tally.steps - first, now - began, np.array(latencies))
+            self.statistics.add(batch, flags or ())
+        return _as_round(self.statistics.steps - first, now - began, np.array(latencies))
 
     async def _collect(self, min_results: int, limits: Limits) -> Round:
         latencies: list[NDArray[np.float64]] = []
         group, sent_at = self._group, self._sent_at
-        first, began = self.tally.steps, time.monotonic()
+        first, began = self.statistics.steps, time.monotonic()
         now = began
         sent_at[:] = now
         respond_to_all(group, self._respond, self._everyone)
-        while now - began < limits.seconds and self.tally.steps - first < limits.steps:
+        while now - began < limits.seconds and self.statistics.steps - first < limits.steps:
             batch, flags = await group.collect_async(min_results=min_results)
             now = time.monotonic()
-            self.tally.add(batch, flags)
+            self.statistics.add(batch, flags)
             for part in batch.parts:
                 latencies.append(now - sent_at[part.slots])
                 sent_at[part.slots] = now
             respond_to_all(group, self._respond, batch)
-        steps = self.tally.steps - first
+        steps = self.statistics.steps - first
         batch, flags = await group.collect_async(wait_all=True)
-        self.tally.add(batch, flags)
+        self.statistics.add(batch, flags)
         return _as_round(steps, now - began, np.concatenate(latencies))
 
 

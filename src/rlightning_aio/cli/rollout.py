@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn
 import rlightning_aio
 from rlightning_aio.cli.collecting import Roster, resetting, respond_to_all, responder
 from rlightning_aio.cli.policies import Policy, load_policy
-from rlightning_aio.cli.tally import EntryFigures, Tally
+from rlightning_aio.cli.rollout_statistics import EntryFigures, RolloutStatistics
 from rlightning_aio.cli.terminal import (
     INTERRUPTED,
     count,
@@ -96,14 +96,14 @@ def rollout(
         seed=seed,
         policy=load_policy(policy) if policy else None,
     )
-    tally = Tally(configs)
+    statistics = RolloutStatistics(configs)
     group = rlightning_aio.build_env_group(configs, mixed_actions=True)
     interrupted = False
     try:
         with (
-            _Display(group, tally, steps) as display,
+            _Display(group, statistics, steps) as display,
             interruptible(),
-            contextlib.closing(_collect(group, configs, order, tally, display)) as collecting,
+            contextlib.closing(_collect(group, configs, order, statistics, display)) as collecting,
         ):
             rlightning_aio.run(collecting)
     except KeyboardInterrupt:
@@ -111,12 +111,16 @@ def rollout(
         raise typer.Exit(INTERRUPTED) from None
     finally:
         # Also after an error: what was collected until then is worth knowing.
-        if interrupted or tally.began:
-            _report(config, group, tally, interrupted=interrupted, as_json=as_json)
+        if interrupted or statistics.began:
+            _report(config, group, statistics, interrupted=interrupted, as_json=as_json)
 
 
 async def _collect(
-    group: EnvGroup, configs: Sequence[EnvConfig], order: _Order, tally: Tally, display: _Display
+    group: EnvGroup,
+    configs: Sequence[EnvConfig],
+    order: _Order,
+    statistics: RolloutStatistics,
+    display: _Display,
 ) -> None:
     async with group:
         roster = Roster(group, await group.init())
@@ -126,15 +130,15 @@ async def _collect(
         respond = responder(group, roster, order.policy, order.seed)
         sub_envs = max(config.num_envs for config in configs)
         display.ready()
-        tally.begin(roster)
+        statistics.begin(roster)
         with resetting(group, configs):
             respond_to_all(group, respond, batch)
-            while (left := order.steps - tally.steps) > 0:
+            while (left := order.steps - statistics.steps) > 0:
                 most = -(-left // sub_envs)
                 batch, flags = await group.collect_async(
                     min_results=min(order.min_results, most), max_results=most
                 )
-                tally.add(batch, flags)
+                statistics.add(batch, flags)
                 respond_to_all(group, respond, batch)
                 if display.due():
                     display.show()
@@ -145,9 +149,9 @@ async def _collect(
 class _Display:
     """The live line on stderr; on anything but a terminal, plain lines at the start."""
 
-    def __init__(self, group: EnvGroup, tally: Tally, steps: int) -> None:
+    def __init__(self, group: EnvGroup, statistics: RolloutStatistics, steps: int) -> None:
         self._group = group
-        self._tally = tally
+        self._statistics = statistics
         self._steps = steps
         self._console = err()
         self._progress = Progress(
@@ -198,11 +202,11 @@ class _Display:
         if not self._console.is_terminal:
             return
         then, steps = self._last
-        self._last = now, self._tally.steps
-        rate = (self._tally.steps - steps) / (now - then)
-        entries = self._tally.by_entry(self._group.get_env_stats())
+        self._last = now, self._statistics.steps
+        rate = (self._statistics.steps - steps) / (now - then)
+        entries = self._statistics.by_entry(self._group.get_env_stats())
         self._progress.update(
-            self._task, completed=self._tally.steps, figures=_figures(entries, rate)
+            self._task, completed=self._statistics.steps, figures=_figures(entries, rate)
         )
         self._progress.refresh()
 
@@ -216,18 +220,23 @@ def _figures(entries: Sequence[EntryFigures], rate: float) -> str:
 
 
 def _report(
-    config: Path, group: EnvGroup, tally: Tally, *, interrupted: bool, as_json: bool
+    config: Path,
+    group: EnvGroup,
+    statistics: RolloutStatistics,
+    *,
+    interrupted: bool,
+    as_json: bool,
 ) -> None:
-    entries = tally.by_entry(group.get_env_stats())
+    entries = statistics.by_entry(group.get_env_stats())
     stats = group.get_stats()
     if as_json:
         print_json(
             {
                 "config": str(config),
                 "interrupted": interrupted,
-                "seconds": tally.seconds,
-                "steps": tally.steps,
-                "steps_per_second": tally.steps_per_second,
+                "seconds": statistics.seconds,
+                "steps": statistics.steps,
+                "steps_per_second": statistics.steps_per_second,
                 "entries": [asdict(entry) for entry in entries],
                 "batch_size": stats["batch_size"],
                 "latency_us": stats["latency_us"],
@@ -235,8 +244,8 @@ def _report(
         )
         return
     title = (
-        f"{'Interrupted after ' if interrupted else ''}{count(tally.steps)} steps in "
-        f"{tally.seconds:.1f} s: {count(tally.steps_per_second)} steps/s"
+        f"{'Interrupted after ' if interrupted else ''}{count(statistics.steps)} steps in "
+        f"{statistics.seconds:.1f} s: {count(statistics.steps_per_second)} steps/s"
     )
     _print_table(title, entries, stats["latency_us"])
 

@@ -164,7 +164,7 @@ async def _measure_env(
         stand = stands[setting]
         if not isinstance(stand, str):
             await stand.measure(Rule("step", None), search.limits)
-            search.step_us = stand.tally.mean_step_us()
+            search.step_us = stand.statistics.mean_step_us()
             return
 
 

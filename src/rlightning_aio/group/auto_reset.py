@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.group.slots import Slots
 
-__all__ = ["NO_RESETS", "AutoReset", "whole"]
+__all__ = ["NO_RESETS", "AutoReset", "as_int"]
 
 NO_RESETS: Final[NDArray[np.bool_]] = np.zeros(1, np.bool_)
 """No env is due; broadcasts to any number of slots."""
@@ -35,7 +35,7 @@ NO_RESETS: Final[NDArray[np.bool_]] = np.zeros(1, np.bool_)
 _STEP: Final = np.array(STEP)
 
 
-def whole(value: Any) -> int | None:
+def as_int(value: Any) -> int | None:
     """`value` as an int, NumPy's included; None for what is no whole number, as a bool."""
     if isinstance(value, bool):
         return None
@@ -91,7 +91,7 @@ class AutoReset:
                     "auto_reset(max_episode_steps=…)"
                 )
             return np.array(configured, np.int64)
-        limit = whole(given)
+        limit = as_int(given)
         if limit is None or limit < 1:
             raise ValueError(f"max_episode_steps must be a positive int, not {given!r}")
         if any(own is not None and own != limit for own in configured):

@@ -18,7 +18,7 @@ from rlightning_aio.errors import (
     NothingPending,
     RLightningError,
 )
-from rlightning_aio.group.auto_reset import whole
+from rlightning_aio.group.auto_reset import as_int
 from rlightning_aio.group.hint import HINT_AFTER_BATCHES
 from rlightning_aio.group.ledger import CALL, Ledger, Ticket
 from rlightning_aio.group.results import collected
@@ -387,7 +387,7 @@ class Core(Ledger):
 
 def _checked(seed: Any) -> int:
     """`seed` as an int that every env can count on from."""
-    value = whole(seed)
+    value = as_int(seed)
     if value is None or not 0 <= value < 1 << 62:
         raise ValueError(f"a seed must be an int from 0 to 2**62 - 1, not {seed!r}")
     return value

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from rlightning_aio.hosts.base import Host
     from rlightning_aio.hosts.worker import ErrorText
     from rlightning_aio.protocol.info import InfoSchema
-    from rlightning_aio.protocol.server_session import Manners
+    from rlightning_aio.protocol.net.server_session import ClientTraits
     from rlightning_aio.types import EnvMeta
 
 __all__ = ["CALL", "Ledger", "Ticket"]
@@ -322,14 +322,14 @@ class Ledger:
         self.slots.schemas[host.first_slot][number] = schema
         self.info_width = max(self.info_width, schema.size)
 
-    def on_client(self, host: Host, row: int, meta: EnvMeta, manners: Manners) -> int:
+    def on_client(self, host: Host, row: int, meta: EnvMeta, traits: ClientTraits) -> int:
         """See `base.Inbox.on_client`."""
         table, slot = self.slots, host.first_slot + row
         table.christen(slot, meta.env_id)
         table.resets_itself[slot] = meta.autoreset != "disabled"
         has_row = self.fleet.slabs[int(table.slab[slot])].action is not None
-        table.by_frame[slot] = manners.free_actions or not has_row
-        table.reads_extras[slot] = manners.reads_extras
+        table.by_frame[slot] = traits.free_actions or not has_row
+        table.reads_extras[slot] = traits.reads_extras
         table.note_envs()
         if table.state[slot] == IDLE:
             self._mark_sent(self.slots.alone(slot), JOINED, 0, 0.0)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rlightning_aio.errors import EnvFault
     from rlightning_aio.hosts.worker import AttachOrder, ErrorText, Started
     from rlightning_aio.protocol.info import InfoSchema
-    from rlightning_aio.protocol.server_session import Manners
+    from rlightning_aio.protocol.net.server_session import ClientTraits
     from rlightning_aio.protocol.slab import Slab
     from rlightning_aio.types import EnvMeta
 
@@ -210,7 +210,7 @@ class Inbox(Protocol):
         """The envs of an elastic host have rows from now on: those of `slab`."""
         ...
 
-    def on_client(self, host: Host, row: int, meta: EnvMeta, manners: Manners) -> int:
+    def on_client(self, host: Host, row: int, meta: EnvMeta, traits: ClientTraits) -> int:
         """An env has joined, and its first result follows; the entry of what that answers."""
         ...
 

@@ -12,7 +12,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from rlightning_aio.hosts.arena import Arena, map_shared
-from rlightning_aio.hosts.owned import owned
+from rlightning_aio.hosts.copied import copied
 from rlightning_aio.hosts.runner import EnvRunner, Rest
 from rlightning_aio.hosts.worker import (
     AttachOrder,
@@ -109,7 +109,7 @@ class InlineHost:
 
     def pack(self, content: Any) -> Any:
         """See `base.Host.pack`."""
-        return owned(content)
+        return copied(content)
 
     def request_step(self, row: int, number: int, packed: tuple[Any, dict[str, Any]]) -> None:
         """See `base.Host.request_step`."""

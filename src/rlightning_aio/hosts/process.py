@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import rlightning_aio
 from rlightning_aio.hosts.arena import Arena, map_shared
 from rlightning_aio.hosts.base import Death, Inbox, Watcher
-from rlightning_aio.hosts.forkserver import BOOTSTRAP, Exited, Fork, Forked, Hello, Kill, Ready
+from rlightning_aio.hosts.fork_server import BOOTSTRAP, Exited, Fork, Forked, Hello, Kill, Ready
 from rlightning_aio.hosts.pickling import dumped, dumped_with_code
 from rlightning_aio.hosts.worker import ErrorText
 from rlightning_aio.protocol.frames import BELL, CHUNK_BYTES, Frame, FrameKind, FrameReader, encode

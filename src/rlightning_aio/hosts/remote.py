@@ -1,7 +1,7 @@
 """`RemoteHost`: the trainer's end of env_server, a ZMQ ROUTER without a thread.
 
 Rule: one descriptor wakes the driver, which then calls `RemoteHost.pump`; everything
-that means something happens in `protocol.server_session`. The descriptor is an epoll
+that means something happens in `protocol.net.server_session`. The descriptor is an epoll
 over ZMQ's own, which only tell that something changed, and an eventfd that is set
 whenever there is something to be had without a change.
 """
@@ -21,8 +21,8 @@ from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
 from zmq.utils import z85
 
 from rlightning_aio.errors import ConfigError, StartFailed
-from rlightning_aio.protocol.server_session import PATIENCE, ServerSessions
-from rlightning_aio.protocol.wire import MAX_FRAME_BYTES
+from rlightning_aio.protocol.net.server_session import PATIENCE, ServerSessions
+from rlightning_aio.protocol.net.wire import MAX_FRAME_BYTES
 from rlightning_aio.remote.keys import PUBLIC_SUFFIX, read_keys, read_server_keys
 from rlightning_aio.remote.parts import receive_parts, send_parts
 
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from rlightning_aio.config import EnvConfig
-    from rlightning_aio.protocol.server_session import Manners, RemoteResult
-    from rlightning_aio.protocol.wire import Part
+    from rlightning_aio.protocol.net.server_session import ClientTraits, RemoteResult
+    from rlightning_aio.protocol.net.wire import Part
     from rlightning_aio.types import EnvMeta
 
 __all__ = ["RemoteHost", "ServerSettings", "server_settings"]
@@ -288,9 +288,9 @@ class RemoteHost:
             self._has_more = True
             os.eventfd_write(self._more, 1)
 
-    def manners(self, client: str) -> Manners:
+    def traits(self, client: str) -> ClientTraits:
         """What a client that is here makes of requests."""
-        return self._sessions.manners(client)
+        return self._sessions.traits(client)
 
     def dismiss(self, client: str, cause: str) -> None:
         """Send a client away that is here; it is told `cause`."""

@@ -23,8 +23,8 @@ from rlightning_aio.envs.base import (
     result_of,
 )
 from rlightning_aio.envs.tensors import as_numpy, holds_tensor
+from rlightning_aio.hosts.copied import copied
 from rlightning_aio.hosts.episodes import EpisodeSums
-from rlightning_aio.hosts.owned import owned
 from rlightning_aio.protocol.columns import fitted_tree, leaves, row_reader, row_writer
 from rlightning_aio.protocol.info import NO_INFO, PICKLED, InfoSchema, InfoWriter
 from rlightning_aio.protocol.slab import RowLayout, Slab
@@ -225,7 +225,7 @@ class EnvRunner:
 
     def _beside(self, rest: Rest) -> Rest:
         """`rest` as the trainer may keep it; it is pickled on its way to another process."""
-        return owned(rest) if rest and self._inline else rest
+        return copied(rest) if rest and self._inline else rest
 
     def reset_episode(self) -> None:
         """Forget what was summed up of the current episode."""

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from rlightning_aio.hosts.remote import RemoteHost
     from rlightning_aio.hosts.runner import Rest
     from rlightning_aio.hosts.worker import AttachOrder
-    from rlightning_aio.protocol.server_session import RemoteResult
+    from rlightning_aio.protocol.net.server_session import RemoteResult
     from rlightning_aio.types import EnvMeta
 
 __all__ = ["MAX_CLIENTS", "ServerHost"]
@@ -276,7 +276,7 @@ class ServerHost:
         if row is None:
             self.remote.dismiss(name, "the server has no place for another client")
             return None
-        owed = self._inbox.on_client(self, row, meta, self.remote.manners(name))
+        owed = self._inbox.on_client(self, row, meta, self.remote.traits(name))
         self._places[row].entry = owed
         return row, number_of(owed)
 

@@ -23,7 +23,8 @@ from zmq.utils.monitor import recv_monitor_message
 
 from rlightning_aio.envs.base import default_env_preprocess_fn
 from rlightning_aio.errors import ClientRefused, ConfigError
-from rlightning_aio.protocol.client_session import (
+from rlightning_aio.protocol.columns import Misfit
+from rlightning_aio.protocol.net.client_session import (
     ClientSession,
     Ended,
     Phase,
@@ -31,11 +32,10 @@ from rlightning_aio.protocol.client_session import (
     ResetRequest,
     StepRequest,
 )
-from rlightning_aio.protocol.columns import Misfit
-from rlightning_aio.protocol.payload import Outcome
-from rlightning_aio.protocol.server_session import PATIENCE
-from rlightning_aio.protocol.space_description import UnsupportedSpace
-from rlightning_aio.protocol.wire import MAX_FRAME_BYTES, MAX_NAME_LENGTH
+from rlightning_aio.protocol.net.payload import Outcome
+from rlightning_aio.protocol.net.server_session import PATIENCE
+from rlightning_aio.protocol.net.space_description import UnsupportedSpace
+from rlightning_aio.protocol.net.wire import MAX_FRAME_BYTES, MAX_NAME_LENGTH
 from rlightning_aio.remote.keys import read_client_keys
 from rlightning_aio.remote.parts import receive_parts, send_parts
 from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from types import TracebackType
 
     from rlightning_aio.envs.base import BaseEnv
-    from rlightning_aio.protocol.client_session import Event
+    from rlightning_aio.protocol.net.client_session import Event
 
 __all__ = ["RemoteEnvClient"]
 

@@ -12,7 +12,7 @@ import zmq
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rlightning_aio.protocol.wire import Part
+    from rlightning_aio.protocol.net.wire import Part
 
 __all__ = ["receive_parts", "send_parts"]
 

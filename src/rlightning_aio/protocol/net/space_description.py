@@ -17,7 +17,7 @@ import numpy as np
 from gymnasium import spaces
 
 from rlightning_aio.protocol.columns import is_dict, is_tuple
-from rlightning_aio.protocol.wire import DTYPES, MAX_FRAME_BYTES, WireError
+from rlightning_aio.protocol.net.wire import DTYPES, MAX_FRAME_BYTES, WireError
 
 if TYPE_CHECKING:
     from collections.abc import Callable

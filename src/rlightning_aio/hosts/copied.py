@@ -9,10 +9,10 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["owned"]
+__all__ = ["copied"]
 
 
-def owned(value: Any) -> Any:
+def copied(value: Any) -> Any:
     """`value` with its containers and arrays copied: its maker may change them later.
 
     Everything else is left as it is; a tensor must stay the tensor it is.
@@ -20,9 +20,9 @@ def owned(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return cast("NDArray[Any]", value).copy()
     if type(value) is dict:
-        return {key: owned(inner) for key, inner in cast("dict[Any, Any]", value).items()}
+        return {key: copied(inner) for key, inner in cast("dict[Any, Any]", value).items()}
     if type(value) in (tuple, list):
-        return type(value)(map(owned, value))
+        return type(value)(map(copied, value))
     if hasattr(value, "_make") and not isinstance(value, type):
-        return value._make(map(owned, value))  # A named tuple: a graph, for one.
+        return value._make(map(copied, value))  # A named tuple: a graph, for one.
     return value

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rlightning_aio import EnvConfig, sync
-from rlightning_aio.cli.tally import Tally
+from rlightning_aio.cli.rollout_statistics import RolloutStatistics
 
 if TYPE_CHECKING:
     from rlightning_aio import BatchedData
@@ -44,23 +44,23 @@ def test_steps_are_what_envs_have_executed(
         )
         for index, length in enumerate(lengths)
     ]
-    tally = Tally(configs)
+    statistics = RolloutStatistics(configs)
     with sync.build_env_group(configs) as group:
         metas = {meta.env_id: meta for meta in group.init()}
         batch, _ = group.reset()
         Stub.steps = 0
-        tally.begin(metas.__getitem__)
+        statistics.begin(metas.__getitem__)
         with group.auto_reset(limit):
             group.step_async(act(batch))
             for least, most in collects:
                 batch, flags = group.collect_async(min_results=min(least, most), max_results=most)
-                tally.add(batch, flags)
+                statistics.add(batch, flags)
                 group.step_async(act(batch))
-            tally.add(*group.collect_async(wait_all=True))
+            statistics.add(*group.collect_async(wait_all=True))
         stats = group.get_env_stats()
-    assert tally.steps == Stub.steps
-    entries = tally.by_entry(stats)
-    assert sum(entry.steps for entry in entries) == tally.steps
+    assert statistics.steps == Stub.steps
+    entries = statistics.by_entry(stats)
+    assert sum(entry.steps for entry in entries) == statistics.steps
     for entry, length in zip(entries, lengths, strict=True):
         finished = length <= limit and entry.episodes > 0
         assert entry.mean_length == (length if finished else None)
@@ -71,7 +71,7 @@ def test_an_entry_that_was_not_met_has_no_figures() -> None:
     """None stands for what is not known; zero would be a lie."""
     config = EnvConfig(name="idle", backend="stub", task="any")
     idle: dict[str, Any] = {"episodes": 0, "mean_return": None, "mean_length": None}
-    (figures,) = Tally([config]).by_entry({"idle-0": idle})
+    (figures,) = RolloutStatistics([config]).by_entry({"idle-0": idle})
     assert (figures.steps, figures.episodes) == (0, 0)
     assert figures.mean_return is None
     assert figures.step_us is None

@@ -39,7 +39,7 @@ try:
         "rlightning_aio", sys.argv[1] + "/__init__.py", submodule_search_locations=[sys.argv[1]])
     m = sys.modules["rlightning_aio"] = u.module_from_spec(s)
     s.loader.exec_module(m)
-    from rlightning_aio.hosts.forkserver import main
+    from rlightning_aio.hosts.fork_server import main
 except BaseException:
     import os, traceback
     os.write(int(sys.argv[2]), b"!" + traceback.format_exc()[-60000:].encode())

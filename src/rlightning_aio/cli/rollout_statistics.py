@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.types import EnvMeta
 
-__all__ = ["EntryFigures", "Tally"]
+__all__ = ["EntryFigures", "RolloutStatistics"]
 
 _NOTHING: Final = np.empty(0, np.int64)
 _LATENCY_BATCHES: Final = 4096
@@ -48,7 +48,7 @@ class EntryFigures:
     step_us: dict[str, float] | None
 
 
-class Tally:
+class RolloutStatistics:
     """Counts results as they are collected.
 
     Args:

@@ -19,9 +19,9 @@ import gymnasium as gym
 
 from rlightning_aio.errors import BadAction, EnvBusy, EnvRaised, UnknownEnv
 from rlightning_aio.protocol.columns import Misfit
-from rlightning_aio.protocol.payload import Packed, ResultLayout, SpaceLayout
-from rlightning_aio.protocol.space_description import describe, space_from
-from rlightning_aio.protocol.wire import (
+from rlightning_aio.protocol.net.payload import Packed, ResultLayout, SpaceLayout
+from rlightning_aio.protocol.net.space_description import describe, space_from
+from rlightning_aio.protocol.net.wire import (
     STALE_REQUEST,
     VERSION,
     Bye,
@@ -48,7 +48,7 @@ from rlightning_aio.types import EnvMeta
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-__all__ = ["PATIENCE", "Manners", "Outgoing", "RemoteResult", "ServerSessions"]
+__all__ = ["PATIENCE", "ClientTraits", "Outgoing", "RemoteResult", "ServerSessions"]
 
 PATIENCE: Final = 8
 """Parts of the heartbeat limit: one between pings, two until a broken connection is given up."""
@@ -104,7 +104,7 @@ class Outgoing(NamedTuple):
     parts: list[bytes]
 
 
-class Manners(NamedTuple):
+class ClientTraits(NamedTuple):
     """What a client makes of requests.
 
     Attributes:
@@ -458,12 +458,12 @@ class ServerSessions:
         if session is not None:
             self._dismiss(session, cause)
 
-    def manners(self, client: str) -> Manners:
+    def traits(self, client: str) -> ClientTraits:
         """What a client that is here makes of requests."""
         session = self._seats[client].session
         if session is None:
             raise UnknownEnv(f"no client named {client!r} is connected to {self._server_id}")
-        return Manners(session.free_actions, session.reads_extras)
+        return ClientTraits(session.free_actions, session.reads_extras)
 
     def check(self, client: str, action: Any) -> None:
         """Raises `BadAction` if `client` is here and can't take `action`; nothing is sent."""

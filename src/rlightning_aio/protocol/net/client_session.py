@@ -14,10 +14,10 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING, Any, Final, cast
 
-from rlightning_aio.protocol.payload import Outcome, Packed, ResultLayout, SpaceLayout
-from rlightning_aio.protocol.server_session import PATIENCE, random_token
-from rlightning_aio.protocol.space_description import describe
-from rlightning_aio.protocol.wire import (
+from rlightning_aio.protocol.net.payload import Outcome, Packed, ResultLayout, SpaceLayout
+from rlightning_aio.protocol.net.server_session import PATIENCE, random_token
+from rlightning_aio.protocol.net.space_description import describe
+from rlightning_aio.protocol.net.wire import (
     STALE_REQUEST,
     VERSION,
     Bye,

@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium import spaces
 
 from rlightning_aio.protocol.columns import Leaf, Misfit, as_array, fitted
-from rlightning_aio.protocol.wire import DTYPES, ArrayForm, Part, WireError
+from rlightning_aio.protocol.net.wire import DTYPES, ArrayForm, Part, WireError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
