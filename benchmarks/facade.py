@@ -17,7 +17,7 @@ from harness import Question, Target, main
 from round_trip import SyncCalls, median_us
 
 if TYPE_CHECKING:
-    from rlightning_aio.group.wait import Operation
+    from rlightning_aio.group.wait import Procedure
     from rlightning_aio.hosts.base import Source
 
 WORK = Work(no_work.NO_WORK, num_envs=1, modules=("no_work",))
@@ -51,13 +51,14 @@ class RawDriver:
     def wake(self) -> None:
         """Nobody to wake: `run` goes on after every read."""
 
-    def run(self, operation: Operation[Any]) -> Any:
+    def run(self, procedure: Procedure[Any]) -> Any:
         try:
-            wait = operation.send(None)  # pyright: ignore[reportArgumentType]
+            wait = procedure.send(None)  # pyright: ignore[reportArgumentType]
             while True:
                 for descriptor, _ in self._poll.poll(None if wait.until is None else 0):
                     self._sources[descriptor].on_readable()
-                wait = operation.send(time.monotonic())
+                self.drain()
+                wait = procedure.send(time.monotonic())
         except StopIteration as stop:
             return stop.value
 
@@ -67,15 +68,14 @@ class Raw(Stepped):
     package = "rlightning_aio"
 
     def setup(self) -> None:
-        from rlightning_aio.group.build import build_fleet, plan_group
-        from rlightning_aio.group.core import Core
+        from rlightning_aio.group.build import assemble, plan_group
 
         self._driver = RawDriver()
         config = group_config(self.work, "auto")
         plan = plan_group(config, None, mixed_actions=False, zero_copy=False)
-        self._fleet = build_fleet(plan, self._driver)
-        self._core = Core(self._fleet, zero_copy=False)
-        metas = self._driver.run(self._fleet.start(time.monotonic()))
+        self._core = assemble(plan, self._driver, shares_thread=False)
+        self._driver.drain = self._core.drain
+        metas = self._driver.run(self._core.start(time.monotonic()))
         self._actions = sampled(metas[0].action_space, self.work.num_envs)
 
     def round(self, seconds: float) -> float:
@@ -85,8 +85,8 @@ class Raw(Stepped):
         return median_us(lambda: run(core.step(response, time.monotonic())), seconds)
 
     def teardown(self) -> None:
-        if hasattr(self, "_fleet"):
-            self._driver.run(self._fleet.close(time.monotonic()))
+        if hasattr(self, "_core"):
+            self._driver.run(self._core.close(time.monotonic()))
 
 
 QUESTION = Question(

@@ -36,37 +36,41 @@ class WorkerLoop(Stepped):
 
     def setup(self) -> None:
         from rlightning_aio.config import EnvConfig
+        from rlightning_aio.hosts.build_env import build_env
         from rlightning_aio.hosts.runner import EnvRunner
-        from rlightning_aio.hosts.worker import Worker, build_env
-        from rlightning_aio.protocol import rings
+        from rlightning_aio.hosts.worker import Worker
+        from rlightning_aio.protocol import bell, entries, rings
         from rlightning_aio.protocol.slab import Slab
 
         count = self.work.num_envs
         config = EnvConfig(**group_config(self.work, count))
-        runners = [EnvRunner(build_env(config, None, k, None)) for k in range(count)]
+        runners = [EnvRunner(build_env(config, worker_index=k)) for k in range(count)]
         layout = runners[0].layout
         self._slab = Slab(layout, memoryview(bytearray(layout.size(count))), count)
         memory = memoryview(bytearray(rings.rings_size(count)))
         channel: Any = Nobody()
-        self._worker = Worker(channel, 0, memory, 0, count)
+        bell_memory = memoryview(bytearray(bell.bell_size(1)))
+        worker_rings = rings.WorkerRings(memory, count, bell.WorkerBell(bell_memory, 1, 0))
+        self._worker = Worker(channel, 0, worker_rings, 0)
         self._worker.adopt(runners, [(self._slab, row) for row in range(count)])
         gc.collect()
         gc.freeze()  # As workers do.
-        self._trainer = rings.TrainerRings(memory, count)
-        self._entries = np.array([rings.entry(0, row, rings.RESET) for row in range(count)])
-        self._next = 1 << rings.NUMBER_SHIFT
+        self._trainer = rings.TrainerRings(memory, count, bell.TrainerBell(bell_memory, 1), 0)
+        reset = entries.Operation.RESET
+        self._entries = np.array([entries.entry(0, row, reset) for row in range(count)])
+        self._next = 1 << entries.NUMBER_SHIFT
         self._actions: Iterator[Any] = sampled(layout.action_space, count)
         self._ended = np.ones(count, bool)
 
     def step(self) -> int:
-        from rlightning_aio.protocol.rings import OP_MASK, STEP
+        from rlightning_aio.protocol.entries import OP_MASK, Operation
 
         self._slab.action[:] = next(self._actions)
-        self._entries = (self._entries & ~OP_MASK) + self._next + STEP + self._ended
+        self._entries = (self._entries & ~OP_MASK) + self._next + Operation.STEP + self._ended
         self._trainer.request(self._entries)
         self._worker.run_requests()
         self._trainer.reports()
-        self._ended = self._slab.ends.any(axis=1)
+        self._ended = self._slab.over.copy()
         return len(self._entries)
 
     def teardown(self) -> None:

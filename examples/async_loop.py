@@ -1,4 +1,4 @@
-"""Collect 20,000 steps from CartPoles as they get ready, with random actions."""
+"""Collect 20,000 transitions from CartPoles as they get ready, with random actions."""
 
 import numpy as np
 
@@ -9,12 +9,14 @@ async def main() -> None:
     rng = np.random.default_rng(0)
     async with rl.build_env_group(rl.load_config("configs/cartpole.yaml")) as group:
         batch, _ = await group.reset(seed=0)
-        with group.auto_reset(max_episode_steps=500):
+        transitions = 0
+        with group.auto_reset():
             group.step_async(batch.respond(action=rng.integers(2, size=len(batch))))
-            for _ in range(20_000 // 32):
+            while transitions < 20_000:
                 batch, _ = await group.collect_async(min_results=32, max_results=32)
+                transitions += np.count_nonzero(~batch.is_reset)
                 group.step_async(batch.respond(action=rng.integers(2, size=len(batch))))
-        group.print_timing_summary()
+        print(group.get_env_stats(by_entry=True))
 
 
 rl.run(main())

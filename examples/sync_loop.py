@@ -9,9 +9,8 @@ rng = np.random.default_rng(0)
 config = rl.EnvConfig(name="cheetah", backend="mujoco", task="HalfCheetah-v5", num_workers=8)
 with sync.build_env_group(config) as group:
     batch, _ = group.reset(seed=0)
-    total = np.zeros(len(batch))
-    with group.auto_reset(max_episode_steps=1000):
-        for _ in range(200):
+    with group.auto_reset(max_episode_steps=100):
+        for _ in range(250):
             batch, _ = group.step(batch.respond(action=rng.uniform(-1, 1, (8, 6))))
-            total += batch.reward
-print("returns after 200 steps:", total.round(1))
+            if batch.done.any():
+                print("returns:", batch.info("episode")["r"].round(1))

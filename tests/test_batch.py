@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+import re
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,11 +14,21 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rlightning_aio.batch import BatchedData, Origin, ResultColumns
+from rlightning_aio.batch import BatchedData
+from rlightning_aio.batch.columns import ResultColumns
+from rlightning_aio.batch.data import (
+    Origin,
+    batch_of_results,
+    columns_of_responses,
+    parts_of,
+    slots_of,
+)
+from rlightning_aio.batch.sent import columns_of_values, kept_columns
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.errors import BadAction
-from rlightning_aio.group.slots import Slots
+from rlightning_aio.group.env_table import EnvTable
 from rlightning_aio.protocol.info import InfoSchema
+from rlightning_aio.protocol.slab import IS_RESET, OVER, TERMINATED, TRUNCATED
 from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
 
 PENDULUMS, GRIDS = (
@@ -22,7 +36,19 @@ PENDULUMS, GRIDS = (
     for name, n in (("pendulum", 3), ("grid-world", 2))
 )
 IDS = ["pendulum-0", "pendulum-1", "pendulum-2", "grid-world-0", "grid-world-1"]
-TABLE = Slots([PENDULUMS] * 3 + [GRIDS] * 2, IDS)
+NAMES = EnvTable([PENDULUMS] * 3 + [GRIDS] * 2, IDS)
+NAMES.index_offset[:] = range(5)
+
+
+def flags(head: tuple[int, ...], **which: Any) -> Any:
+    """A column of flags with the given ones set, by the names of their places."""
+    column = np.zeros((*head, 4), bool)
+    for name, values in which.items():
+        column[..., FLAGS[name]] = values
+    return column
+
+
+FLAGS = {"terminated": TERMINATED, "truncated": TRUNCATED, "is_reset": IS_RESET, "over": OVER}
 
 
 def columns(
@@ -38,15 +64,15 @@ def columns(
     head = (n, len(agents)) if agents else (n,)
     values: dict[str, Any] = {
         "slots": np.array(slots, np.intp),
-        "table": TABLE,
+        "names": NAMES,
         "positions": None if positions is None else np.array(positions, np.intp),
         "observation": observation,
         "reward": np.arange(np.prod(head)).reshape(head) + 0.5,
-        "ends": np.zeros((*head, 2), bool),
+        "flags": flags(head),
         "info_marks": np.zeros(n, np.uint8),
         "info": None,
         "schemas": [{} for _ in IDS],
-        "rests": {},
+        "out_of_band": {},
         "episode_return": None,
         "episode_length": None,
         "times": np.arange(2 * n).reshape(n, 2),
@@ -55,12 +81,13 @@ def columns(
     return ResultColumns(**{**values, **fields})
 
 
-def results(*parts: ResultColumns) -> BatchedData:
+def results(*parts: ResultColumns, sources: Any = None, group: object = "a group") -> BatchedData:
     size = sum(map(len, parts))
     slots = np.zeros(size, np.intp)
     for part in parts:
         slots[range(size) if part.positions is None else part.positions] = part.slots
-    return BatchedData.of_results(parts, Origin("a group", slots, TABLE))
+    names = parts[0].names if parts else NAMES
+    return batch_of_results(parts, Origin(group, slots, names), sources)
 
 
 def mixed() -> BatchedData:
@@ -179,27 +206,26 @@ def test_infos_are_decoded_for_the_env_they_are_of() -> None:
             info=rows,
             info_marks=np.array([1, 255, 0], np.uint8),
             schemas=[{1: schema}, {}, {}, {}, {}],
-            rests={1: {"info": {"text": "hi"}}},
+            out_of_band={1: {"info": {"text": "hi"}}},
         )
     )
-    assert batch.info == [{"x": 2.5}, {"text": "hi"}, {}]
-    assert [value.info for value in batch.values()] == batch.info
+    assert batch.info() == [{"x": 2.5}, {"text": "hi"}, {}]
+    assert [value.info for value in batch.values()] == batch.info()
 
 
 def test_an_episode_that_ended_is_told_with_its_last_result() -> None:
     """Its return and length lie in the info of that result alone."""
-    ends = np.array([[False, False], [True, False]])
     batch = results(
         columns(
             [0, 1],
             np.zeros((2, 2)),
-            ends=ends,
+            flags=flags((2,), terminated=[False, True]),
             episode_return=np.array([9.0, 4.5]),
             episode_length=np.array([7, 3]),
         )
     )
-    assert batch.info == [{}, {"episode": {"r": 4.5, "l": 3}}]
-    assert batch.ended.tolist() == [False, True]
+    assert batch.info() == [{}, {"episode": {"r": 4.5, "l": 3}}]
+    assert batch.done.tolist() == [False, True]
     assert batch["pendulum-1"].last_terminated is True
 
 
@@ -219,10 +245,12 @@ def test_a_multi_agent_batch_has_columns_by_agent() -> None:
 
 def test_observations_that_came_one_by_one_stack_where_they_can() -> None:
     """Strings stay a list, arrays of one shape become an array."""
-    texts = results(columns([0, 1], None, rests={0: {"observation": "a"}, 1: {"observation": "b"}}))
+    texts = results(
+        columns([0, 1], None, out_of_band={0: {"observation": "a"}, 1: {"observation": "b"}})
+    )
     assert texts.observation == ["a", "b"]
     arrays = results(
-        columns([0, 1], None, rests={k: {"observation": np.full(2, k)} for k in range(2)})
+        columns([0, 1], None, out_of_band={k: {"observation": np.full(2, k)} for k in range(2)})
     )
     assert arrays.observation.tolist() == [[0, 0], [1, 1]]
 
@@ -244,7 +272,7 @@ def test_a_batch_of_plain_results_has_columns_too() -> None:
     assert batch.observation["x"].tolist() == [[0, 0], [1, 1], [2, 2]]
     assert batch.reward.tolist() == [0, 1, 2]
     assert batch.terminated.tolist() == batch.truncated.tolist() == [False] * 3
-    assert batch.info == [{"k": 0}, {"k": 1}, {"k": 2}]
+    assert batch.info() == [{"k": 0}, {"k": 1}, {"k": 2}]
 
 
 # -- responses
@@ -306,7 +334,7 @@ def test_values_without_a_fixed_size_come_as_a_list() -> None:
         items=spaces.Sequence(spaces.Discrete(9)), pair=spaces.Tuple([spaces.Discrete(9)] * 2)
     )
     values = [{"items": (1, 2), "pair": (3, 4)}, {"items": (5, 6), "pair": (7, 8)}]
-    part = columns([0, 1], None, rests=dict(enumerate({"observation": v} for v in values)))
+    part = columns([0, 1], None, out_of_band=dict(enumerate({"observation": v} for v in values)))
     part.observation_space = space
     observation = results(part).observation
     assert observation["items"] == [(1, 2), (5, 6)]
@@ -331,3 +359,507 @@ def test_what_differs_in_structure_does_not_stack(one: Any, other: Any) -> None:
     )
     with pytest.raises(ValueError, match=r"by_name\(\)"):
         batch.observation  # noqa: B018
+
+
+# -- what each row is
+
+
+HEADS = st.sampled_from([((), ()), ((2,), ()), ((3,), ("a", "b", "c")), ((2, 3), ("a", "b"))])
+
+
+@st.composite
+def any_results(draw: st.DrawFn) -> tuple[BatchedData, list[dict[str, Any]]]:
+    """A batch of several parts whose rows have one shape, and what each of its rows says.
+
+    Envs 0 to 4 in any order, the first three of one entry; a part without positions is alone.
+    """
+    inner, agents = draw(HEADS)
+    sub_envs = inner[1:] if agents else inner
+    slots = draw(st.permutations(range(5)))[: draw(st.integers(1, 5))]
+    n = len(slots)
+    names = SimpleNamespace(
+        index_offset=np.arange(5) * (sub_envs or (1,))[0],
+        turns=np.zeros(5, bool),
+        ids=NAMES.ids,
+        batch_ids=NAMES.batch_ids,
+        names=NAMES.names,
+    )
+
+    def bits(shape: tuple[int, ...]) -> Any:
+        size = int(np.prod(shape))
+        drawn = draw(st.lists(st.booleans(), min_size=size, max_size=size))
+        return np.array(drawn, bool).reshape(shape)
+
+    # A sub-environment resets itself for all of its agents.
+    all_flags = bits((n, *inner, 4))
+    resets = bits((n, *sub_envs))
+    all_flags[..., IS_RESET] = resets[:, None] if agents else resets
+    limits = draw(st.none() | st.just(bits((n,))))
+    restarted = draw(st.none() | st.just(bits((n,))))
+    part_of = draw(st.lists(st.integers(0, 2), min_size=n, max_size=n))
+    parts: list[ResultColumns] = []
+    for number in sorted(set(part_of)):
+        chosen = [k for k in range(n) if part_of[k] == number]
+        parts.append(
+            columns(
+                [slots[k] for k in chosen],
+                dict.fromkeys(agents, np.zeros(len(chosen))) if agents else np.zeros(len(chosen)),
+                None if len(chosen) == n else chosen,
+                names=names,
+                agents=agents,
+                reward=np.zeros((len(chosen), *inner)),
+                flags=all_flags[chosen],
+                limit_reached=None if limits is None else limits[chosen],
+                restarted=None if restarted is None else restarted[chosen],
+            )
+        )
+    no = np.zeros(n, bool)
+    count = (sub_envs or (1,))[0]
+
+    def spread(value: Any) -> Any:
+        return np.full(sub_envs, value).tolist()
+
+    rows = [
+        {
+            "is_reset": resets[k].tolist(),
+            "limit_reached": spread((no if limits is None else limits)[k]),
+            "restarted": spread((no if restarted is None else restarted)[k]),
+            "index": (slots[k] * count + np.arange(count)).reshape(sub_envs).tolist(),
+            "done": (
+                all_flags[k, ..., TERMINATED]
+                | all_flags[k, ..., TRUNCATED]
+                | (no if limits is None else limits)[k]
+            ).tolist(),
+            "place": k,
+        }
+        for k in range(n)
+    ]
+    sources = np.empty(n, object), np.arange(n)
+    sources[0][:] = [{"place": np.arange(n)}] * n
+    return results(*parts, sources=sources), rows
+
+
+def said(batch: BatchedData, name: str) -> list[Any]:
+    """A column row by row, agents on the first axis."""
+    column = batch.sent.place if name == "place" else getattr(batch, name)
+    if isinstance(column, dict):
+        return np.stack(list(column.values()), axis=1).tolist()
+    return column.tolist()
+
+
+@given(drawn=any_results())
+def test_each_row_says_what_it_is(drawn: tuple[BatchedData, list[dict[str, Any]]]) -> None:
+    """In the batch's order, whatever parts it consists of, and in those of its entries alone."""
+    batch, rows = drawn
+    for name in rows[0]:
+        assert said(batch, name) == [row[name] for row in rows], name
+    ids = batch.ids()
+    for entry, part in batch.by_name().items():
+        mine = [row for row, id_ in zip(rows, ids, strict=True) if id_.startswith(entry)]
+        for name in rows[0]:
+            assert said(part, name) == [row[name] for row in mine], name
+
+
+def test_what_each_row_says_is_the_readers_own() -> None:
+    """Whoever masks rows may write to the columns."""
+    batch = results(columns([0, 1], np.zeros((2, 1))))
+    for name in ("limit_reached", "restarted"):
+        getattr(batch, name)[:] = True
+        assert not getattr(batch, name).any()
+
+
+def test_sub_environments_that_take_turns_say_which_they_are() -> None:
+    """Each result holds some of them; their own numbers lie in the infos."""
+    names = copy.copy(NAMES)
+    names.turns = np.array([True] * 5)
+    names.index_offset = np.arange(5) * 4
+    batch = results(
+        columns(
+            [1, 0],
+            np.zeros((2, 2, 1)),
+            names=names,
+            reward=np.zeros((2, 2)),
+            flags=flags((2, 2)),
+            out_of_band={
+                k: {"info": {"env_id": np.array(ids)}} for k, ids in enumerate(([3, 1], [0, 2]))
+            },
+        )
+    )
+    assert batch.index.tolist() == [[7, 5], [0, 2]]
+
+
+def test_rows_of_different_shape_do_not_make_one_column() -> None:
+    """It is said what to do."""
+    batch = results(
+        columns([0], np.zeros((1, 1)), [0]),
+        columns([3], np.zeros((1, 1)), [1], reward=np.zeros((1, 2)), flags=flags((1, 2))),
+    )
+    with pytest.raises(ValueError, match=r"by_name\(\)"):
+        batch.is_reset  # noqa: B018
+    assert [part.is_reset.shape for part in batch.by_name().values()] == [(1,), (1, 2)]
+
+
+@pytest.mark.parametrize("name", ["is_reset", "limit_reached", "restarted", "index", "sent"])
+def test_plain_values_tell_nothing_of_a_group(name: str) -> None:
+    """Neither do responses."""
+    for batch in (BatchedData(["a"], [1]), mixed().respond(action=np.zeros(4))):
+        with pytest.raises(AttributeError, match="only results of a group"):
+            getattr(batch, name)
+
+
+def test_the_step_limit_makes_an_episode_done_that_has_not_ended() -> None:
+    """Its sums are told all the same, and the flags of the env stay its own."""
+    batch = results(
+        columns(
+            [0, 1, 2],
+            np.zeros((3, 1)),
+            flags=flags((3,), truncated=[True, False, False]),
+            limit_reached=np.array([False, True, False]),
+            episode_return=np.array([1.0, 2.0, 3.0]),
+            episode_length=np.array([4, 5, 6]),
+        )
+    )
+    assert batch.done.tolist() == [True, True, False]
+    assert batch.truncated.tolist() == [True, False, False]
+    assert batch.info("episode", None) == [{"r": 1.0, "l": 4}, {"r": 2.0, "l": 5}, None]
+
+
+def test_results_handed_over_whole_are_done_as_others_are() -> None:
+    """What an inline env has returned is not taken apart, and its ends count."""
+    rets = [
+        EnvRet(env_id=id_, observation=0.0, last_reward=1.0, last_terminated=k == 0)
+        for k, id_ in enumerate(IDS[:2])
+    ]
+    batch = results(
+        columns(
+            [0, 1],
+            None,
+            flags=flags((2,), terminated=[True, False]),
+            limit_reached=np.array([False, True]),
+            out_of_band={k: {"ret": ret} for k, ret in enumerate(rets)},
+            whole_results=True,
+        )
+    )
+    assert batch["pendulum-0"] is rets[0]
+    assert batch.done.tolist() == [True, True]
+    assert batch.is_reset.tolist() == [False, False]
+
+
+# -- what was sent for the rows
+
+
+@st.composite
+def any_sources(draw: st.DrawFn) -> tuple[Any, Any, list[Any]]:
+    """Columns of several requests, or none, that rows came from; with each row's values."""
+    requests: list[Any] = [None]
+    for number in range(draw(st.integers(0, 3))):
+        rows = 4
+        base = number * 10.0 + np.arange(rows)
+        request: dict[str, Any] = {
+            "action": {"move": np.stack((base, -base), axis=1), "jump": (base.astype(int),)},
+            "tag": [f"{number}-{k}" for k in range(rows)],
+        }
+        if draw(st.booleans()):
+            request["log_prob"] = base / 2
+        requests.append(request)
+    n = draw(st.integers(1, 6))
+    chosen = draw(st.lists(st.sampled_from(range(len(requests))), min_size=n, max_size=n))
+    rows = draw(st.lists(st.integers(0, 3), min_size=n, max_size=n))
+    of_rows = np.empty(n, object)
+    of_rows[:] = [requests[k] for k in chosen]
+    return (
+        of_rows,
+        np.array(rows, np.intp),
+        [(requests[k], row) for k, row in zip(chosen, rows, strict=True)],
+    )
+
+
+@given(drawn=any_sources())
+def test_what_was_sent_comes_back_in_the_order_of_the_results(
+    drawn: tuple[Any, Any, list[Any]],
+) -> None:
+    """From whatever requests; rows that answer none, or one without the column, say nothing."""
+    of_rows, rows, expected = drawn
+    batch = results(columns([k % 5 for k in range(len(rows))], None), sources=(of_rows, rows))
+    sent = batch.sent
+    names = {name for request, _ in expected if request for name in request}
+    assert set(sent) == set(sent.keys()) == names
+    for name in ("action", "tag", "log_prob"):
+        assert (name in sent) == (name in names)
+        if name not in names:
+            with pytest.raises(AttributeError, match=f"no '{name}' was sent"):
+                getattr(sent, name)
+            with pytest.raises(KeyError, match=f"no '{name}' was sent"):
+                sent[name]
+    if "tag" in names:
+        assert sent.tag == [request and request["tag"][row] for request, row in expected]
+        assert sent["tag"] == sent.tag
+        move, (jump,) = sent.action["move"], sent.action["jump"]
+        for k, (request, row) in enumerate(expected):
+            if request is None:
+                assert np.isnan(move[k]).all()
+                assert jump[k] == 0
+            else:
+                assert (move[k] == request["action"]["move"][row]).all()
+                assert jump[k] == request["action"]["jump"][0][row]
+        assert (move.shape, jump.dtype) == ((len(rows), 2), int)
+    if "log_prob" in names:
+        found = sent.log_prob
+        for k, (request, row) in enumerate(expected):
+            if request is None or "log_prob" not in request:
+                assert np.isnan(found[k])
+            else:
+                assert found[k] == request["log_prob"][row]
+
+
+def sent_for(n: int, *requests: Any, of_rows: list[int], rows: list[int]) -> Any:
+    """What was sent for `n` results that answer these requests."""
+    of_each = np.empty(n, object)
+    of_each[:] = [requests[k] for k in of_rows]
+    return results(columns(list(range(n)), None), sources=(of_each, np.array(rows))).sent
+
+
+def test_tensors_that_were_sent_come_back_as_tensors() -> None:
+    """On their device; rows that answer nothing hold NaN, or 0 where there is none."""
+    torch = pytest.importorskip("torch")
+    sent = sent_for(
+        3,
+        None,
+        {"value": torch.tensor([1.0, 2.0]), "choice": torch.tensor([3, 4])},
+        {"value": torch.tensor([5.0]), "choice": torch.tensor([6])},
+        of_rows=[2, 0, 1],
+        rows=[0, 0, 1],
+    )
+    assert torch.equal(sent.value.nan_to_num(-1.0), torch.tensor([5.0, -1.0, 2.0]))
+    assert torch.equal(sent.choice, torch.tensor([6, 0, 4]))
+
+
+def test_what_is_kept_does_not_change_with_what_was_sent() -> None:
+    """A policy may go on writing to its arrays."""
+    action, tags = {"a": (np.zeros(2),)}, ["x", "y"]
+    kept = kept_columns({"action": action, "tag": tags})
+    action["a"][0][:] = 9
+    tags[0] = "z"
+    assert kept["action"]["a"][0].tolist() == [0, 0]
+    assert kept["tag"] == ["x", "y"]
+
+
+def test_what_is_kept_of_tensors_is_a_copy() -> None:
+    """As of arrays."""
+    torch = pytest.importorskip("torch")
+    tensor = torch.zeros(2)
+    kept = kept_columns({"action": tensor})
+    tensor += 1
+    assert kept["action"].tolist() == [0, 0]
+
+
+def test_responses_that_came_one_by_one_are_columns_too() -> None:
+    """Where they stack; else lists, with None where one lacks what others have."""
+    responses = [
+        PolicyResponse("a-0", np.zeros(2), log_prob=0.5, thought="x"),
+        PolicyResponse("a-1", np.ones(2), log_prob=1.5),
+    ]
+    found = columns_of_values(responses)
+    assert found["action"].tolist() == [[0, 0], [1, 1]]
+    assert found["log_prob"].tolist() == [0.5, 1.5]
+    assert found["thought"] == ["x", None]
+    ragged = columns_of_values([PolicyResponse("a-0", np.zeros(2)), PolicyResponse("a-1", 3)])
+    assert [np.shape(action) for action in ragged["action"]] == [(2,), ()]
+
+
+def test_an_unknown_name_says_what_was_sent() -> None:
+    """Also where nothing was."""
+    sent = sent_for(1, {"action": np.zeros(1), "value": np.zeros(1)}, of_rows=[0], rows=[0])
+    with pytest.raises(AttributeError, match=r"no 'logprob' was sent.*action, value"):
+        sent.logprob  # noqa: B018
+    with pytest.raises(KeyError, match="nothing"):
+        sent_for(1, None, of_rows=[0], rows=[0])["action"]
+
+
+def test_what_was_sent_can_be_copied_and_pickled() -> None:
+    """As a batch can that goes to another thread or process."""
+    sent = sent_for(2, {"action": np.arange(2)}, of_rows=[0, 0], rows=[1, 0])
+    for one in (copy.copy(sent), copy.deepcopy(sent), pickle.loads(pickle.dumps(sent))):
+        assert one.action.tolist() == [1, 0]
+
+
+# -- infos
+
+
+@given(
+    infos=st.lists(
+        st.fixed_dictionaries(
+            {},
+            optional={
+                "count": st.integers(-9, 9),
+                "speed": st.floats(allow_nan=False),
+                "position": st.lists(st.integers(0, 9), min_size=2, max_size=2).map(np.array),
+                "name": st.text(max_size=3),
+                "nested": st.fixed_dictionaries({}, optional={"deep": st.integers(0, 9)}),
+            },
+        ),
+        min_size=1,
+        max_size=5,
+    )
+)
+def test_infos_are_columns_with_masks(infos: list[dict[str, Any]]) -> None:
+    """Typed where they can be; the mask tells which rows have the key, in nested dicts, too."""
+    batch = results(
+        columns(
+            list(range(len(infos))),
+            None,
+            out_of_band={k: {"info": info} for k, info in enumerate(infos)},
+        )
+    )
+
+    def check(found: Any, given_: list[Any], path: str = "") -> None:
+        keys = {key for info in given_ for key in info}
+        assert {key for key in found if key[0] != "_"} == keys, path
+        for key in keys:
+            has = [key in info for info in given_]
+            assert found["_" + key].tolist() == has
+            if key == "nested":
+                check(found[key], [info.get(key, {}) for info in given_], key)
+                continue
+            for value, info in zip(found[key], given_, strict=True):
+                if key in info:
+                    assert np.array_equal(value, info[key])
+
+    check(batch.infos, infos)
+    kinds = {"count": "i", "speed": "f", "position": "i", "name": "O"}
+    for key in kinds.keys() & batch.infos.keys():
+        assert batch.infos[key].dtype.kind == kinds[key]
+    assert batch.infos is batch.infos
+
+
+def test_infos_are_those_of_gymnasiums_vector_envs() -> None:
+    """A loop written for one reads these."""
+    import gymnasium as gym
+
+    class Telling(gym.Env[Any, Any]):
+        observation_space = action_space = spaces.Discrete(2)
+
+        def __init__(self, number: int) -> None:
+            self.number = number
+
+        def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+            return 0, infos[self.number]
+
+    infos: list[dict[str, Any]] = [
+        {"x": 1, "where": np.array([1.0, 2.0])},
+        {"x": 2, "episode": {"r": 3.5, "l": 2}, "final_obs": np.zeros(2)},
+        {},
+    ]
+    vector = gym.vector.SyncVectorEnv([lambda k=k: Telling(k) for k in range(3)])
+    _, expected = vector.reset()
+    vector.close()
+    batch = results(
+        columns([0, 1, 2], None, out_of_band={k: {"info": info} for k, info in enumerate(infos)})
+    )
+    assert repr(batch.infos) == repr(expected)
+
+
+def test_one_key_of_all_infos_is_a_column() -> None:
+    """A list where its values differ in shape; a default stands in where the key is missing."""
+    infos = [{"a": 1.5, "b": [1]}, {"a": 2.5, "b": [1, 2]}, {"b": [], "c": None}]
+    batch = results(
+        columns([0, 1, 2], None, out_of_band={k: {"info": info} for k, info in enumerate(infos)})
+    )
+    assert batch.info() == infos
+    assert batch.info("b") == [[1], [1, 2], []]
+    assert batch.info("a", 0.0).tolist() == [1.5, 2.5, 0.0]
+    assert batch.info("c", None).tolist() == [None] * 3
+    with pytest.raises(KeyError, match=r"the info of pendulum-2 has no 'a'; give a default"):
+        batch.info("a")
+    plain = BatchedData(
+        ["a-0", "a-1"], [EnvRet(env_id=f"a-{k}", observation=0, info={"k": k}) for k in range(2)]
+    )
+    assert plain.info("k").tolist() == [0, 1]
+    assert plain.infos["k"].tolist() == [0, 1]
+
+
+# -- what only groups ask, and what people see
+
+
+def test_only_its_own_group_knows_a_batch() -> None:
+    """Another one goes by the ids."""
+    group = object()
+    batch = results(columns([2, 0], np.zeros((2, 1))), group=group)
+    slots = slots_of(batch, group)
+    assert slots is not None
+    assert slots.tolist() == [2, 0]
+    assert slots_of(batch, object()) is slots_of(BatchedData(), group) is None
+    responses = batch.respond(action=np.zeros(2), value=np.ones(2))
+    assert slots_of(responses, group) is slots
+    columns_ = columns_of_responses(responses)
+    assert columns_ is not None
+    assert list(columns_) == ["action", "value"]
+    assert columns_of_responses(batch) is None
+    assert len(parts_of(batch)) == 1
+    assert parts_of(responses) == parts_of(BatchedData()) == ()
+
+
+def test_what_a_batch_looks_like_is_said_without_its_contents() -> None:
+    """Ids of the first, dtype and shape of every column."""
+    shown = repr(mixed())
+    assert shown.startswith("BatchedData(4 results of pendulum-0, grid-world-1, pendulum-2, …,")
+    assert "observation: float64[2, 2], reward: float64[2]" in shown
+    assert "observation: int64[2]" in shown
+    tree = {"a": np.zeros((1, 3), np.float32), "b": (np.zeros(1, bool),)}
+    assert "{a: float32[1, 3], b: (bool[1])}" in repr(results(columns([0], tree)))
+    responses = mixed().respond(action=np.zeros((4, 2)), tag=list("abcd"))
+    assert re.search(r"4 responses of .*action: float64\[4, 2\], tag: list\[4\]", repr(responses))
+    assert repr(BatchedData(["a", "b"], [1, 2])) == "BatchedData(2 values of a, b)"
+
+
+# -- found by looking for it
+
+
+def test_an_empty_batch_of_results_has_columns() -> None:
+    """As a step of no env at all gives in a group of several layouts."""
+    batch = results()
+    for name in ("done", "is_reset", "limit_reached", "restarted", "index"):
+        assert len(getattr(batch, name)) == 0
+
+
+def test_the_step_limit_cuts_results_of_tensors_too() -> None:
+    """Envs whose results are handed over whole reach it one by one."""
+    torch = pytest.importorskip("torch")
+    no = torch.zeros(3, dtype=torch.bool)
+    rets = [
+        EnvRet(
+            env_id=id_,
+            observation=torch.zeros(3, 2),
+            last_reward=torch.zeros(3),
+            last_terminated=no,
+            last_truncated=no,
+        )
+        for id_ in IDS[:2]
+    ]
+    batch = results(
+        columns(
+            [0, 1],
+            None,
+            reward=np.zeros((2, 3)),
+            flags=flags((2, 3)),
+            limit_reached=np.array([False, True]),
+            out_of_band={k: {"ret": ret} for k, ret in enumerate(rets)},
+            whole_results=True,
+        )
+    )
+    assert batch.truncated.tolist() == [[False] * 3] * 2
+    assert batch.done.tolist() == [[False] * 3, [True] * 3]
+
+
+def test_tensors_that_do_not_stack_can_be_attached_to_responses() -> None:
+    """They are kept as a list, as arrays are."""
+    torch = pytest.importorskip("torch")
+    found = columns_of_values(
+        [
+            PolicyResponse("a-0", torch.zeros(1), memory=torch.zeros(2)),
+            PolicyResponse("a-1", torch.zeros(1), memory=torch.zeros(3)),
+            PolicyResponse("a-2", torch.zeros(1)),
+        ]
+    )
+    assert found["action"].shape == (3, 1)
+    assert [None if m is None else len(m) for m in found["memory"]] == [2, 3, None]

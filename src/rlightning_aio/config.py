@@ -30,7 +30,7 @@ from pydantic import (
 )
 
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.registry import BACKENDS, ENVS
+from rlightning_aio.registry import BACKENDS, ENVS, PLACEMENTS
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -63,8 +63,8 @@ class EnvConfig(BaseModel):
     """GPUs of each worker (``placement: ray`` only)."""
     env_kwargs: dict[str, Any] = Field(default_factory=dict)
     """Passed to the backend."""
-    placement: Literal["process", "inline", "ray"] = "process"
-    """Where the envs live: worker processes, this process, or Ray actors."""
+    placement: str = "process"
+    """Where the envs live: worker processes, this process (``inline``), or Ray actors."""
     envs_per_process: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
     """Envs that share a worker."""
     step_timeout: float | None = Field(default=None, gt=0)
@@ -112,6 +112,14 @@ class EnvConfig(BaseModel):
             if not name or "=" in name or "\0" in name + value:
                 raise ValueError(f"{name!r} can't be set in an environment")
         return env_vars
+
+    @field_validator("placement")
+    @classmethod
+    def _know_placement(cls, placement: str) -> str:
+        if placement not in PLACEMENTS:
+            *others, last = map(repr, PLACEMENTS)
+            raise ValueError(f"should be {', '.join(others)} or {last}, got {placement!r}")
+        return placement
 
     @field_validator("interpreter")
     @classmethod

@@ -13,7 +13,7 @@ import importlib
 import importlib.metadata
 import importlib.util
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from rlightning_aio.errors import ConfigError
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from rlightning_aio.envs.base import BaseEnv
 
-__all__ = ["BACKENDS", "ENVS", "Backend", "Registry"]
+__all__ = ["BACKENDS", "ENVS", "PLACEMENTS", "Backend", "Placement", "Registry", "load"]
 
 ENTRY_POINT_GROUP = "rlightning_aio.envs"
 
@@ -86,7 +86,7 @@ BACKENDS: dict[str, Backend] = {
                 preload=("rlightning_aio.envs.gymnasium", "gymnasium.envs.mujoco")),
         Backend("gymnasium", "rlightning_aio.envs.gymnasium:GymnasiumEnv", "gymnasium",
                 "gymnasium", cpu_bound=True, preload=("rlightning_aio.envs.gymnasium",)),
-        Backend("env_server", "rlightning_aio.hosts.remote:RemoteHost", "zmq", "pyzmq"),
+        Backend("env_server", "rlightning_aio.hosts.env_server:EnvServerHost", "zmq", "pyzmq"),
         Backend("ale", "rlightning_aio.envs.ale:ALEEnv", "ale_py", "ale-py", extra="ale",
                 cpu_bound=True, vectorized=True, preload=("rlightning_aio.envs.ale",)),
         Backend("pettingzoo", "rlightning_aio.envs.pettingzoo:PettingZooEnv", "pettingzoo",
@@ -106,6 +106,33 @@ BACKENDS: dict[str, Backend] = {
     )
 }
 # fmt: on
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """Where the envs of an entry may live.
+
+    Attributes:
+        target: ``module:Class`` of the host; None if there is none yet.
+        spreads: an entry's envs may be spread over several hosts, to which functions travel
+            by pickle.
+    """
+
+    target: str | None
+    spreads: bool
+
+
+PLACEMENTS: dict[str, Placement] = {
+    "process": Placement("rlightning_aio.hosts.process:ProcessHost", spreads=True),
+    "inline": Placement("rlightning_aio.hosts.inline:InlineHost", spreads=False),
+    "ray": Placement(None, spreads=True),
+}
+
+
+def load(target: str) -> Any:
+    """The object that ``module:name`` names."""
+    module_name, _, name = target.partition(":")
+    return getattr(importlib.import_module(module_name), name)
 
 
 class Registry:
@@ -155,8 +182,7 @@ class Registry:
         if (env_class := self._classes.get(name)) is not None:
             return env_class
         if (backend := BACKENDS.get(name)) is not None:
-            module_name, _, class_name = backend.target.partition(":")
-            return getattr(importlib.import_module(module_name), class_name)
+            return load(backend.target)
         for entry_point in importlib.metadata.entry_points(group=ENTRY_POINT_GROUP, name=name):
             return entry_point.load()
         raise ConfigError(self.unknown(name))

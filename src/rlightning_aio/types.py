@@ -8,12 +8,12 @@ Absent on purpose: anything that knows where an env runs.
 from __future__ import annotations
 
 import time
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import gymnasium as gym
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
 
-__all__ = ["Autoreset", "EnvMeta", "EnvRet", "MultiAgentEnvRet", "PolicyResponse"]
+__all__ = ["Autoreset", "ClientTraits", "EnvMeta", "EnvRet", "MultiAgentEnvRet", "PolicyResponse"]
 
 Autoreset: TypeAlias = Literal["disabled", "next_step", "same_step"]
 """See `EnvMeta`."""
@@ -121,3 +121,15 @@ class EnvMeta(BaseModel):
     agents: tuple[str, ...] = ()
     max_episode_steps: int | None = None
     autoreset: Autoreset = "disabled"
+
+
+class ClientTraits(NamedTuple):
+    """What a client of an env_server makes of requests.
+
+    Attributes:
+        free_actions: its actions need not fit its action space.
+        reads_extras: something there reads what the policy attaches beside the action.
+    """
+
+    free_actions: bool
+    reads_extras: bool

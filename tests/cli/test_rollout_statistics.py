@@ -53,18 +53,18 @@ def test_steps_are_what_envs_have_executed(
         with group.auto_reset(limit):
             group.step_async(act(batch))
             for least, most in collects:
-                batch, flags = group.collect_async(min_results=min(least, most), max_results=most)
-                statistics.add(batch, flags)
+                batch, _ = group.collect_async(min_results=min(least, most), max_results=most)
+                statistics.add(batch)
                 group.step_async(act(batch))
-            statistics.add(*group.collect_async(wait_all=True))
+            statistics.add(group.collect_async(wait_all=True)[0])
         stats = group.get_env_stats()
     assert statistics.steps == Stub.steps
     entries = statistics.by_entry(stats)
     assert sum(entry.steps for entry in entries) == statistics.steps
     for entry, length in zip(entries, lengths, strict=True):
-        finished = length <= limit and entry.episodes > 0
-        assert entry.mean_length == (length if finished else None)
-        assert entry.mean_return == (length if finished else None)
+        # The step limit ends an episode, too.
+        expected = min(length, limit) if entry.episodes else None
+        assert entry.mean_length == entry.mean_return == expected
 
 
 def test_an_entry_that_was_not_met_has_no_figures() -> None:

@@ -85,7 +85,7 @@ def test_a_bad_action_reaches_the_trainer_and_not_the_arm() -> None:
             group.step(batch.respond(action=bad))
         batch, _ = group.reset()
         batch, _ = group.step(batch.respond(action=np.array([[*READY, 0.0]], np.float32)))
-        assert batch.info[0]["arm_status"] == "NORMAL"
+        assert batch.info()[0]["arm_status"] == "NORMAL"
 
 
 @pytest.mark.parametrize("death", [signal.SIGKILL, signal.SIGTERM])

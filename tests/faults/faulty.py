@@ -26,6 +26,7 @@ from gymnasium import spaces
 import rlightning_aio
 import rlightning_aio.sync
 from rlightning_aio.envs.base import BaseEnv
+from rlightning_aio.hosts.process import ForkServer
 from rlightning_aio.registry import ENVS
 from rlightning_aio.types import EnvRet
 
@@ -354,3 +355,10 @@ def marked(ret: EnvRet) -> bool:
     assert list(ret.observation[2:]) == [1, 0, 0], "it shows the first reset of a new life"
     assert ret.info["resets"] == 1
     return True
+
+
+def fork_server_of(group: Any) -> ForkServer:
+    """The one fork server of a group."""
+    shared = group._core.supervisor.resources.values()
+    (server,) = (one for one in shared if isinstance(one, ForkServer))
+    return server

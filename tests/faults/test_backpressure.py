@@ -91,9 +91,9 @@ def test_megabytes_for_a_trainer_that_is_busy_wait_in_the_worker(start: Start) -
     for env_id in group.group.env_ids:
         group.call(env_id, "answer_with", info=lambda: {"cargo": np.ones(MEGABYTES, np.uint8)})
     group.step_async(tokens.steps(group.group.env_ids))
-    for host in group.group._fleet.hosts:
+    for host in group.group._core.supervisor.hosts:
         # The first reply of each has begun to fill its channel, which nobody reads yet.
-        assert select.select([host.fileno()], [], [], 10)[0]
+        assert select.select([host._link.fileno()], [], [], 10)[0]
     batch, _ = group.collect_async(wait_all=True)
     assert len(batch) == 4
     for ret in batch.values():

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import pytest
-from faults.faulty import Driven, Tokens, entry, marked
+from faults.faulty import Driven, Tokens, entry, fork_server_of, marked
 
 from rlightning_aio.errors import EnvRaised, StartFailed, WorkerDied
 
@@ -323,7 +323,7 @@ def test_replacement_whose_reset_raises_answers_with_that(start: Start, tmp_path
 def test_fork_server_that_is_killed_is_replaced_with_its_workers(start: Start) -> None:
     """Everything of it is gone at once; every env answers once, and goes on."""
     group, tokens = start(two_workers()), Tokens()
-    (server,) = group.group._fleet.servers
+    server = fork_server_of(group.group)
     group.step_async(tokens.steps(["faulty-1"]))
     kill(server._process.pid)
     batch, _ = group.collect_async()
@@ -339,7 +339,7 @@ def test_fork_server_that_is_killed_is_replaced_with_its_workers(start: Start) -
 def test_failed_fork_costs_one_worker_and_tells_why(start: Start) -> None:
     """A machine that is out of descriptors can't replace a worker; the others live on."""
     group, tokens = start(two_workers(max_restarts=2)), Tokens()
-    (server,) = group.group._fleet.servers
+    server = fork_server_of(group.group)
     pid = server._process.pid
     held = len(list(Path(f"/proc/{pid}/fd").iterdir()))
     kept = resource.prlimit(pid, resource.RLIMIT_NOFILE)

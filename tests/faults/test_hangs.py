@@ -111,8 +111,8 @@ def test_hang_is_found_while_others_leave_the_trainer_no_time_to_wait(start: Sta
     found: dict[str, Any] = {}
     while "faulty-0" not in found and time.monotonic() < until:
         group.step_async(tokens.steps(["faulty-2", "faulty-3"]))
-        while group.group._core.fleet.hosts[1].in_flight:
-            group.group._core._sweep()  # So that the collect finds all it wants.
+        while group.group._core.requests.in_flight[1]:
+            group.group._core._poll()  # So that the collect finds all it wants.
         batch, _ = group.collect_async(min_results=2)
         found = dict(batch.items())
     assert marked(found["faulty-0"])
@@ -161,7 +161,7 @@ def test_replacement_that_hangs_is_replaced_until_there_are_too_many(
     kwargs = {"faults": {"building": "sleep"}, "while_exists": str(broken)}
     config = two_workers(env_kwargs=kwargs, max_restarts=1, start_timeout=5)
     group, tokens = start(config), Tokens()
-    for member in group.group._fleet._members:
+    for member in group.group._core.supervisor._records:
         member.config = member.config.model_copy(update={"start_timeout": LIMIT})
     broken.touch()
     with pytest.raises(WorkerDied, match=f"did not start again within {LIMIT} s") as caught:
@@ -178,11 +178,11 @@ def test_replacement_that_hangs_is_found_though_nobody_was_waiting_for_it(
     kwargs = {"faults": {"building": "sleep"}, "while_exists": str(broken)}
     group = start(two_workers(env_kwargs=kwargs, max_restarts=1, start_timeout=5))
     tokens = Tokens()
-    for member in group.group._fleet._members:
+    for member in group.group._core.supervisor._records:
         member.config = member.config.model_copy(update={"start_timeout": LIMIT})
     broken.touch()
     os.kill(pid_of(group, "faulty-0"), signal.SIGKILL)
-    while not group.group._fleet.recovering:
+    while not group.group._core.supervisor.recovering:
         group.step(tokens.steps(["faulty-2"]))
     with pytest.raises(WorkerDied, match="did not start again"):
         group.reset()
@@ -195,7 +195,7 @@ def test_after_a_missed_deadline_the_next_results_are_right(
     """Nothing is lost, nothing comes twice, nothing answers another request."""
     group, tokens = start(two_workers(step_timeout=60)), Tokens()
     os.kill(pid_of(group, "faulty-0"), signal.SIGSTOP)
-    pid = group.group._fleet.hosts[0].pid
+    pid = group.group._core.supervisor.hosts[0].pid
     group.step_async(tokens.steps(["faulty-0", "faulty-1"]))
     for _ in range(3):
         with pytest.raises(TimeoutError, match="nothing is lost"):

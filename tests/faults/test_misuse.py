@@ -213,7 +213,7 @@ async def test_second_collector_is_refused_and_the_first_goes_on() -> None:
     async with rlightning_aio.build_env_group(two_workers()) as group:
         await group.reset()
         # Workers that are stopped keep the first collector waiting.
-        pids = [host.pid for host in group._core.fleet.hosts]
+        pids = [host.pid for host in group._core.supervisor.hosts]
         for pid in pids:
             os.kill(pid, signal.SIGSTOP)
         try:

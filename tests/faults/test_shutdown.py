@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import pytest
-from faults.faulty import Driven, Tokens
+from faults.faulty import Driven, Tokens, fork_server_of
 from faults.test_deaths import kill, pid_of, two_workers
 
 import rlightning_aio
@@ -302,7 +302,7 @@ def test_env_that_hangs_in_a_step_does_not_hold_up_close(start: Start) -> None:
     """Whatever its own timeout says."""
     group, tokens = start(two_workers(step_timeout=60)), Tokens()
     group.step_async(tokens.steps(["faulty-1"], {"faulty-1": "loop in C"}))
-    while not group.group._fleet.hosts[0].executing()[0]:
+    while not group.group._core.supervisor.hosts[0].executing()[0]:
         os.sched_yield()
     began = time.monotonic()
     with pytest.warns(UserWarning, match="did not close in time and was killed"):
@@ -313,7 +313,7 @@ def test_env_that_hangs_in_a_step_does_not_hold_up_close(start: Start) -> None:
 def test_stopped_fork_server_does_not_hold_up_close(start: Start) -> None:
     """Who would kill the workers can't; so it is killed, and the kernel kills them."""
     group = start(two_workers())
-    (server,) = group.group._fleet.servers
+    server = fork_server_of(group.group)
     os.kill(pid_of(group, "faulty-0"), signal.SIGSTOP)
     os.kill(server._process.pid, signal.SIGSTOP)
     with watched(descendants(os.getpid())) as ended:
@@ -393,7 +393,7 @@ def test_interrupted_wait_loses_nothing(waiting: str) -> None:
 def test_replaced_workers_leave_no_zombies(start: Start) -> None:
     """Whoever has died is buried, and its descriptors are given back."""
     group, tokens = start(two_workers(max_restarts=100)), Tokens()
-    (server,) = group.group._fleet.servers
+    server = fork_server_of(group.group)
 
     def held() -> tuple[int, int, int]:
         return (

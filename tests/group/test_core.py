@@ -70,13 +70,13 @@ def test_the_window_ends_for_results_that_joined_unnoticed(new_group: NewGroup) 
 def test_the_window_opens_when_an_inline_result_is_there(new_group: NewGroup) -> None:
     """Not before the env was stepped, however long that takes."""
     group = new_group(1, 1, inline=[True, False])
-    run_one = group.hosts[0].run_one
+    execute_next = group.hosts[0].execute_next
 
     def run_slowly() -> bool:
         group.now += 2.0 if group.hosts[0].waiting else 0.0
-        return run_one()
+        return execute_next()
 
-    group.hosts[0].run_one = run_slowly
+    group.hosts[0].execute_next = run_slowly
     group.core.step_async(steps(0, 1), group.now)
     running = collect(group, timeout=1.0)
     group.pass_time(0.5)
@@ -106,7 +106,7 @@ def test_a_step_given_up_after_its_last_reply_loses_nothing(new_group: NewGroup)
     host.finish()
     host.finish()
     host.on_readable()
-    group.core.absorb()
+    group.core.drain()
     group.cancel(running)
     assert ids_of(collect(group)) == ["fake-0", "fake-1"]
 
@@ -189,7 +189,7 @@ def test_a_group_that_is_not_open_says_so(moment: str) -> None:
     """Whatever is asked of it; nothing is confused with an idle group."""
     group = FakeGroup([1])
     if moment == "before init":
-        group.fleet.open = False
+        group.core.supervisor.open = False
     else:
         group.core.step_async(steps(0), group.now)
         group.finish(0)

@@ -46,6 +46,7 @@ class Answer:
     terminated: bool = False
     truncated: bool = False
     info: dict[str, Any] = field(default_factory=dict)
+    over: bool = False
     error: bool = False
 
 
@@ -57,10 +58,12 @@ class Request:
         op: ``step``, ``reset`` or ``call``; a step that auto-reset replaces is a ``reset``.
         owner: the operation that waits for it; None for `collect_async`.
         restarts: its worker died before it replied.
+        value: what was attached to the step.
     """
 
     op: str
     action: int = PLAIN
+    value: int | None = None
     seed: int | None = None
     owner: Running | None = None
     answer: Answer | None = None
@@ -76,6 +79,7 @@ class ModelEnv:
     request: Request | None = None
     count: int = 0
     due: bool = False
+    over: bool = False
     lost: bool = False
 
 
@@ -132,16 +136,16 @@ class CoreMachine(RuleBasedStateMachine):
         """A batch for `slots`: from columns where the last batch holds just them."""
         actions = [data.draw(ACTIONS) for _ in slots]
         last = self.last_batch
+        self.attaches = True
         if last is not None and [self.slot(id_) for id_ in last.ids()] == slots:
             return last.respond(np.array(actions), value=np.array(slots)), actions
         ids = [self.group.env_ids[slot] for slot in slots]
-        extras = {"value": 1} if data.draw(st.booleans()) else {}
-        return (
-            BatchedData(
-                ids, [PolicyResponse(i, a, **extras) for i, a in zip(ids, actions, strict=True)]
-            ),
-            actions,
-        )
+        self.attaches = data.draw(st.booleans())
+        extras = [{"value": slot} if self.attaches else {} for slot in slots]
+        values = [
+            PolicyResponse(i, a, **own) for i, a, own in zip(ids, actions, extras, strict=True)
+        ]
+        return BatchedData(ids, values), actions
 
     @staticmethod
     def slot(env_id: str) -> int:
@@ -152,11 +156,12 @@ class CoreMachine(RuleBasedStateMachine):
         requests: list[Request] = []
         for slot, action in zip(slots, actions, strict=True):
             env = self.envs[slot]
-            request = Request("step", action)
+            value = slot if self.attaches else None
+            request = Request("step", action, value)
             if self.limit is not None and env.due:
-                request = Request("reset")
+                request = Request("reset", value=value)
             if env.lost:
-                request = Request("reset", restarts=True)
+                request = Request("reset", value=value, restarts=True)
                 env.lost = False
             env.request = request
             requests.append(request)
@@ -179,6 +184,7 @@ class CoreMachine(RuleBasedStateMachine):
             return
         if request.op == "reset":
             env.reset()
+            model.over = False
             request.answer = Answer(tuple(env.observation()))
             if request.seed is not None:
                 request.answer.info = {"seed": [request.seed]}
@@ -190,6 +196,7 @@ class CoreMachine(RuleBasedStateMachine):
             return
         else:
             env.step()
+            model.over |= request.action in (TERMINATES, TRUNCATES)
             told = {"told": [env.steps]} if request.action == TELLS else {}
             request.answer = Answer(
                 tuple(env.observation()),
@@ -197,6 +204,7 @@ class CoreMachine(RuleBasedStateMachine):
                 request.action == TERMINATES,
                 request.action == TRUNCATES,
                 told,
+                over=model.over,
             )
         if request.restarts:
             request.answer.truncated = True
@@ -211,7 +219,7 @@ class CoreMachine(RuleBasedStateMachine):
             if not host.inline:
                 continue
             waiting = {host.first_slot + row for row, _ in host.waiting}
-            for slot in range(host.first_slot, host.first_slot + host.rows):
+            for slot in range(host.first_slot, host.first_slot + host.num_envs):
                 request = self.envs[slot].request
                 if request is not None and request.answer is None and slot not in waiting:
                     self.execute(slot)
@@ -390,7 +398,7 @@ class CoreMachine(RuleBasedStateMachine):
     def die(self, data: st.DataObject) -> None:
         """A worker dies: each of its envs that owed a reply gives one marked result."""
         host = data.draw(st.sampled_from([h for h in self.group.hosts if not h.inline]))
-        for slot in range(host.first_slot, host.first_slot + host.rows):
+        for slot in range(host.first_slot, host.first_slot + host.num_envs):
             model = self.envs[slot]
             model.env = FakeEnv(slot, host.life + 1)
             model.lost = True
@@ -556,13 +564,20 @@ class CoreMachine(RuleBasedStateMachine):
             assert batch.reward[position] == answer.reward
             assert batch.terminated[position] == answer.terminated
             assert batch.truncated[position] == answer.truncated
-            assert batch.info[position] == answer.info
+            assert batch.info()[position] == answer.info
             assert batch.values()[position].env_id == f"fake-{slot}"
             model.count = model.count + 1 if stepped else 0
             reached = self.limit is not None and model.count >= self.limit
-            ended = stepped and self.on_done and (answer.terminated or answer.truncated)
+            ended = stepped and self.on_done and answer.over
             model.due = self.limit is not None and (reached or ended)
             expected_flags.append(reached)
+            assert batch.index[position] == slot
+            assert batch.is_reset[position] == (not stepped)
+            assert batch.restarted[position] == request.restarts
+            assert batch.limit_reached[position] == reached
+            assert batch.done[position] == (answer.terminated or answer.truncated or reached)
+            if request.value is not None:
+                assert batch.sent.value[position] == request.value
         if flags is not None:
             assert flags == expected_flags
 
@@ -577,8 +592,12 @@ class CoreMachine(RuleBasedStateMachine):
             if env.request is not None and env.request.owner is None and not env.request.abandoned
         ]
         assert self.core.pending() == len(mine)
-        inline_unread = sum(len(h.unread) for h in self.group.hosts if h.inline)
-        assert not inline_unread
+        in_flight = self.core.requests.in_flight
+        for host, count in zip(self.group.hosts, in_flight, strict=True):
+            slots = range(host.first_slot, host.first_slot + host.num_envs)
+            outstanding = [r for k in slots if (r := self.envs[k].request) is not None]
+            assert count <= len(outstanding)
+            assert count >= sum(r.answer is None for r in outstanding)
 
 
 TestCore = CoreMachine.TestCase

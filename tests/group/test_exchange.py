@@ -142,12 +142,12 @@ async def test_extras_reach_the_function_and_the_step(start: Any) -> None:
     columns = batch.respond(action=np.array([[0, 2.0], [0, 3.0]]), weight=np.array([10.0, 20.0]))
     batch, _ = await group.step(columns)
     assert batch.reward.tolist() == [20.0, 60.0]
-    assert batch.info == [{"extras": {"weight": 10.0}}, {"extras": {"weight": 20.0}}]
+    assert batch.info() == [{"extras": {"weight": 10.0}}, {"extras": {"weight": 20.0}}]
     one = PolicyResponse("probe-1", np.array([0, 4.0]), weight=2.0, thought=Thought(3))
     group.step_async(BatchedData(["probe-1"], [one]))
     batch, _ = await group.collect_async()
     assert batch.reward.tolist() == [8.0]
-    assert batch.info[0]["extras"]["thought"].depth == 3
+    assert batch.info()[0]["extras"]["thought"].depth == 3
 
 
 async def test_extras_that_nothing_can_read_are_not_sent(start: Any) -> None:
@@ -206,7 +206,7 @@ async def test_an_env_that_transforms_actions_takes_any(start: Any) -> None:
     batch, _ = await group.reset()
     batch, _ = await group.step(batch.respond(action=[[1.0] * 9, {"chunk": np.ones((2, 2))}]))
     assert batch.reward.tolist() == [9.0, 4.0]
-    assert [info["type"] for info in batch.info] == ["list", "dict"]
+    assert [info["type"] for info in batch.info()] == ["list", "dict"]
     batch, _ = await group.step(batch.respond(action=np.full((2, 2), 3.0)))
     assert batch.reward.tolist() == [6.0, 6.0]
     group.step_async(batch.respond(action=np.ones((2, 7, 3))))
@@ -268,7 +268,7 @@ async def test_sub_environments_have_an_axis_of_their_own(start: Any) -> None:
         batch, _ = await group.step(batch.respond(action=actions))
     assert batch.reward.tolist() == [[2, 4, 6], [8, 10, 12]]
     assert batch.terminated.tolist() == [[False] * 3, [False, True, True]]
-    assert batch.ended.tolist() == [False, False]
+    assert batch.done.tolist() == batch.terminated.tolist()
     value = batch["b-1"]
     assert value.last_reward.tolist() == [8, 10, 12]
     assert value.info["episode"]["ended"].tolist() == [False, True, True]
@@ -321,7 +321,7 @@ async def test_envs_of_different_observations_work_as_one_group(start: Any) -> N
     batch, _ = await group.collect_async(wait_all=True)
     assert sorted(batch.by_name()) == ["e", "pole"]
     batch, _ = await group.step(batch.respond(action=np.zeros(3, int)))
-    assert len(batch.info) == 3
+    assert len(batch.info()) == 3
 
 
 async def test_actions_of_different_shapes_are_refused_unless_meant(place: Any, start: Any) -> None:

@@ -12,6 +12,7 @@ from group import sample_envs
 from group.sample_envs import HALVED
 
 import rlightning_aio.sync
+from rlightning_aio.batch.data import parts_of
 from rlightning_aio.envs.contract import same
 from rlightning_aio.errors import EnvRaised
 
@@ -36,7 +37,7 @@ def test_a_step_of_halves_starts_when_it_is_sent(halved: rlightning_aio.sync.Env
     batch, _ = halved.collect_async()
     assert sample_envs.Halved.log == ["start", "wait"]
     assert batch.observation.tolist() == [[-1, 5]]
-    assert batch.info == [{"nested": {"total": 5}, "success": False}]
+    assert batch.info() == [{"nested": {"total": 5}, "success": False}]
 
 
 @pytest.mark.parametrize("action", [9, 8])
@@ -84,7 +85,7 @@ def test_what_the_trainer_does_between_the_halves_is_not_the_envs_time() -> None
         group.step_async(batch.respond(action=np.array([1])))
         clock.now += 1000
         batch, _ = group.collect_async()
-        (part,) = batch.parts
+        (part,) = parts_of(batch)
         assert part.busy_ns.tolist() == [12]
 
 

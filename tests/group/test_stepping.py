@@ -90,9 +90,9 @@ async def test_options_reach_every_env_of_a_reset(start: Any) -> None:
     """Together with its seed."""
     group = await start(ENTRY)
     batch, _ = await group.reset(seed=3, options={"pose": [1, 2]})
-    assert batch.info == [{"options": {"pose": [1, 2]}}] * 4
+    assert batch.info() == [{"options": {"pose": [1, 2]}}] * 4
     assert batch.observation[:, 3].tolist() == [3, 4, 5, 6]
-    assert (await group.reset(options={}))[0].info == [{"options": {}}] * 4
+    assert (await group.reset(options={}))[0].info() == [{"options": {}}] * 4
 
 
 async def test_a_step_returns_the_same_ids_in_the_same_order(start: Any) -> None:
@@ -296,7 +296,7 @@ async def test_results_are_never_overwritten(start: Any) -> None:
     first, _ = await group.reset()
     probes, others = first.by_name().values()
     before = probes.observation.copy()
-    infos = others.info
+    infos = others.info()
     values = others.values()
     for _ in range(3):
         await group.step(probes.respond(action=actions(1, 2, 3, 4)))
@@ -347,7 +347,7 @@ async def test_what_a_group_has_measured(start: Any, capsys: pytest.CaptureFixtu
     await group.reset(env_ids=["probe-0"])
     group.step_async(responses(["probe-0"], 5.0, what=TRUNCATE))
     batch, _ = await group.collect_async()
-    assert batch.info[0]["episode"] == {"r": 5.0, "l": 1}
+    assert batch.info()[0]["episode"] == {"r": 5.0, "l": 1}
     stats = group.get_stats()
     assert stats["steps_per_second"] > 0
     assert set(stats["entries"]) == {"probe", "more"}

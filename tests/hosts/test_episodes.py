@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rlightning_aio.hosts.episodes import EpisodeSum, EpisodeSums
+from rlightning_aio.hosts.episodes import EpisodeSums
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -17,107 +18,149 @@ if TYPE_CHECKING:
     from rlightning_aio.types import Autoreset
 
 MODES: list[Autoreset] = ["disabled", "next_step", "same_step"]
-steps = st.lists(st.tuples(st.integers(-9, 9), st.booleans()), max_size=30)
+SHAPES: list[tuple[int, ...]] = [(), (3,), (2, 3)]
 
 
-def naive_episodes(mode: Autoreset, stream: list[tuple[int, bool]]) -> list[Any]:
-    """For each step the (return, length) of the episode that ended in it, or None."""
-    found: list[Any] = []
-    total, length, over = 0, 0, False
-    for reward, ended in stream:
-        if over:
-            found.append(None)
-            over = mode == "disabled"
-            continue
-        total, length = total + reward, length + 1
-        found.append((total, length) if ended else None)
-        if ended:
-            total, length = 0, 0
-            over = mode != "same_step"
-    return found
+@dataclass
+class Stream:
+    """One sub-environment (of one agent), told step by step.
+
+    Attributes:
+        total, length: of the episode that is under way or has just ended; length 0 where the
+            last step belongs to none.
+        over: it has ended and was not reset since.
+        reset: the last step was a reset of its own.
+    """
+
+    mode: Autoreset
+    total: float = 0.0
+    length: int = 0
+    over: bool = False
+    reset: bool = False
+
+    def begin(self, *, begun: bool = True) -> None:
+        self.total, self.length, self.over, self.reset = 0.0, 0, not begun, False
+
+    def step(self, reward: float, *, ended: bool) -> None:
+        self.reset = False
+        if self.over and self.mode == "disabled":
+            self.total, self.length = 0.0, 0
+            return
+        if self.over and self.mode == "next_step":
+            self.total, self.length, self.over, self.reset = 0.0, 0, False, True
+            return
+        if self.over:  # It has reset itself in the step of its end.
+            self.total, self.length = 0.0, 0
+        self.total += reward
+        self.length += 1
+        self.over = ended
 
 
-def ends_of(ended: Any) -> NDArray[np.bool_]:
-    """Episodes that end by truncation."""
-    return np.stack((np.zeros_like(ended, bool), np.asarray(ended)), axis=-1)
+class Both:
+    """Sums and, for each of them, a stream of its own; they must agree after every event."""
+
+    def __init__(self, shape: tuple[int, ...], mode: Autoreset) -> None:
+        self.row = np.zeros(shape), np.zeros(shape, np.int64), np.zeros(shape, np.bool_)
+        self.sums = EpisodeSums(*self.row, mode)
+        self.streams = np.empty(shape, object)
+        for place in np.ndindex(shape):
+            self.streams[place] = Stream(mode)
+
+    def column(self, name: str) -> NDArray[Any]:
+        values = [getattr(self.streams[p], name) for p in np.ndindex(self.streams.shape)]
+        return np.array(values).reshape(self.streams.shape)
+
+    def step(self, reward: NDArray[np.float64], ended: NDArray[np.bool_], which: Any = ...) -> None:
+        streams = self.streams[which] if self.streams.shape else self.streams
+        for place in np.ndindex(reward.shape):
+            streams[place].step(float(reward[place]), ended=bool(ended[place]))
+        found = self.sums.step(reward, ended if ended.any() else None, which)
+        expected = self.column("reset")[which]
+        assert (found is None) == (not expected.any())
+        if found is not None:
+            assert found.tolist() == expected.tolist()
+        self.check()
+
+    def begin(self, begun: Any = ...) -> None:
+        for place in np.ndindex(self.streams.shape):
+            self.streams[place].begin(begun=begun is ... or place[0] in begun)
+        self.sums.begin(begun)
+        self.check()
+
+    def check(self) -> None:
+        returns, lengths, over = self.row
+        assert returns.tolist() == self.column("total").tolist()
+        assert lengths.tolist() == self.column("length").tolist()
+        assert over.tolist() == self.column("over").tolist()
+
+
+def drawn_step(data: st.DataObject, shape: tuple[int, ...]) -> tuple[Any, Any]:
+    size = int(np.prod(shape))
+    rewards = data.draw(st.lists(st.integers(-9, 9), min_size=size, max_size=size))
+    # Often none ends, which goes a shorter way.
+    ends = st.just([False] * size) | st.lists(st.booleans(), min_size=size, max_size=size)
+    ended = data.draw(ends)
+    return np.array(rewards, float).reshape(shape), np.array(ended, bool).reshape(shape)
 
 
 @pytest.mark.parametrize("mode", MODES)
-@given(streams=st.lists(steps, min_size=1, max_size=4))
+@pytest.mark.parametrize("shape", SHAPES, ids=str)
+@given(data=st.data())
 def test_sums_are_those_of_each_stream_alone(
-    mode: Autoreset, streams: list[list[tuple[int, bool]]]
+    mode: Autoreset, shape: tuple[int, ...], data: st.DataObject
 ) -> None:
-    """Sub-environments that run together count as if each ran alone."""
-    length = min(map(len, streams))
-    sums = EpisodeSums((len(streams),), mode)
-    expected = [naive_episodes(mode, stream[:length]) for stream in streams]
-    for t in range(length):
-        rewards = np.array([float(stream[t][0]) for stream in streams])
-        ended = np.array([stream[t][1] for stream in streams])
-        found = sums.add(rewards, ends_of(ended))
-        if found is None:
-            assert not ended.any()
-            assert all(one[t] is None for one in expected)
-            continue
-        for k, one in enumerate(expected):
-            assert (found[1][k] > 0) == (one[t] is not None)
-            if one[t] is not None:
-                assert (found[0][k], found[1][k]) == one[t]
+    """Sub-environments and agents that run together count as if each ran alone.
+
+    They stand in the very arrays that were given, of which nobody else knows when to change.
+    """
+    both = Both(shape, mode)
+    for _ in range(data.draw(st.integers(0, 20))):
+        if data.draw(st.integers(0, 5)) == 0:
+            both.begin()
+        else:
+            both.step(*drawn_step(data, shape))
 
 
-@given(data=st.data(), mode=st.sampled_from(MODES))
+@pytest.mark.parametrize("mode", MODES)
+@given(data=st.data())
 def test_sub_environments_that_take_turns_keep_their_own_sums(
-    data: st.DataObject, mode: Autoreset
+    mode: Autoreset, data: st.DataObject
 ) -> None:
-    """Which of them a step is about decides, not where in the batch it stands."""
-    together, alone = EpisodeSums((4,), mode), [EpisodeSums((), mode) for _ in range(4)]
+    """Which of them a step is about decides, not where in the batch it stands.
 
-    for _ in range(data.draw(st.integers(0, 30))):
-        which = np.array(data.draw(st.permutations(range(4)))[:2], np.int32)
-        rewards = np.array(data.draw(st.tuples(*[st.integers(-9, 9)] * 2)), float)
-        ended = np.array(data.draw(st.tuples(*[st.booleans()] * 2)))
-        found = together.add(rewards, ends_of(ended), which)
-        for row, index in enumerate(which):
-            single = alone[index].add(rewards[row], ends_of(ended[row]))
-            if single is not None:
-                assert found is not None
-                assert (found[0][row], found[1][row]) == single
-            elif found is not None:
-                assert found[1][row] == 0
+    A reset tells of some; the first that is heard of the others after it is their start.
+    """
+    both = Both((4,), mode)
+
+    def some() -> Any:
+        chosen = data.draw(st.permutations(range(4)))[: data.draw(st.integers(1, 4))]
+        return np.array(chosen, np.int32)
+
+    for _ in range(data.draw(st.integers(0, 20))):
+        if data.draw(st.integers(0, 5)) == 0:
+            both.begin(some())
+        else:
+            which = some()
+            both.step(*drawn_step(data, (len(which),)), which)
 
 
 @pytest.mark.parametrize("mode", MODES)
 def test_a_reset_forgets_the_episodes_under_way(mode: Autoreset) -> None:
     """What came before it is in no sum after it."""
-    sums = EpisodeSums((2,), mode)
-    sums.add(np.array([5.0, 5.0]), ends_of([True, False]))
-    sums.forget()
-    found = sums.add(np.array([1.0, 2.0]), ends_of([True, True]))
-    assert found is not None
-    assert found[0].tolist() == [1.0, 2.0]
-    assert found[1].tolist() == [1, 1]
+    both = Both((2,), mode)
+    both.step(np.array([5.0, 5.0]), np.array([True, False]))
+    both.begin()
+    both.step(np.array([1.0, 2.0]), np.array([True, True]))
+    returns, lengths, _ = both.row
+    assert (returns.tolist(), lengths.tolist()) == ([1.0, 2.0], [1, 1])
 
 
 def test_an_episode_may_begin_with_a_later_result() -> None:
     """The first that is heard of a sub-environment after a reset is its start, not a step."""
-    sums = EpisodeSums((3,), "next_step")
-    sums.forget(begun=np.array([2]))
-    both = np.array([0, 2])
-    sums.add(np.array([0.0, 4.0]), ends_of([False, False]), both)
-    found = sums.add(np.array([1.0, 1.0]), ends_of([True, True]), both)
-    assert found is not None
-    assert found[0].tolist() == [1.0, 5.0]
-    assert found[1].tolist() == [1, 2]
-
-
-@given(stream=steps)
-def test_the_sum_of_a_single_env_is_the_same(stream: list[tuple[int, bool]]) -> None:
-    """What comes after an end that nobody has reset belongs to no episode."""
-    one, expected = EpisodeSum(), naive_episodes("disabled", stream)
-    for (reward, ended), outcome in zip(stream, expected, strict=True):
-        found = one.add(float(reward), ended)
-        assert (found is None) == (not ended)
-        if found is not None:
-            assert found == (outcome or (0.0, 0))
-    one.forget()
-    assert one.add(2.0, True) == (2.0, 1)
+    both = Both((3,), "next_step")
+    both.begin(begun=np.array([2]))
+    which = np.array([0, 2])
+    both.step(np.array([0.0, 4.0]), np.array([False, False]), which)
+    both.step(np.array([1.0, 1.0]), np.array([True, True]), which)
+    returns, lengths, _ = both.row
+    assert (returns[which].tolist(), lengths[which].tolist()) == ([1.0, 5.0], [1, 2])

@@ -16,23 +16,24 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+from protocol.memory_of_rings import both_sides, memory_size
 
-from rlightning_aio.protocol.rings import (
+from rlightning_aio.protocol.entries import (
     NUMBER_SHIFT,
-    RESET,
     SLOT_MASK,
-    STEP,
-    TrainerRings,
-    WorkerRings,
+    Operation,
     entry,
     number_of,
     op_of,
-    rings_size,
     slot_of,
 )
 
 if TYPE_CHECKING:
     from types import FrameType
+
+    from rlightning_aio.protocol.rings import WorkerRings
+
+STEP = Operation.STEP
 
 
 class RingsMachine(RuleBasedStateMachine):
@@ -44,9 +45,8 @@ class RingsMachine(RuleBasedStateMachine):
 
     @initialize(rows=st.integers(1, 6))
     def start(self, rows: int) -> None:
-        memory = memoryview(bytearray(rings_size(rows)))
         self.rows = rows
-        self.trainer, self.worker = TrainerRings(memory, rows), WorkerRings(memory, rows)
+        self.bell, self.trainer, self.worker = both_sides(rows)
         self.number = 0
         self.requested: deque[int] = deque()
         self.reported: deque[int] = deque()
@@ -92,18 +92,20 @@ class RingsMachine(RuleBasedStateMachine):
     @rule()
     def read_reports(self) -> None:
         assert self.trainer.reports().tolist() == list(self.reported)
+        if self.ordered is not None:
+            # What is read counts towards the order: it is for so many in all.
+            self.ordered -= len(self.reported)
         self.reported.clear()
 
     @rule(count=st.integers(1, 6))
     def order(self, count: int) -> None:
-        late = self.trainer.want(count)
-        assert late == (len(self.reported) >= count)
-        # One that came too late is obeyed at the next report, if it still fits then.
+        self.bell.arm(self.bell.goal(count), 1)
+        # One that came too late is obeyed at the next look, if it still fits then.
         self.ordered = count
 
     @rule()
     def withdraw(self) -> None:
-        self.trainer.forget_want()
+        self.bell.disarm()
         self.ordered = None
 
     @rule()
@@ -139,7 +141,8 @@ class RingsMachine(RuleBasedStateMachine):
     def both_sides_agree(self) -> None:
         if not hasattr(self, "trainer"):
             return
-        assert self.trainer.unread() == len(self.reported)
+        assert self.bell.unread() == len(self.reported)
+        assert self.bell.with_news() == [0] * bool(self.reported)
         assert self.trainer.frames_from_worker() == self.frames[1]
         assert self.worker.has_frame() == bool(self.frames[0])
         assert self.worker.has_news() == bool(self.frames[0] or self.requested)
@@ -152,7 +155,7 @@ TestRings.settings = settings(max_examples=100, stateful_step_count=40, deadline
 @given(
     number=st.integers(0, (1 << (63 - NUMBER_SHIFT)) - 1),
     slot=st.integers(0, SLOT_MASK),
-    op=st.sampled_from((0, STEP, RESET)),
+    op=st.sampled_from((0, *Operation)),
 )
 def test_an_entry_holds_number_slot_and_operation(number: int, slot: int, op: int) -> None:
     """All three come out as they went in, from one 64-bit word."""
@@ -160,10 +163,16 @@ def test_an_entry_holds_number_slot_and_operation(number: int, slot: int, op: in
     assert (number_of(packed), slot_of(packed), op_of(packed)) == (number, slot, op)
 
 
+def test_a_batch_of_steps_becomes_resets_by_adding_a_mask() -> None:
+    """Which is how the trainer makes them."""
+    steps = np.array([entry(k + 1, k, Operation.STEP) for k in range(3)])
+    found = steps + np.array([False, True, False])
+    assert [op_of(one) for one in found.tolist()] == [STEP, Operation.RESET, STEP]
+
+
 def test_the_trainer_sees_what_the_worker_executes_and_since_when() -> None:
     """The word that tells of a hang is empty while nothing is executed."""
-    memory = memoryview(bytearray(rings_size(3)))
-    trainer, worker = TrainerRings(memory, 3), WorkerRings(memory, 3)
+    _, trainer, worker = both_sides(3)
     assert trainer.current()[0] == 0
     worker.begin(entry(7, 2, STEP), 123)
     assert trainer.current() == (entry(7, 2, STEP), 123)
@@ -186,18 +195,18 @@ def _work(rings: WorkerRings, channel: socket.socket) -> None:
 def test_two_processes_never_miss_each_other() -> None:
     """Thousands of rounds in which either side may fall asleep at the wrong moment."""
     rows = 5
-    memory = memoryview(mmap.mmap(-1, rings_size(rows)))
+    memory = memoryview(mmap.mmap(-1, memory_size(rows)))
+    bell, rings, worker = both_sides(rows, memory)
     ours, theirs = socket.socketpair()
     pid = os.fork()
     if pid == 0:
         ours.close()
         try:
-            _work(WorkerRings(memory, rows), theirs)
+            _work(worker, theirs)
         finally:
             os._exit(0)
     theirs.close()
-    rings, draw = TrainerRings(memory, rows), random.Random(0)
-    number = 0
+    draw, number = random.Random(0), 0
     for _ in range(4000):
         count = draw.randint(1, rows)
         entries = [entry(number + k, k, STEP) for k in range(count)]
@@ -206,7 +215,9 @@ def test_two_processes_never_miss_each_other() -> None:
             ours.send(b"!")
         found: list[int] = []
         while len(found) < count:
-            if not rings.want(draw.randint(1, count - len(found))):
+            wanted = draw.randint(1, count - len(found))
+            bell.arm(bell.goal(wanted), draw.choice((1, 2, 256)))
+            if bell.unread() < wanted:
                 ours.recv(1 << 16)
             found += rings.reports().tolist()
         assert found == entries
@@ -219,7 +230,7 @@ def test_rings_of_several_threads_are_fenced_each_for_itself() -> None:
     failures: list[RuntimeError] = []
 
     def work() -> None:
-        trainer = TrainerRings(memoryview(bytearray(rings_size(1))), 1)
+        _, trainer, _ = both_sides(1)
         try:
             for _ in range(20_000):
                 trainer.worker_sleeps()
@@ -241,7 +252,7 @@ def test_rings_of_several_threads_are_fenced_each_for_itself() -> None:
 
 def test_an_interrupt_within_a_fence_leaves_the_next_one_whole() -> None:
     """Wherever Ctrl-C strikes."""
-    trainer = TrainerRings(memoryview(bytearray(rings_size(1))), 1)
+    _, trainer, _ = both_sides(1)
     struck = 0
 
     def strike(frame: FrameType, event: str, arg: Any) -> Any:

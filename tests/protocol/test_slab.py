@@ -20,7 +20,14 @@ from rlightning_aio.protocol.columns import (
     row_reader,
     row_writer,
 )
-from rlightning_aio.protocol.slab import RowLayout, Slab
+from rlightning_aio.protocol.slab import (
+    IS_RESET,
+    OVER,
+    TERMINATED,
+    TRUNCATED,
+    RowLayout,
+    Slab,
+)
 
 fixed_space = any_space.filter(lambda space: leaves(space) is not None)
 HEADS = st.sampled_from([((), ()), ((3,), ()), ((2,), ("a", "b")), ((2, 3), ("a", "b"))])
@@ -48,6 +55,9 @@ def test_values_go_through_rows_unchanged(
         row_writer(observations, theirs.observation, row, "observation")(seen[row])
         theirs.reward[row] = row
         theirs.terminated[row] = row % 2
+        theirs.over[row] = row % 3 > 0
+        theirs.episode_return[row] = row / 2
+        theirs.episode_length[row] = row
         theirs.info[row] = row
     for row in range(rows):
         assert same(row_reader(actions, theirs.action, row)(), sent[row])
@@ -55,6 +65,10 @@ def test_values_go_through_rows_unchanged(
         assert (ours.reward[row] == row).all()
         assert (ours.terminated[row] == bool(row % 2)).all()
         assert not ours.truncated[row].any()
+        assert not ours.is_reset[row].any()
+        assert (ours.over[row] == (row % 3 > 0)).all()
+        assert (ours.episode_return[row] == row / 2).all()
+        assert (ours.episode_length[row] == row).all()
         assert (ours.info[row] == row).all()
 
 
@@ -159,6 +173,28 @@ def test_spaces_without_a_fixed_size_have_no_rows(space: Any) -> None:
     slab = Slab(layout, memoryview(bytearray(layout.size(2))), 2)
     assert slab.observation is None
     assert slab.action is not None
+
+
+@given(head=HEADS, rows=st.integers(1, 3), data=st.data())
+def test_the_flags_are_columns_of_one_array(head: Any, rows: int, data: st.DataObject) -> None:
+    """So that one copy takes all of them along; each is written alone."""
+    layout = RowLayout(spaces.Discrete(2), spaces.Discrete(2), *head)
+    slab = Slab(layout, memoryview(bytearray(layout.size(rows))), rows)
+    names = ("terminated", "truncated", "is_reset", "over")
+    expected = np.zeros((rows, *head[0], 4), bool)
+    assert [TERMINATED, TRUNCATED, IS_RESET, OVER] == [0, 1, 2, 3]
+    for place, name in enumerate(names):
+        row = data.draw(st.integers(0, rows - 1))
+        getattr(slab, name)[row] = expected[row, ..., place] = data.draw(st.booleans())
+    assert (slab.flags == expected).all()
+
+
+def test_a_seed_is_good_for_one_reset() -> None:
+    """The next finds none; 0 is a seed."""
+    layout = RowLayout(spaces.Discrete(2), spaces.Discrete(2), (), ())
+    slab = Slab(layout, memoryview(bytearray(layout.size(2))), 2)
+    slab.seed[1] = 0 + 1
+    assert [slab.take_seed(0), slab.take_seed(1), slab.take_seed(1)] == [None, 0, None]
 
 
 def test_a_tree_keeps_its_shape_when_its_arrays_are_mapped() -> None:

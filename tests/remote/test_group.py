@@ -219,7 +219,7 @@ def test_a_client_that_returns_starts_a_new_episode() -> None:
         while not np.array_equal(batch.observation[0], [5, -1, 3]):
             group.step_async(batch.respond(action=actions(batch)))
             batch, _ = group.collect_async(deadline=20)
-            infos += batch.info
+            infos += batch.info()
         assert sum("client_lost" in info for info in infos) == 1
         group.close()
         again.join()
@@ -236,7 +236,7 @@ async def test_a_client_that_returns_while_the_trainer_thinks_is_no_error() -> N
             batch, _ = await group.collect_async(deadline=20)
         group.step_async(batch.respond(action=actions(batch)))
         marked, _ = await group.collect_async(deadline=20)
-        assert "client_lost" in marked.info[0]
+        assert "client_lost" in marked.info()[0]
         again = ClientThread(address, "c0", CountingEnv(5))
         async with asyncio.timeout(20):
             # The trainer thinks, and the event loop goes on.

@@ -17,7 +17,7 @@ from remote.random_spaces import mutation
 from rlightning_aio import ConfigError, sync
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.errors import StartFailed
-from rlightning_aio.hosts.remote import server_settings
+from rlightning_aio.hosts.listener import server_settings
 from rlightning_aio.protocol.net.wire import Hello, Writer
 from rlightning_aio.remote import RemoteEnvClient, make_keys
 from rlightning_aio.remote.keys import read_client_keys, read_server_keys
@@ -251,7 +251,7 @@ def test_nonsense_and_pickles_from_strangers_leave_the_service_unharmed(tmp_path
     )
     with sync.build_env_group(entry()) as group:
         address = group["robots-0"].address
-        remote = group["robots-0"]._listener.remote
+        remote = group["robots-0"]._server[0]._listener
         friend = ClientThread(address, "arm")
         batch, _ = group.reset()
         with zmq.Context() as context, context.socket(zmq.DEALER) as stranger:
@@ -291,7 +291,7 @@ def test_a_frame_beyond_the_limit_is_not_taken_in() -> None:
                 batch, _ = group.collect_async(deadline=20)
             stranger.disable_monitor()
             monitor.close()
-        assert group["robots-0"]._listener.remote.malformed == 0
+        assert group["robots-0"]._server[0]._listener.malformed == 0
         group.close()
         friend.join()
 

@@ -19,6 +19,7 @@ import numpy as np
 
 import rlightning_aio
 from rlightning_aio.batch import BatchedData
+from rlightning_aio.batch.data import parts_of
 from rlightning_aio.cli.collecting import Roster, resetting, respond_to_all, responder
 from rlightning_aio.cli.rollout_statistics import RolloutStatistics
 from rlightning_aio.cli.terminal import counted
@@ -236,17 +237,18 @@ class Stand:
         await one_round(rule.min_results or 0, Limits(limits.steps, limits.seconds / 10))
         return await one_round(rule.min_results or 0, limits)
 
-    async def _step(self, _: int, limits: Limits) -> Round:
+    async def _step(self, ignored: int, limits: Limits) -> Round:
+        del ignored
         latencies: list[float] = []
         first, began = self.statistics.steps, time.monotonic()
         now = began
         while now - began < limits.seconds and self.statistics.steps - first < limits.steps:
             responses = _joined(self._respond(self._everyone))
             sent_at = time.monotonic()
-            batch, flags = await self._group.step(responses)
+            batch, _ = await self._group.step(responses)
             now = time.monotonic()
             latencies.append(now - sent_at)
-            self.statistics.add(batch, flags or ())
+            self.statistics.add(batch)
         return _as_round(self.statistics.steps - first, now - began, np.array(latencies))
 
     async def _collect(self, min_results: int, limits: Limits) -> Round:
@@ -257,16 +259,16 @@ class Stand:
         sent_at[:] = now
         respond_to_all(group, self._respond, self._everyone)
         while now - began < limits.seconds and self.statistics.steps - first < limits.steps:
-            batch, flags = await group.collect_async(min_results=min_results)
+            batch, _ = await group.collect_async(min_results=min_results)
             now = time.monotonic()
-            self.statistics.add(batch, flags)
-            for part in batch.parts:
+            self.statistics.add(batch)
+            for part in parts_of(batch):
                 latencies.append(now - sent_at[part.slots])
                 sent_at[part.slots] = now
             respond_to_all(group, self._respond, batch)
         steps = self.statistics.steps - first
-        batch, flags = await group.collect_async(wait_all=True)
-        self.statistics.add(batch, flags)
+        batch, _ = await group.collect_async(wait_all=True)
+        self.statistics.add(batch)
         return _as_round(steps, now - began, np.concatenate(latencies))
 
 

@@ -28,7 +28,8 @@ from rlightning_aio.cli.terminal import (
 )
 from rlightning_aio.config import check_installed, load_config
 from rlightning_aio.errors import ConfigError, EnvRaised, RLightningError
-from rlightning_aio.hosts.worker import ErrorText, build_env
+from rlightning_aio.hosts.build_env import build_env
+from rlightning_aio.hosts.messages import ErrorText
 from rlightning_aio.remote import RemoteEnvClient, make_keys
 
 if TYPE_CHECKING:
@@ -82,7 +83,7 @@ def client(
     interrupted = False
     try:
         with interruptible(), _faults_of(entry):
-            env = build_env(entry, None, 0, None)
+            env = build_env(entry)
             served = _client_of(env, hostname, port, keys, name)
             with served, _status(served, connect):
                 served.run()

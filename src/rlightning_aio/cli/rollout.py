@@ -135,10 +135,10 @@ async def _collect(
             respond_to_all(group, respond, batch)
             while (left := order.steps - statistics.steps) > 0:
                 most = -(-left // sub_envs)
-                batch, flags = await group.collect_async(
+                batch, _ = await group.collect_async(
                     min_results=min(order.min_results, most), max_results=most
                 )
-                statistics.add(batch, flags)
+                statistics.add(batch)
                 respond_to_all(group, respond, batch)
                 if display.due():
                     display.show()

@@ -14,12 +14,15 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from rlightning_aio.batch.data import parts_of
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
-    from rlightning_aio.batch import BatchedData, EnvTable
+    from rlightning_aio.batch import BatchedData
+    from rlightning_aio.batch.columns import EnvNames
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.types import EnvMeta
 
@@ -65,7 +68,6 @@ class RolloutStatistics:
         self._meta_of: Callable[[str], EnvMeta] | None = None
         self._sub_envs: dict[str, int] = {}
         self._counts: Counter[str] = Counter()
-        self._resetting: set[str] = set()
         self._step_times: deque[_StepTimes] = deque(maxlen=_LATENCY_BATCHES)
         self._began = self._ended = 0.0
         self.steps = 0
@@ -94,36 +96,23 @@ class RolloutStatistics:
         self._meta_of = meta_of
         self._began = self._ended = time.monotonic()
 
-    def add(self, batch: BatchedData, flags: Sequence[bool]) -> None:
-        """Count what `collect_async` or `step` returned inside `auto_reset`."""
+    def add(self, batch: BatchedData) -> None:
+        """Count what `collect_async` or `step` returned."""
         self._ended = time.monotonic()
-        env_ids = batch.env_ids()
-        stepped = env_ids
-        if resets := self._resetting.intersection(env_ids):
-            stepped = [env_id for env_id in env_ids if env_id not in resets]
-            self._resetting -= resets
-        self._counts.update(stepped)
-        self.steps += sum(self._sub_envs.get(id_) or self._meet(id_) for id_ in stepped)
-        if batch.any_ended or any(flags):
-            self._note_ends(env_ids, batch.ended, flags)
-        for part in batch.parts:
-            self._step_times.append(_StepTimes(part.table, part.slots, part.busy_ns))
+        for part in parts_of(batch):
+            stepped = ~part.is_reset.reshape(len(part), -1)
+            env_ids = part.names.ids(part.slots)
+            for env_id, count in zip(env_ids, stepped.sum(axis=1).tolist(), strict=True):
+                self._counts[env_id] += count
+                if env_id not in self._sub_envs:
+                    self._meet(env_id)
+            self.steps += int(stepped.sum())
+            self._step_times.append(_StepTimes(part.names, part.slots, part.busy_ns))
 
-    def _note_ends(
-        self, env_ids: Sequence[str], ended: NDArray[np.bool_], flags: Sequence[bool]
-    ) -> None:
-        """Remember whose next result is a reset."""
-        assert self._meta_of is not None
-        for position in np.flatnonzero(ended | flags).tolist():
-            env_id = env_ids[position]
-            if flags[position] or self._meta_of(env_id).autoreset == "disabled":
-                self._resetting.add(env_id)
-
-    def _meet(self, env_id: str) -> int:
-        """Sub-environments of an env that is met for the first time."""
+    def _meet(self, env_id: str) -> None:
+        """Take note of an env that is met for the first time."""
         assert self._meta_of is not None
         self._sub_envs[env_id] = self._meta_of(env_id).num_envs
-        return self._sub_envs[env_id]
 
     def _entry(self, env_id: str) -> str:
         """Its config entry; a client's is its server's, ``<server id>/<client name>``."""
@@ -135,7 +124,7 @@ class RolloutStatistics:
         """One line for each entry, with the episodes of `EnvGroup.get_env_stats`."""
         steps, episodes = Counter[str](), dict[str, list[Mapping[str, Any]]]()
         for env_id, count in self._counts.items():
-            steps[self._entry(env_id)] += count * self._sub_envs[env_id]
+            steps[self._entry(env_id)] += count
         for env_id, stats in env_stats.items():
             episodes.setdefault(self._entry(env_id), []).append(stats)
         return [
@@ -182,13 +171,13 @@ class RolloutStatistics:
 class _StepTimes:
     """How long the envs of one batch took."""
 
-    table: EnvTable
+    names: EnvNames
     slots: NDArray[np.intp]
     busy_ns: NDArray[np.int64]
 
     def of(self, entry: str) -> NDArray[np.int64]:
         """Those of an entry's envs."""
-        mine = [name == entry for name in self.table.names(self.slots)]
+        mine = [name == entry for name in self.names.names(self.slots)]
         return self.busy_ns[mine]
 
 

@@ -13,25 +13,27 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from rlightning_aio.batch.data import columns_of_responses
 from rlightning_aio.errors import BadAction
-from rlightning_aio.hosts.runner import NO_ACTION
+from rlightning_aio.hosts.messages import NO_ACTION
 from rlightning_aio.protocol.columns import Leaf, Tree, as_array, index
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio.batch import BatchedData
-    from rlightning_aio.group.slots import Slots
+    from rlightning_aio.group.env_table import EnvTable
+    from rlightning_aio.group.slab_layout import SlabLayout
     from rlightning_aio.protocol.slab import Slab
 
-__all__ = ["DEBUG", "Letters", "write_actions"]
+__all__ = ["DEBUG", "OutOfBandSteps", "write_actions"]
 
 DEBUG: Final = os.environ.get("RLIGHTNING_AIO_DEBUG") == "1"
 """Whether actions are searched for NaN, which no action space holds."""
 
 
 @dataclass(frozen=True, slots=True)
-class Letters:
+class OutOfBandSteps:
     """What does not fit the rows: for some positions of a batch (action, extras)."""
 
     positions: NDArray[np.intp]
@@ -39,81 +41,81 @@ class Letters:
 
 
 def write_actions(
-    batch: BatchedData, slots: NDArray[np.intp], table: Slots, slabs: list[Slab]
-) -> Letters | None:
+    batch: BatchedData, slots: NDArray[np.intp], envs: EnvTable, layout: SlabLayout
+) -> OutOfBandSteps | None:
     """Check the actions of `batch` and write those that fit into their rows.
 
-    Returns what has to be sent beside, or None if the rows hold all.
+    Returns what has to be sent out of band, or None if the rows hold all.
 
     Raises:
         BadAction: an action's shape, dtype or count doesn't fit its env; rows of idle envs
             may have been written, nothing else has happened.
     """
-    letters = None
-    if table.letters:
-        letters = _letters(batch, slots, table, slabs)
-        if letters is not None and len(letters.positions) == len(slots):
-            return letters
-    columns = batch.response_columns
-    if columns is not None and len(slabs) == 1 and letters is None:
-        _write_column(columns.get("action"), slabs[0], slots, table)
+    out_of_band = None
+    if envs.any_out_of_band:
+        out_of_band = _chosen_out_of_band(batch, slots, envs, layout)
+        if out_of_band is not None and len(out_of_band.positions) == len(slots):
+            return out_of_band
+    columns = columns_of_responses(batch)
+    if columns is not None and len(layout.slabs) == 1 and out_of_band is None:
+        _write_column(columns.get("action"), layout.slabs[0], slots, envs)
         return None
-    _write_one_by_one(batch, slots, table, slabs, letters)
-    return letters
+    _write_one_by_one(batch, slots, envs, layout, out_of_band)
+    return out_of_band
 
 
-def _write_column(action: Any, slab: Slab, slots: NDArray[np.intp], table: Slots) -> None:
+def _write_column(action: Any, slab: Slab, slots: NDArray[np.intp], envs: EnvTable) -> None:
     """Write the actions of a whole batch with one copy for each array."""
-    rows = slice(None) if slots is table.all else slots
+    rows = slice(None) if slots is envs.all else slots
     for leaf, target in slab.action_columns:
         source = _as_array(_at(action, leaf))
         if source.shape != (len(slots), *leaf.shape) or not _castable(source, leaf):
             raise BadAction(_misfit(f"the batch's action{leaf.name}", source, leaf, len(slots)))
         if DEBUG:
-            _refuse_nan(source, leaf, slots, table)
+            _refuse_nan(source, leaf, slots, envs)
         target[rows] = source
 
 
 def _write_one_by_one(
     batch: BatchedData,
     slots: NDArray[np.intp],
-    table: Slots,
-    slabs: list[Slab],
-    letters: Letters | None,
+    envs: EnvTable,
+    layout: SlabLayout,
+    out_of_band: OutOfBandSteps | None,
 ) -> None:
     """Write actions that came as separate values, or for envs of several layouts."""
-    elsewhere = set(letters.positions.tolist()) if letters is not None else set[int]()
+    elsewhere = set(out_of_band.positions.tolist()) if out_of_band is not None else set[int]()
     actions = actions_of(batch)
     by_slab: dict[int, list[int]] = {}
-    for position, slab_index in enumerate(table.slab[slots].tolist()):
+    for position, slab_index in enumerate(layout.slab[slots].tolist()):
         if position not in elsewhere:
             by_slab.setdefault(slab_index, []).append(position)
     for slab_index, positions in by_slab.items():
-        slab = slabs[slab_index]
-        rows = table.row[slots[positions]]
+        slab = layout.slabs[slab_index]
+        rows = layout.row[slots[positions]]
         for leaf, target in slab.action_columns:
             sources = [_as_array(_at(actions[k], leaf)) for k in positions]
             for k, source in zip(positions, sources, strict=True):
                 if source.shape != leaf.shape or not _castable(source, leaf):
-                    who = table.describe(int(slots[k]))
+                    who = envs.describe(int(slots[k]))
                     raise BadAction(_misfit(f"action{leaf.name} for {who}", source, leaf))
             if DEBUG:
-                _refuse_nan(np.array(sources), leaf, slots[positions], table)
+                _refuse_nan(np.array(sources), leaf, slots[positions], envs)
             target[rows] = sources
 
 
-def _refuse_nan(source: NDArray[Any], leaf: Leaf, slots: NDArray[np.intp], table: Slots) -> None:
+def _refuse_nan(source: NDArray[Any], leaf: Leaf, slots: NDArray[np.intp], envs: EnvTable) -> None:
     if source.dtype.kind not in "fc":
         return
     bad = np.isnan(source).reshape(len(slots), -1).any(axis=1)
     if bad.any():
-        who = table.describe(int(slots[bad.argmax()]))
+        who = envs.describe(int(slots[bad.argmax()]))
         raise BadAction(f"action{leaf.name} for {who} holds NaN; nothing was sent")
 
 
 def actions_of(batch: BatchedData) -> list[Any]:
     """One action for each value of `batch`."""
-    columns = batch.response_columns
+    columns = columns_of_responses(batch)
     if columns is not None:
         return [index(columns["action"], k) for k in range(len(batch))]
     actions: list[Any] = []
@@ -127,15 +129,15 @@ def actions_of(batch: BatchedData) -> list[Any]:
     return actions
 
 
-def _letters(
-    batch: BatchedData, slots: NDArray[np.intp], table: Slots, slabs: list[Slab]
-) -> Letters | None:
+def _chosen_out_of_band(
+    batch: BatchedData, slots: NDArray[np.intp], envs: EnvTable, layout: SlabLayout
+) -> OutOfBandSteps | None:
     """What the channel must carry: actions without a row, and extras that somebody reads."""
-    columns = batch.response_columns
+    columns = columns_of_responses(batch)
     all_extras = columns is None or len(columns) > 1
-    chosen = table.by_frame[slots]
+    chosen = envs.out_of_band_actions[slots]
     if all_extras:
-        chosen = chosen | table.reads_extras[slots]
+        chosen = chosen | envs.reads_extras[slots]
     positions = np.flatnonzero(chosen)
     if not len(positions):
         return None
@@ -144,23 +146,23 @@ def _letters(
     kept: list[int] = []
     for k in positions.tolist():
         slot = int(slots[k])
-        extras = _extras(batch, k) if table.reads_extras[slot] else {}
+        extras = _extras(batch, k) if envs.reads_extras[slot] else {}
         action = actions[k]
-        slab = slabs[int(table.slab[slot])]
+        slab = layout.slabs[int(layout.slab[slot])]
         if slab.action is not None and _fits(action, slab):
             if not extras:
                 continue
-            _write_one(action, slab, int(table.row[slot]))
+            _write_one(action, slab, int(layout.row[slot]))
             action = NO_ACTION
-        elif not table.by_frame[slot]:
+        elif not envs.out_of_band_actions[slot]:
             continue
         kept.append(k)
         contents.append((_plain(action), extras))
-    return Letters(np.array(kept, np.intp), contents) if kept else None
+    return OutOfBandSteps(np.array(kept, np.intp), contents) if kept else None
 
 
 def _extras(batch: BatchedData, position: int) -> dict[str, Any]:
-    columns = batch.response_columns
+    columns = columns_of_responses(batch)
     if columns is not None:
         return {name: index(c, position) for name, c in columns.items() if name != "action"}
     return batch.values()[position].extras

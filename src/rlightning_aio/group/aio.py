@@ -13,17 +13,16 @@ import time
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from rlightning_aio.group.build import PreprocessFn, plan_group
-from rlightning_aio.group.facade import AutoResetContext, Facade, ServerView, sole, steps_of
+from rlightning_aio.group.facade import Facade, ServerView, sole, steps_of
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine, Mapping, Sequence
+    from collections.abc import Callable, Coroutine, Mapping, Sequence
     from types import TracebackType
 
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.group.core import Core
-    from rlightning_aio.group.wait import Operation
-    from rlightning_aio.hosts.base import Source
-    from rlightning_aio.hosts.server import ServerHost
+    from rlightning_aio.group.wait import Procedure
+    from rlightning_aio.hosts.base import Host, Membership, Source
     from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
 
 __all__ = ["AioDriver", "EnvGroup", "EnvHandle", "ServerHandle"]
@@ -31,12 +30,15 @@ __all__ = ["AioDriver", "EnvGroup", "EnvHandle", "ServerHandle"]
 T = TypeVar("T")
 
 
-class AioDriver:
-    """Watches sources with `loop.add_reader` and waits for operations to end."""
+def _nothing() -> None: ...
 
-    shares_thread = True
+
+class AioDriver:
+    """Watches sources with `loop.add_reader` and waits for procedures to end."""
 
     def __init__(self) -> None:
+        # Takes in what sources have told; set by the group.
+        self.drain: Callable[[], None] = _nothing
         # Invariant: the future of those who wait now; None while nobody does. Whoever starts
         # to wait gets one that is not done: what was told before is in the core already.
         self._told: asyncio.Future[None] | None = None
@@ -84,24 +86,26 @@ class AioDriver:
     def _readable(self, source: Source) -> None:
         try:
             source.on_readable()
+            self.drain()
         except BaseException as error:  # An event loop would log it and let the waiter hang.
             self._broken = error
         self.wake()
 
-    async def run(self, operation: Operation[T]) -> T:
-        """Wait until `operation` ends; its result. It gets to clean up if it is cancelled."""
+    async def run(self, procedure: Procedure[T]) -> T:
+        """Wait until `procedure` ends; its result. It gets to clean up if it is cancelled."""
         try:
-            wait = operation.send(None)  # pyright: ignore[reportArgumentType]
+            wait = procedure.send(None)  # pyright: ignore[reportArgumentType]
             while True:
                 try:
                     await self._block(wait.until)
                     if self._broken is not None:
                         raise self._broken
+                    self.drain()
                 except BaseException as error:
                     # Thrown, not closed: closing down takes waiting, too.
-                    wait = operation.throw(error)
+                    wait = procedure.throw(error)
                 else:
-                    wait = operation.send(time.monotonic())
+                    wait = procedure.send(time.monotonic())
         except StopIteration as stop:
             return stop.value
 
@@ -130,9 +134,9 @@ class EnvGroup(Facade):
     """
 
     _driver: AioDriver
+    _shares_thread = True
 
-    @staticmethod
-    def _new_driver() -> AioDriver:
+    def _new_driver(self) -> AioDriver:
         return AioDriver()
 
     async def init(self) -> list[EnvMeta]:
@@ -147,7 +151,7 @@ class EnvGroup(Facade):
             GroupClosed: the group was closed before.
         """
         try:
-            return await self._driver.run(self._fleet.start(time.monotonic()))
+            return await self._driver.run(self._core.start(time.monotonic()))
         except BaseException:
             self._closed()
             raise
@@ -208,6 +212,8 @@ class EnvGroup(Facade):
         min_results: int = 1,
         max_results: int | None = None,
         deadline: float | None = None,
+        entries: Sequence[str] | None = None,
+        ordered: bool = False,
     ) -> tuple[BatchedData, list[bool]]:
         """Wait for results of `step_async`; never returns an empty batch.
 
@@ -218,45 +224,32 @@ class EnvGroup(Facade):
             min_results: don't return before that many are ready (or all that are pending).
             max_results: leave what is above to the next call, first come first served.
             deadline: seconds in all, from now.
+            entries: take results of these config entries only; the others' stay.
+            ordered: in the group's order instead of that of arrival. With ``wait_all`` that
+                makes a run reproducible.
 
-        Returns results in the order of their arrival, and a flag for each (inside
-        `auto_reset` whether it reached the step limit). Cancelling loses no result.
+        Returns results, and a flag for each: inside `auto_reset` whether it reached the step
+        limit, which `BatchedData.limit_reached` tells as well. Cancelling loses no result.
 
         Raises:
-            NothingPending: no request is outstanding.
+            NothingPending: no request is outstanding (of `entries`).
+            UnknownEnv: no config entry has such a name.
             TimeoutError: `deadline` has passed; the next call gets the results.
             EnvRaised, WorkerDied, EnvHung: the answer to one request; the results of others
                 stay for the next call.
             RuntimeError: another collector is waiting.
         """
-        operation = self._collect(timeout, wait_all, min_results, max_results, deadline)
-        return await self._driver.run(operation)
-
-    def auto_reset(
-        self, max_episode_steps: int | None = None, on_done: bool = True
-    ) -> AutoResetContext:
-        """Reset envs at their step limit, in place of their next step.
-
-        Args:
-            max_episode_steps: the limit for all envs; None takes each entry's own.
-            on_done: also reset envs whose episode has ended by itself.
-
-        An env that has made the limit's number of steps returns a True flag; its next step is
-        replaced by a reset that returns reward 0 and a False flag. Works with ``with`` and
-        ``async with``.
-
-        Raises:
-            ValueError: the limit isn't a positive int, or it is None and an env has none.
-            RuntimeError: contexts don't nest.
-        """
-        return self._auto_reset(max_episode_steps, on_done)
+        procedure = self._collect(
+            timeout, wait_all, min_results, max_results, deadline, entries, ordered
+        )
+        return await self._driver.run(procedure)
 
     def __getitem__(self, env_id: str) -> EnvHandle:
         """A handle on one env, or on one env_server; raises `UnknownEnv`."""
-        listener = self._fleet.listener(env_id)
-        if listener is not None:
-            return ServerHandle(self, self._core, self._driver, listener)
-        return EnvHandle(self, self._core, self._driver, self._core.slots.find_one(env_id))
+        server = self._core.supervisor.server(env_id)
+        if server is not None:
+            return ServerHandle(self, self._core, self._driver, server)
+        return EnvHandle(self, self._core, self._driver, self._core.envs.find_one(env_id))
 
     async def offload(self) -> None:
         """Have every env free its device memory until `reload`."""
@@ -272,7 +265,7 @@ class EnvGroup(Facade):
         Idempotent. Whoever waits on the group gets `GroupClosed`; results that were not
         collected are gone.
         """
-        await self._driver.run(self._fleet.close(time.monotonic()))
+        await self._driver.run(self._core.close(time.monotonic()))
         self._closed()
 
 
@@ -288,7 +281,7 @@ class EnvHandle:
     @property
     def env_id(self) -> str:
         """Its id."""
-        return self._core.slots.env_ids[self._slot]
+        return self._core.envs.env_ids[self._slot]
 
     async def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -307,8 +300,8 @@ class EnvHandle:
         Raises:
             EnvRaised: the method raised, or its value can't be pickled.
         """
-        operation = self._core.call(time.monotonic(), self._slot, name, args, kwargs)
-        return await self._driver.run(operation)
+        procedure = self._core.call(time.monotonic(), self._slot, name, args, kwargs)
+        return await self._driver.run(procedure)
 
     async def get_attr(self, name: str, target: str = "unwrapped") -> Any:
         """Attribute `name` of the simulator; of its outermost wrapper with target ``outer``."""
@@ -335,10 +328,15 @@ class ServerHandle(ServerView, EnvHandle):
     """An env_server of an asynchronous group; its clients' envs have handles of their own."""
 
     def __init__(
-        self, group: EnvGroup, core: Core, driver: AioDriver, listener: ServerHost
+        self,
+        group: EnvGroup,
+        core: Core,
+        driver: AioDriver,
+        server: tuple[Host, Membership],
     ) -> None:
         super().__init__(group, core, driver, -1)
-        self._listener = listener
+        self._server = server
+        self._membership = server[1]
 
     async def reset(  # pyright: ignore[reportIncompatibleMethodOverride]  # One for each client.
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -353,8 +351,8 @@ class ServerHandle(ServerView, EnvHandle):
         Raises:
             TimeoutError: too few clients have joined.
         """
-        operation = self._core.reset_clients(time.monotonic(), self._listener, seed, options)
-        return (await self._driver.run(operation))[0].values()
+        procedure = self._core.reset_members(time.monotonic(), self._server, seed, options)
+        return (await self._driver.run(procedure))[0].values()
 
     async def step(self, response: PolicyResponse | Any) -> EnvRet | MultiAgentEnvRet:
         """Raises NotImplementedError: remote envs answer when they can."""

@@ -16,23 +16,21 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from rlightning_aio.protocol.rings import NUMBER_SHIFT, STEP
-
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from types import EllipsisType
 
     from numpy.typing import NDArray
 
-    from rlightning_aio.batch import BatchedData
-    from rlightning_aio.group.slots import Slots
+    from rlightning_aio.batch.columns import ResultColumns
+    from rlightning_aio.group.env_table import EnvTable
+    from rlightning_aio.group.requests import Requests
 
 __all__ = ["NO_RESETS", "AutoReset", "as_int"]
 
 NO_RESETS: Final[NDArray[np.bool_]] = np.zeros(1, np.bool_)
 """No env is due; broadcasts to any number of slots."""
-
-# A 0-d array: NumPy takes twice as long over a Python int.
-_STEP: Final = np.array(STEP)
+_ENDLESS: Final = 1 << 62
 
 
 def as_int(value: Any) -> int | None:
@@ -46,28 +44,33 @@ def as_int(value: Any) -> int | None:
 
 
 class AutoReset:
-    """Counters of completed steps, and what follows from them while it is active."""
+    """Counters of completed steps, and what follows from them while it is active.
 
-    def __init__(self, slots: Slots) -> None:
-        self._slots = slots
+    Attributes:
+        mark_truncated: a result that reaches the limit is to be marked as truncated.
+    """
+
+    def __init__(self, envs: EnvTable, requests: Requests) -> None:
+        self._envs = envs
+        self._requests = requests
         # Numbers of the last resets, and one more for each later request that was no step.
-        self._base = np.zeros(len(slots), np.int64)
-        self._due = np.zeros(len(slots), np.bool_)
+        self._base = np.zeros(len(envs), np.int64)
+        self._due = np.zeros(len(envs), np.bool_)
         self._any_due = False
-        # Invariant: true of every env whose current request is a reset.
-        self._resetting = np.zeros(len(slots), np.bool_)
-        self._any_resetting = False
         # For so many batches no env can reach its limit.
         self._margin = 0
         self._limits: NDArray[np.int64] | None = None
         self._on_done = True
+        self.mark_truncated = False
 
     @property
     def active(self) -> bool:
         """Whether the context is open."""
         return self._limits is not None
 
-    def begin(self, max_episode_steps: int | None, *, on_done: bool) -> None:
+    def begin(
+        self, max_episode_steps: int | None, *, on_done: bool, mark_truncated: bool = False
+    ) -> None:
         """Open the context.
 
         Raises:
@@ -79,80 +82,88 @@ class AutoReset:
         self._limits = self._chosen_limits(max_episode_steps)
         self._margin = 0
         self._on_done = on_done
+        self.mark_truncated = mark_truncated
 
     def _chosen_limits(self, given: int | None) -> NDArray[np.int64]:
-        table = self._slots
-        configured = [config.max_episode_steps for config in table.configs]
+        envs = self._envs
         if given is None:
-            if None in configured:
-                slot = configured.index(None)
+            here = np.array([bool(env_id) for env_id in envs.env_ids])
+            lacking = np.flatnonzero(here & (envs.step_limits == 0))
+            if len(lacking):
                 raise ValueError(
-                    f"{table.describe(slot)} has no max_episode_steps; configure one or pass "
+                    f"{envs.describe(int(lacking[0]))} has no step limit, neither a configured "
+                    "max_episode_steps nor one of the simulator's own; configure one or pass "
                     "auto_reset(max_episode_steps=…)"
                 )
-            return np.array(configured, np.int64)
+            return np.where(envs.step_limits == 0, _ENDLESS, envs.step_limits)
         limit = as_int(given)
         if limit is None or limit < 1:
             raise ValueError(f"max_episode_steps must be a positive int, not {given!r}")
-        if any(own is not None and own != limit for own in configured):
+        configured = {config.max_episode_steps for config in envs.configs} - {None, limit}
+        if configured:
             warnings.warn(
                 f"auto_reset(max_episode_steps={limit}) overrides the limits that are configured",
                 stacklevel=4,
             )
-        return np.full(len(table), limit, np.int64)
+        return np.full(len(envs), limit, np.int64)
 
     def end(self) -> None:
         """Close the context: steps are plain again."""
         self._limits = None
         self._due[:] = False
         self._any_due = False
+        self.mark_truncated = False
 
     def due(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Which of `slots` are to be reset in place of their step."""
         return self._due[slots] if self._any_due else NO_RESETS
 
-    def resets_sent(self, slots: NDArray[np.intp]) -> None:
-        """Take note that `slots` were asked for a reset, or for their first result."""
-        self._resetting[slots] = True
-        self._any_resetting = True
-
     def not_completed(self, slots: NDArray[np.intp]) -> None:
         """Leave the counters of `slots` as they are, though their request has a number."""
         self._base[slots] += 1
 
-    def account(self, slots: NDArray[np.intp], batch: BatchedData) -> list[bool]:
-        """Count results as they are handed out; the flags that go with them."""
-        stepped = self._note_resets(slots) if self._any_resetting else None
+    def account(
+        self, slots: NDArray[np.intp], flagged: Sequence[ResultColumns]
+    ) -> NDArray[np.bool_] | None:
+        """Count results as they are handed out; which reached the limit (None: no one).
+
+        Args:
+            slots: of all results.
+            flagged: those parts in which any flag is set.
+        """
+        over = [self._note_flags(part) for part in flagged]
         if self._limits is None:
-            return [False] * len(slots)
+            return None
         self._margin -= 1
-        due = reached = None
+        reached = None
         if self._margin <= 0:
             self._margin = int((self._limits - self._counts(...)).min())
-            due = reached = self._counts(slots) >= self._limits[slots]
-        if self._on_done and batch.any_ended:
-            ended = batch.ended
-            if self._slots.any_resets_itself:
-                ended &= ~self._slots.resets_itself[slots]
-            if stepped is not None:
-                ended &= stepped
-            due = ended if due is None else due | ended
-        if due is not None:
-            self._due[slots] |= due
+            reached = self._counts(slots) >= self._limits[slots]
+            self._set_due(slots[reached])
+        if self._on_done:
+            for ended in over:
+                self._set_due(ended)
+        return reached if reached is not None and np.count_nonzero(reached) else None
+
+    def _note_flags(self, part: ResultColumns) -> NDArray[np.intp]:
+        """Start the counters of those that were reset anew; slots that are to be."""
+        resets = part.is_reset
+        if resets.ndim > 1:
+            resets = resets.all(axis=1)
+        begun = part.slots[resets]
+        if len(begun):
+            self._base[begun] = self._requests.numbers(begun)
+            self._due[begun] = False
             self._any_due = np.count_nonzero(self._due) > 0
-        return [False] * len(slots) if reached is None else reached.tolist()
+        over = part.over
+        if self._envs.any_resets_itself:
+            over &= ~self._envs.resets_itself[part.slots]
+        return part.slots[over]
+
+    def _set_due(self, slots: NDArray[np.intp]) -> None:
+        if len(slots):
+            self._due[slots] = self._any_due = True
 
     def _counts(self, slots: NDArray[np.intp] | EllipsisType) -> NDArray[np.int64]:
         """Counters of `slots`; too high by 1 where a request is in flight."""
-        return (self._slots.entry[slots] >> NUMBER_SHIFT) - self._base[slots]
-
-    def _note_resets(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Start the counters of those that were reset anew; which of `slots` were not."""
-        stepped = self._slots.ops(slots) == _STEP
-        begun = slots[~stepped]
-        if len(begun):
-            self._base[begun] = self._slots.entry[begun] >> NUMBER_SHIFT
-            self._due[begun] = self._resetting[begun] = False
-            self._any_due = np.count_nonzero(self._due) > 0
-            self._any_resetting = np.count_nonzero(self._resetting) > 0
-        return stepped
+        return self._requests.numbers(slots) - self._base[slots]

@@ -7,29 +7,38 @@ from __future__ import annotations
 
 import os
 import warnings
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
+
 from rlightning_aio.config import EnvConfig, check_installed, parse_configs
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.group.fleet import Fleet
-from rlightning_aio.group.slots import Slots
-from rlightning_aio.hosts.arena import Arena
-from rlightning_aio.hosts.inline import InlineHost
+from rlightning_aio.group.core import Core
+from rlightning_aio.group.env_table import EnvTable
+from rlightning_aio.group.poller import Poller
+from rlightning_aio.group.requests import Requests
+from rlightning_aio.group.single import SingleEnvCore, StepsAtOnce
+from rlightning_aio.group.slab_layout import SlabLayout
+from rlightning_aio.group.supervisor import Supervisor
+from rlightning_aio.hosts.arena import Arena, map_shared
+from rlightning_aio.hosts.base import Wiring
+from rlightning_aio.hosts.messages import StartOrder
 from rlightning_aio.hosts.pickling import dumped_with_code
-from rlightning_aio.hosts.process import ForkServer, ProcessHost
-from rlightning_aio.hosts.server import MAX_CLIENTS, ServerHost
-from rlightning_aio.hosts.worker import StartOrder
-from rlightning_aio.registry import BACKENDS, ENVS
+from rlightning_aio.protocol.bell import TrainerBell, bell_size
+from rlightning_aio.registry import BACKENDS, ENVS, PLACEMENTS, load
 from rlightning_aio.types import PolicyResponse
 
 if TYPE_CHECKING:
-    from rlightning_aio.hosts.base import Host, Watcher
+    from rlightning_aio.hosts.base import HostFactory, Watcher
 
 ENV_SERVER: Final = "env_server"
+MAX_CLIENTS: Final = 1024
+"""Places of an env_server; twice as many as it lets in at once."""
 
-__all__ = ["ENV_SERVER", "Plan", "build_fleet", "plan_group"]
+__all__ = ["ENV_SERVER", "Plan", "assemble", "plan_group"]
 
 PreprocessFn = Callable[[PolicyResponse], Any]
 
@@ -59,19 +68,33 @@ def plan_group(
     configs = parse_configs(cfgs)
     check_installed(configs)
     for config in configs:
-        if config.placement == "ray":
-            raise ConfigError(
-                f"entry {config.name!r}: placement 'ray' is not available yet; use 'process'"
-            )
+        host_class(config)
         if config.backend == ENV_SERVER:
             _check_server(config, ignored=preprocess_fn is not None)
     fns = _preprocess_fns(configs, preprocess_fn)
     return Plan(configs, fns, mixed_actions, zero_copy)
 
 
+def host_class(config: EnvConfig) -> HostFactory:
+    """What makes the hosts of an entry.
+
+    Raises:
+        ConfigError: its placement is not available.
+    """
+    if config.backend == ENV_SERVER:
+        return load(BACKENDS[ENV_SERVER].target)
+    target = PLACEMENTS[config.placement].target
+    if target is None:
+        raise ConfigError(
+            f"entry {config.name!r}: placement {config.placement!r} is not available yet; use "
+            "'process'"
+        )
+    return load(target)
+
+
 def _check_server(config: EnvConfig, *, ignored: bool) -> None:
     # ZMQ is imported where an env_server is asked for.
-    from rlightning_aio.hosts.remote import server_settings  # noqa: PLC0415
+    from rlightning_aio.hosts.listener import server_settings  # noqa: PLC0415
 
     server_settings(config)
     if config.num_workers > 1:
@@ -121,7 +144,7 @@ def _check_preprocess(config: EnvConfig, fn: Any) -> None:
         raise ConfigError(
             f"entry {config.name!r}: preprocess_fn must be callable, not {type(fn).__name__}"
         )
-    if config.placement == "inline":
+    if not PLACEMENTS[config.placement].spreads:
         return
     try:
         dumped_with_code(fn)
@@ -148,66 +171,94 @@ def _culprit(fn: Any) -> str:
     return ""
 
 
-def build_fleet(plan: Plan, watcher: Watcher) -> Fleet:
-    """The hosts of a plan, not started."""
+def assemble(plan: Plan, watcher: Watcher, *, shares_thread: bool) -> Core:
+    """The core of a plan, with all of its hosts, not started.
+
+    Args:
+        plan: what `plan_group` made.
+        watcher: the driver.
+        shares_thread: other tasks may use the group while a procedure waits.
+    """
     local = [config for config in plan.configs if config.backend != ENV_SERVER]
-    remote = [config for config in plan.configs if config.backend == ENV_SERVER]
-    slots = Slots(
+    servers = [config for config in plan.configs if config.backend == ENV_SERVER]
+    envs = EnvTable(
         [config for config in local for _ in range(config.num_workers)],
         [f"{config.name}-{index}" for config in local for index in range(config.num_workers)],
-        [(f"{config.name}-0", config, MAX_CLIENTS) for config in remote],
+        [(f"{config.name}-0", config, MAX_CLIENTS) for config in servers],
     )
-    arena = Arena()
-    fleet = Fleet(slots, arena, watcher, mixed_actions=plan.mixed_actions)
     cores = sorted(os.sched_getaffinity(0))
-    orders = [
-        (config, shares)
+    orders = _orders(plan, servers, cores)
+    arena = Arena()
+    bell_offset = arena.append(bell_size(len(orders)))
+    bell_memory = map_shared(arena.descriptor, bell_offset, bell_size(len(orders)))
+    bell = TrainerBell(bell_memory, len(orders))
+    requests = Requests(
+        np.repeat(np.arange(len(orders)), [len(order.worker_indices) for order in orders]),
+        len(orders),
+    )
+    layout = SlabLayout(len(envs))
+    supervisor = Supervisor(
+        envs,
+        requests,
+        layout,
+        arena,
+        mixed_actions=plan.mixed_actions,
+        num_cores=len(cores),
+    )
+    supervisor.resources["bell"] = bell
+    poller = Poller(requests, bell, len(cores))
+    wiring = Wiring(
+        completions=deque(),
+        watcher=watcher,
+        arena=arena,
+        bell=bell,
+        bell_offset=bell_offset,
+        num_hosts=len(orders),
+        configs=plan.configs,
+        objection=supervisor.objection,
+        is_idle=requests.is_idle,
+        resources=supervisor.resources,
+    )
+    first_slot = 0
+    for host_id, order in enumerate(orders):
+        host = host_class(order.config)(host_id, first_slot, order, wiring)
+        supervisor.add(host, order.config)
+        poller.add(host)
+        first_slot += host.num_envs
+    parts = (envs, requests, layout, supervisor, poller, wiring.completions, watcher)
+    host = supervisor.hosts[0]
+    if not shares_thread and len(envs) == 1 and isinstance(host, StepsAtOnce):
+        core = SingleEnvCore(*parts, zero_copy=plan.zero_copy)
+        core.single_host = host
+        return core
+    return Core(*parts, zero_copy=plan.zero_copy)
+
+
+def _orders(plan: Plan, servers: Sequence[EnvConfig], cores: Sequence[int]) -> list[StartOrder]:
+    """What each host is to build: local ones first, then the env_servers."""
+    shares = [
+        (config, share)
         for config, fns in zip(plan.configs, plan.preprocess_fns, strict=True)
         if config.backend != ENV_SERVER
-        for shares in _shares(config, fns, len(cores))
+        for share in _shares(config, fns, len(cores))
     ]
-    num_processes = sum(config.placement == "process" for config, _ in orders)
-    servers: dict[object, ForkServer] = {}
-    first_slot = 0
-    for host_id, (config, shares) in enumerate(orders):
-        order = StartOrder(
+    num_processes = sum(PLACEMENTS[config.placement].spreads for config, _ in shares)
+    orders = [
+        StartOrder(
             config=config,
             env_class=ENVS.registered(config.backend),
-            worker_indices=tuple(index for index, _ in shares),
-            preprocess_fns=tuple(fn for _, fn in shares),
+            worker_indices=tuple(index for index, _ in share),
+            preprocess_fns=tuple(fn for _, fn in share),
             spins=num_processes <= len(cores),
             core=cores[host_id % len(cores)] if config.cpu_affinity else None,
         )
-        host: Host
-        if config.placement == "inline":
-            host = InlineHost(host_id, first_slot, order, arena, fleet)
-        else:
-            server = _server_for(config, plan.configs, servers, watcher)
-            host = ProcessHost(host_id, first_slot, order, server, arena, fleet, watcher)
-        fleet.add(host, config)
-        first_slot += len(shares)
-    for config in remote:
-        host_id = len(fleet.hosts)
-        fleet.add(_server_host(config, host_id, first_slot, fleet, watcher), config)
-        first_slot += MAX_CLIENTS
-    fleet.servers = list(servers.values())
-    fleet.lookout.num_cores = len(cores)
-    return fleet
-
-
-def _server_host(
-    config: EnvConfig, host_id: int, first_slot: int, fleet: Fleet, watcher: Watcher
-) -> ServerHost:
-    from rlightning_aio.hosts.remote import RemoteHost, server_settings  # noqa: PLC0415
-
-    listener = RemoteHost(
-        f"{config.name}-0",
-        server_settings(config),
-        step_timeout=config.step_timeout,
-        reset_timeout=config.reset_timeout,
-        objection=fleet.objection,
-    )
-    return ServerHost(host_id, first_slot, listener, fleet, watcher)
+        for host_id, (config, share) in enumerate(shares)
+    ]
+    everybody = tuple(range(MAX_CLIENTS))
+    return orders + [
+        StartOrder(config, None, everybody, (None,) * MAX_CLIENTS, spins=False, core=None)
+        for config in servers
+    ]
 
 
 def _shares(
@@ -215,7 +266,7 @@ def _shares(
 ) -> list[list[tuple[int, PreprocessFn | None]]]:
     """Which envs of an entry live together: as evenly as can be, neighbours together."""
     count = config.num_workers
-    if config.placement == "inline":
+    if not PLACEMENTS[config.placement].spreads:
         num_hosts = 1
     elif config.envs_per_process == "auto":
         backend = BACKENDS.get(config.backend)
@@ -225,26 +276,3 @@ def _shares(
         num_hosts = -(-count // config.envs_per_process)
     envs = list(enumerate(fns))
     return [envs[count * k // num_hosts : count * (k + 1) // num_hosts] for k in range(num_hosts)]
-
-
-def _server_for(
-    config: EnvConfig,
-    configs: Sequence[EnvConfig],
-    servers: dict[object, ForkServer],
-    watcher: Watcher,
-) -> ForkServer:
-    key = _server_key(config)
-    if key not in servers:
-        preload = dict[str, None]()
-        for other in configs:
-            backend = BACKENDS.get(other.backend)
-            if _server_key(other) == key and backend is not None:
-                preload.update(dict.fromkeys(backend.preload))
-        servers[key] = ForkServer(
-            config.interpreter, dict(config.env_vars), tuple(preload), watcher
-        )
-    return servers[key]
-
-
-def _server_key(config: EnvConfig) -> tuple[object, ...]:
-    return config.interpreter, tuple(sorted(config.env_vars.items()))

@@ -6,24 +6,23 @@ import os
 import time
 import warnings
 import weakref
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Protocol, Self
 
 from rlightning_aio.batch import BatchedData
-from rlightning_aio.group.build import Plan, build_fleet
-from rlightning_aio.group.lone import core_of
+from rlightning_aio.group.build import Plan, assemble
+from rlightning_aio.hosts.base import Watcher
 from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
     from types import TracebackType
 
     import gymnasium as gym
 
     from rlightning_aio.group.core import Core
-    from rlightning_aio.group.fleet import Fleet
-    from rlightning_aio.group.wait import Operation
-    from rlightning_aio.hosts.base import Watcher
-    from rlightning_aio.hosts.server import ServerHost
+    from rlightning_aio.group.supervisor import Supervisor
+    from rlightning_aio.group.wait import Procedure
+    from rlightning_aio.hosts.base import Membership
 
 __all__ = ["AutoResetContext", "Facade", "ServerView", "sole", "steps_of"]
 
@@ -43,13 +42,18 @@ def steps_of(env_id: str, response: PolicyResponse | Any) -> BatchedData:
 class AutoResetContext:
     """Open while envs are reset at their step limit; see `EnvGroup.auto_reset`."""
 
-    def __init__(self, core: Core, max_episode_steps: int | None, on_done: bool) -> None:
+    def __init__(
+        self, core: Core, max_episode_steps: int | None, on_done: bool, mark_truncated: bool
+    ) -> None:
         self._core = core
         self._limit = max_episode_steps
         self._on_done = on_done
+        self._mark_truncated = mark_truncated
 
     def __enter__(self) -> Self:
-        self._core.auto.begin(self._limit, on_done=self._on_done)
+        self._core.auto.begin(
+            self._limit, on_done=self._on_done, mark_truncated=self._mark_truncated
+        )
         return self
 
     def __exit__(
@@ -75,27 +79,37 @@ class AutoResetContext:
 class ServerView:
     """What both kinds of `ServerHandle` tell without waiting."""
 
-    _listener: ServerHost
+    _membership: Membership
 
     @property
     def env_id(self) -> str:
         """Its id."""
-        return self._listener.remote.server_id
+        return self._membership.server_id
 
     @property
     def address(self) -> str:
         """Where clients connect to, as ``tcp://host:port``."""
-        return self._listener.remote.address
+        return self._membership.address()
 
     @property
     def clients(self) -> list[str]:
         """Ids of the envs of the clients that are connected, ``<server id>/<client name>``."""
-        return [f"{self.env_id}/{name}" for name in self._listener.remote.clients]
+        return [f"{self.env_id}/{name}" for name in self._membership.members()]
 
     @property
     def metas(self) -> list[EnvMeta]:
         """What the envs of these clients are like, in the same order."""
-        return list(self._listener.remote.clients.values())
+        return list(self._membership.members().values())
+
+
+class Driver(Watcher, Protocol):
+    """What waits for a group.
+
+    Attributes:
+        drain: takes in what sources have told; to be called whenever one has.
+    """
+
+    drain: Callable[[], None]
 
 
 class Facade:
@@ -103,26 +117,29 @@ class Facade:
 
     def __init__(self, plan: Plan) -> None:
         self._driver = self._new_driver()
-        self._fleet = build_fleet(plan, self._driver)
-        self._core = core_of(self._fleet, zero_copy=plan.zero_copy)
-        self._finalizer = weakref.finalize(self, _abandon, self._fleet, os.getpid())
+        self._core = assemble(plan, self._driver, shares_thread=self._shares_thread)
+        self._driver.drain = self._core.drain
+        supervisor = self._core.supervisor
+        self._finalizer = weakref.finalize(self, _abandon, supervisor, os.getpid())
 
-    @staticmethod
-    def _new_driver() -> Watcher:
+    _shares_thread = False
+    """Whether other tasks may use the group while a call waits."""
+
+    def _new_driver(self) -> Driver:
         raise NotImplementedError
 
     @property
     def _metas(self) -> list[EnvMeta]:
-        self._core.check_open()
-        return self._fleet.metas
+        self._core.supervisor.check_open()
+        return self._core.supervisor.metas
 
     # -- what it holds ------------------------------------------------------------
 
     @property
     def env_ids(self) -> list[str]:
         """Ids of the local envs, then of the env_servers, in order."""
-        slots = self._core.slots
-        return [*slots.local_ids, *slots.server_ids]
+        envs = self._core.envs
+        return [*envs.local_ids, *envs.server_ids]
 
     def __len__(self) -> int:
         """Envs of the group, each env_server counted once."""
@@ -130,7 +147,7 @@ class Facade:
 
     def size(self) -> int:
         """Local envs of the group."""
-        return len(self._core.slots.local_ids)
+        return len(self._core.envs.local_ids)
 
     def get_observation_spaces(self) -> list[gym.Space[Any] | None]:
         """Observation space of each env, in order."""
@@ -163,7 +180,9 @@ class Facade:
         min_results: int,
         max_results: int | None,
         deadline: float | None,
-    ) -> Operation[tuple[BatchedData, list[bool]]]:
+        entries: Sequence[str] | None,
+        ordered: bool,
+    ) -> Procedure[tuple[BatchedData, list[bool]]]:
         for name, seconds in (("timeout", timeout), ("deadline", deadline)):
             if seconds is not None and not seconds > 0:
                 raise ValueError(f"{name} must be a positive number of seconds, not {seconds!r}")
@@ -183,10 +202,35 @@ class Facade:
             min_results=min_results,
             max_results=max_results,
             deadline=deadline,
+            entries=entries,
+            ordered=ordered,
         )
 
-    def _auto_reset(self, max_episode_steps: int | None, on_done: bool) -> AutoResetContext:
-        return AutoResetContext(self._core, max_episode_steps, on_done)
+    def auto_reset(
+        self,
+        max_episode_steps: int | None = None,
+        on_done: bool = True,
+        mark_truncated: bool = False,
+    ) -> AutoResetContext:
+        """Reset envs at their step limit, in place of their next step.
+
+        An env that has made the limit's number of steps says so in that result
+        (`BatchedData.limit_reached`, and the flag that comes with it). Its next step is replaced
+        by a reset, which returns reward 0 and `BatchedData.is_reset`. Works with ``with`` and
+        ``async with``.
+
+        Args:
+            max_episode_steps: the limit for all envs; None takes each entry's own, or the
+                simulator's.
+            on_done: also reset envs whose episode has ended by itself: with sub-environments
+                or agents, when all of them have ended.
+            mark_truncated: set `BatchedData.truncated`, too, where the limit is reached.
+
+        Raises:
+            ValueError: the limit isn't a positive int, or it is None and an env has none.
+            RuntimeError: contexts don't nest.
+        """
+        return AutoResetContext(self._core, max_episode_steps, on_done, mark_truncated)
 
     # -- what was measured --------------------------------------------------------
 
@@ -200,19 +244,23 @@ class Facade:
         """
         return self._core.stats.summary()
 
-    def get_env_stats(self, reset: bool = False) -> dict[str, dict[str, Any]]:
+    def get_env_stats(
+        self, reset: bool = False, by_entry: bool = False
+    ) -> dict[str, dict[str, Any]]:
         """By env id: requests sent, episodes ended, mean and last return and length.
 
-        Where the env judges its episodes (``info["success"]`` and ``info["fail"]`` of the
-        results that end them), ``success_rate`` and ``fail_rate`` are the shares that were
-        true; None where it doesn't.
+        An episode ends by itself or at the step limit of `auto_reset`. Where the env judges its
+        episodes (``info["success"]`` and ``info["fail"]`` of the results that end them),
+        ``success_rate`` and ``fail_rate`` are the shares that were true; None where it doesn't.
 
         Args:
             reset: start the sums anew after this call.
+            by_entry: sum up by config entry.
         """
-        found = self._core.stats.by_env()
+        stats = self._core.stats
+        found = stats.by_entry() if by_entry else stats.by_env()
         if reset:
-            self._core.stats.reset_envs()
+            stats.reset_envs()
         return found
 
     def print_timing_summary(self) -> None:
@@ -226,15 +274,16 @@ class Facade:
 
     def _closed(self) -> None:
         self._finalizer.detach()
-        errors = list(self._fleet.close_errors)
-        self._fleet.close_errors.clear()  # Told once, however often it is closed.
+        close_errors = self._core.supervisor.close_errors
+        errors = list(close_errors)
+        close_errors.clear()  # Told once, however often it is closed.
         _warn_of(errors)
 
 
-def _abandon(fleet: Fleet, owner_pid: int) -> None:
+def _abandon(supervisor: Supervisor, owner_pid: int) -> None:
     """End what nobody can close any more, unless this is a child that its owner has forked."""
     if os.getpid() == owner_pid:
-        fleet.abandon()
+        supervisor.abandon()
 
 
 def _warn_of(errors: Sequence[tuple[str, Any]]) -> None:

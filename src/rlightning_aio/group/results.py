@@ -1,102 +1,229 @@
-"""Ready rows become a batch: a few copies for each slab, none for each env."""
+"""`Results`: ready rows become a batch, with a few copies for each slab and none for each env."""
 
 from __future__ import annotations
 
+import pickle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rlightning_aio.batch import BatchedData, Origin, ResultColumns
+from rlightning_aio.batch.columns import ResultColumns
+from rlightning_aio.batch.sent import kept_columns
 from rlightning_aio.protocol.columns import Rows, gather, mapped, stacked
+from rlightning_aio.protocol.info import NO_INFO, PICKLED
+from rlightning_aio.protocol.slab import TRUNCATED
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
-    from rlightning_aio.group.core import Core
+    from rlightning_aio.batch.sent import Sources
+    from rlightning_aio.group.env_table import EnvTable
+    from rlightning_aio.group.slab_layout import SlabLayout
+    from rlightning_aio.hosts.messages import OutOfBand
+    from rlightning_aio.protocol.info import InfoSchema
     from rlightning_aio.protocol.slab import Slab
 
-__all__ = ["collected"]
+__all__ = ["Results"]
 
 
-def collected(core: Core, slots: NDArray[np.intp], rests: dict[int, Any]) -> BatchedData:
-    """A batch of the results of `slots`, which lie in their rows, in the order of `slots`."""
-    fleet, table = core.fleet, core.slots
-    if len(fleet.slabs) == 1:
-        parts = [_part(core, fleet.slabs[0], slots, None, rests)]
-    else:
-        slabs = table.slab[slots]
+class Results:
+    """What lies in the rows of a group, and beside them.
+
+    Args:
+        envs: names them; layout: where their rows are.
+        zero_copy: observations are handed out as views where their rows are contiguous.
+    """
+
+    def __init__(self, envs: EnvTable, layout: SlabLayout, *, zero_copy: bool) -> None:
+        self._envs = envs
+        self._layout = layout
+        self._zero_copy = zero_copy
+        self._out_of_band: dict[int, Any] = {}
+        # Of each slot's host; a host's slots share one dict.
+        self._schemas: list[dict[int, InfoSchema]] = [{} for _ in range(len(envs))]
+        # Bytes of a row's info that any schema uses.
+        self._info_width = 0
+        self._restarted = np.zeros(len(envs), np.bool_)
+        self._any_restarted = False
+        # What was sent, by slot; that of the last batch is entered when that is needed.
+        self._sent_columns = np.full(len(envs), None, object)
+        self._sent_rows = np.zeros(len(envs), np.intp)
+        self._last_sent: tuple[NDArray[np.intp], Mapping[str, Any] | None] | None = None
+        self._each = np.arange(len(envs))
+
+    # -- what comes in ----------------------------------------------------------------
+
+    def note_sent(self, slots: NDArray[np.intp], columns: Mapping[str, Any] | None) -> None:
+        """Keep what a policy has sent to `slots`, one row for each, for their results."""
+        self._enter_last_sent()
+        self._last_sent = slots, None if columns is None else kept_columns(columns)
+
+    def _enter_last_sent(self) -> None:
+        if self._last_sent is not None:
+            slots, columns = self._last_sent
+            self._last_sent = None
+            self._sent_columns[slots] = columns
+            self._sent_rows[slots] = self._each[: len(slots)]
+
+    def keep(self, slot: int, out_of_band: bytes | OutOfBand) -> None:
+        """Keep what of a result has no place in its row."""
+        if out_of_band:
+            self._out_of_band[slot] = out_of_band
+
+    def drop(self, slot: int) -> None:
+        """Nobody will ask for the result of `slot`."""
+        self._out_of_band.pop(slot, None)
+
+    def begin_schemas(self, slots: range) -> None:
+        """The host of `slots` announces its ways of holding infos (anew, after a restart)."""
+        shared: dict[int, InfoSchema] = {}
+        # A new list: batches that were handed out go on reading the old one.
+        self._schemas = list(self._schemas)
+        for slot in slots:
+            self._schemas[slot] = shared
+
+    def note_schema(self, first_slot: int, number: int, schema: InfoSchema) -> None:
+        """A host holds infos in one more way."""
+        self._schemas[first_slot][number] = schema
+        self._info_width = max(self._info_width, schema.size)
+
+    def mark_restarted(self, slot: int, cause: str) -> None:
+        """Mark a result as the first of a replaced worker."""
+        self.detach_info(slot)
+        found = self._out_of_band.get(slot)
+        if isinstance(found, dict):
+            found["info"]["worker_restarted"] = cause
+        self.mark_lost(slot)
+
+    def mark_lost(self, slot: int) -> None:
+        """Mark a result as one whose episode before was lost; it will be truncated."""
+        self._restarted[slot] = self._any_restarted = True
+
+    def detach_info(self, slot: int) -> None:
+        """Decode the info of a result that is ready, while its row and schemas are there."""
+        slab, row = self._layout.of(slot)
+        found = self._out_of_band.get(slot)
+        try:
+            kept: dict[str, Any] = pickle.loads(found) if isinstance(found, bytes) else found or {}
+        except Exception:  # noqa: BLE001  # It may hold anything; whoever reads it learns why not.
+            return
+        mark = int(slab.info_mark[row])
+        info: dict[str, Any] = kept.get("info", {})
+        if mark not in (NO_INFO, PICKLED):
+            info = self._schemas[slot][mark].decode(memoryview(slab.info[row]))
+        slab.info_mark[row] = PICKLED
+        self._out_of_band[slot] = {**kept, "info": dict(info)}
+
+    # -- what goes out ----------------------------------------------------------------
+
+    def gather(self, slots: NDArray[np.intp]) -> list[ResultColumns]:
+        """Copy the results of `slots` out of their rows: one part for each layout."""
+        layout = self._layout
+        if len(layout.slabs) == 1:
+            return [self._part(layout.slabs[0], slots, None)]
+        slabs = layout.slab[slots]
         present: list[int] = np.unique(slabs).tolist()
-        parts = [
-            _part(core, fleet.slabs[slab], slots[places], places, rests)
+        return [
+            self._part(layout.slabs[slab], slots[places], places)
             for slab in present
             for places in (np.flatnonzero(slabs == slab),)
         ]
-    return BatchedData.of_results(parts, Origin(core, slots, table))
 
+    def add_episodes(self, part: ResultColumns) -> None:
+        """Copy the sums of the episodes that end in `part`; its rows are as they were."""
+        slab, rows = self._slab_of(part), self._rows(part.slots)
+        part.episode_return = _copy(slab.episode_return, rows)
+        part.episode_length = _copy(slab.episode_length, rows)
 
-def _part(
-    core: Core,
-    slab: Slab,
-    slots: NDArray[np.intp],
-    positions: NDArray[np.intp] | None,
-    rests: dict[int, Any],
-) -> ResultColumns:
-    table = core.slots
-    rows: Rows
-    if slots is table.all:
-        rows = slice(0, slab.rows)
-    else:
-        rows = slots if table.row_is_slot else table.row[slots]
-    ends = gather(slab.ends, rows)
-    any_ended = np.count_nonzero(ends) > 0
-    own_rests, whole = _rests(slots, rests) if rests else ({}, False)
-    return ResultColumns(
-        slots=slots,
-        table=table,
-        positions=positions,
-        observation=_observations(core, slab, rows, own_rests),
-        reward=_copy(slab.reward, rows),
-        ends=ends,
-        info_marks=_copy(slab.info_mark, rows) if core.info_width else None,
-        info=_copy(slab.info[:, : core.info_width], rows) if core.info_width else None,
-        schemas=table.schemas,
-        rests=own_rests,
-        episode_return=_copy(slab.episode_return, rows) if any_ended else None,
-        episode_length=_copy(slab.episode_length, rows) if any_ended else None,
-        times=gather(slab.times, rows),
-        agents=slab.layout.agents,
-        observation_space=slab.layout.observation_space,
-        whole_results=whole,
-    )
+    def sources(self, slots: NDArray[np.intp]) -> Sources:
+        """What was sent for the results of `slots`."""
+        if self._last_sent is not None and self._last_sent[0] is slots:
+            return self._last_sent[1], None  # As `step` asks and is answered.
+        self._enter_last_sent()
+        return self._sent_columns[slots], self._sent_rows[slots]
+
+    def _slab_of(self, part: ResultColumns) -> Slab:
+        return self._layout.slabs[self._layout.slab.item(part.slots.item(0))]
+
+    def _rows(self, slots: NDArray[np.intp]) -> Rows:
+        if slots is self._envs.all:
+            return slice(0, len(slots))
+        return slots if self._layout.row_is_slot else self._layout.row[slots]
+
+    def _part(
+        self, slab: Slab, slots: NDArray[np.intp], positions: NDArray[np.intp] | None
+    ) -> ResultColumns:
+        rows = self._rows(slots) if positions is None else self._layout.row[slots]
+        flags = gather(slab.flags, rows)
+        restarted = self._take_restarted(slots) if self._any_restarted else None
+        if restarted is not None:
+            # Here and not in the row, where envs write their flags only when they change.
+            flags[restarted, ..., TRUNCATED] = True
+        extra, whole = self._take_out_of_band(slots) if self._out_of_band else ({}, False)
+        width = self._info_width
+        return ResultColumns(
+            slots=slots,
+            names=self._envs,
+            positions=positions,
+            observation=self._observations(slab, rows, extra),
+            reward=_copy(slab.reward, rows),
+            flags=flags,
+            info_marks=_copy(slab.info_mark, rows) if width else None,
+            info=_copy(slab.info[:, :width], rows) if width else None,
+            schemas=self._schemas,
+            out_of_band=extra,
+            restarted=restarted,
+            times=gather(slab.times, rows),
+            agents=slab.layout.agents,
+            observation_space=slab.layout.observation_space,
+            whole_results=whole,
+        )
+
+    def _take_restarted(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
+        restarted = self._restarted[slots]
+        self._restarted[slots] = False
+        self._any_restarted = bool(self._restarted.any())
+        return restarted
+
+    def _take_out_of_band(self, slots: NDArray[np.intp]) -> tuple[dict[int, Any], bool]:
+        """What belongs to `slots`, by row of the batch; whether some is a whole result."""
+        found: dict[int, Any] = {}
+        whole = False
+        for row, slot in enumerate(slots.tolist()):
+            kept = self._out_of_band.pop(slot, None)
+            if kept is not None:
+                found[row] = kept
+                whole = whole or (type(kept) is dict and "ret" in kept)
+        return found, whole
+
+    def _observations(self, slab: Slab, rows: Rows, out_of_band: dict[int, Any]) -> Any:
+        """Fresh columns; read-only views where the group hands those out and the rows allow it.
+
+        What envs have handed over as it is leaves `out_of_band`; that of one alone isn't
+        copied.
+        """
+        if slab.observation is None:
+            handed_over = slab.layout.observations_apart and len(out_of_band) > 0
+            if not handed_over or not all("observation" in kept for kept in out_of_band.values()):
+                return None
+            return stacked([kept.pop("observation") for kept in out_of_band.values()])
+        contiguous = _contiguous(rows) if self._zero_copy else None
+        if contiguous is None:
+            return gather(slab.observation, rows)
+
+        def view(array: NDArray[Any]) -> NDArray[Any]:
+            part = array[contiguous]
+            part.flags.writeable = False
+            return part
+
+        return mapped(view, slab.observation)
 
 
 def _copy(column: NDArray[Any], rows: Rows) -> NDArray[Any]:
     """Rows of a narrow column: for those, indexing is the quickest copy."""
     return column[rows].copy() if type(rows) is slice else column[rows]
-
-
-def _observations(core: Core, slab: Slab, rows: Rows, rests: dict[int, Any]) -> Any:
-    """Fresh columns; read-only views where the group hands those out and the rows allow it.
-
-    What envs have handed over as it is leaves `rests`; that of one alone isn't copied.
-    """
-    if slab.observation is None:
-        handed_over = slab.layout.observations_apart and len(rests) > 0
-        if not handed_over or not all("observation" in rest for rest in rests.values()):
-            return None
-        return stacked([rest.pop("observation") for rest in rests.values()])
-    if not core.zero_copy:
-        return gather(slab.observation, rows)
-    contiguous = _contiguous(rows)
-    if contiguous is None:
-        return gather(slab.observation, rows)
-
-    def view(array: NDArray[Any]) -> NDArray[Any]:
-        part = array[contiguous]
-        part.flags.writeable = False
-        return part
-
-    return mapped(view, slab.observation)
 
 
 def _contiguous(rows: Rows) -> slice | None:
@@ -108,15 +235,3 @@ def _contiguous(rows: Rows) -> slice | None:
     if last - first + 1 == len(rows) and (np.diff(rows) == 1).all():
         return slice(first, last + 1)
     return None
-
-
-def _rests(slots: NDArray[np.intp], rests: dict[int, Any]) -> tuple[dict[int, Any], bool]:
-    """Take what belongs to `slots`, by row of the batch; and whether some is a whole result."""
-    found: dict[int, Any] = {}
-    whole = False
-    for row, slot in enumerate(slots.tolist()):
-        rest = rests.pop(slot, None)
-        if rest is not None:
-            found[row] = rest
-            whole = whole or (type(rest) is dict and "ret" in rest)
-    return found, whole

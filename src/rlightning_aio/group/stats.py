@@ -18,8 +18,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from rlightning_aio.batch import ResultColumns
-    from rlightning_aio.group.slots import Slots
+    from rlightning_aio.batch.columns import ResultColumns
+    from rlightning_aio.group.env_table import EnvTable
+    from rlightning_aio.group.requests import Requests
 
 __all__ = ["Stats"]
 
@@ -51,28 +52,29 @@ class _Verdicts:
     def of(cls, size: int) -> _Verdicts:
         return cls(np.zeros(size, np.int64), np.zeros(size, np.int64))
 
-    def rate(self, slot: int) -> float | None:
-        count = int(self.count[slot])
-        return int(self.true[slot]) / count if count else None
+    def rate(self, slots: list[int]) -> float | None:
+        count = int(self.count[slots].sum())
+        return int(self.true[slots].sum()) / count if count else None
 
 
 class Stats:
     """Windows over what was handed out, and sums over the episodes that have ended."""
 
-    def __init__(self, slots: Slots) -> None:
-        self._table = slots
+    def __init__(self, envs: EnvTable, requests: Requests) -> None:
+        self._envs = envs
+        self._requests = requests
         self._samples: deque[_Sample] = deque(maxlen=_WINDOW_BATCHES)
         # By slot: episodes, the sum of their returns, that of their lengths.
-        self._sums = np.zeros((len(slots), 3))
+        self._sums = np.zeros((len(envs), 3))
         # Return and length of the last episode.
-        self._last = np.zeros((len(slots), 2))
-        self._requests_before = np.zeros(len(slots), np.int64)
-        self._verdicts = {name: _Verdicts.of(len(slots)) for name in _VERDICTS}
+        self._last = np.zeros((len(envs), 2))
+        self._requests_before = np.zeros(len(envs), np.int64)
+        self._verdicts = {name: _Verdicts.of(len(envs)) for name in _VERDICTS}
 
     def account(self, parts: Sequence[ResultColumns], *, synchronous: bool) -> None:
         """Take note of results that are handed out."""
         now = time.monotonic_ns()
-        sent_ns = self._table.sent_ns
+        sent_ns = self._requests.sent_ns
         for part in parts:
             slots = part.slots
             self._samples.append(_Sample(now, slots, sent_ns[slots], part.times, synchronous))
@@ -82,7 +84,7 @@ class Stats:
     def _note_episodes(
         self, part: ResultColumns, returns: NDArray[np.float64], lengths: NDArray[np.int64]
     ) -> None:
-        ended = part.ended & (lengths > 0)
+        ended = part.done & (lengths > 0)
         rows = np.flatnonzero(ended if ended.ndim == 1 else ended.reshape(len(part), -1).any(1))
         if not len(rows):
             return
@@ -99,9 +101,9 @@ class Stats:
                 own_returns, own_lengths = returns[row][mask], lengths[row][mask]
                 self._sums[slot] += (len(own_returns), own_returns.sum(), own_lengths.sum())
                 self._last[slot] = own_returns[-1], own_lengths[-1]
-        if part.info_marks is not None or part.rests:
+        if part.info_marks is not None or part.out_of_band:
             for slot, row in zip(slots.tolist(), rows.tolist(), strict=True):
-                if part.reports(row, _VERDICTS):
+                if part.may_hold(row, _VERDICTS):
                     self._note_verdicts(slot, part.info_of(row), ended[row])
 
     def _note_verdicts(self, slot: int, info: dict[str, Any], ended: NDArray[np.bool_]) -> None:
@@ -125,7 +127,7 @@ class Stats:
         counted = samples[1:]
         return {
             "steps_per_second": sum(len(s.slots) for s in counted) / seconds,
-            "entries": self._by_entry(counted, seconds),
+            "entries": self._rates_by_entry(counted, seconds),
             "batch_size": {
                 "mean": float(sizes.mean()),
                 "min": int(sizes.min()),
@@ -140,11 +142,13 @@ class Stats:
         since = self._samples[-1].at_ns - int(_WINDOW_SECONDS * 1e9)
         return [sample for sample in self._samples if sample.at_ns >= since]
 
-    def _by_entry(self, samples: list[_Sample], seconds: float) -> dict[str, dict[str, float]]:
+    def _rates_by_entry(
+        self, samples: list[_Sample], seconds: float
+    ) -> dict[str, dict[str, float]]:
         rates: dict[str, dict[str, float]] = {}
         for sample in samples:
             kind = "sync" if sample.synchronous else "async"
-            for name in self._table.names(sample.slots):
+            for name in self._envs.names(sample.slots):
                 entry = rates.setdefault(name, {"sync": 0.0, "async": 0.0})
                 entry[kind] += 1.0 / seconds
         return rates
@@ -165,22 +169,30 @@ class Stats:
 
     def by_env(self) -> dict[str, dict[str, Any]]:
         """See `EnvGroup.get_env_stats`."""
-        found: dict[str, dict[str, Any]] = {}
-        for slot, env_id in enumerate(self._table.env_ids):
-            if not env_id:
-                continue
-            episodes, total_return, total_length = self._sums[slot].tolist()
-            last_return, last_length = self._last[slot].tolist()
-            found[env_id] = {
-                "requests": self._table.number(slot) - int(self._requests_before[slot]),
-                "episodes": int(episodes),
-                "mean_return": total_return / episodes if episodes else None,
-                "mean_length": total_length / episodes if episodes else None,
-                "last_return": last_return if episodes else None,
-                "last_length": int(last_length) if episodes else None,
-                **{f"{name}_rate": v.rate(slot) for name, v in self._verdicts.items()},
-            }
-        return found
+        return {
+            env_id: self._summed([slot]) for slot, env_id in enumerate(self._envs.env_ids) if env_id
+        }
+
+    def by_entry(self) -> dict[str, dict[str, Any]]:
+        """The same for each config entry, over all of its envs."""
+        found: dict[str, list[int]] = {name: [] for name in self._envs.entry_names}
+        for slot, name in enumerate(self._envs.names(np.arange(len(self._envs)))):
+            found[name].append(slot)
+        return {name: self._summed(slots) for name, slots in found.items()}
+
+    def _summed(self, slots: list[int]) -> dict[str, Any]:
+        episodes, total_return, total_length = self._sums[slots].sum(axis=0).tolist()
+        found = {
+            "requests": int((self._requests.numbers(slots) - self._requests_before[slots]).sum()),
+            "episodes": int(episodes),
+            "mean_return": total_return / episodes if episodes else None,
+            "mean_length": total_length / episodes if episodes else None,
+        }
+        if len(slots) == 1:
+            last_return, last_length = self._last[slots[0]].tolist()
+            found["last_return"] = last_return if episodes else None
+            found["last_length"] = int(last_length) if episodes else None
+        return found | {f"{name}_rate": v.rate(slots) for name, v in self._verdicts.items()}
 
     def reset_envs(self) -> None:
         """Start the sums over episodes anew."""
@@ -191,4 +203,4 @@ class Stats:
             *(v.true for v in self._verdicts.values()),
         ):
             sums[:] = 0
-        self._requests_before[:] = [self._table.number(slot) for slot in range(len(self._table))]
+        self._requests_before[:] = self._requests.numbers()

@@ -11,17 +11,16 @@ import time
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from rlightning_aio.group.build import PreprocessFn, plan_group
-from rlightning_aio.group.facade import AutoResetContext, Facade, ServerView, sole, steps_of
+from rlightning_aio.group.facade import Facade, ServerView, sole, steps_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from types import TracebackType
 
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.group.core import Core
-    from rlightning_aio.group.wait import Operation
-    from rlightning_aio.hosts.base import Source
-    from rlightning_aio.hosts.server import ServerHost
+    from rlightning_aio.group.wait import Procedure
+    from rlightning_aio.hosts.base import Host, Membership, Source
     from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
 
 __all__ = ["EnvGroup", "EnvHandle", "ServerHandle", "SyncDriver"]
@@ -29,12 +28,15 @@ __all__ = ["EnvGroup", "EnvHandle", "ServerHandle", "SyncDriver"]
 T = TypeVar("T")
 
 
-class SyncDriver:
-    """Watches sources with one persistent epoll and waits for operations to end."""
+def _nothing() -> None: ...
 
-    shares_thread = False
+
+class SyncDriver:
+    """Watches sources with one persistent epoll and waits for procedures to end."""
 
     def __init__(self) -> None:
+        # Takes in what sources have told; set by the group.
+        self.drain: Callable[[], None] = _nothing
         self._epoll: select.epoll | None = None
         self._sources: dict[int, Source] = {}
         self._descriptors: dict[Source, int] = {}
@@ -67,20 +69,21 @@ class SyncDriver:
             self._epoll.modify(descriptor, events)
 
     def wake(self) -> None:
-        """See `base.Watcher.wake`. One operation runs at a time: nobody else waits."""
+        """See `base.Watcher.wake`. One procedure runs at a time: nobody else waits."""
 
-    def run(self, operation: Operation[T]) -> T:
-        """Wait until `operation` ends; its result. It gets to clean up if it is interrupted."""
+    def run(self, procedure: Procedure[T]) -> T:
+        """Wait until `procedure` ends; its result. It gets to clean up if it is interrupted."""
         try:
-            wait = operation.send(None)  # pyright: ignore[reportArgumentType]
+            wait = procedure.send(None)  # pyright: ignore[reportArgumentType]
             while True:
                 try:
                     self._block(wait.until)
+                    self.drain()
                 except BaseException as error:
                     # Thrown, not closed: closing down takes waiting, too.
-                    wait = operation.throw(error)
+                    wait = procedure.throw(error)
                 else:
-                    wait = operation.send(time.monotonic())
+                    wait = procedure.send(time.monotonic())
         except StopIteration as stop:
             return stop.value
 
@@ -107,14 +110,13 @@ class EnvGroup(Facade):
 
     _driver: SyncDriver
 
-    @staticmethod
-    def _new_driver() -> SyncDriver:
+    def _new_driver(self) -> SyncDriver:
         return SyncDriver()
 
     def init(self) -> list[EnvMeta]:
         """See `rlightning_aio.EnvGroup.init`."""
         try:
-            return self._driver.run(self._fleet.start(time.monotonic()))
+            return self._driver.run(self._core.start(time.monotonic()))
         except BaseException:
             self._closed()
             raise
@@ -151,23 +153,21 @@ class EnvGroup(Facade):
         min_results: int = 1,
         max_results: int | None = None,
         deadline: float | None = None,
+        entries: Sequence[str] | None = None,
+        ordered: bool = False,
     ) -> tuple[BatchedData, list[bool]]:
         """See `rlightning_aio.EnvGroup.collect_async`."""
-        operation = self._collect(timeout, wait_all, min_results, max_results, deadline)
-        return self._driver.run(operation)
-
-    def auto_reset(
-        self, max_episode_steps: int | None = None, on_done: bool = True
-    ) -> AutoResetContext:
-        """See `rlightning_aio.EnvGroup.auto_reset`."""
-        return self._auto_reset(max_episode_steps, on_done)
+        procedure = self._collect(
+            timeout, wait_all, min_results, max_results, deadline, entries, ordered
+        )
+        return self._driver.run(procedure)
 
     def __getitem__(self, env_id: str) -> EnvHandle:
         """A handle on one env, or on one env_server; raises `UnknownEnv`."""
-        listener = self._fleet.listener(env_id)
-        if listener is not None:
-            return ServerHandle(self, self._core, self._driver, listener)
-        return EnvHandle(self, self._core, self._driver, self._core.slots.find_one(env_id))
+        server = self._core.supervisor.server(env_id)
+        if server is not None:
+            return ServerHandle(self, self._core, self._driver, server)
+        return EnvHandle(self, self._core, self._driver, self._core.envs.find_one(env_id))
 
     def offload(self) -> None:
         """See `rlightning_aio.EnvGroup.offload`."""
@@ -179,7 +179,7 @@ class EnvGroup(Facade):
 
     def close(self) -> None:
         """See `rlightning_aio.EnvGroup.close`."""
-        self._driver.run(self._fleet.close(time.monotonic()))
+        self._driver.run(self._core.close(time.monotonic()))
         self._closed()
 
 
@@ -195,7 +195,7 @@ class EnvHandle:
     @property
     def env_id(self) -> str:
         """Its id."""
-        return self._core.slots.env_ids[self._slot]
+        return self._core.envs.env_ids[self._slot]
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -210,8 +210,8 @@ class EnvHandle:
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> Any:
         """Call method `name` of the env (or, if it has none, of its simulator); its value."""
-        operation = self._core.call(time.monotonic(), self._slot, name, args, kwargs)
-        return self._driver.run(operation)
+        procedure = self._core.call(time.monotonic(), self._slot, name, args, kwargs)
+        return self._driver.run(procedure)
 
     def get_attr(self, name: str, target: str = "unwrapped") -> Any:
         """Attribute `name` of the simulator; of its outermost wrapper with target ``outer``."""
@@ -238,10 +238,15 @@ class ServerHandle(ServerView, EnvHandle):
     """An env_server of a synchronous group; see `rlightning_aio.ServerHandle`."""
 
     def __init__(
-        self, group: EnvGroup, core: Core, driver: SyncDriver, listener: ServerHost
+        self,
+        group: EnvGroup,
+        core: Core,
+        driver: SyncDriver,
+        server: tuple[Host, Membership],
     ) -> None:
         super().__init__(group, core, driver, -1)
-        self._listener = listener
+        self._server = server
+        self._membership = server[1]
 
     def reset(  # pyright: ignore[reportIncompatibleMethodOverride]  # One for each client.
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -256,8 +261,8 @@ class ServerHandle(ServerView, EnvHandle):
         Raises:
             TimeoutError: too few clients have joined.
         """
-        operation = self._core.reset_clients(time.monotonic(), self._listener, seed, options)
-        return self._driver.run(operation)[0].values()
+        procedure = self._core.reset_members(time.monotonic(), self._server, seed, options)
+        return self._driver.run(procedure)[0].values()
 
     def step(self, response: PolicyResponse | Any) -> EnvRet | MultiAgentEnvRet:
         """Raises NotImplementedError: remote envs answer when they can."""

@@ -1,4 +1,4 @@
-"""`Wait` and `Operation`: how the core says that it can't go on yet."""
+"""`Wait` and `Procedure`: how the core says that it can't go on yet."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Generator
 from dataclasses import dataclass
 from typing import TypeAlias, TypeVar
 
-__all__ = ["Operation", "Wait", "earliest"]
+__all__ = ["Procedure", "Wait", "earliest"]
 
 T = TypeVar("T")
 
@@ -21,8 +21,11 @@ class Wait:
     until: float | None = None
 
 
-Operation: TypeAlias = Generator[Wait, float, T]
-"""Yields what it waits for, is sent the time, returns its result."""
+Procedure: TypeAlias = Generator[Wait, float, T]
+"""Yields what it waits for, is sent the time, returns its result.
+
+Before it goes on, its driver has the core take in what hosts have told (`Core.drain`).
+"""
 
 
 def earliest(*times: float | None) -> float | None:

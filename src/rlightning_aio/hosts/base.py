@@ -1,47 +1,41 @@
-"""The seam between the group's core and the places where envs live.
+"""The seam between a group's core and the places where envs live.
 
-A *source* is something whose descriptor wakes a driver; a *host* is a source that
-holds envs. Hosts tell the core what happened through an `Inbox`, and ask the driver
-to watch their descriptors through a `Watcher`; neither side ever waits here.
+A `Host` starts, is asked, and ends; what becomes of that it appends to its group's queue
+of completions (see `messages`). Beyond that a host does only what it can: one with a
+descriptor is a `Source`, one whose results may lie there unnoticed is `Polled`, one that
+executes in the caller's thread is `Executing`, and one whose envs come and go has
+`Membership`. The core asks what a host can do, never what it is.
+Absent on purpose: waiting. Neither side ever does.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
     import numpy as np
     from numpy.typing import NDArray
 
-    from rlightning_aio.errors import EnvFault
-    from rlightning_aio.hosts.worker import AttachOrder, ErrorText, Started
-    from rlightning_aio.protocol.info import InfoSchema
-    from rlightning_aio.protocol.net.server_session import ClientTraits
-    from rlightning_aio.protocol.slab import Slab
+    from rlightning_aio.config import EnvConfig
+    from rlightning_aio.hosts.arena import Arena
+    from rlightning_aio.hosts.messages import AttachOrder, Completions, StartOrder
+    from rlightning_aio.protocol.bell import TrainerBell
     from rlightning_aio.types import EnvMeta
 
-__all__ = ["Death", "Host", "Inbox", "Source", "Watcher"]
-
-
-@dataclass(frozen=True)
-class Death:
-    """Why a worker is gone.
-
-    Attributes:
-        cause: one clause, such as "was killed by SIGKILL".
-        exit_code: negative for a signal; None if nobody knows.
-        stderr_tail: the last lines it wrote.
-        hung: it was killed because an env ran into its timeout.
-        requests: ring entries, those first that it may have been executing; they may be
-            answered already, or be 0.
-    """
-
-    cause: str
-    exit_code: int | None = None
-    stderr_tail: str = ""
-    hung: bool = False
-    requests: tuple[int, ...] = ()
+__all__ = [
+    "Executing",
+    "Host",
+    "HostFactory",
+    "Killable",
+    "Membership",
+    "Polled",
+    "Source",
+    "Watcher",
+    "Wiring",
+]
 
 
 class Source(Protocol):
@@ -52,7 +46,7 @@ class Source(Protocol):
         ...
 
     def on_readable(self) -> None:
-        """Read what there is, without blocking; tell the inbox."""
+        """Read what there is, without blocking; append what it means to the completions."""
         ...
 
     def on_writable(self) -> None:
@@ -61,13 +55,7 @@ class Source(Protocol):
 
 
 class Watcher(Protocol):
-    """What a driver does for sources.
-
-    Attributes:
-        shares_thread: other tasks may use the group while an operation waits.
-    """
-
-    shares_thread: bool
+    """What a driver does for sources."""
 
     def watch(self, source: Source) -> None:
         """Call `source.on_readable` whenever its descriptor is readable, from now on."""
@@ -86,88 +74,49 @@ class Watcher(Protocol):
         ...
 
 
-class Host(Source, Protocol):
-    """Envs of one worker, numbered by row from 0.
+class Host(Protocol):
+    """Envs that live in one place, numbered by index from 0.
 
     Attributes:
         host_id: position among the group's hosts.
-        first_slot: the group's slot of row 0; the other rows follow.
-        rows: envs here.
-        in_flight: requests that are not answered yet.
-        ordered: results after which it will wake us next; 0 if nothing was ordered.
-        inline: its requests are executed by `run_one`, not by themselves.
-        elastic: its envs come and go, so it may tell of results that nobody asked for.
+        first_slot: the group's slot of index 0; the other envs follow.
+        num_envs: envs here, or places for them.
     """
 
     host_id: int
     first_slot: int
-    rows: int
-    in_flight: int
-    ordered: int
-    inline: bool
-    elastic: bool
+    num_envs: int
 
     def start(self) -> None:
-        """Begin to build the envs; `Inbox.on_started` or `Inbox.on_start_error` follows."""
+        """Begin to build the envs; `Built` or `NotBuilt` follows, or `Died`."""
         ...
 
     def attach(self, order: AttachOrder) -> None:
-        """Give the envs their rows; `Inbox.on_attached` follows."""
+        """Give the envs their rows; `Attached` follows."""
         ...
 
-    def request(self, entries: NDArray[np.int64]) -> None:
-        """Send numbered requests whose arguments lie in the rows."""
-        ...
-
-    def pack(self, content: Any) -> Any:
-        """`content` as the requests below send it; nobody's later change reaches it.
+    def packed(self, arguments: Any) -> Any:
+        """`arguments` as `submit` sends them; nobody's later change reaches them.
 
         Raises whatever makes it impossible to send, which is why it comes before anything is.
         """
         ...
 
-    def request_step(self, row: int, number: int, packed: Any) -> None:
-        """Send a step whose arguments don't fit the row: (action, extras)."""
-        ...
+    def submit(self, entries: NDArray[np.int64], arguments: Sequence[Any] | None = None) -> None:
+        """Send requests, which their entries name (see `protocol.entries`).
 
-    def request_reset(self, row: int, number: int, packed: Any) -> None:
-        """Send a reset with options: (seed, options)."""
-        ...
+        Args:
+            entries: env, number and operation of each.
+            arguments: packed, one for each: (action, extras) of a step, (seed, options) of a
+                reset, (name, args, kwargs) of a call. None: they lie in the rows.
 
-    def request_call(self, row: int, number: int, packed: Any) -> None:
-        """Send a method call: (name, args, kwargs)."""
-        ...
-
-    def order(self, count: int) -> bool:
-        """Ask to be woken when `count` results are ready; True if they already are."""
-        ...
-
-    def withdraw(self) -> None:
-        """Take the last `order` back: the caller looks for results itself."""
-        ...
-
-    def unread(self) -> int:
-        """Results that wait to be swept; costs a look into memory."""
-        ...
-
-    def sweep(self) -> None:
-        """Tell the inbox of results that came without a wake-up."""
-        ...
-
-    def run_one(self) -> bool:
-        """Execute one waiting request here and now (inline placement); False if none waits."""
-        ...
-
-    def executing(self) -> tuple[int, int]:
-        """Entry being executed and since when (monotonic ns); entry 0 if none."""
-        ...
-
-    def kill(self, *, dump: bool) -> None:
-        """End the worker; `Inbox.on_death` follows."""
+        One completion follows for each: `Reported`, `Result`, `Value`, `Raised`, `Failed` or
+        `Withdrawn`, with the same entry; or the host's `Died` for all.
+        """
         ...
 
     def close(self) -> None:
-        """Ask the envs to close; `Inbox.on_closed` follows."""
+        """Ask the envs to close; `Closed` follows."""
         ...
 
     def release(self) -> None:
@@ -175,65 +124,129 @@ class Host(Source, Protocol):
         ...
 
 
-class Inbox(Protocol):
-    """What hosts tell the core."""
+@runtime_checkable
+class Killable(Protocol):
+    """A host that can hang, and be ended by force."""
 
-    def on_started(self, host: Host, started: list[Started]) -> None:
-        """The envs are built."""
+    def executing(self) -> tuple[int, int]:
+        """Entry being executed and since when (monotonic ns); entry 0 if none."""
         ...
 
-    def on_start_error(self, host: Host, row: int, error: ErrorText) -> None:
-        """Env `row` could not be built."""
+    def kill(self, *, dump: bool) -> None:
+        """End it; `Died` follows. With `dump`, have it write its stacks first."""
         ...
 
-    def on_attached(self, host: Host) -> None:
-        """The envs can be asked."""
+
+@runtime_checkable
+class Polled(Protocol):
+    """A host some of whose results wake nobody."""
+
+    def poll(self) -> None:
+        """Append what lies there to the completions, without blocking."""
         ...
 
-    def on_reports(self, entries: NDArray[np.int64]) -> None:
-        """These requests are done, and their results lie in the rows."""
+
+@runtime_checkable
+class Executing(Protocol):
+    """A host that executes requests where it is asked to."""
+
+    def execute_next(self) -> bool:
+        """Execute one waiting request here and now; False if none waits."""
         ...
 
-    def on_rest(self, host: Host, row: int, number: int, rest: bytes | dict[str, Any]) -> None:
-        """A request is done, and `rest` (a pickle, or plain) goes with its row."""
+
+@runtime_checkable
+class Membership(Protocol):
+    """A host whose envs come and go, and answer when they can (an env_server).
+
+    Its results come unasked, too (`Joined`), and wake the driver by themselves.
+
+    Attributes:
+        server_id: what a batch calls its envs.
+    """
+
+    server_id: str
+
+    def address(self) -> str:
+        """Where its envs connect to."""
         ...
 
-    def on_value(self, host: Host, row: int, number: int, value: Any) -> None:
-        """A call has returned."""
+    def members(self) -> Mapping[str, EnvMeta]:
+        """The envs that are here, by name."""
         ...
 
-    def on_error(self, host: Host, row: int, number: int, error: ErrorText) -> None:
-        """A request has raised."""
+    def member_indices(self) -> list[int]:
+        """Where they are, in the order of their names."""
         ...
 
-    def on_slab(self, host: Host, slab: Slab) -> None:
-        """The envs of an elastic host have rows from now on: those of `slab`."""
+    def num_sub_envs(self, index: int) -> int:
+        """Sub-environments of an env that is here."""
         ...
 
-    def on_client(self, host: Host, row: int, meta: EnvMeta, traits: ClientTraits) -> int:
-        """An env has joined, and its first result follows; the entry of what that answers."""
+    def check_step(self, index: int, action: Any) -> None:
+        """Raises `BadAction` if an env can't take `action`."""
         ...
 
-    def is_idle(self, host: Host, row: int) -> bool:
-        """Whether nothing was asked of an env, and nothing of it waits to be collected."""
+    def missing(self, waited: float) -> float | None:
+        """How long a reset may wait in all for envs that are missing; None if none are.
+
+        Raises:
+            TimeoutError: it has waited longer than that.
+        """
         ...
 
-    def on_withdrawn(self, host: Host, row: int, number: int) -> None:
-        """A request will not be answered: its env is away, and the caller was told so."""
+    def is_readable(self) -> bool:
+        """Whether anything has come that `tick` would take in."""
         ...
 
-    def on_fault(self, host: Host, row: int, number: int, fault: EnvFault) -> None:
-        """A request has ended in an error that is known as such."""
+    def deadline(self) -> float | None:
+        """When `tick` is due at the latest (monotonic seconds)."""
         ...
 
-    def on_schema(self, host: Host, number: int, schema: InfoSchema) -> None:
-        """The worker holds infos in one more way."""
+    def tick(self, now: float) -> None:
+        """Take in what has come; find those that are gone."""
         ...
 
-    def on_death(self, host: Host, death: Death) -> None:
-        """The worker is gone, without having been asked to close."""
+
+@dataclass(frozen=True)
+class Wiring:
+    """What a group gives its hosts.
+
+    Attributes:
+        completions: where a host says what has become of requests.
+        watcher: the driver.
+        arena: shared memory; bell: how workers wake the trainer, and where it lies there.
+        num_hosts: of the group.
+        configs: all entries.
+        objection: why an env that comes by itself may not join, if there is a reason.
+        is_idle: whether nothing was asked of a slot and nothing of it waits to be collected.
+        resources: what hosts of one kind share, made by the first of them; ended with
+            `release(seconds)` after the hosts.
+    """
+
+    completions: Completions
+    watcher: Watcher
+    arena: Arena
+    bell: TrainerBell
+    bell_offset: int
+    num_hosts: int
+    configs: Sequence[EnvConfig]
+    objection: Callable[[EnvMeta], str | None]
+    is_idle: Callable[[int], bool]
+    resources: dict[object, Shared]
+
+
+class Shared(Protocol):
+    """What several hosts use, and none of them ends."""
+
+    def release(self, seconds: float) -> None:
+        """Let go of it; what it still does may take so long."""
         ...
 
-    def on_closed(self, host: Host, errors: list[tuple[int, ErrorText]]) -> None:
-        """The worker has closed and is gone; `errors` are those of the envs' `close`."""
-        ...
+
+class HostFactory(Protocol):
+    """How a host is made: its class, for all that the group knows."""
+
+    def __call__(
+        self, host_id: int, first_slot: int, order: StartOrder, wiring: Wiring
+    ) -> Host: ...

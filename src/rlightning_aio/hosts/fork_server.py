@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from types import FrameType
 
+    from rlightning_aio.hosts.messages import WorkerPlace
+
 __all__ = ["BOOTSTRAP", "DUMP_SIGNAL", "Exited", "Fork", "Forked", "Hello", "Kill", "Ready", "main"]
 
 BOOTSTRAP: Final = """
@@ -80,12 +82,9 @@ class Ready:
 
 @dataclass(frozen=True)
 class Fork:
-    """Fork worker `host_id`; the channel's and the arena's descriptors ride along."""
+    """Fork the worker of `place`; the channel's and the arena's descriptors ride along."""
 
-    host_id: int
-    first_slot: int
-    rings_offset: int
-    rows: int
+    place: WorkerPlace
 
 
 @dataclass(frozen=True)
@@ -263,7 +262,7 @@ class _ForkServer:
         except OSError as error:
             for descriptor in (*pipe, *descriptors):
                 os.close(descriptor)
-            self._tell(Exited(order.host_id, 1, f"no worker could be forked: {error}"))
+            self._tell(Exited(order.place.host_id, 1, f"no worker could be forked: {error}"))
             return
         reader, writer = pipe
         channel, arena = descriptors
@@ -272,9 +271,9 @@ class _ForkServer:
         os.close(writer)
         os.close(arena)
         os.set_blocking(reader, False)
-        self._children[pid] = _Child(order.host_id, pid, reader, channel)
+        self._children[pid] = _Child(order.place.host_id, pid, reader, channel)
         self._choose_heard()
-        self._tell(Forked(order.host_id, pid))
+        self._tell(Forked(order.place.host_id, pid))
 
     def _become_worker(self) -> None:
         """Leave behind, in the child, what belongs to the fork server."""
@@ -402,7 +401,7 @@ def _run_worker(
         from rlightning_aio.hosts import worker  # noqa: PLC0415
 
         trainer = socket.socket(fileno=channel)
-        worker.main(trainer, arena, order.rings_offset, order.first_slot, order.rows)
+        worker.main(trainer, arena, order.place)
         code = 0
     except BaseException:
         traceback.print_exc()

@@ -1,7 +1,7 @@
 """`InlineHost`: envs in the trainer's own process, with the same rows and rules.
 
 Requests wait in a queue; one is executed whenever a driver has nothing ready and asks
-for it (`run_one`), so sending never blocks here either. An env blocks the process
+for it (`execute_next`), so sending never blocks here either. An env blocks the process
 while it steps; nothing protects the trainer from an env that crashes.
 """
 
@@ -11,80 +11,67 @@ from collections import deque
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
-from rlightning_aio.hosts.arena import Arena, map_shared
+from rlightning_aio.hosts.arena import map_shared
+from rlightning_aio.hosts.build_env import built_envs
 from rlightning_aio.hosts.copied import copied
-from rlightning_aio.hosts.runner import EnvRunner, Rest
-from rlightning_aio.hosts.worker import (
-    AttachOrder,
+from rlightning_aio.hosts.messages import (
+    Attached,
+    Built,
+    Closed,
     ErrorText,
-    Started,
-    StartOrder,
-    build_env,
+    NewSchema,
+    NotBuilt,
+    Raised,
+    Result,
+    Value,
 )
+from rlightning_aio.protocol.entries import Operation, answers_with_value, op_of, slot_of
 from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
-from rlightning_aio.protocol.rings import STEP, number_of, op_of, slot_of
 from rlightning_aio.protocol.slab import Slab
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     import numpy as np
     from numpy.typing import NDArray
 
-    from rlightning_aio.hosts.base import Inbox
+    from rlightning_aio.hosts.base import Wiring
+    from rlightning_aio.hosts.messages import AttachOrder, OutOfBand, StartOrder
+    from rlightning_aio.hosts.runner import EnvRunner, Execute
 
 __all__ = ["InlineHost"]
 
-Execute: TypeAlias = "Callable[[], Any]"
-Tell: TypeAlias = "Callable[[int, int, Any], None]"
-"""Takes the row, the request's number, and what executing it gave."""
+_Waiting: TypeAlias = "tuple[int, Callable[[], Any]]"
+"""An entry, and what executes it."""
 
 
 class InlineHost:
-    """See `base.Host`. It has no descriptor and is never watched."""
+    """See `base.Host` and `Executing`. It has no descriptor and is never watched."""
 
-    def __init__(
-        self, host_id: int, first_slot: int, order: StartOrder, arena: Arena, inbox: Inbox
-    ) -> None:
+    def __init__(self, host_id: int, first_slot: int, order: StartOrder, wiring: Wiring) -> None:
         self.host_id = host_id
         self.first_slot = first_slot
-        self.rows = len(order.worker_indices)
-        self.in_flight = 0
-        self.ordered = 0
-        self.elastic = False
-        self.inline = True
+        self.num_envs = len(order.worker_indices)
         self._order = order
-        self._arena = arena
-        self._inbox = inbox
+        self._arena = wiring.arena
+        self._tell = wiring.completions.append
         self._runners: list[EnvRunner] = []
-        self._queue: deque[tuple[int, int, Execute, Tell]] = deque()
+        self._queue: deque[_Waiting] = deque()
         self._schemas = InfoSchemas(self._announce)
-
-    def fileno(self) -> int:
-        """There is none."""
-        raise ValueError("an inline host has no descriptor")
-
-    def on_readable(self) -> None:
-        """Never called."""
-
-    def on_writable(self) -> None:
-        """Never called."""
 
     def start(self) -> None:
         """Build the envs here and now."""
-        order = self._order
-        for row, (index, fn) in enumerate(
-            zip(order.worker_indices, order.preprocess_fns, strict=True)
-        ):
-            try:
-                env = build_env(order.config, order.env_class, index, fn)
-                self._runners.append(EnvRunner(env, inline=True))
-            except KeyboardInterrupt:
-                raise
-            except BaseException as error:
-                self._inbox.on_start_error(self, row, ErrorText.of(error))
-                return
-        self._inbox.on_started(self, [Started.of(runner) for runner in self._runners])
+        try:
+            for runner in built_envs(self._order, inline=True):
+                self._runners.append(runner)
+            started = [runner.started() for runner in self._runners]
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
+            index = min(len(self._runners), self.num_envs - 1)
+            self._tell(NotBuilt(self.host_id, index, ErrorText.of(error)))
+            return
+        self._tell(Built(self.host_id, started))
 
     def attach(self, order: AttachOrder) -> None:
         """See `base.Host.attach`."""
@@ -94,111 +81,67 @@ class InlineHost:
         ]
         for runner, (slab_index, row) in zip(self._runners, order.rows, strict=True):
             runner.attach(slabs[slab_index], row, self._schemas.announce)
-        self._inbox.on_attached(self)
+        self._tell(Attached(self.host_id))
 
     def _announce(self, number: int, schema: InfoSchema) -> None:
-        self._inbox.on_schema(self, number, schema)
+        self._tell(NewSchema(self.host_id, number, schema))
 
-    def request(self, entries: NDArray[np.int64]) -> None:
-        """See `base.Host.request`."""
-        for entry in cast("list[int]", entries.tolist()):
-            row = slot_of(entry) - self.first_slot
-            runner = self._runners[row]
-            execute = _begun(runner) if op_of(entry) == STEP else runner.reset_from_row
-            self._enqueue(row, number_of(entry), execute, self._tell_result)
+    def packed(self, arguments: Any) -> Any:
+        """See `base.Host.packed`."""
+        return copied(arguments)
 
-    def pack(self, content: Any) -> Any:
-        """See `base.Host.pack`."""
-        return copied(content)
+    def submit(self, entries: NDArray[np.int64], arguments: Sequence[Any] | None = None) -> None:
+        """See `base.Host.submit`."""
+        for position, entry in enumerate(cast("list[int]", entries.tolist())):
+            runner, op = self._runners[slot_of(entry) - self.first_slot], op_of(entry)
+            if arguments is not None:
+                execute = partial(runner.execute, op, arguments[position])
+            elif op == Operation.STEP:
+                execute = _begun(runner)
+            else:
+                execute = runner.reset_from_row
+            self._queue.append((entry, execute))
 
-    def request_step(self, row: int, number: int, packed: tuple[Any, dict[str, Any]]) -> None:
-        """See `base.Host.request_step`."""
-        runner = self._runners[row]
-        self._enqueue(row, number, lambda: runner.step_with(*packed), self._tell_result)
-
-    def request_reset(
-        self, row: int, number: int, packed: tuple[int | None, dict[str, Any]]
-    ) -> None:
-        """See `base.Host.request_reset`."""
-        runner = self._runners[row]
-        self._enqueue(row, number, lambda: runner.reset(*packed), self._tell_result)
-
-    def request_call(
-        self, row: int, number: int, packed: tuple[str, tuple[Any, ...], dict[str, Any]]
-    ) -> None:
-        """See `base.Host.request_call`."""
-        runner = self._runners[row]
-        self._enqueue(row, number, lambda: runner.call(*packed), self._tell_value)
-
-    def _enqueue(self, row: int, number: int, execute: Execute, tell: Tell) -> None:
-        self.in_flight += 1
-        self._queue.append((row, number, execute, tell))
-
-    def _tell_result(self, row: int, number: int, rest: Rest | None) -> None:
-        self._inbox.on_rest(self, row, number, rest or {})
-
-    def _tell_value(self, row: int, number: int, value: Any) -> None:
-        self._inbox.on_value(self, row, number, value)
-
-    def step_now(self, row: int) -> Rest | None:
-        """Step with the action in `row`, past the queue, which holds nothing for this env."""
-        return self._runners[row].step()
-
-    def order(self, count: int) -> bool:
-        """Nothing gets ready by itself here."""
-        del count
-        return False
-
-    def withdraw(self) -> None:
-        """Nothing is ever ordered here."""
-
-    def unread(self) -> int:
-        """Nothing waits to be swept here."""
-        return 0
-
-    def sweep(self) -> None:
-        """Nothing gets ready by itself here."""
-
-    def run_one(self) -> bool:
-        """See `base.Host.run_one`."""
+    def execute_next(self) -> bool:
+        """See `base.Executing.execute_next`."""
         if not self._queue:
             return False
-        self.in_flight -= 1
-        row, number, execute, tell = self._queue.popleft()
+        entry, execute = self._queue.popleft()
         try:
-            tell(row, number, execute())
+            outcome = execute()
         except BaseException as error:
-            self._inbox.on_error(self, row, number, ErrorText.of(error))
+            self._tell(Raised(self.host_id, entry, ErrorText.of(error)))
             if isinstance(error, KeyboardInterrupt):
                 raise  # It was meant for the program; the request that it struck ends all the same.
+            return True
+        if answers_with_value(op_of(entry)):
+            self._tell(Value(self.host_id, entry, outcome))
+        else:
+            self._tell(Result(self.host_id, entry, outcome or {}))
         return True
 
-    def executing(self) -> tuple[int, int]:
-        """Nothing is being executed while somebody can ask."""
-        return 0, 0
-
-    def kill(self, *, dump: bool) -> None:
-        """An inline env can't be killed."""
+    def step_now(self) -> OutOfBand | None:
+        """Step env 0 with the action in its row, past the queue, which holds nothing for it."""
+        return self._runners[0].step()
 
     def close(self) -> None:
         """Close the envs here and now."""
         errors: list[tuple[int, ErrorText]] = []
-        for row, runner in enumerate(self._runners):
+        for index, runner in enumerate(self._runners):
             try:
                 runner.env.close()
             except BaseException as error:
-                errors.append((row, ErrorText.of(error)))
+                errors.append((index, ErrorText.of(error)))
         self.release()
-        self._inbox.on_closed(self, errors)
+        self._tell(Closed(self.host_id, errors))
 
     def release(self) -> None:
         """Drop the envs and what was asked of them."""
         self._runners.clear()
         self._queue.clear()
-        self.in_flight = 0
 
 
-def _begun(runner: EnvRunner) -> Callable[[], Rest | None]:
+def _begun(runner: EnvRunner) -> Execute:
     """Start a step where the simulator computes by itself; what will end it."""
     if runner.begin_step is None:
         return runner.step
@@ -209,5 +152,5 @@ def _begun(runner: EnvRunner) -> Callable[[], Rest | None]:
         return partial(_reraise, error)
 
 
-def _reraise(error: BaseException) -> Rest | None:
+def _reraise(error: BaseException) -> OutOfBand | None:
     raise error

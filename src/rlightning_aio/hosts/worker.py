@@ -1,7 +1,7 @@
 """The other end of a process host: a plain blocking loop around a few envs.
 
 Rule: one thread, no asyncio; requests are executed in the order in which they were
-sent, and every request gets exactly one reply under its own number. When there is
+sent, and every request gets exactly one reply with its own entry. When there is
 nothing to do the worker spins for a moment (see `spinner`), then sleeps on its channel.
 """
 
@@ -9,126 +9,42 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import importlib
 import os
 import pickle
 import socket
 import time
-import traceback
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from rlightning_aio.hosts.arena import map_shared
+from rlightning_aio.hosts.build_env import built_envs
+from rlightning_aio.hosts.messages import ErrorText
 from rlightning_aio.hosts.pickling import dumped, dumped_with_code
-from rlightning_aio.hosts.runner import EnvRunner, Rest
 from rlightning_aio.hosts.spinner import Spinner
-from rlightning_aio.protocol.frames import BELL, CHUNK_BYTES, Frame, FrameKind, FrameReader, encode
-from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
-from rlightning_aio.protocol.rings import (
+from rlightning_aio.protocol.bell import WorkerBell, bell_size
+from rlightning_aio.protocol.entries import (
     OP_BITS,
     OP_MASK,
     SLOT_MASK,
-    STEP,
-    WorkerRings,
+    Operation,
+    answers_with_value,
     entry,
-    number_of,
-    rings_size,
+    op_of,
+    slot_of,
 )
-from rlightning_aio.protocol.slab import RowLayout, Slab
-from rlightning_aio.registry import ENVS
+from rlightning_aio.protocol.frames import BELL, CHUNK_BYTES, Frame, FrameKind, FrameReader, encode
+from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
+from rlightning_aio.protocol.rings import WorkerRings, rings_size
+from rlightning_aio.protocol.slab import Slab
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rlightning_aio.config import EnvConfig
-    from rlightning_aio.envs.base import BaseEnv
-    from rlightning_aio.types import EnvMeta
+    from rlightning_aio.hosts.messages import AttachOrder, OutOfBand, StartOrder, WorkerPlace
+    from rlightning_aio.hosts.runner import EnvRunner, Execute
 
-__all__ = ["AttachOrder", "ErrorText", "StartOrder", "Started", "Worker", "main"]
+__all__ = ["Worker", "main"]
 
-
-@dataclass(frozen=True)
-class StartOrder:
-    """What a worker is to build; travels by cloudpickle.
-
-    Attributes:
-        config: the entry.
-        env_class: the class itself where it was registered in the trainer by hand;
-            None lets the worker resolve the entry's backend.
-        worker_indices: which envs of the entry.
-        preprocess_fns: one for each of them; None for the default.
-        spins: whether waiting may burn a core for some microseconds.
-        core: the core to stay on; None for any.
-    """
-
-    config: EnvConfig
-    env_class: type[BaseEnv] | None
-    worker_indices: tuple[int, ...]
-    preprocess_fns: tuple[Any, ...]
-    spins: bool
-    core: int | None
-
-
-@dataclass(frozen=True)
-class AttachOrder:
-    """Where a worker's envs write.
-
-    Attributes:
-        slabs: layout, rows and offset in the arena of each slab.
-        rows: for each env which slab and which row of it.
-    """
-
-    slabs: tuple[tuple[RowLayout, int, int], ...]
-    rows: tuple[tuple[int, int], ...]
-
-
-@dataclass(frozen=True)
-class Started:
-    """What a worker tells of an env that it has built."""
-
-    meta: EnvMeta
-    layout: RowLayout
-    reads_extras: bool
-    transforms_actions: bool
-
-    @classmethod
-    def of(cls, runner: EnvRunner) -> Started:
-        """What `runner` has to tell."""
-        return cls(runner.meta, runner.layout, runner.reads_extras, runner.transforms_actions)
-
-
-@dataclass(frozen=True)
-class ErrorText:
-    """An exception as text: it crosses processes whatever its class is like."""
-
-    type_name: str
-    text: str
-    traceback: str
-
-    @classmethod
-    def of(cls, error: BaseException) -> ErrorText:
-        """`error` in words; a broken ``__str__`` is no obstacle."""
-        kind = type(error)
-        name = kind.__qualname__
-        if kind.__module__ != "builtins":
-            name = f"{kind.__module__}.{name}"
-        try:
-            text = str(error)
-        except BaseException as broken:
-            text = f"<its __str__ raised {type(broken).__name__}>"
-        try:
-            lines = "".join(traceback.format_exception(error))
-        except BaseException:
-            lines = "".join(traceback.format_tb(error.__traceback__)) + f"{name}: {text}\n"
-        return cls(name, text, lines)
-
-
-def build_env(config: EnvConfig, env_class: type[BaseEnv] | None, index: int, fn: Any) -> BaseEnv:
-    """Import what the entry asks for and build env `index` of it."""
-    for module in config.imports:
-        importlib.import_module(module)
-    env_class = env_class or ENVS.resolve(config.backend)
-    return env_class(config, worker_index=index, preprocess_fn=fn)
+_STEP = int(Operation.STEP)
 
 
 class TrainerGone(Exception):
@@ -141,26 +57,20 @@ class Worker:
     Args:
         channel: blocking stream socket to the trainer.
         arena: descriptor of the group's shared memory.
-        rings_memory: this worker's rings, mapped.
+        rings: this worker's.
         first_slot: slot of its first env in the group.
-        rows: envs that it will hold.
     """
 
     def __init__(
-        self,
-        channel: socket.socket,
-        arena: int,
-        rings_memory: memoryview,
-        first_slot: int,
-        rows: int,
+        self, channel: socket.socket, arena: int, rings: WorkerRings, first_slot: int
     ) -> None:
         self._channel = channel
         self._first_slot = first_slot
         self._arena = arena
         self._frames = FrameReader()
-        self._rings = WorkerRings(rings_memory, rows)
+        self._rings = rings
         self._runners: list[EnvRunner] = []
-        self._steps: list[Callable[[], Rest | None]] = []
+        self._steps: list[Execute] = []
         self._schemas = InfoSchemas(self._send_schema)
         self._timed = False
         self._spinner = Spinner(enabled=False)
@@ -202,21 +112,21 @@ class Worker:
         if self._closing:
             return False
         # `slot_of` and `op_of`, spelt out: they would be felt in every step.
-        row = ((request >> OP_BITS) & SLOT_MASK) - self._first_slot
+        index = ((request >> OP_BITS) & SLOT_MASK) - self._first_slot
         if self._timed:
             self._rings.begin(request, time.monotonic_ns())
         try:
-            rest = (
-                self._steps[row]()
-                if request & OP_MASK == STEP
-                else self._runners[row].reset_from_row()
+            out_of_band = (
+                self._steps[index]()
+                if request & OP_MASK == _STEP
+                else self._runners[index].reset_from_row()
             )
         except BaseException as error:
-            self._send_error(row, number_of(request), error)
+            self._send_error(request, error)
             return False
-        if rest is None:
+        if out_of_band is None:
             return True
-        self._send_rest(row, number_of(request), rest)
+        self._send_result(request, out_of_band)
         return False
 
     def _ring(self) -> None:
@@ -244,43 +154,46 @@ class Worker:
             self._rings.frame_seen()
             self._handle(frame)
 
-    def _begin(self, row: int, number: int) -> None:
-        """Say which env is being worked on, should that be the last thing it does."""
-        self._rings.begin(entry(number, self._first_slot + row, 0), time.monotonic_ns())
-
     def _handle(self, frame: Frame) -> None:
         """Execute one frame and answer it."""
-        self._begin(frame.row, frame.number)
         try:
             self._handlers[frame.kind](self, frame)
-        except TrainerGone:
-            raise
-        except BaseException as error:
-            self._send_error(frame.row, frame.number, error)
-        self._rings.idle()
+        finally:
+            self._rings.idle()
+
+    def _begin(self, request: int) -> None:
+        """Say what is being worked on, should that be the last thing it does."""
+        self._rings.begin(request, time.monotonic_ns())
+
+    def _begin_with(self, index: int) -> None:
+        """Say which env is being built or closed."""
+        self._begin(entry(0, self._first_slot + index, 0))
 
     def _start(self, frame: Frame) -> None:
-        order: StartOrder = pickle.loads(frame.payload)
-        if order.core is not None:
-            os.sched_setaffinity(0, {order.core})
-        self._spinner = Spinner(enabled=order.spins)
-        self._timed = (order.config.step_timeout or order.config.reset_timeout) is not None
-        started: list[Started] = []
-        for row, (index, fn) in enumerate(
-            zip(order.worker_indices, order.preprocess_fns, strict=True)
-        ):
-            self._begin(row, 0)
-            try:
-                env = build_env(order.config, order.env_class, index, fn)
-                self._runners.append(EnvRunner(env))
-                started.append(Started.of(self._runners[-1]))
-            except BaseException as error:
-                self._send_error(row, frame.number, error)
-                return
+        order: StartOrder | None = None
+        try:
+            self._begin_with(0)
+            order = pickle.loads(frame.payload)
+            assert order is not None
+            if order.core is not None:
+                os.sched_setaffinity(0, {order.core})
+            self._spinner = Spinner(enabled=order.spins)
+            config = order.config
+            self._timed = (config.step_timeout or config.reset_timeout) is not None
+            for runner in built_envs(order):
+                self._runners.append(runner)
+                self._begin_with(len(self._runners) % len(order.worker_indices))
+            started = dumped_with_code([runner.started() for runner in self._runners])
+        except BaseException as error:
+            index = len(self._runners)
+            if order is not None:
+                index = min(index, len(order.worker_indices) - 1)
+            self._send(FrameKind.START_ERROR, index, pickle.dumps(ErrorText.of(error)))
+            return
         # What was built stays: sparing the collector from walking it saves time and pages.
         gc.collect()
         gc.freeze()
-        self._send(FrameKind.STARTED, frame, dumped_with_code(started))
+        self._send(FrameKind.STARTED, payload=started)
 
     def _attach(self, frame: Frame) -> None:
         """Map the slabs; the arena's descriptor was inherited for this."""
@@ -292,7 +205,7 @@ class Worker:
         os.close(self._arena)
         self.adopt(self._runners, [(slabs[slab_index], row) for slab_index, row in order.rows])
         self._attached = True
-        self._send(FrameKind.ATTACHED, frame)
+        self._send(FrameKind.ATTACHED)
 
     def adopt(self, runners: list[EnvRunner], rows: list[tuple[Slab, int]]) -> None:
         """Serve the envs of `runners`, each in the row of a slab that is given for it."""
@@ -301,43 +214,44 @@ class Worker:
         self._runners = runners
         self._steps = [runner.step for runner in runners]
 
-    def _step(self, frame: Frame) -> None:
-        action, extras = pickle.loads(frame.payload)
-        rest = self._runners[frame.row].step_with(action, extras)
-        self._send_rest(frame.row, frame.number, rest or {})
-
-    def _reset(self, frame: Frame) -> None:
-        seed, options = pickle.loads(frame.payload)
-        rest = self._runners[frame.row].reset(seed, options)
-        self._send_rest(frame.row, frame.number, rest or {})
-
-    def _call(self, frame: Frame) -> None:
-        name, args, kwargs = pickle.loads(frame.payload)
-        value = self._runners[frame.row].call(name, args, kwargs)
-        self._send(FrameKind.VALUE, frame, dumped(value, f"what {name}() returned"))
+    def _request(self, frame: Frame) -> None:
+        """Execute a request whose arguments came out of band."""
+        request, op = frame.number, op_of(frame.number)
+        self._begin(request)
+        try:
+            arguments = pickle.loads(frame.payload)
+            outcome = self._runners[slot_of(request) - self._first_slot].execute(op, arguments)
+            if answers_with_value(op):
+                payload = dumped(outcome, f"what {arguments[0]}() returned")
+                self._send(FrameKind.VALUE, request, payload)
+            else:
+                self._send_result(request, outcome or {})
+        except TrainerGone:
+            raise
+        except BaseException as error:
+            self._send_error(request, error)
 
     def _close(self, frame: Frame) -> None:
+        del frame
         self._closing = True
         errors = self._close_envs()
-        self._send(FrameKind.CLOSED, frame, pickle.dumps(errors))
+        self._send(FrameKind.CLOSED, payload=pickle.dumps(errors))
 
     _handlers: ClassVar[dict[int, Callable[[Worker, Frame], None]]] = {
         FrameKind.START: _start,
         FrameKind.ATTACH: _attach,
-        FrameKind.STEP: _step,
-        FrameKind.RESET: _reset,
-        FrameKind.CALL: _call,
+        FrameKind.REQUEST: _request,
         FrameKind.CLOSE: _close,
     }
 
     def _close_envs(self) -> list[tuple[int, ErrorText]]:
         errors: list[tuple[int, ErrorText]] = []
-        for row, runner in enumerate(self._runners):
-            self._begin(row, 0)
+        for index, runner in enumerate(self._runners):
+            self._begin_with(index)
             try:
                 runner.env.close()
             except BaseException as error:
-                errors.append((row, ErrorText.of(error)))
+                errors.append((index, ErrorText.of(error)))
         self._runners.clear()
         return errors
 
@@ -348,31 +262,32 @@ class Worker:
             # A part may be out, which nothing can follow; and no env has raised this.
             raise TrainerGone from error
 
-    def _send(self, kind: FrameKind, asked: Frame, payload: bytes = b"") -> None:
-        self._write(encode(kind, asked.row, asked.number, payload))
+    def _send(self, kind: FrameKind, number: int = 0, payload: bytes = b"") -> None:
+        self._write(encode(kind, number, payload))
         self._rings.count_frame()
 
-    def _send_rest(self, row: int, number: int, rest: Rest) -> None:
+    def _send_result(self, request: int, out_of_band: OutOfBand) -> None:
         try:
-            payload = dumped(rest, "the result")
+            payload = dumped(out_of_band, "the result")
         except BaseException as error:
-            self._send_error(row, number, error)
+            self._send_error(request, error)
             return
-        self._write(encode(FrameKind.RESULT, row, number, payload))
-        self._rings.count_frame()
+        self._send(FrameKind.RESULT, request, payload)
 
-    def _send_error(self, row: int, number: int, error: BaseException) -> None:
-        payload = pickle.dumps(ErrorText.of(error))
-        self._write(encode(FrameKind.ERROR, row, number, payload))
-        self._rings.count_frame()
+    def _send_error(self, request: int, error: BaseException) -> None:
+        self._send(FrameKind.ERROR, request, pickle.dumps(ErrorText.of(error)))
 
     def _send_schema(self, number: int, schema: InfoSchema) -> None:
-        payload = pickle.dumps(schema)
-        self._write(encode(FrameKind.INFO_SCHEMA, 0, number, payload))
-        self._rings.count_frame()
+        self._send(FrameKind.INFO_SCHEMA, number, pickle.dumps(schema))
 
 
-def main(channel: socket.socket, arena: int, rings_offset: int, first_slot: int, rows: int) -> None:
+def main(channel: socket.socket, arena: int, place: WorkerPlace) -> None:
     """Run a worker in this process; returns when it has closed."""
-    rings_memory = map_shared(arena, rings_offset, rings_size(rows))
-    Worker(channel, arena, rings_memory, first_slot, rows).serve()
+    bell = WorkerBell(
+        map_shared(arena, place.bell_offset, bell_size(place.num_hosts)),
+        place.num_hosts,
+        place.host_id,
+    )
+    rings_memory = map_shared(arena, place.rings_offset, rings_size(place.num_envs))
+    rings = WorkerRings(rings_memory, place.num_envs, bell)
+    Worker(channel, arena, rings, place.first_slot).serve()

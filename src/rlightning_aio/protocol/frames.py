@@ -1,9 +1,9 @@
 """Frames: what travels in the channel between a host and its local worker.
 
-A frame is a 16-byte header (payload length, kind, row, request number) and a payload.
-A *bell* is a frame without a payload that only wakes the other side. The payload is a
-pickle: both ends are the same user's own processes on the same machine, connected by
-an anonymous socket pair. Nothing here ever meets a network (see `wire` for that).
+A frame is a 16-byte header (payload length, kind, an entry or another number) and a
+payload. A *bell* is a frame without a payload that only wakes the other side. The payload
+is a pickle: both ends are the same user's own processes on the same machine, connected by
+an anonymous socket pair. Nothing here ever meets a network (see `net` for that).
 """
 
 from __future__ import annotations
@@ -14,40 +14,38 @@ from typing import Final, NamedTuple
 
 __all__ = ["BELL", "CHUNK_BYTES", "HEADER", "Frame", "FrameKind", "FrameReader", "encode"]
 
-HEADER: Final = struct.Struct("<IHHq")
+HEADER: Final = struct.Struct("<IIq")
 
 
 class FrameKind(IntEnum):
-    """What a frame is; the comment names its sender and payload."""
+    """What a frame is; the comment names its sender, its number and its payload."""
 
-    BELL = 0  # both: nothing
-    START = 1  # trainer: what to build; file descriptors ride along at ATTACH
-    STARTED = 2  # worker: metadata of each env
-    ATTACH = 3  # trainer: layouts of the slabs whose descriptors ride along
-    ATTACHED = 4  # worker: nothing
-    STEP = 5  # trainer: (action or NO_ACTION, extras)
-    RESET = 6  # trainer: (seed, options)
-    CALL = 7  # trainer: (name, args, kwargs)
-    CLOSE = 8  # trainer: nothing
-    RESULT = 9  # worker: (what the row doesn't hold)
-    VALUE = 10  # worker: what a CALL returned
-    ERROR = 11  # worker: (type, text, traceback)
-    INFO_SCHEMA = 12  # worker: a new way in which rows hold infos
-    CLOSED = 13  # worker: errors of close(), by env
+    BELL = 0  # both
+    START = 1  # trainer: what to build
+    STARTED = 2  # worker: what each env is like
+    START_ERROR = 3  # worker; the env's position: why it could not be built
+    ATTACH = 4  # trainer: layouts of the slabs, and the rows of the envs
+    ATTACHED = 5  # worker
+    REQUEST = 6  # trainer; its entry: arguments that don't lie in the row
+    RESULT = 7  # worker; the request's entry: what the row doesn't hold
+    VALUE = 8  # worker; the request's entry: what a call returned
+    ERROR = 9  # worker; the request's entry: an exception as text
+    INFO_SCHEMA = 10  # worker; its number: a new way in which rows hold infos
+    CLOSE = 11  # trainer
+    CLOSED = 12  # worker: errors of close(), by env
 
 
 class Frame(NamedTuple):
     """One message."""
 
     kind: int
-    row: int
     number: int
     payload: bytes
 
 
-def encode(kind: FrameKind, row: int = 0, number: int = 0, payload: bytes = b"") -> bytes:
+def encode(kind: FrameKind, number: int = 0, payload: bytes = b"") -> bytes:
     """The bytes of one frame."""
-    return HEADER.pack(len(payload), kind, row, number) + payload
+    return HEADER.pack(len(payload), kind, number) + payload
 
 
 BELL: Final = encode(FrameKind.BELL)
@@ -69,13 +67,13 @@ class FrameReader:
         self._buffer += data
         buffer, size, start = self._buffer, HEADER.size, 0
         while len(buffer) - start >= size:
-            length, kind, row, number = HEADER.unpack_from(buffer, start)
+            length, kind, number = HEADER.unpack_from(buffer, start)
             end = start + size + length
             if len(buffer) < end:
                 break
             payload = bytes(memoryview(buffer)[start + size : end])
             start = end
             if kind != FrameKind.BELL:
-                frames.append(Frame(kind, row, number, payload))
+                frames.append(Frame(kind, number, payload))
         del buffer[:start]
         return frames

@@ -24,9 +24,14 @@ if TYPE_CHECKING:
     import gymnasium as gym
     from numpy.typing import NDArray
 
-__all__ = ["NO_SEED", "RowLayout", "Slab"]
+__all__ = ["IS_RESET", "NO_SEED", "OVER", "TERMINATED", "TRUNCATED", "RowLayout", "Slab"]
 
 NO_SEED: Final = -1
+TERMINATED: Final = 0
+TRUNCATED: Final = 1
+IS_RESET: Final = 2
+OVER: Final = 3
+"""Places of the flags in their column."""
 _ALIGNMENT: Final = 64
 
 
@@ -74,7 +79,7 @@ class RowLayout:
         for leaf in (*(self.observation_leaves or ()), *(self.action_leaves or ())):
             yield leaf.shape, leaf.dtype
         yield self.head, np.dtype(np.float64)
-        yield (*self.head, 2), np.dtype(np.bool_)
+        yield (*self.head, 4), np.dtype(np.bool_)
         yield self.head, np.dtype(np.float64)
         yield self.head, np.dtype(np.int64)
         yield (), np.dtype(np.uint8)
@@ -109,9 +114,12 @@ class Slab:
         observation, action: trees of ``[rows, ...]``; None where they travel pickled.
         action_columns: the arrays of `action`, each with its leaf.
         reward: ``[rows, *head]`` float64.
-        ends: ``[rows, *head, 2]`` bool; terminated and truncated are its halves.
+        flags: ``[rows, *head, 4]`` bool; terminated, truncated, is_reset and over are its
+            columns. ``is_reset``: no transition ends here. ``over``: the episode has ended,
+            here or before, and nothing has reset it since.
         episode_return: ``[rows, *head]`` float64, episode_length: ``[rows, *head]`` int64;
-            valid where an episode has just ended.
+            of the episode that is under way or ends here, this step included; length 0 where
+            the step belongs to none.
         info_mark: ``[rows]`` uint8, see `info`; info: ``[rows, INFO_BYTES]`` uint8.
         seed: ``[rows]`` int64, of the reset that was sent, plus 1; 0 for none.
         times: ``[rows, 2]`` int64; its halves are done_ns, the monotonic time at which the
@@ -131,8 +139,9 @@ class Slab:
             self.action = assemble(layout.action_space, arrays)
             self.action_columns = list(leaf_of(action_leaves, self.action))
         self.reward = next(arrays)
-        self.ends = next(arrays)
-        self.terminated, self.truncated = self.ends[..., 0], self.ends[..., 1]
+        self.flags = next(arrays)
+        self.terminated, self.truncated = self.flags[..., TERMINATED], self.flags[..., TRUNCATED]
+        self.is_reset, self.over = self.flags[..., IS_RESET], self.flags[..., OVER]
         self.episode_return = next(arrays)
         self.episode_length = next(arrays)
         self.info_mark = next(arrays)

@@ -43,12 +43,12 @@ from rlightning_aio.protocol.net.wire import (
     Writer,
     portable,
 )
-from rlightning_aio.types import EnvMeta
+from rlightning_aio.types import ClientTraits, EnvMeta
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-__all__ = ["PATIENCE", "ClientTraits", "Outgoing", "RemoteResult", "ServerSessions"]
+__all__ = ["PATIENCE", "Outgoing", "RemoteResult", "ServerSessions"]
 
 PATIENCE: Final = 8
 """Parts of the heartbeat limit: one between pings, two until a broken connection is given up."""
@@ -81,6 +81,7 @@ class RemoteResult:
         info, extra: as the env gave them; ``info["client_lost"]`` says why a client is gone.
         busy_ns: how long the env took, by the client's clock.
         error: set instead of all that, if the env raised.
+        is_reset: it is the first of an episode.
         is_loss: no result of the env's, but the mark that the client was lost.
     """
 
@@ -94,6 +95,7 @@ class RemoteResult:
     extra: dict[str, Any] = field(default_factory=dict[str, Any])
     busy_ns: int = 0
     error: EnvRaised | None = None
+    is_reset: bool = False
     is_loss: bool = False
 
 
@@ -102,18 +104,6 @@ class Outgoing(NamedTuple):
 
     route: bytes
     parts: list[bytes]
-
-
-class ClientTraits(NamedTuple):
-    """What a client makes of requests.
-
-    Attributes:
-        free_actions: its actions need not fit its action space.
-        reads_extras: something there reads what the policy attaches beside the action.
-    """
-
-    free_actions: bool
-    reads_extras: bool
 
 
 @dataclass(slots=True)
@@ -612,9 +602,11 @@ class ServerSessions:
             if session.bad_results >= _MAX_BAD_RESULTS:
                 self._dismiss(session, f"its results don't fit what it announced: {error}")
             return
+        request = session.seat.request
         result = RemoteResult(
-            session.seat.name, number, *outcome, message.info, message.extra, message.busy_ns
-        )
+            session.seat.name, number, *outcome, message.info, message.extra, message.busy_ns,
+            is_reset=number is None or (request is not None and request.doing == "reset"),
+        )  # fmt: skip
         if number is None:
             self._join(session, result)
         else:

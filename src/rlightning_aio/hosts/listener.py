@@ -1,6 +1,6 @@
-"""`RemoteHost`: the trainer's end of env_server, a ZMQ ROUTER without a thread.
+"""`Listener`: the trainer's end of env_server, a ZMQ ROUTER without a thread.
 
-Rule: one descriptor wakes the driver, which then calls `RemoteHost.pump`; everything
+Rule: one descriptor wakes the driver, which then calls `Listener.pump`; everything
 that means something happens in `protocol.net.server_session`. The descriptor is an epoll
 over ZMQ's own, which only tell that something changed, and an eventfd that is set
 whenever there is something to be had without a change.
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from rlightning_aio.protocol.net.wire import Part
     from rlightning_aio.types import EnvMeta
 
-__all__ = ["RemoteHost", "ServerSettings", "server_settings"]
+__all__ = ["Listener", "ServerSettings", "server_settings"]
 
 _MESSAGES_A_PUMP: Final = 1000
 """Read in one go at most, so that a flood doesn't keep the driver."""
@@ -111,7 +111,7 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
-class RemoteHost:
+class Listener:
     """Listens for env clients and speaks with them; never blocks.
 
     Args:

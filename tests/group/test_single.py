@@ -19,7 +19,7 @@ import rlightning_aio.sync
 from rlightning_aio import BatchedData, PolicyResponse
 from rlightning_aio.errors import EnvRaised
 from rlightning_aio.group.core import Core
-from rlightning_aio.group.lone import LoneCore
+from rlightning_aio.group.single import SingleEnvCore, StepsAtOnce
 
 PROBE = HALVED | {"backend": "probe"}
 CARTPOLE = HALVED | {"backend": "gymnasium", "task": "CartPole-v1"}
@@ -32,12 +32,18 @@ def action_of(backend: str, number: int) -> Any:
     return number % 2 if backend == "gymnasium" else number
 
 
+class Nothing:
+    """What no host is."""
+
+
 class Used:
     """A group and what is done with it; each deed gives what can be told of its outcome."""
 
     def __init__(self, entry: dict[str, Any], core: type[Core]) -> None:
-        with patch("rlightning_aio.group.facade.core_of", core):
+        kind = StepsAtOnce if core is SingleEnvCore else Nothing
+        with patch("rlightning_aio.group.build.StepsAtOnce", kind):
             self.group = rlightning_aio.sync.build_env_group(entry)
+        assert type(self.group._core) is core
         self.group.init()
         self.backend = entry["backend"]
         self.batch, _ = self.group.reset(seed=1)
@@ -53,12 +59,19 @@ class Used:
         self.batch, flags = results
         (value,) = self.batch.values()
         told = value.model_dump(exclude={"ts_env_sent_ns"})
-        columns = (self.batch.observation, self.batch.reward, self.batch.terminated)
-        return repr((told, value._extra, columns, flags))
+        batch = self.batch
+        columns = (batch.observation, batch.reward, batch.terminated, batch.done, batch.infos)
+        rows = (batch.is_reset, batch.limit_reached, batch.restarted, batch.index)
+        sent = {name: batch.sent[name] for name in batch.sent}
+        return repr((told, value._extra, columns, rows, sent, flags))
 
     def step(self, number: int) -> Any:
         action = np.array([action_of(self.backend, number)])
         return self._results(self.group.step(self.batch.respond(action=action)))
+
+    def step_with_extras(self, number: int) -> Any:
+        action = np.array([action_of(self.backend, number)])
+        return self._results(self.group.step(self.batch.respond(action=action, value=[number])))
 
     def step_by_hand(self, number: int) -> Any:
         response = PolicyResponse("one-0", action_of(self.backend, number), log_prob=0.5)
@@ -108,10 +121,10 @@ def test_nothing_but_the_time_is_different(
     entry: dict[str, Any], deeds: list[tuple[str, int]]
 ) -> None:
     """Results, errors, flags and sums are those of the general core."""
-    lone, general = Used(entry, LoneCore), Used(entry, Core)
+    single, general = Used(entry, SingleEnvCore), Used(entry, Core)
     for deed, number in deeds:
-        assert lone.told(deed, number) == general.told(deed, number), deed
-    assert lone.close() == general.close()
+        assert single.told(deed, number) == general.told(deed, number), deed
+    assert single.close() == general.close()
 
 
 def test_a_step_that_raises_counts_towards_no_limit(halved: rlightning_aio.sync.EnvGroup) -> None:
@@ -128,7 +141,7 @@ def test_a_step_that_raises_counts_towards_no_limit(halved: rlightning_aio.sync.
 def test_it_is_used_for_one_inline_env_alone() -> None:
     """Not for two, nor for a worker's."""
     for fields, core in (
-        ({}, LoneCore),
+        ({}, SingleEnvCore),
         ({"num_workers": 2}, Core),
         ({"placement": "process"}, Core),
     ):

@@ -1,0 +1,79 @@
+"""`HostRecord`: what the supervisor knows of one host, from its first start to its end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum, auto
+from typing import TYPE_CHECKING
+
+from rlightning_aio.hosts.base import Killable
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rlightning_aio.config import EnvConfig
+    from rlightning_aio.errors import WorkerDied
+    from rlightning_aio.hosts.base import Host
+    from rlightning_aio.hosts.messages import AttachOrder, EnvStarted, ErrorText
+
+__all__ = ["HostRecord", "Stage"]
+
+
+class Stage(Enum):
+    """How far a host has come."""
+
+    NEW = auto()
+    BUILDING = auto()
+    BUILT = auto()
+    ATTACHING = auto()
+    UP = auto()
+    FAILED = auto()
+    CLOSED = auto()
+
+
+@dataclass
+class HostRecord:
+    """See the module.
+
+    Attributes:
+        start_by: when it must be up; late: it wasn't, and is being killed.
+        deaths: by slot, of workers that died while they executed that env, since the env
+            last completed a step; None where no env is known. culprit: the last one's.
+        hung_slot: the env for which it is being killed.
+        idle: how far it had got when it was last seen to do nothing (`Supervisor._progress`).
+        failure: makes the error for whoever asks a host that was given up.
+        killable: the host, if it can be ended by force.
+        timed: any of its requests has a time limit, which the supervisor must watch.
+    """
+
+    host: Host
+    config: EnvConfig
+    stage: Stage = Stage.NEW
+    started: list[EnvStarted] = field(default_factory=list["EnvStarted"])
+    order: AttachOrder | None = None
+    start_by: float | None = None
+    late: bool = False
+    deaths: dict[int | None, int] = field(default_factory=dict[int | None, int])
+    culprit: int | None = None
+    hung_slot: int | None = None
+    idle: tuple[int, ...] = ()
+    idle_since: float = 0.0
+    rebuild_error: ErrorText | None = None
+    failure: Callable[[], WorkerDied] | None = None
+    killable: Killable | None = field(init=False)
+    timed: bool = field(init=False)
+
+    def __post_init__(self) -> None:
+        limits = (self.config.step_timeout, self.config.reset_timeout)
+        self.killable = self.host if isinstance(self.host, Killable) else None
+        self.timed = self.killable is not None and limits != (None, None)
+
+    @property
+    def slots(self) -> range:
+        """Of its envs."""
+        return range(self.host.first_slot, self.host.first_slot + self.host.num_envs)
+
+    def kill(self, *, dump: bool) -> None:
+        """End it, if it can be ended."""
+        if self.killable is not None:
+            self.killable.kill(dump=dump)

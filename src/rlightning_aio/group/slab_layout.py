@@ -1,0 +1,129 @@
+"""`SlabLayout`: where the results of each env lie: which slab, and which row of it.
+
+Local envs get their rows all at once, when they are built; those of an env_server bring a
+slab of their own with the first of them.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rlightning_aio.errors import ConfigError
+from rlightning_aio.hosts.arena import map_shared
+from rlightning_aio.hosts.messages import AttachOrder
+from rlightning_aio.protocol.columns import leaves
+from rlightning_aio.protocol.slab import RowLayout, Slab
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from rlightning_aio.hosts.arena import Arena
+    from rlightning_aio.hosts.messages import EnvStarted
+    from rlightning_aio.types import EnvMeta
+
+__all__ = ["SlabLayout", "check_actions"]
+
+
+def check_actions(metas: Sequence[EnvMeta]) -> None:
+    """Raises `ConfigError` if the envs' actions have different shapes."""
+    for meta in metas[1:]:
+        first = metas[0]
+        if _action_shape(meta) != _action_shape(first):
+            raise ConfigError(
+                f"envs {first.env_id!r} and {meta.env_id!r} have different action spaces: "
+                f"{first.action_space} and {meta.action_space}; if that is meant, build the "
+                "group with mixed_actions=True"
+            )
+
+
+def _action_shape(meta: EnvMeta) -> Any:
+    """Shapes of an action, without the batch axis."""
+    if meta.action_space is None:
+        return None
+    found = leaves(meta.action_space)
+    if found is None:
+        return str(meta.action_space)
+    skip = 1 if meta.num_envs > 1 else 0
+    return [(leaf.path, leaf.shape[skip:]) for leaf in found]
+
+
+class SlabLayout:
+    """Over the slots of a group.
+
+    Attributes:
+        slabs: all there are.
+        slab, row: of each slot; row_is_slot: of every slot, for which `row` need not be
+            asked then.
+    """
+
+    def __init__(self, size: int) -> None:
+        self.slabs: list[Slab] = []
+        self.slab = np.zeros(size, np.intp)
+        self.row = np.zeros(size, np.intp)
+        self.row_is_slot = False
+        self._places: list[tuple[RowLayout, int, int]] = []
+
+    def place(self, started: Sequence[EnvStarted], arena: Arena) -> None:
+        """Give each local env a row in the slab of its layout.
+
+        Args:
+            started: the envs, in the order of their slots.
+            arena: takes the slabs.
+        """
+        keys: dict[tuple[object, ...], int] = {}
+        layouts: list[RowLayout] = []
+        rows_used: list[int] = []
+        for slot, env in enumerate(started):
+            slab = keys.setdefault(env.layout.key, len(keys))
+            if slab == len(layouts):
+                layouts.append(env.layout)
+                rows_used.append(0)
+            self.slab[slot], self.row[slot] = slab, rows_used[slab]
+            rows_used[slab] += 1
+        self._places = [
+            (layout, rows, arena.append(layout.size(rows)))
+            for layout, rows in zip(layouts, rows_used, strict=True)
+        ]
+        self.slabs += [
+            Slab(layout, map_shared(arena.descriptor, offset, layout.size(rows)), rows)
+            for layout, rows, offset in self._places
+        ]
+        self._note_rows()
+
+    def order_for(self, first_slot: int, num_envs: int) -> AttachOrder:
+        """What a host of local envs is told of their rows."""
+        slots = range(first_slot, first_slot + num_envs)
+        rows = tuple((int(self.slab[slot]), int(self.row[slot])) for slot in slots)
+        return AttachOrder(tuple(self._places), rows)
+
+    def add(self, slab: Slab, first_slot: int) -> None:
+        """Take in the slab of an env_server, whose rows are its slots in order."""
+        slots = slice(first_slot, first_slot + slab.rows)
+        self.slab[slots] = len(self.slabs)
+        self.row[slots] = np.arange(slab.rows)
+        self.slabs.append(slab)
+        self._note_rows()
+
+    def _note_rows(self) -> None:
+        self.row_is_slot = bool((self.row == np.arange(len(self.row))).all())
+
+    def of(self, slot: int) -> tuple[Slab, int]:
+        """Slab and row of a slot."""
+        return self.slabs[self.slab.item(slot)], self.row.item(slot)
+
+    def write_seeds(self, slots: NDArray[np.intp], seeds: NDArray[np.int64]) -> None:
+        """Put the seeds of resets into the rows; `NO_SEED` for none."""
+        if len(self.slabs) == 1:
+            self.slabs[0].seed[self.row[slots]] = seeds + 1
+            return
+        for slot, seed in zip(slots.tolist(), seeds.tolist(), strict=True):
+            slab, row = self.of(slot)
+            slab.seed[row] = seed + 1
+
+    def release(self) -> None:
+        """Let go of the memory; batches that were handed out keep theirs."""
+        self.slabs.clear()

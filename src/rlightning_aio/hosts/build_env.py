@@ -1,0 +1,37 @@
+"""Where an env comes from: the one place that calls an env's class."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from rlightning_aio.hosts.runner import EnvRunner
+from rlightning_aio.registry import ENVS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from rlightning_aio.config import EnvConfig
+    from rlightning_aio.envs.base import BaseEnv
+    from rlightning_aio.hosts.messages import StartOrder
+
+__all__ = ["build_env", "built_envs"]
+
+
+def build_env(
+    config: EnvConfig,
+    env_class: type[BaseEnv] | None = None,
+    worker_index: int = 0,
+    preprocess_fn: Any = None,
+) -> BaseEnv:
+    """Import what the entry asks for and build one env of it; `env_class` None resolves it."""
+    for module in config.imports:
+        importlib.import_module(module)
+    env_class = env_class or ENVS.resolve(config.backend)
+    return env_class(config, worker_index=worker_index, preprocess_fn=preprocess_fn)
+
+
+def built_envs(order: StartOrder, *, inline: bool = False) -> Iterator[EnvRunner]:
+    """Build the envs of a host, one after the other."""
+    for index, fn in zip(order.worker_indices, order.preprocess_fns, strict=True):
+        yield EnvRunner(build_env(order.config, order.env_class, index, fn), inline=inline)

@@ -1,0 +1,293 @@
+"""What crosses between a trainer and the places where its envs live.
+
+Orders go one way, completions come back: each completion says what has become of one
+request, or of a host, and hosts append them to their group's one queue, in order, whatever
+thread of events they come from. What of a request or a result has no place in a row
+travels *out of band*.
+Absent on purpose: how these travel (see `link`), and what they mean (see `group.core`).
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from rlightning_aio.config import EnvConfig
+    from rlightning_aio.envs.base import BaseEnv
+    from rlightning_aio.errors import EnvFault
+    from rlightning_aio.protocol.info import InfoSchema
+    from rlightning_aio.protocol.slab import RowLayout, Slab
+    from rlightning_aio.types import ClientTraits, EnvMeta
+
+__all__ = [
+    "NO_ACTION",
+    "AttachOrder",
+    "Attached",
+    "Built",
+    "Closed",
+    "Completion",
+    "Completions",
+    "Death",
+    "Died",
+    "EnvStarted",
+    "ErrorText",
+    "Failed",
+    "Joined",
+    "NewSchema",
+    "NotBuilt",
+    "OutOfBand",
+    "Raised",
+    "Reported",
+    "Result",
+    "StartOrder",
+    "Value",
+    "Withdrawn",
+    "WorkerPlace",
+]
+
+NO_ACTION: Final = "the action is in the row"
+"""Travels in place of an action whose extras alone did not fit the row."""
+OutOfBand: TypeAlias = dict[str, Any]
+"""What of a result is not in its row. Keys: ``observation``, ``info``, ``extra`` (the
+result's ``_extra``), ``ret`` (all of it)."""
+
+
+# -- orders -----------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class StartOrder:
+    """What a host is to build; travels by cloudpickle.
+
+    Attributes:
+        config: the entry.
+        env_class: the class itself where it was registered in the trainer by hand;
+            None resolves the entry's backend where the env is built.
+        worker_indices: which envs of the entry.
+        preprocess_fns: one for each of them; None for the default.
+        spins: whether waiting may burn a core for some microseconds.
+        core: the core to stay on; None for any.
+    """
+
+    config: EnvConfig
+    env_class: type[BaseEnv] | None
+    worker_indices: tuple[int, ...]
+    preprocess_fns: tuple[Any, ...]
+    spins: bool
+    core: int | None
+
+
+@dataclass(frozen=True)
+class AttachOrder:
+    """Where a host's envs write.
+
+    Attributes:
+        slabs: layout, rows and offset in the arena of each slab.
+        rows: for each env which slab and which row of it.
+    """
+
+    slabs: tuple[tuple[RowLayout, int, int], ...]
+    rows: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True)
+class WorkerPlace:
+    """Where a worker finds its part of the group's shared memory.
+
+    Attributes:
+        host_id: which of the group's `num_hosts` hosts it belongs to.
+        first_slot, num_envs: slots of its envs.
+        bell_offset, rings_offset: in the arena.
+    """
+
+    host_id: int
+    num_hosts: int
+    first_slot: int
+    num_envs: int
+    bell_offset: int
+    rings_offset: int
+
+
+# -- what comes back --------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class EnvStarted:
+    """What is known of an env once it is built."""
+
+    meta: EnvMeta
+    layout: RowLayout
+    reads_extras: bool
+    transforms_actions: bool
+
+
+@dataclass(frozen=True)
+class ErrorText:
+    """An exception as text: it crosses processes whatever its class is like."""
+
+    type_name: str
+    text: str
+    traceback: str
+
+    @classmethod
+    def of(cls, error: BaseException) -> ErrorText:
+        """`error` in words; a broken ``__str__`` is no obstacle."""
+        kind = type(error)
+        name = kind.__qualname__
+        if kind.__module__ != "builtins":
+            name = f"{kind.__module__}.{name}"
+        try:
+            text = str(error)
+        except BaseException as broken:
+            text = f"<its __str__ raised {type(broken).__name__}>"
+        try:
+            lines = "".join(traceback.format_exception(error))
+        except BaseException:
+            lines = "".join(traceback.format_tb(error.__traceback__)) + f"{name}: {text}\n"
+        return cls(name, text, lines)
+
+
+@dataclass(frozen=True)
+class Death:
+    """Why a worker is gone.
+
+    Attributes:
+        cause: one clause, such as "was killed by SIGKILL".
+        exit_code: negative for a signal; None if nobody knows.
+        stderr_tail: the last lines it wrote.
+        requests: entries, those first that it may have been executing; they may be
+            answered already, or be 0.
+    """
+
+    cause: str
+    exit_code: int | None = None
+    stderr_tail: str = ""
+    requests: tuple[int, ...] = ()
+
+
+class Built(NamedTuple):
+    """The host's envs are built."""
+
+    host_id: int
+    started: list[EnvStarted]
+
+
+class NotBuilt(NamedTuple):
+    """Env `env_index` of the host could not be built."""
+
+    host_id: int
+    env_index: int
+    error: ErrorText
+
+
+class Attached(NamedTuple):
+    """The host's envs have their rows, and can be asked."""
+
+    host_id: int
+
+
+class Died(NamedTuple):
+    """The worker is gone, without having been asked to close."""
+
+    host_id: int
+    death: Death
+
+
+class Closed(NamedTuple):
+    """The host has closed and is gone; `errors` are those of the envs' `close`, by index."""
+
+    host_id: int
+    errors: list[tuple[int, ErrorText]]
+
+
+class NewSchema(NamedTuple):
+    """The host holds infos in one more way."""
+
+    host_id: int
+    number: int
+    schema: InfoSchema
+
+
+class Reported(NamedTuple):
+    """These requests to one host are done, and their results lie in the rows."""
+
+    host_id: int
+    entries: NDArray[np.int64]
+
+
+class Result(NamedTuple):
+    """A request is done; `out_of_band` (a pickle, or plain) goes with its row.
+
+    Attributes:
+        is_loss: no result of the env's, but the mark that it is gone.
+    """
+
+    host_id: int
+    entry: int
+    out_of_band: bytes | OutOfBand
+    is_loss: bool = False
+
+
+class Value(NamedTuple):
+    """A call has returned."""
+
+    host_id: int
+    entry: int
+    value: Any
+
+
+class Raised(NamedTuple):
+    """A request has raised."""
+
+    host_id: int
+    entry: int
+    error: ErrorText
+
+
+class Failed(NamedTuple):
+    """A request has ended in an error that is known as such."""
+
+    host_id: int
+    entry: int
+    fault: EnvFault
+
+
+class Withdrawn(NamedTuple):
+    """A request will not be answered: its env is away, and the caller was told so."""
+
+    host_id: int
+    entry: int
+
+
+class Joined(NamedTuple):
+    """An env has come by itself, with a first result that nobody has asked for.
+
+    Attributes:
+        env_index: its position in the host.
+        slab: where the host's envs have their rows from now on; None if that is known.
+        write: puts the result into its row, which may hold one that nobody has collected
+            yet; returns what doesn't fit there.
+    """
+
+    host_id: int
+    env_index: int
+    meta: EnvMeta
+    traits: ClientTraits
+    slab: Slab | None
+    write: Callable[[], OutOfBand | None]
+
+
+Completion: TypeAlias = (
+    Built | NotBuilt | Attached | Died | Closed | NewSchema
+    | Reported | Result | Value | Raised | Failed | Withdrawn | Joined
+)  # fmt: skip
+Completions: TypeAlias = deque[Completion]
+"""A group's queue: every host appends, the core takes out."""

@@ -1,0 +1,217 @@
+"""The bell of a group: how workers wake a trainer that waits for a number of results.
+
+Shared memory holds a counter of reports for each worker, and the trainer's *order*: "ring
+when all counters together have come to this". The worker whose report gets them there
+rings, by a few bytes in its channel. So the trainer is woken once, when there is enough,
+and by nobody before.
+
+Invariant: every word has one writer. A worker publishes its counter and fences before it
+adds up everybody's; so of two that finish at the same time at least one sees the sum.
+Not fenced: the look at the order after each report. An order that is being written at that
+very moment may be overlooked there, and is seen after the next one, or when the worker has
+nothing left to do. Whoever gives a new order for a part of what is in flight therefore
+looks once more a moment later (see `group.poller`).
+"""
+
+from __future__ import annotations
+
+import platform
+import threading
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+__all__ = [
+    "LINE",
+    "ORDER",
+    "PACE_MASK",
+    "PACE_SHIFT",
+    "STORES_STAY_IN_ORDER",
+    "TrainerBell",
+    "WorkerBell",
+    "bell_size",
+    "new_fence",
+]
+
+LINE: Final = 8
+"""Words of a cache line."""
+STORES_STAY_IN_ORDER: Final = platform.machine() in ("x86_64", "AMD64")
+"""x86 publishes stores in program order; elsewhere an entry could be seen after its count."""
+
+ORDER: Final = 0
+_COUNTERS: Final = LINE
+
+# An order is, from the lowest bit: 1, the pace, the sum at which to ring, and how often
+# counters have begun anew; 0 is none.
+PACE_SHIFT: Final = 1
+PACE_MASK: Final = 0xFF
+_GOAL_SHIFT: Final = 9
+_GOAL_MASK: Final = (1 << 46) - 1
+_EPOCH_SHIFT: Final = 55
+_EPOCH_MASK: Final = 0x7F
+_FEW: Final = 12
+"""So many counters are added up sooner one by one than by NumPy."""
+
+
+def new_fence() -> Callable[[], None]:
+    """A fence of one thread: it releases and retakes a held lock, which orders all memory
+    accesses around it.
+
+    On x86 both are locked instructions; on ARM a store-release followed by a
+    load-acquire of the same word.
+    """
+    lock = threading.Lock()
+    lock.acquire()
+    release, acquire = lock.release, lock.acquire
+
+    def fence() -> None:
+        try:  # noqa: SIM105  # `suppress` would take longer than all the rest.
+            release()
+        except RuntimeError:
+            pass  # A Ctrl-C had struck between the two.
+        acquire()
+
+    return fence
+
+
+def bell_size(num_workers: int) -> int:
+    """Bytes that the bell of a group with so many workers takes."""
+    return 8 * (_COUNTERS + LINE * num_workers)
+
+
+def _words(buffer: memoryview, num_workers: int) -> memoryview[int]:
+    return buffer.cast("B")[: bell_size(num_workers)].cast("q")
+
+
+def _sum_of(words: memoryview[int]) -> Callable[[], int]:
+    """A function that adds up all counters."""
+    counters = words[_COUNTERS::LINE]
+    if len(counters) == 1:
+        return lambda: words[_COUNTERS]
+    if len(counters) <= _FEW:
+        return lambda: sum(counters)
+    array: NDArray[np.int64] = np.frombuffer(words, np.int64)[_COUNTERS::LINE]
+    return lambda: int(array.sum())
+
+
+class TrainerBell:
+    """The trainer's side: gives orders, and knows what is unread.
+
+    Args:
+        buffer: the bell's memory, zeroed.
+        num_workers: as many counters.
+    """
+
+    def __init__(self, buffer: memoryview, num_workers: int) -> None:
+        self._fence = new_fence()
+        self._epoch = 0
+        self._attach(buffer, num_workers)
+
+    def _attach(self, buffer: memoryview, num_workers: int) -> None:
+        self._words = _words(buffer, num_workers)
+        self._sum = _sum_of(self._words)
+        self._counters: NDArray[np.int64] = np.frombuffer(self._words, np.int64)[_COUNTERS::LINE]
+        self._read = [0] * num_workers
+        self._read_in_all = 0
+        self._order = 0
+
+    def count(self, index: int) -> int:
+        """Reports of one worker so far."""
+        return self._words[_COUNTERS + LINE * index]
+
+    def took(self, index: int, count: int) -> None:
+        """Take note of reports that were read."""
+        self._read[index] += count
+        self._read_in_all += count
+
+    def restart(self, index: int) -> None:
+        """The worker is gone, and its replacement counts from 0.
+
+        Whoever waits must give its order anew.
+        """
+        self._words[_COUNTERS + LINE * index] = 0
+        self.took(index, -self._read[index])
+        self._epoch = (self._epoch + 1) & _EPOCH_MASK
+        self.disarm()
+
+    def unread(self) -> int:
+        """Reports that wait to be read, of all workers."""
+        return self._sum() - self._read_in_all
+
+    def with_news(self) -> list[int]:
+        """Workers whose reports wait to be read."""
+        read = self._read
+        if len(read) > _FEW:
+            return np.flatnonzero(self._counters != read).tolist()
+        words = self._words
+        return [k for k in range(len(read)) if words[_COUNTERS + LINE * k] != read[k]]
+
+    def goal(self, wanted: int) -> int:
+        """What to order for so many unread reports; the same until they are read."""
+        return self._read_in_all + wanted
+
+    def arm(self, goal: int, pace: int) -> bool:
+        """Order one bell for `goal`; whether that is another order than before.
+
+        Args:
+            goal: see there.
+            pace: workers look after each 1st, 2nd, 4th, … report: a power of two, 256 at
+                most. They look in any case when they have nothing left to do.
+        """
+        order = (
+            (self._epoch << _EPOCH_SHIFT) | (goal << _GOAL_SHIFT) | ((pace - 1) << PACE_SHIFT) | 1
+        )
+        if order == self._order:
+            return False
+        self._words[ORDER] = self._order = order
+        self._fence()
+        return True
+
+    def disarm(self) -> None:
+        """Withdraw the order: the trainer is awake."""
+        if self._order:
+            self._words[ORDER] = self._order = 0
+
+    def release(self, seconds: float = 0.0) -> None:
+        """Let go of the shared memory; what is asked of the bell from now on means nothing."""
+        del seconds
+        self._attach(memoryview(bytearray(8 * len(self._words))), len(self._read))
+
+
+class WorkerBell:
+    """One worker's side: counts its reports, and tells when the bell is due.
+
+    Attributes:
+        words, own: the shared memory, and where its own counter lies there.
+        obeyed: the order for which it has rung, or need not ring.
+    """
+
+    def __init__(self, buffer: memoryview, num_workers: int, index: int) -> None:
+        self.words = _words(buffer, num_workers)
+        self._sum = _sum_of(self.words)
+        self.own = _COUNTERS + LINE * index
+        self._fence = new_fence()
+        self.obeyed = 0
+
+    def publish(self, count: int) -> bool:
+        """Say how many reports there are; whether it is time to ask `is_due`."""
+        words = self.words
+        words[self.own] = count
+        order = words[ORDER]
+        return order != self.obeyed and not count & (order >> PACE_SHIFT & PACE_MASK)
+
+    def is_due(self) -> bool:
+        """Whether the trainer is to be rung, now and by this worker; True once an order."""
+        self._fence()
+        order = self.words[ORDER]
+        if order == self.obeyed:
+            return False
+        if order and self._sum() < (order >> _GOAL_SHIFT & _GOAL_MASK):
+            return False
+        self.obeyed = order
+        return order != 0

@@ -1,0 +1,346 @@
+"""How the trainer comes by results: what it orders, when it looks, and what it executes itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rlightning_aio.group.poller import Poller
+from rlightning_aio.group.requests import COLLECTOR, Requests
+from rlightning_aio.protocol.bell import TrainerBell, WorkerBell, bell_size
+from rlightning_aio.protocol.entries import Operation
+
+LONGEST_PACE = 256
+SHORT, LONG = 5e3, 5e6
+"""Steps in ns: short or long beside a wake-up."""
+
+
+@dataclass(eq=False)
+class Worker:
+    """As much of a process host as a poller sees."""
+
+    host_id: int
+    polled: int = 0
+
+    def poll(self) -> None:
+        self.polled += 1
+
+
+class Server(Worker):
+    """As much of an env_server, too."""
+
+    server_id, address, members = "server-0", "tcp://nowhere", ()
+
+    def __init__(self, host_id: int) -> None:
+        super().__init__(host_id)
+        self.readable = False
+        self.looked_at = 0
+
+    def is_readable(self) -> bool:
+        self.looked_at += 1
+        return self.readable
+
+    def _not_asked(self, *args: Any) -> Any:
+        raise AssertionError
+
+    member_indices = num_sub_envs = check_step = missing = deadline = tick = _not_asked
+
+
+@dataclass(eq=False)
+class Inline:
+    """An inline host; it notes what it executes."""
+
+    host_id: int
+    waiting: int
+    log: list[int] = field(default_factory=list)
+
+    def execute_next(self) -> bool:
+        if not self.waiting:
+            return False
+        self.waiting -= 1
+        self.log.append(self.host_id)
+        return True
+
+
+class Scene:
+    """A poller over hosts with so many requests in flight, and a bell that can be looked at."""
+
+    def __init__(
+        self, *in_flight: int, kinds: Any = Worker, num_cores: int = 0, clock: Any = None
+    ) -> None:
+        count = len(in_flight)
+        memory = memoryview(bytearray(bell_size(count)))
+        self.bell = TrainerBell(memory, count)
+        self.workers = [WorkerBell(memory, count, k) for k in range(count)]
+        self.counts = [0] * count
+        self.requests = Requests(np.repeat(np.arange(count), in_flight), count)
+        self.requests.submit(np.arange(sum(in_flight)), Operation.STEP, COLLECTOR, 0.0)
+        self.requests.in_flight[:] = in_flight
+        self.orders: list[tuple[int, int]] = []
+        arm = self.bell.arm
+
+        def noted(goal: int, pace: int) -> bool:
+            self.orders.append((goal - self.bell.goal(0), pace))
+            return arm(goal, pace)
+
+        self.bell.arm = noted  # type: ignore[method-assign]
+        given_clock = {} if clock is None else {"clock": clock}
+        self.poller = Poller(self.requests, self.bell, num_cores, **given_clock)
+        kinds = kinds if isinstance(kinds, tuple) else (kinds,) * count
+        self.hosts: list[Any] = [kind(k) for k, kind in enumerate(kinds)]
+        for host in self.hosts:
+            self.poller.add(host)
+
+    def note_steps(self, *step_ns: float) -> None:
+        """Until nothing else is remembered."""
+        for _ in range(200):
+            for host_id, ns in enumerate(step_ns):
+                self.poller.note_step(host_id, ns)
+
+    def report(self, host_id: int, count: int = 1) -> None:
+        self.counts[host_id] += count
+        self.workers[host_id].publish(self.counts[host_id])
+
+    def take(self) -> None:
+        """The trainer reads all reports there are."""
+        for host_id in self.bell.with_news():
+            count = self.bell.count(host_id) - self.bell._read[host_id]
+            self.bell.took(host_id, count)
+            self.requests.in_flight[host_id] -= count
+
+    def arm(self, wanted: int, now: float = 0.0) -> tuple[bool, float | None]:
+        return self.poller.arm(wanted, now)
+
+
+# -- orders
+
+
+@pytest.mark.parametrize("wanted", [32, 40])
+def test_for_all_results_exactly_all_are_ordered_at_the_slowest_pace(wanted: int) -> None:
+    """The last to finish rings; nobody looks in between, and neither does the trainer."""
+    scene = Scene(16, 16)
+    assert scene.arm(wanted) == (False, None)
+    assert scene.orders == [(32, LONGEST_PACE)]
+
+
+def test_the_same_wait_gives_the_same_order() -> None:
+    """Results that are taken in meanwhile change nothing of what it waits for."""
+    scene = Scene(16, 16)
+    scene.arm(32)
+    order = scene.bell._order
+    scene.report(0, 16)
+    scene.take()
+    scene.arm(16)
+    assert scene.bell._order == order
+
+
+def test_for_some_of_short_steps_a_few_more_are_ordered_at_first() -> None:
+    """One look soon after; then exactly what is wanted, with no more looks."""
+    scene = Scene(16, 16)
+    scene.note_steps(SHORT, SHORT)
+    came, again = scene.arm(16, now=10.0)
+    assert not came
+    assert again is not None
+    assert 10.0 < again < 10.001
+    # Half of what is left over; nobody runs dry meanwhile.
+    assert scene.orders == [(16 + 8, 1)]
+    assert scene.arm(16, now=again)[0] is False
+    assert scene.orders[1:] == [(16, 1)]
+    # That order is new, so it may have been overlooked in the moment it was given.
+    for later in (10.002, 20.0):
+        assert scene.arm(16, now=later) == (False, None)
+    assert scene.orders[2:] == [(16, 1)] * 2
+
+
+def test_long_steps_are_not_waited_for_because_others_are_short() -> None:
+    """A group may hold simulators of very different speed."""
+    scene = Scene(16, 16)
+    scene.note_steps(SHORT, LONG)
+    scene.arm(16)
+    assert scene.orders == [(16 + 4, 1)]
+
+
+def test_a_new_wait_begins_with_a_few_more_again() -> None:
+    """Also for as many results as the last one, which are others."""
+    scene = Scene(16, 16)
+    scene.note_steps(SHORT, SHORT)
+    scene.arm(16)
+    scene.arm(16)
+    scene.poller.disarm()
+    scene.arm(16)
+    assert [count for count, _ in scene.orders] == [24, 16, 24]
+
+
+def test_who_wants_one_result_gets_the_first() -> None:
+    """It is not kept waiting for others."""
+    scene = Scene(16, 16)
+    scene.note_steps(SHORT, SHORT)
+    scene.arm(1)
+    assert scene.orders == [(1, 1)]
+
+
+@given(
+    in_flight=st.lists(st.integers(1, 64), min_size=1, max_size=8),
+    wanted=st.integers(1, 512),
+    step_ns=st.floats(0, 1e8),
+    data=st.data(),
+)
+def test_orders_can_be_met_and_come_in_time(
+    in_flight: list[int], wanted: int, step_ns: float, data: st.DataObject
+) -> None:
+    """Never more than is in flight; never fewer than wanted; not for long more than wanted."""
+    scene = Scene(*in_flight)
+    scene.note_steps(*[step_ns] * len(in_flight))
+    total = sum(in_flight)
+    now = 0.0
+    for turn in range(6):
+        came, again = scene.arm(wanted, now)
+        least = min(wanted, total)
+        ordered, pace = scene.orders[-1]
+        assert least <= ordered <= total
+        assert pace == (LONGEST_PACE if least == total else 1)
+        if turn or step_ns > 160_000 or wanted == 1:
+            assert ordered == least
+        assert came == (scene.bell.unread() >= least)
+        if again is not None:
+            assert now < again < now + 1e-3
+            now = again
+    # In the end it sleeps until it is rung.
+    assert again is None
+    # And the bell that it has ordered is rung by whoever reports the last that is wanted.
+    rung = 0
+    order = [k for k, count in enumerate(in_flight) for _ in range(count)]
+    left = list(in_flight)
+    for number, host_id in enumerate(data.draw(st.permutations(order)), 1):
+        scene.counts[host_id] += 1
+        left[host_id] -= 1
+        worker = scene.workers[host_id]
+        if worker.publish(scene.counts[host_id]) or not left[host_id]:
+            rung += worker.is_due()
+        if pace == 1:
+            assert (rung > 0) == (number >= least)
+        else:
+            assert (rung > 0) == (number == total)
+
+
+def test_results_that_are_there_are_not_waited_for() -> None:
+    """However they came between two looks."""
+    scene = Scene(4, 4)
+    scene.report(0, 4)
+    scene.report(1, 1)
+    assert scene.arm(5)[0] is True
+    assert scene.arm(6)[0] is False
+    scene.report(1, 3)
+    assert scene.arm(8) == (True, None)
+
+
+def test_nothing_is_ordered_where_no_worker_has_anything_to_do() -> None:
+    """Clients and inline envs wake the trainer by themselves, or are asked."""
+    scene = Scene(0, 3, kinds=(Worker, Server))
+    assert scene.arm(2) == (False, None)
+    assert scene.orders == []
+
+
+# -- taking in
+
+
+def test_only_hosts_with_news_are_polled() -> None:
+    """Workers that have reported, and servers that owe something."""
+    scene = Scene(2, 2, 2, 0, kinds=(Worker, Worker, Server, Server))
+    scene.report(1)
+    scene.poller.poll()
+    assert [host.polled for host in scene.hosts] == [0, 1, 1, 0]
+
+
+def test_clients_on_this_machine_are_left_the_cores() -> None:
+    """As many of them may want one as owe a result."""
+    scene = Scene(2, kinds=Server, num_cores=2)
+    (server,) = scene.hosts
+    server.readable = True
+    assert not scene.poller.spin(1)
+    assert not server.looked_at
+    scene.requests.in_flight[0] = 1
+    assert scene.poller.spin(1)
+    assert server.looked_at
+
+
+def test_workers_are_left_the_cores() -> None:
+    """One each, however many requests it has; the trainer looks only on a core of its own."""
+    scene = Scene(8, 8, num_cores=2)
+    scene.report(0, 8)
+    assert not scene.poller.spin(1)
+    scene.take()
+    scene.report(1)
+    assert scene.poller.spin(1)
+
+
+def test_who_looks_by_itself_is_not_rung() -> None:
+    """It has withdrawn its order."""
+    scene = Scene(2, num_cores=2)
+    scene.arm(2)
+    scene.report(0, 2)
+    assert scene.poller.spin(2)
+    assert not scene.workers[0].is_due()
+
+
+# -- inline hosts
+
+
+def inline_scene(*waiting: int, workers: int = 0, clock: Any = None) -> Scene:
+    """Inline hosts with so many requests each, and one worker with so many."""
+    kinds = tuple(lambda k, n=n: Inline(k, n) for n in waiting)
+    scene = Scene(*waiting, workers, kinds=(*kinds, Worker), clock=clock)
+    log: list[int] = []
+    for host in scene.hosts[:-1]:
+        host.log = log
+    return scene
+
+
+@given(waiting=st.lists(st.integers(0, 5), min_size=1, max_size=4), wanted=st.integers(1, 12))
+def test_inline_hosts_execute_what_nobody_else_can_give(waiting: list[int], wanted: int) -> None:
+    """No more than is wanted, in turns; whether there was anything to execute is told."""
+    scene = inline_scene(*waiting)
+    assert scene.poller.execute(wanted, None) == (sum(waiting) > 0)
+    log = scene.hosts[0].log
+    assert len(log) == min(wanted, sum(waiting))
+    counts = [log.count(k) for k in range(len(waiting))]
+    assert max(counts) - min(counts) <= 1 or any(
+        count == n < max(counts) for count, n in zip(counts, waiting, strict=True)
+    )
+
+
+def test_one_at_a_time_is_executed_while_workers_have_something_to_do() -> None:
+    """Their results may come first."""
+    scene = inline_scene(3, 3, workers=1)
+    for count in range(1, 5):
+        assert scene.poller.execute(5, None)
+        assert len(scene.hosts[0].log) == count
+    assert all(one != other for one, other in pairwise(scene.hosts[0].log))
+
+
+def test_inline_hosts_stop_when_the_time_is_over() -> None:
+    """Between two envs; one is executed in any case, else nothing would ever come."""
+    times = iter([0.0, 1.0, 2.0, 3.0])
+    scene = inline_scene(9, clock=lambda: next(times))
+    assert scene.poller.execute(9, 2.0)
+    assert len(scene.hosts[0].log) == 3
+    scene = inline_scene(9, clock=lambda: 5.0)
+    assert scene.poller.execute(9, 2.0)
+    assert len(scene.hosts[0].log) == 1
+
+
+def test_without_an_end_no_clock_is_asked() -> None:
+    """It would be felt where steps are short."""
+
+    def asked() -> float:
+        raise AssertionError
+
+    scene = inline_scene(9, clock=asked)
+    assert scene.poller.execute(9, None)
+    assert len(scene.hosts[0].log) == 9

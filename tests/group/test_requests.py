@@ -1,0 +1,632 @@
+"""What may happen to a request: every line of `LEGAL`, and why nothing else can.
+
+`Requests` has no method for each event of its table, so `Driven` says which ones stand for
+it. Then a state machine does all of it at random, over several hosts, beside a naive model.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+
+from rlightning_aio.errors import EnvFault
+from rlightning_aio.group.requests import (
+    COLLECTOR,
+    LEGAL,
+    NOBODY,
+    Event,
+    Owner,
+    Requests,
+    State,
+    Ticket,
+)
+from rlightning_aio.protocol.entries import Operation
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+Situation: TypeAlias = tuple[State, Owner]
+Combination: TypeAlias = tuple[State, Owner, Event]
+
+HOST_OF = np.array([0, 1, 1])
+SLOT, COMPANION = 1, 2
+"""The slot that is looked at, and another of the same host that its calls wait for, too."""
+
+
+def fault() -> EnvFault:
+    return EnvFault("as asked for", env_id="any")
+
+
+def kind_of(owner: int) -> Owner:
+    return {COLLECTOR: Owner.COLLECTOR, NOBODY: Owner.NOBODY}.get(owner, Owner.TICKET)
+
+
+class Driven:
+    """A table, and what makes each event happen to `SLOT`.
+
+    Args:
+        method: calls are of methods, instead of steps and resets.
+    """
+
+    def __init__(self, *, method: bool = False) -> None:
+        self.table = Requests(HOST_OF, 2)
+        self.method = method
+        self.ticket: Ticket | None = None
+        self.settled: list[int] = []
+        self.events: dict[Event, Callable[[], None]] = {
+            Event.SENT: lambda: self._ask([SLOT], Operation.STEP, COLLECTOR),
+            Event.SENT_FOR_CALL: self._call,
+            Event.JOINED: lambda: self.table.join(SLOT, 1.0),
+            Event.RESULT: self._result,
+            Event.VALUE: lambda: self.table.set_value(self._end(), "value"),
+            Event.FAULT: self._fail,
+            Event.WITHDRAWN: lambda: self.table.withdraw(self._end()),
+            Event.RESTARTED: self._restart,
+            Event.HANDED_OUT: lambda: self.table.hand_out(self.table.take(1)),
+            Event.SETTLED: self._settle,
+            Event.GIVEN_UP: self._give_up,
+            Event.METHOD_GIVEN_UP: self._give_up,
+            Event.CLAIMED: self._claim,
+            Event.DROPPED: lambda: self.table.take_joined(self.table.alone(SLOT), None),
+        }
+
+    def situation(self) -> Situation:
+        return State(self.table.state.item(SLOT)), kind_of(self.table.owner.item(SLOT))
+
+    def entry(self, slot: int = SLOT) -> int:
+        return self.table.entry.item(slot)
+
+    def _ask(self, slots: list[int], op: int, owner: int) -> None:
+        asked = np.array(slots)
+        self.table.submit(asked, op, owner, 1.0)
+        for _ in self.table.by_host(asked):
+            pass
+
+    def _call(self) -> None:
+        slots = [SLOT, COMPANION]
+        self.ticket = self.table.open_ticket(np.array(slots), calls=self.method)
+        op = Operation.CALL if self.method else Operation.RESET
+        self._ask(slots, op, self.ticket.owner)
+
+    def _claim(self) -> None:
+        self.ticket = self.table.open_ticket(np.array([SLOT, COMPANION]))
+        self.table.take_joined(self.table.alone(SLOT), self.ticket)
+        self._ask([COMPANION], Operation.RESET, self.ticket.owner)
+
+    def _result(self) -> None:
+        assert self.table.complete_one(1, self.entry()) == SLOT
+
+    def _end(self) -> int:
+        slot = self.table.end(1, self.entry())
+        assert slot == SLOT
+        return slot
+
+    def _fail(self) -> None:
+        slots = self.table.alone(self._end())
+        ((owner, mine),) = self.table.owners(slots).items()
+        self.table.fail(mine, owner, fault())
+
+    def _restart(self) -> None:
+        owed = self.table.owed(np.arange(3))
+        self.table.lose_host(1)
+        self.table.restart(owed)
+        for _ in self.table.by_host(owed):
+            pass
+
+    def _settle(self) -> None:
+        assert self.ticket is not None
+        slot = self.table.end(1, self.entry(COMPANION))
+        assert slot == COMPANION
+        if self.method:
+            self.table.set_value(slot, None)
+        else:
+            self.table.fail(self.table.alone(slot), self.ticket.owner, fault())
+        assert self.ticket.remaining == 0
+        self.table.settle(self.ticket)
+        # A call hands out at once what it has waited for; nobody can collect it.
+        self.settled = self.table.ready(self.ticket.slots).tolist()
+
+    def _give_up(self) -> None:
+        assert self.ticket is not None
+        self.table.give_up(self.ticket)
+
+    def check_counts(self) -> None:
+        """Every count is what the arrays say."""
+        table = self.table
+        busy, ready = table.state == State.BUSY, table.state == State.READY
+        collected = table.owner == COLLECTOR
+        collected[self.settled] = False
+        assert table.in_flight == [int(busy[host == HOST_OF].sum()) for host in range(2)]
+        assert table.total_in_flight() == busy.sum()
+        assert table.num_ready == (ready & collected).sum()
+        assert table.num_awaited == (busy & collected).sum()
+        table.hand_out(np.array(self.settled, np.intp))
+        for among in (None, np.array([True, True, False]), np.arange(3) == SLOT):
+            chosen = collected if among is None else collected & among
+            assert table.pending(among) == (
+                (ready & chosen).sum(),
+                ((ready | busy) & chosen).sum(),
+            )
+
+
+# How each situation comes about; of methods' calls where it matters.
+STEPS: dict[Situation, list[Event]] = {
+    (State.IDLE, Owner.COLLECTOR): [],
+    (State.BUSY, Owner.COLLECTOR): [Event.SENT],
+    (State.READY, Owner.COLLECTOR): [Event.SENT, Event.RESULT],
+    (State.BUSY, Owner.TICKET): [Event.SENT_FOR_CALL],
+    (State.READY, Owner.TICKET): [Event.SENT_FOR_CALL, Event.RESULT],
+    (State.SPENT, Owner.TICKET): [Event.SENT_FOR_CALL, Event.FAULT],
+}
+METHODS: dict[Situation, list[Event]] = {
+    (State.BUSY, Owner.TICKET): [Event.SENT_FOR_CALL],
+    (State.SPENT, Owner.TICKET): [Event.SENT_FOR_CALL, Event.VALUE],
+    (State.BUSY, Owner.NOBODY): [Event.SENT_FOR_CALL, Event.METHOD_GIVEN_UP],
+}
+UNCOLLECTED: Situation = (State.READY, Owner.COLLECTOR)
+ALL: list[Combination] = list(itertools.product(State, Owner, Event))
+NOT_EXPRESSIBLE: dict[Combination, str] = {
+    (State.BUSY, Owner.COLLECTOR, Event.VALUE): "only methods have values; each has a ticket",
+    (State.BUSY, Owner.TICKET, Event.WITHDRAWN): "a call learns by an error that its env is away",
+    (State.BUSY, Owner.NOBODY, Event.RESULT): "what was given up for nobody is a method",
+    (State.BUSY, Owner.NOBODY, Event.WITHDRAWN): "no method of a client's env can be called",
+    (State.BUSY, Owner.NOBODY, Event.RESTARTED): "a method fails with its worker",
+    (State.READY, Owner.TICKET, Event.METHOD_GIVEN_UP): "methods have values, not results",
+    (State.SPENT, Owner.TICKET, Event.METHOD_GIVEN_UP): "one that has ended is given up like any",
+}
+REACHABLE = {*STEPS, *METHODS}
+REFUSED = [
+    combination
+    for combination in ALL
+    if combination[:2] in REACHABLE and combination not in {*LEGAL, *NOT_EXPRESSIBLE}
+]
+
+
+def brought_to(state: State, owner: Owner, event: Event | None = None) -> Driven:
+    """A table whose slot is in that situation, as it is before `event`."""
+    of_methods = event in (Event.VALUE, Event.METHOD_GIVEN_UP) and (state, owner) in METHODS
+    method = owner is Owner.NOBODY or of_methods
+    driven = Driven(method=method)
+    way = (METHODS if method else STEPS)[state, owner]
+    if event in (Event.CLAIMED, Event.DROPPED) and (state, owner) == UNCOLLECTED:
+        way = [Event.JOINED]
+    for past in way:
+        driven.events[past]()
+    assert driven.situation() == (state, owner)
+    driven.check_counts()
+    return driven
+
+
+def named(value: object) -> str:
+    return value.name if isinstance(value, State | Owner | Event) else str(value)
+
+
+@pytest.mark.parametrize(("state", "owner", "event"), LEGAL, ids=named)
+def test_a_legal_event_does_what_the_table_says(state: State, owner: Owner, event: Event) -> None:
+    """State and owner follow the table, and the counts follow them."""
+    driven = brought_to(state, owner, event)
+    driven.events[event]()
+    assert driven.situation() == LEGAL[state, owner, event]
+    driven.check_counts()
+
+
+@pytest.mark.parametrize(("state", "owner", "event"), REFUSED, ids=named)
+def test_any_other_event_cannot_come(state: State, owner: Owner, event: Event) -> None:
+    """Who could bring it about is told so before, or finds nothing to do it to."""
+    driven = brought_to(state, owner, event)
+    table = driven.table
+    slots = table.alone(SLOT)
+    if event in (Event.SENT, Event.SENT_FOR_CALL, Event.JOINED):
+        assert table.first_not_idle(slots) == SLOT
+        assert not table.is_idle(SLOT)
+    elif event in (Event.RESULT, Event.VALUE, Event.FAULT, Event.WITHDRAWN):
+        # A reply that nobody waits for, like any that is late.
+        assert table.end(1, driven.entry()) is None
+        assert table.complete_one(1, driven.entry()) is None
+    elif event is Event.RESTARTED:
+        assert table.owed(slots).size == 0
+    elif event in (Event.CLAIMED, Event.DROPPED):
+        assert not table.joined(slots).any()
+    elif event is Event.HANDED_OUT:
+        assert table.num_ready == 0
+    elif event is Event.SETTLED and owner is Owner.TICKET:
+        assert driven.ticket is not None
+        assert driven.ticket.remaining > 0
+    else:
+        assert not any(SLOT in ticket.slots for ticket in table._tickets.values())
+    assert driven.situation() == (state, owner)
+    driven.check_counts()
+
+
+def test_every_combination_is_accounted_for() -> None:
+    """Legal, refused, not expressible, or of a situation to which nothing legal leads."""
+    unreachable = {(state, owner) for state, owner, _ in ALL} - REACHABLE
+    assert not unreachable & set(LEGAL.values())
+    assert not NOT_EXPRESSIBLE.keys() & LEGAL.keys()
+    rest = {combination for combination in ALL if combination[:2] in unreachable}
+    assert {*LEGAL, *REFUSED, *NOT_EXPRESSIBLE, *rest} == set(ALL)
+
+
+def test_every_situation_of_the_table_follows_from_it() -> None:
+    """Beginning with an idle slot, legal events lead to all of them."""
+    found: set[Situation] = set()
+    new: set[Situation] = {(State.IDLE, Owner.COLLECTOR)}
+    while new:
+        found |= new
+        new = {after for (*before, _), after in LEGAL.items() if tuple(before) in found} - found
+    assert found == REACHABLE
+
+
+def test_a_method_that_was_given_up_is_nobodys() -> None:
+    """Unlike a step or a reset: no collector could make anything of its value."""
+    driven = brought_to(State.BUSY, Owner.NOBODY)
+    assert driven.table.pending() == (0, 0)
+    driven.events[Event.FAULT]()
+    assert not driven.table.faults
+
+
+def test_a_first_result_that_a_call_has_taken_is_not_offered_again() -> None:
+    """Another call finds its env busy, whatever it would do with a first result."""
+    table = Requests(HOST_OF, 2)
+    ticket = table.open_ticket(np.array([SLOT, COMPANION]))
+    table.join(SLOT, 1.0)
+    assert table.joined(table.alone(SLOT)).all()
+    table.take_joined(table.alone(SLOT), ticket)
+    assert not table.joined(table.alone(SLOT)).any()
+
+
+# -- everything at once, beside a model
+
+
+@dataclass
+class Asked:
+    """A slot as the model sees it; `came` counts the moments at which results came."""
+
+    op: Operation | None = None
+    state: State = State.IDLE
+    owner: Claim | None = None
+    nobodys: bool = False
+    entry: int = 0
+    came: int = 0
+
+
+@dataclass(eq=False)
+class Claim:
+    """A call as the model sees it."""
+
+    ticket: Ticket
+    slots: list[int]
+    num_faults: int = 0
+
+
+class RequestsMachine(RuleBasedStateMachine):
+    """Each rule does something to the table and to the model; the invariant compares them."""
+
+    @initialize(counts=st.lists(st.integers(1, 3), min_size=1, max_size=4))
+    def begin(self, counts: list[int]) -> None:
+        self.host_of = np.repeat(np.arange(len(counts)), counts)
+        self.table = Requests(self.host_of, len(counts))
+        self.slots = [Asked() for _ in self.host_of]
+        self.claims: list[Claim] = []
+        self.late: list[int] = []
+        self.num_faults = 0
+        self.moment = 0
+
+    # -- drawing
+
+    def those(self, *states: State, host: int | None = None) -> list[int]:
+        return [
+            slot
+            for slot, asked in enumerate(self.slots)
+            if asked.state in states and host in (None, self.host_of[slot])
+        ]
+
+    def some(self, data: st.DataObject, slots: list[int]) -> list[int]:
+        return data.draw(st.lists(st.sampled_from(slots), min_size=1, unique=True))
+
+    def one_busy(self, data: st.DataObject) -> tuple[int, Asked]:
+        slot = data.draw(st.sampled_from(self.those(State.BUSY)))
+        return slot, self.slots[slot]
+
+    # -- asking
+
+    def ask(self, slots: list[int], op: Operation, claim: Claim | None) -> None:
+        asked = np.array(slots, np.intp)
+        owner = COLLECTOR if claim is None else claim.ticket.owner
+        by_auto_reset = op is Operation.RESET and claim is None
+        entries = self.table.submit(asked, Operation.STEP if by_auto_reset else op, owner, 1.0)
+        if by_auto_reset:
+            self.table.into_resets(asked, entries, np.ones(len(slots), np.bool_))
+        parts = list(self.table.by_host(asked))
+        given = [slot for _, part in parts for slot in asked[part].tolist()]
+        assert given == slots
+        assert all((self.host_of[asked[part]] == host).all() for host, part in parts)
+        for slot, entry in zip(slots, entries.tolist(), strict=True):
+            self.slots[slot] = Asked(op, State.BUSY, claim, entry=entry)
+
+    @precondition(lambda self: self.those(State.IDLE))
+    @rule(data=st.data(), reset=st.booleans())
+    def ask_for_the_collector(self, data: st.DataObject, reset: bool) -> None:
+        op = Operation.RESET if reset else Operation.STEP
+        self.ask(self.some(data, self.those(State.IDLE)), op, None)
+
+    @precondition(lambda self: self.those(State.IDLE))
+    @rule(data=st.data(), op=st.sampled_from((Operation.STEP, Operation.RESET, Operation.CALL)))
+    def ask_for_a_call(self, data: st.DataObject, op: Operation) -> None:
+        """A reset has the first results of those that have just joined, too."""
+        slots = self.some(data, self.those(State.IDLE))
+        joined = self.joined() if op is Operation.RESET else []
+        taken = self.some(data, joined) if joined else []
+        everyone = np.array(slots + taken, np.intp)
+        claim = Claim(self.table.open_ticket(everyone, calls=op is Operation.CALL), slots + taken)
+        self.claims.append(claim)
+        if taken:
+            self.table.take_joined(np.array(taken), claim.ticket)
+            for slot in taken:
+                self.slots[slot].owner = claim
+        self.ask(slots, op, claim)
+
+    @precondition(lambda self: self.those(State.IDLE))
+    @rule(data=st.data())
+    def refuse(self, data: st.DataObject) -> None:
+        """A call for which nothing was sent."""
+        slots = self.some(data, self.those(State.IDLE))
+        self.table.drop(self.table.open_ticket(np.array(slots)))
+
+    @precondition(lambda self: self.those(State.IDLE))
+    @rule(data=st.data())
+    def join(self, data: st.DataObject) -> None:
+        slot = data.draw(st.sampled_from(self.those(State.IDLE)))
+        self.table.join(slot, 1.0)
+        self.moment += 1
+        entry = self.table.entry.item(slot)
+        self.slots[slot] = Asked(Operation.JOIN, State.READY, entry=entry, came=self.moment)
+
+    def joined(self) -> list[int]:
+        return [
+            slot
+            for slot in self.those(State.READY)
+            if self.slots[slot].op is Operation.JOIN and self.slots[slot].owner is None
+        ]
+
+    @precondition(lambda self: self.joined())
+    @rule(data=st.data())
+    def drop_first_results(self, data: st.DataObject) -> None:
+        slots = self.some(data, self.joined())
+        self.table.take_joined(np.array(slots), None)
+        for slot in slots:
+            self.slots[slot] = Asked(entry=self.slots[slot].entry)
+
+    # -- answers
+
+    def deliver(self, slots: list[int]) -> None:
+        self.moment += 1
+        for slot in slots:
+            self.slots[slot].state, self.slots[slot].came = State.READY, self.moment
+
+    @precondition(lambda self: self.those(State.BUSY))
+    @rule(data=st.data())
+    def report(self, data: st.DataObject) -> None:
+        """Results of one host, among them some that are late."""
+        host = int(self.host_of[self.one_busy(data)[0]])
+        busy = [
+            slot
+            for slot in self.those(State.BUSY, host=host)
+            if self.slots[slot].op is not Operation.CALL
+        ]
+        slots = data.draw(st.lists(st.sampled_from(busy), unique=True)) if busy else []
+        told = [self.slots[slot].entry for slot in slots]
+        if self.late:
+            told += data.draw(st.lists(st.sampled_from(self.late), max_size=2))
+        entries = np.array(data.draw(st.permutations(told)), np.int64)
+        found = self.table.complete(host, entries).tolist()
+        assert sorted(found) == sorted(slots)
+        self.deliver(found)
+
+    @precondition(lambda self: self.those(State.BUSY))
+    @rule(data=st.data())
+    def answer(self, data: st.DataObject) -> None:
+        """One request ends in what it was sent for."""
+        slot, asked = self.one_busy(data)
+        host = int(self.host_of[slot])
+        if asked.op is not Operation.CALL:
+            assert self.table.complete_one(host, asked.entry) == slot
+            self.deliver([slot])
+            return
+        assert self.table.end(host, asked.entry) == slot
+        self.table.set_value(slot, slot)
+        if asked.owner is not None:
+            assert asked.owner.ticket.value == slot
+        self.finish(slot)
+
+    def finish(self, slot: int) -> None:
+        """Note that a request has ended without a result."""
+        asked = self.slots[slot]
+        if asked.owner is None:
+            self.slots[slot] = Asked(entry=asked.entry)
+        else:
+            asked.state = State.SPENT
+
+    def fail(self, slots: list[int]) -> None:
+        """Requests that are in flight no more end in one error for each owner."""
+        owners = self.table.owners(np.array(slots, np.intp)).items()
+        assert sorted(slot for _, mine in owners for slot in mine.tolist()) == sorted(slots)
+        for owner, mine in owners:
+            self.table.fail(mine, owner, fault())
+            first = self.slots[mine.item(0)]
+            if first.owner is not None:
+                first.owner.num_faults += 1
+            elif not first.nobodys:
+                self.num_faults += 1
+            for slot in mine.tolist():
+                self.finish(slot)
+
+    @precondition(lambda self: self.those(State.BUSY))
+    @rule(data=st.data())
+    def raise_error(self, data: st.DataObject) -> None:
+        slot, asked = self.one_busy(data)
+        assert self.table.end(int(self.host_of[slot]), asked.entry) == slot
+        self.fail([slot])
+
+    @precondition(lambda self: self.those(State.BUSY))
+    @rule(data=st.data())
+    def withdraw(self, data: st.DataObject) -> None:
+        """A request of the collector's ends in nothing; of a call's, in an error."""
+        slot, asked = self.one_busy(data)
+        assert self.table.end(int(self.host_of[slot]), asked.entry) == slot
+        if asked.owner is None and not asked.nobodys:
+            self.table.withdraw(slot)
+            self.finish(slot)
+        else:
+            self.fail([slot])
+
+    @precondition(lambda self: self.late)
+    @rule(data=st.data())
+    def answer_late(self, data: st.DataObject) -> None:
+        """Nothing comes of it."""
+        entry = data.draw(st.sampled_from(self.late))
+        host = data.draw(st.sampled_from(range(len(self.table.in_flight))))
+        assert self.table.end(host, entry) is None
+        assert self.table.complete_one(host, entry) is None
+
+    # -- deaths
+
+    @rule(data=st.data(), replaced=st.booleans())
+    def die(self, data: st.DataObject, replaced: bool) -> None:
+        """Steps and resets are asked anew of a replacement; all else ends in errors."""
+        host = data.draw(st.sampled_from(range(len(self.table.in_flight))))
+        owed = self.those(State.BUSY, host=host)
+        again = [s for s in owed if replaced and self.slots[s].op is not Operation.CALL]
+        self.table.lose_host(host)
+        if failed := [slot for slot in owed if slot not in again]:
+            self.fail(failed)
+        if not again:
+            return
+        asked = np.array(again)
+        entries = self.table.restart(asked).tolist()
+        assert [h for h, _ in self.table.by_host(asked)] == [host]
+        for slot, entry in zip(again, entries, strict=True):
+            self.late.append(self.slots[slot].entry)
+            self.slots[slot].entry, self.slots[slot].op = entry, Operation.RESET
+
+    # -- calls that end
+
+    @precondition(lambda self: self.claims)
+    @rule(data=st.data())
+    def settle_or_give_up(self, data: st.DataObject) -> None:
+        """A call with nothing left to wait for is settled; any other is given up."""
+        claim = data.draw(st.sampled_from(self.claims))
+        self.claims.remove(claim)
+        if any(self.slots[slot].state is State.BUSY for slot in claim.slots):
+            self.give_up(claim)
+            return
+        self.table.settle(claim.ticket)
+        ready = [slot for slot in claim.slots if self.slots[slot].state is State.READY]
+        assert sorted(self.table.ready(claim.ticket.slots).tolist()) == sorted(ready)
+        self.table.hand_out(np.array(ready, np.intp))
+        for slot in claim.slots:
+            self.slots[slot] = Asked(entry=self.slots[slot].entry)
+
+    @precondition(lambda self: self.claims)
+    @rule(data=st.data())
+    def interrupt(self, data: st.DataObject) -> None:
+        """A call is given up, perhaps in the moment in which it has all."""
+        claim = data.draw(st.sampled_from(self.claims))
+        self.claims.remove(claim)
+        self.give_up(claim)
+
+    def give_up(self, claim: Claim) -> None:
+        self.table.give_up(claim.ticket)
+        self.moment += 1
+        if not claim.ticket.calls:
+            self.num_faults += claim.num_faults
+        for slot in claim.slots:
+            asked = self.slots[slot]
+            asked.owner = None
+            if asked.state is State.SPENT:
+                self.slots[slot] = Asked(entry=asked.entry)
+            elif claim.ticket.calls:
+                asked.nobodys = True
+            elif asked.state is State.READY:
+                asked.came = self.moment
+
+    # -- the collector
+
+    def collectable(self, among: list[int]) -> list[int]:
+        return [slot for slot in self.those(State.READY) if not self.slots[slot].owner
+                and slot in among]  # fmt: skip
+
+    @precondition(lambda self: self.collectable(list(range(len(self.slots)))))
+    @rule(data=st.data(), most=st.integers(1, 6), choosy=st.booleans())
+    def take(self, data: st.DataObject, most: int, choosy: bool) -> None:
+        """First come, first served; those that came together in any order."""
+        among = list(range(len(self.slots)))
+        if choosy:
+            among = self.some(data, among)
+        mask = np.isin(np.arange(len(self.slots)), among) if choosy else None
+        here = self.collectable(among)
+        taken = self.table.take(most, mask).tolist()
+        assert len(taken) == len(set(taken)) == min(most, len(here))
+        assert set(taken) <= set(here)
+        came = [self.slots[slot].came for slot in taken]
+        assert came == sorted(self.slots[slot].came for slot in here)[:most]
+        self.table.hand_out(np.array(taken, np.intp))
+        for slot in taken:
+            self.slots[slot] = Asked(entry=self.slots[slot].entry)
+
+    @precondition(lambda self: self.num_faults)
+    @rule()
+    def take_fault(self) -> None:
+        self.table.faults.popleft()
+        self.num_faults -= 1
+
+    # -- what must be true
+
+    @invariant()
+    def the_table_is_the_model(self) -> None:
+        table, slots = self.table, self.slots
+        assert table.state.tolist() == [asked.state for asked in slots]
+        owners = [NOBODY if a.nobodys else a.owner.ticket.owner if a.owner else 0 for a in slots]
+        assert table.owner.tolist() == owners
+        assert table.entry[[a.state is not State.IDLE for a in slots]].tolist() == [
+            asked.entry for asked in slots if asked.state is not State.IDLE
+        ]
+        for slot, asked in enumerate(slots):
+            assert table.is_idle(slot) == (asked.state is State.IDLE)
+            assert asked.op in (None, table.op(slot))
+
+    @invariant()
+    def the_counts_are_the_models(self) -> None:
+        table, slots = self.table, self.slots
+        num_hosts = len(table.in_flight)
+        busy = self.those(State.BUSY)
+        assert table.in_flight == [len(self.those(State.BUSY, host=h)) for h in range(num_hosts)]
+        assert len(table.faults) == self.num_faults
+        mine = [s for s in busy if slots[s].owner is None and not slots[s].nobodys]
+        ready = self.collectable(list(range(len(slots))))
+        assert (table.num_ready, table.num_awaited) == (len(ready), len(mine))
+        assert table.pending() == (len(ready), len(ready) + len(mine))
+        for host in range(num_hosts):
+            here = [int(np.sum(self.host_of[found] == host)) for found in (ready, mine)]
+            assert table.pending(self.host_of == host) == (here[0], sum(here))
+        assert table.owed(np.arange(len(slots))).tolist() == busy
+        not_idle = [slot for slot, asked in enumerate(slots) if asked.state is not State.IDLE]
+        assert table.first_not_idle(np.arange(len(slots))) == (not_idle[0] if not_idle else None)
+
+    @invariant()
+    def tickets_know_what_is_outstanding(self) -> None:
+        for claim in self.claims:
+            busy = [slot for slot in claim.slots if self.slots[slot].state is State.BUSY]
+            assert claim.ticket.remaining == len(busy)
+            assert len(claim.ticket.faults) == claim.num_faults
+
+
+TestRequests = RequestsMachine.TestCase
+TestRequests.settings = settings(max_examples=100, stateful_step_count=30)

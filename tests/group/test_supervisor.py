@@ -1,0 +1,553 @@
+"""The life of hosts, with stand-ins for them: no process, no driver, and a clock of our own."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from group.fake_host import ACTION_SPACE, LAYOUT, OBSERVATION_SPACE, Running
+
+from rlightning_aio.config import EnvConfig
+from rlightning_aio.errors import ConfigError, EnvHung, GroupClosed, StartFailed, WorkerDied
+from rlightning_aio.group.env_table import EnvTable
+from rlightning_aio.group.requests import COLLECTOR, Requests
+from rlightning_aio.group.slab_layout import SlabLayout
+from rlightning_aio.group.supervisor import GivenUp, Replaced, Supervisor
+from rlightning_aio.hosts.arena import Arena
+from rlightning_aio.hosts.messages import (
+    Attached,
+    Built,
+    Closed,
+    Death,
+    Died,
+    EnvStarted,
+    ErrorText,
+    NotBuilt,
+)
+from rlightning_aio.protocol.entries import Operation
+from rlightning_aio.types import EnvMeta
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from rlightning_aio.group.wait import Procedure
+
+KILLED = Death("was killed by SIGKILL", -9)
+
+
+@dataclass
+class StandIn:
+    """See `hosts.base.Killable`. It does what the test says, and notes what it is told.
+
+    Attributes:
+        tell: takes its completions; log: takes what it is told.
+        builds, closes: it does so at once; otherwise not before it is killed.
+        dies: a kill works.
+        refusal: what a start raises.
+        close_errors: of its envs.
+        current: the entry that it executes, and since when (ns).
+    """
+
+    host_id: int
+    first_slot: int
+    num_envs: int
+    tell: Callable[[Any], None]
+    log: list[str]
+    builds: bool = True
+    closes: bool = True
+    dies: bool = True
+    refusal: OSError | None = None
+    close_errors: list[tuple[int, ErrorText]] = field(default_factory=list)
+    current: tuple[int, int] = (0, 0)
+    closing: bool = False
+
+    def start(self) -> None:
+        if self.refusal is not None:
+            raise self.refusal
+        self.log.append(f"start {self.host_id}")
+        if self.builds:
+            self.build()
+
+    def build(self) -> None:
+        metas = [
+            EnvMeta(
+                env_id=f"{self.host_id}.{k}",
+                observation_space=OBSERVATION_SPACE,
+                action_space=ACTION_SPACE,
+            )
+            for k in range(self.num_envs)
+        ]
+        started = [
+            EnvStarted(meta, LAYOUT, reads_extras=False, transforms_actions=False) for meta in metas
+        ]
+        self.tell(Built(self.host_id, started))
+
+    def attach(self, order: Any) -> None:
+        self.log.append(f"attach {self.host_id}")
+        assert len(order.rows) == self.num_envs
+        self.tell(Attached(self.host_id))
+
+    def executing(self) -> tuple[int, int]:
+        return self.current
+
+    def kill(self, *, dump: bool) -> None:
+        self.log.append(f"dump and kill {self.host_id}" if dump else f"kill {self.host_id}")
+        if self.dies:
+            self.end()
+
+    def end(self) -> None:
+        self.current = (0, 0)
+        ended = Closed(self.host_id, self.close_errors) if self.closing else None
+        self.tell(ended or Died(self.host_id, KILLED))
+
+    def close(self) -> None:
+        self.log.append(f"close {self.host_id}")
+        self.closing = True
+        if self.closes:
+            self.end()
+
+    def release(self) -> None:
+        self.log.append(f"release {self.host_id}")
+
+
+class Fleet:
+    """A supervisor over stand-ins, what the core would do for it, and a clock.
+
+    Args:
+        counts: envs of each host.
+
+    Attributes:
+        verdicts: what became of each death.
+    """
+
+    def __init__(self, counts: tuple[int, ...] = (1, 1), **fields: Any) -> None:
+        self.now = 1000.0
+        self.told: deque[Any] = deque()
+        self.log: list[str] = []
+        self.verdicts: list[GivenUp | Replaced | None] = []
+        self.running: list[Running] = []
+        config = EnvConfig(
+            **{"name": "e", "backend": "gymnasium", "task": "x", "start_timeout": 10.0, **fields}
+        )
+        size = sum(counts)
+        envs = EnvTable([config] * size, [f"e-{slot}" for slot in range(size)])
+        self.requests = Requests(np.repeat(np.arange(len(counts)), counts), len(counts))
+        self.supervisor = Supervisor(
+            envs, self.requests, SlabLayout(size), Arena(), mixed_actions=False, num_cores=1
+        )
+        self.hosts: list[StandIn] = []
+        for host_id, count in enumerate(counts):
+            host = StandIn(host_id, sum(counts[:host_id]), count, self.told.append, self.log)
+            self.hosts.append(host)
+            self.supervisor.add(host, config)
+
+    def begin(self, procedure: Procedure[Any]) -> Running:
+        running = Running(procedure)
+        self.running.append(running)
+        running.go_on(None)
+        self.turn()
+        return running
+
+    def turn(self) -> None:
+        """What a driver does until nothing is told and no time has come."""
+        for _ in range(50):
+            self.drain()
+            due = [running for running in self.running if running.is_due(self.now)]
+            if not due:
+                return
+            for running in due:
+                running.go_on(self.now)
+        raise AssertionError("the supervisor turns in circles instead of waiting")
+
+    def drain(self) -> None:
+        """As the core does; what is owed is asked anew of a replacement."""
+        while self.told:
+            told = self.told.popleft()
+            for running in self.running:
+                running.woken = True
+            if not isinstance(told, Died):
+                self.supervisor.handle(told)
+                continue
+            verdict = self.supervisor.bury(told)
+            self.verdicts.append(verdict)
+            if isinstance(verdict, Replaced):
+                self.requests.restart(verdict.owed)
+                assert len(list(self.requests.by_host(verdict.owed))) <= 1
+            elif verdict is not None:
+                self.requests.fail(verdict.owed, COLLECTOR, verdict.error_for(verdict.owed))
+
+    def start(self) -> Running:
+        return self.begin(self.supervisor.start(self.now))
+
+    def pass_time(self, seconds: float) -> None:
+        self.now += seconds
+        self.turn()
+
+    def ask(self, *slots: int) -> list[int]:
+        """Send steps; their entries."""
+        asked = np.array(slots)
+        entries = self.requests.submit(asked, Operation.STEP, COLLECTOR, self.now)
+        assert list(self.requests.by_host(asked))
+        return entries.tolist()
+
+    def check(self) -> None:
+        self.supervisor.check(self.now)
+        self.drain()
+
+    def die(self, host_id: int, *requests: int) -> GivenUp | Replaced | None:
+        """A worker dies while it executes `requests`; what becomes of that."""
+        self.told.append(Died(host_id, Death(KILLED.cause, -9, "last words", requests)))
+        self.drain()
+        return self.verdicts[-1]
+
+    def reply(self, slot: int) -> None:
+        """A step is done, and collected."""
+        host_id = self.requests.host_of(slot)
+        assert self.requests.complete_one(host_id, self.requests.entry.item(slot)) == slot
+        self.requests.hand_out(self.requests.take(1))
+        self.supervisor.note_step(slot)
+
+    def close(self) -> Running:
+        return self.begin(self.supervisor.close(self.now))
+
+
+@pytest.fixture
+def fleet() -> Iterator[Callable[..., Fleet]]:
+    """Makes fleets, which are up unless the test has to start them; and closes them."""
+    made: list[Fleet] = []
+
+    def make(counts: tuple[int, ...] = (1, 1), *, up: bool = True, **fields: Any) -> Fleet:
+        made.append(Fleet(counts, **fields))
+        if up:
+            made[-1].start().result()
+            made[-1].log.clear()
+        return made[-1]
+
+    yield make
+    for fleet in made:
+        closing = fleet.close()
+        fleet.pass_time(5)
+        fleet.pass_time(5)
+        assert closing.done
+
+
+# -- start
+
+
+def test_all_are_started_before_any_is_waited_for(fleet: Callable[..., Fleet]) -> None:
+    """Rows are known, and given, when the last is built; metas come in the order of slots."""
+    ours = fleet((2, 1, 1), up=False)
+    ours.hosts[1].builds = False
+    start = ours.start()
+    assert ours.log == ["start 0", "start 1", "start 2"]
+    assert start.until == ours.now + 10
+    ours.now += 3
+    ours.hosts[1].build()
+    ours.turn()
+    assert ours.log[3:] == ["attach 0", "attach 1", "attach 2"]
+    metas = start.result()
+    assert [meta.env_id for meta in metas] == ["0.0", "0.1", "1.0", "2.0"]
+    assert ours.start().result() is metas
+    assert len(ours.log) == 6
+
+
+@pytest.mark.parametrize("dies", [True, False])
+def test_a_late_one_is_dumped_killed_and_given_up(fleet: Callable[..., Fleet], dies: bool) -> None:
+    """It has a second to write its stacks; then the start fails, whether or not it has died."""
+    ours = fleet(up=False)
+    ours.hosts[1].builds = ours.hosts[1].closes = False
+    ours.hosts[1].dies = dies
+    start = ours.start()
+    ours.pass_time(9.9)
+    assert ours.log == ["start 0", "start 1"]
+    ours.pass_time(0.1)
+    assert ours.log[2] == "dump and kill 1"
+    if not dies:
+        assert ours.log[3:] == []
+        assert start.until == ours.now + 1
+        ours.pass_time(1)
+        assert ours.log[3:] == ["close 0", "close 1"]
+        ours.pass_time(1.5)
+        assert ours.log[5:] == ["kill 1"]
+        ours.pass_time(0.3)
+    assert ours.log[-2:] == ["release 0", "release 1"]
+    with pytest.raises(StartFailed, match=r"env 'e-1' .* did not start within 10.0 s"):
+        start.result()
+
+
+def test_a_host_that_cannot_be_started_fails_the_start(fleet: Callable[..., Fleet]) -> None:
+    """Those before it are closed, those behind it were never started."""
+    ours = fleet((1, 1, 1), up=False)
+    ours.hosts[1].refusal = OSError("no such program")
+    with pytest.raises(StartFailed, match="entry 'e': no such program; check its `interpreter`"):
+        ours.start().result()
+    assert "start 2" not in ours.log
+    assert "close 2" not in ours.log
+    assert ours.log[-3:] == ["release 0", "release 1", "release 2"]
+
+
+@pytest.mark.parametrize(
+    ("type_name", "kind"),
+    [("ValueError", StartFailed), ("rlightning_aio.errors.ConfigError", ConfigError)],
+)
+def test_an_env_that_cannot_be_built_fails_the_start(
+    fleet: Callable[..., Fleet], type_name: str, kind: type[Exception]
+) -> None:
+    """What is wrong with a config keeps its type; all else names the env."""
+    ours = fleet((1, 2), up=False)
+    ours.hosts[1].builds = False
+    start = ours.start()
+    ours.told.append(NotBuilt(1, 1, ErrorText(type_name, "no licence", "Traceback\n")))
+    ours.turn()
+    with pytest.raises(kind, match="no licence") as caught:
+        start.result()
+    assert kind is ConfigError or "env 'e-2'" in str(caught.value)
+    assert "close 0" in ours.log
+
+
+def test_a_death_in_the_start_fails_it(fleet: Callable[..., Fleet]) -> None:
+    """Nothing is replaced before it has worked once; its last words are told."""
+    ours = fleet(up=False)
+    ours.hosts[0].builds = False
+    start = ours.start()
+    assert ours.die(0) is None
+    ours.turn()
+    with pytest.raises(StartFailed, match=r"(?s)'e-0'.* SIGKILL while it started.*last words"):
+        start.result()
+
+
+def test_closing_ends_a_start(fleet: Callable[..., Fleet]) -> None:
+    """Whoever starts it is told."""
+    ours = fleet(up=False)
+    ours.hosts[0].builds = False
+    start = ours.start()
+    assert ours.close().done
+    ours.turn()
+    with pytest.raises(GroupClosed, match="closed while it was starting"):
+        start.result()
+    with pytest.raises(GroupClosed, match="build a new one"):
+        ours.start().result()
+
+
+# -- hangs
+
+
+def test_an_env_that_executes_too_long_is_killed(fleet: Callable[..., Fleet]) -> None:
+    """After its limit, once, with a dump; the error says which env and how long."""
+    ours = fleet((1, 2), step_timeout=5.0)
+    entries = ours.ask(1, 2)
+    ours.hosts[1].current = (entries[1], int(ours.now * 1e9))
+    ours.hosts[1].dies = False
+    assert ours.supervisor.next_check() == pytest.approx(ours.now + 5)
+    ours.now += 4.9
+    ours.check()
+    assert ours.log == []
+    ours.now += 0.2
+    ours.check()
+    ours.check()
+    assert ours.log == ["dump and kill 1"]
+    verdict = ours.die(1)
+    assert isinstance(verdict, Replaced)
+    assert verdict.cause == "hung in a step and was killed"
+    error = verdict.error_for(verdict.owed)
+    assert isinstance(error, EnvHung)
+    assert (error.env_id, error.env_ids) == ("e-2", ("e-1", "e-2"))
+    assert "took longer than 5.0 s for a step" in str(error)
+
+
+def test_a_stopped_process_is_found_by_its_doing_nothing(fleet: Callable[..., Fleet]) -> None:
+    """It owes a reply and executes none; every reply begins its time anew."""
+    ours = fleet((2, 1), step_timeout=5.0)
+    ours.ask(0, 1)
+    ours.check()
+    ours.now += 4
+    ours.reply(0)
+    ours.check()
+    ours.now += 4.9
+    ours.check()
+    assert ours.log == []
+    ours.now += 0.2
+    ours.check()
+    assert ours.log[0] == "dump and kill 0"
+    (verdict,) = ours.verdicts
+    assert isinstance(verdict, Replaced)
+    assert verdict.owed.tolist() == [1]
+    assert verdict.error_for(verdict.owed).env_id == "e-1"
+
+
+def test_what_has_no_limit_may_take_for_ever(fleet: Callable[..., Fleet]) -> None:
+    """So may a call, and a reset where steps alone have a limit."""
+    free, limited = fleet(), fleet(step_timeout=5.0)
+    for ours in (free, limited):
+        (entry,) = ours.ask(0)
+        if ours is limited:
+            assert ours.requests.end(0, entry) == 0
+            ours.requests.withdraw(0)
+            ours.requests.submit(np.array([0]), Operation.RESET, COLLECTOR, ours.now)
+            assert list(ours.requests.by_host(np.array([0])))
+            entry = ours.requests.entry.item(0)
+        ours.hosts[0].current = (entry, int(ours.now * 1e9))
+        ours.now += 1e6
+        ours.check()
+        assert ours.log == []
+
+
+# -- deaths
+
+
+def test_a_dead_host_is_replaced(fleet: Callable[..., Fleet]) -> None:
+    """It is started, and given its rows again; what it owed is told, and owed no more by it."""
+    ours = fleet((1, 3))
+    entries = ours.ask(1, 3)
+    ours.told.append(Died(1, Death("left", 3, "last words", (entries[1],))))
+    verdict = ours.supervisor.bury(ours.told.popleft())
+    assert isinstance(verdict, Replaced)
+    assert (verdict.host, verdict.owed.tolist(), verdict.cause) == (ours.hosts[1], [1, 3], "left")
+    assert ours.requests.in_flight == [0, 0]
+    assert ours.log == ["start 1", "attach 1"]
+    assert ours.supervisor.recovering
+    error = verdict.error_for(np.array([1]))
+    assert (error.env_id, error.env_ids, error.exit_code) == ("e-3", ("e-1",), 3)
+    assert "restart 1 of 3 in a row" in str(error)
+    assert str(error).endswith("last words")
+
+
+@pytest.mark.parametrize(
+    ("fields", "why"),
+    [
+        ({"on_worker_death": "raise"}, "on_worker_death is 'raise', so it is not replaced"),
+        ({"max_restarts": 0}, r"not replaced after 0 restarts in a row \(max_restarts\)"),
+    ],
+)
+def test_a_dead_host_may_be_given_up(
+    fleet: Callable[..., Fleet], fields: dict[str, Any], why: str
+) -> None:
+    """Whoever asks its envs from then on is told why, and the others can be used."""
+    ours = fleet((2, 1), **fields)
+    ours.ask(1, 2)
+    verdict = ours.die(0)
+    assert isinstance(verdict, GivenUp)
+    assert (verdict.host, verdict.owed.tolist()) == (ours.hosts[0], [1])
+    assert ours.log == []
+    with pytest.raises(WorkerDied, match=why):
+        raise ours.requests.faults[0]
+    with pytest.raises(WorkerDied, match=why):
+        ours.supervisor.check_usable(np.array([2, 0]))
+    ours.supervisor.check_usable(np.array([2]))
+    ours.supervisor.note_recovery(any_telling=False)
+    assert not ours.supervisor.recovering
+
+
+def test_restarts_are_counted_for_each_culprit(fleet: Callable[..., Fleet]) -> None:
+    """Neighbours don't add up; an env that completes a step is forgiven, and it alone."""
+    ours = fleet((2,), max_restarts=2)
+    for slot in (0, 1, 0, 1):
+        (entry,) = ours.ask(slot)
+        assert isinstance(ours.die(0, entry), Replaced)
+        # Its replacement's reset: that shows nothing yet.
+        assert ours.requests.complete_one(0, ours.requests.entry.item(slot)) == slot
+        ours.requests.hand_out(ours.requests.take(1))
+    ours.ask(0)
+    ours.reply(0)
+    (entry,) = ours.ask(0)
+    assert isinstance(ours.die(0, entry), Replaced)
+    ours.reply(0)
+    (entry,) = ours.ask(1)
+    assert isinstance(ours.die(0, entry), GivenUp)
+
+
+def test_a_replacement_that_cannot_be_started_counts_as_a_death(
+    fleet: Callable[..., Fleet],
+) -> None:
+    """Until it is given up; there is no end to it otherwise."""
+    ours = fleet(max_restarts=3)
+    ours.hosts[0].refusal = OSError("no more processes")
+    ours.ask(0)
+    verdict = ours.die(0)
+    assert isinstance(verdict, GivenUp)
+    error = str(verdict.error_for(verdict.owed))
+    assert "could not be replaced" in error
+    assert "no more processes" in error
+    assert "after 3 restarts" in error
+
+
+def test_a_replacement_that_cannot_be_built_is_killed(fleet: Callable[..., Fleet]) -> None:
+    """Its death says what was wrong; so does that of one that is late."""
+    ours = fleet(max_restarts=2)
+    ours.hosts[0].builds = False
+    ours.ask(0)
+    ours.die(0)
+    ours.told.append(NotBuilt(0, 0, ErrorText("ValueError", "no licence", "")))
+    ours.drain()
+    assert ours.log == ["start 0", "attach 0", "kill 0", "start 0", "attach 0"]
+    assert isinstance(ours.verdicts[1], Replaced)
+    assert ours.verdicts[1].cause == "could not be rebuilt: ValueError: no licence"
+
+
+def test_a_replacement_that_is_late_is_killed(fleet: Callable[..., Fleet]) -> None:
+    """With a dump, and by the clock of its own start."""
+    ours = fleet(max_restarts=1)
+    ours.hosts[0].attach = lambda _: None  # type: ignore[method-assign]
+    ours.ask(0)
+    ours.now += 50
+    ours.check()
+    ours.die(0)
+    assert ours.supervisor.next_check() == ours.now + 10
+    ours.now += 10
+    ours.check()
+    assert ours.log == ["start 0", "dump and kill 0"]
+    assert isinstance(ours.verdicts[1], GivenUp)
+    assert "did not start again within 10.0 s" in str(ours.requests.faults[0])
+
+
+# -- close
+
+
+def test_closing_kills_what_takes_too_long(fleet: Callable[..., Fleet]) -> None:
+    """After a second and a half, without a dump; errors are told with ids."""
+    ours = fleet((2, 2))
+    stuck = ErrorText("ValueError", "stuck", "")
+    ours.hosts[0].close_errors = [(1, stuck)]
+    ours.hosts[1].closes, ours.hosts[1].close_errors = False, [(0, stuck)]
+    closing = ours.close()
+    assert ours.log == ["close 0", "close 1"]
+    with pytest.raises(GroupClosed):
+        ours.supervisor.check_open()
+    ours.pass_time(1.4)
+    assert not closing.done
+    ours.pass_time(0.1)
+    assert closing.done
+    assert ours.log[2:] == ["kill 1", "release 0", "release 1"]
+    assert ours.supervisor.close_errors == [("e-1", stuck), ("e-2", stuck)]
+    assert ours.close().done
+    assert len(ours.log) == 5
+
+
+def test_closing_never_hangs(fleet: Callable[..., Fleet]) -> None:
+    """Not even with what can't be killed."""
+    ours = fleet()
+    ours.hosts[0].closes = ours.hosts[0].dies = False
+    closing = ours.close()
+    ours.pass_time(1.5)
+    ours.pass_time(0.2)
+    assert not closing.done
+    ours.pass_time(0.1)
+    assert closing.done
+    assert ours.log[-3:] == ["kill 0", "release 0", "release 1"]
+
+
+def test_a_death_while_closing_is_an_end_like_any_other(fleet: Callable[..., Fleet]) -> None:
+    """Nothing is replaced, and nobody waits for more; what was given up is closed already."""
+    ours = fleet((1, 1), max_restarts=0)
+    assert isinstance(ours.die(1), GivenUp)
+    ours.hosts[0].closes = False
+    closing = ours.close()
+    assert ours.die(0) is None
+    ours.turn()
+    assert closing.done
+    assert ours.log == ["close 0", "release 0", "release 1"]
+    with pytest.raises(GroupClosed, match="while this call was waiting"):
+        ours.check()

@@ -1,0 +1,448 @@
+"""A process host and its link: what comes by rings, by the channel, and from the fork server."""
+
+from __future__ import annotations
+
+import pickle
+import signal
+from collections import deque
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from rlightning_aio.config import EnvConfig
+from rlightning_aio.hosts.arena import Arena, map_shared
+from rlightning_aio.hosts.base import Wiring
+from rlightning_aio.hosts.messages import (
+    Attached,
+    AttachOrder,
+    Built,
+    Closed,
+    Died,
+    ErrorText,
+    NewSchema,
+    NotBuilt,
+    Raised,
+    Reported,
+    Result,
+    StartOrder,
+    Value,
+)
+from rlightning_aio.hosts.process import ForkServer, ProcessHost, _surroundings
+from rlightning_aio.protocol.bell import TrainerBell, WorkerBell, bell_size
+from rlightning_aio.protocol.entries import Operation, entry
+from rlightning_aio.protocol.frames import BELL, FrameKind, FrameReader, encode
+from rlightning_aio.protocol.info import InfoSchema
+from rlightning_aio.protocol.rings import WorkerRings, rings_size
+
+if TYPE_CHECKING:
+    import socket
+    from collections.abc import Iterator
+
+    from rlightning_aio.hosts.fork_server import Fork
+
+CONFIG = EnvConfig(name="two", backend="gymnasium", task="CartPole-v1", num_workers=2)
+SCHEMA = InfoSchema.of({"x": 1.5})
+
+
+class StandIn(ForkServer):
+    """Starts nothing; notes what it is asked."""
+
+    def __init__(self) -> None:
+        self.orders: list[Fork] = []
+        self.channels: list[socket.socket] = []
+        self.killed: list[bool] = []
+
+    def fork(self, host: ProcessHost, channel: socket.socket, arena: Arena, order: Fork) -> None:
+        self.orders.append(order)
+        self.channels.append(channel)
+
+    def kill(self, host: ProcessHost, *, dump: bool) -> None:
+        self.killed.append(dump)
+
+
+class Scene:
+    """A host of two envs, its watcher, and the other ends of what it shares with its worker."""
+
+    def __init__(self) -> None:
+        self.completions: Any = deque()
+        self.arena = Arena()
+        self.bell_offset = self.arena.append(bell_size(1))
+        memory = map_shared(self.arena.descriptor, self.bell_offset, bell_size(1))
+        self.bell = TrainerBell(memory, 1)
+        self.fork_server = StandIn()
+        self.watched: list[Any] = []
+        self.writable: set[Any] = set()
+        wiring = Wiring(
+            completions=self.completions,
+            watcher=self,
+            arena=self.arena,
+            bell=self.bell,
+            bell_offset=self.bell_offset,
+            num_hosts=1,
+            configs=[CONFIG],
+            objection=lambda meta: None,
+            is_idle=lambda slot: True,
+            resources={(ForkServer, *_surroundings(CONFIG)): self.fork_server},
+        )
+        order = StartOrder(CONFIG, None, (0, 1), (None, None), spins=False, core=None)
+        self.host = ProcessHost(0, 0, order, wiring)
+        self.rung = 0
+
+    # -- a watcher
+
+    def watch(self, source: Any) -> None:
+        self.watched.append(source)
+
+    def unwatch(self, source: Any) -> None:
+        self.watched.remove(source)
+        self.writable.discard(source)
+
+    def watch_writable(self, source: Any, wanted: bool) -> None:
+        (self.writable.add if wanted else self.writable.discard)(source)
+
+    def wake(self) -> None: ...
+
+    # -- a worker
+
+    def start(self) -> None:
+        self.host.start()
+        place = self.fork_server.orders[-1].place
+        bell_memory = map_shared(self.arena.descriptor, place.bell_offset, bell_size(1))
+        size = rings_size(place.num_envs)
+        memory = map_shared(self.arena.descriptor, place.rings_offset, size)
+        self.rings = WorkerRings(memory, place.num_envs, WorkerBell(bell_memory, 1, place.host_id))
+        self.frames = FrameReader()
+
+    @property
+    def channel(self) -> socket.socket:
+        return self.fork_server.channels[-1]
+
+    def send(self, kind: FrameKind, number: int = 0, payload: bytes = b"") -> None:
+        self.channel.send(encode(kind, number, payload))
+        self.rings.count_frame()
+
+    def serve(self, *in_rows: int) -> None:
+        """Execute what waits; all of it is reported, or only some."""
+        self.rings.serve(lambda one: not in_rows or one in in_rows, self.ring)
+
+    def ring(self) -> None:
+        self.rung += 1
+        self.channel.send(BELL)
+
+    def received(self) -> list[Any]:
+        """Frames from the trainer."""
+        return self.frames.feed(self.channel.recv(1 << 20))
+
+    # -- the trainer
+
+    def read(self) -> None:
+        """As the driver does when the channel is readable."""
+        for source in list(self.watched):
+            source.on_readable()
+
+    def told(self) -> list[Any]:
+        """What the host has told since the last time; entries of reports as lists."""
+        found = [
+            ("reported", one.entries.tolist()) if isinstance(one, Reported) else one
+            for one in self.completions
+        ]
+        self.completions.clear()
+        return found
+
+    def close(self) -> None:
+        self.host.release()
+        assert not self.watched
+        for channel in self.fork_server.channels:
+            channel.close()
+        self.arena.close()
+        # What is mapped holds the arena, too.
+        self.bell.release()
+        vars(self).pop("rings", None)
+
+
+@pytest.fixture
+def scene() -> Iterator[Scene]:
+    scene = Scene()
+    yield scene
+    scene.close()
+
+
+@pytest.fixture
+def started(scene: Scene) -> Scene:
+    scene.start()
+    return scene
+
+
+def step(number: int, slot: int) -> int:
+    return entry(number, slot, Operation.STEP)
+
+
+def steps(number: int) -> np.ndarray:
+    return np.array([step(number, slot) for slot in range(2)])
+
+
+# -- rings and channel
+
+
+def test_a_bell_that_is_read_along_with_a_frame_can_be_ordered_again(started: Scene) -> None:
+    """Whoever takes it for a part of the frame's news hears the next one all the same."""
+    scene, bell = started, started.bell
+    for number in (1, 2, 3):
+        scene.host.submit(steps(number))
+        bell.arm(bell.goal(2), 256)
+        assert bell.unread() == 0
+        scene.serve()
+        assert scene.rung == number
+        scene.send(FrameKind.INFO_SCHEMA, number, pickle.dumps(SCHEMA))
+        # Not by the channel: something else has woken the trainer.
+        scene.host.poll()
+        assert scene.told() == [
+            NewSchema(0, number, SCHEMA),
+            ("reported", steps(number).tolist()),
+        ]
+        assert bell.unread() == 0
+
+
+def test_reports_come_after_the_frames_that_were_sent_before_them(started: Scene) -> None:
+    """A row can be read only by a schema that is known, however the trainer comes to look."""
+    for number, look in ((1, started.host.poll), (2, started.read)):
+        started.host.submit(steps(number))
+        started.send(FrameKind.INFO_SCHEMA, number, pickle.dumps(SCHEMA))
+        started.send(FrameKind.RESULT, step(number, 0), b"beside")
+        started.serve(step(number, 1))
+        look()
+        assert started.told() == [
+            NewSchema(0, number, SCHEMA),
+            Result(0, step(number, 0), b"beside"),
+            ("reported", [step(number, 1)]),
+        ]
+
+
+def test_a_frame_alone_waits_for_the_channel_to_be_read(started: Scene) -> None:
+    """It wakes the trainer by itself; looking for reports costs no system call."""
+    started.host.submit(steps(1))
+    started.send(FrameKind.RESULT, step(1, 0), b"beside")
+    started.host.poll()
+    assert started.told() == []
+    started.read()
+    assert started.told() == [Result(0, step(1, 0), b"beside")]
+
+
+def test_a_frame_in_pieces_is_told_when_it_is_whole(started: Scene) -> None:
+    """What is reported meanwhile was sent before it."""
+    frame = encode(FrameKind.RESULT, step(1, 0), b"beside")
+    started.host.submit(steps(1))
+    started.channel.send(frame[:20])
+    started.serve(step(1, 1))
+    started.read()
+    assert started.told() == [("reported", [step(1, 1)])]
+    started.channel.send(frame[20:])
+    started.rings.count_frame()
+    started.read()
+    assert started.told() == [Result(0, step(1, 0), b"beside")]
+
+
+def test_each_frame_is_told_as_what_it_is(started: Scene) -> None:
+    """What can't be unpickled is the request's own failure."""
+    error = ErrorText("ValueError", "text", "traceback")
+    broken = b"\x80not a pickle"
+    for kind, number, payload, expected in (
+        (FrameKind.STARTED, 0, pickle.dumps(["s"]), Built(0, ["s"])),
+        (FrameKind.START_ERROR, 1, pickle.dumps(error), NotBuilt(0, 1, error)),
+        (FrameKind.ATTACHED, 0, b"", Attached(0)),
+        (FrameKind.VALUE, step(3, 1), pickle.dumps(7), Value(0, step(3, 1), 7)),
+        (FrameKind.ERROR, step(3, 1), pickle.dumps(error), Raised(0, step(3, 1), error)),
+    ):
+        started.send(kind, number, payload)
+        started.read()
+        assert started.told() == [expected]
+    started.send(FrameKind.VALUE, step(4, 0), broken)
+    started.send(FrameKind.STARTED, 0, broken)
+    started.read()
+    raised, not_built = started.told()
+    assert (type(raised), raised.entry) == (Raised, step(4, 0))
+    assert (type(not_built), not_built.env_index) == (NotBuilt, 0)
+
+
+def test_requests_go_by_the_ring_or_the_channel_as_they_have_to(started: Scene) -> None:
+    """A worker that sleeps is rung for either, and told of a frame when all of it is there."""
+    (start,) = started.received()
+    assert start.kind == FrameKind.START
+    started.rings.frame_seen()
+    assert started.rings.fall_asleep()
+    started.host.submit(steps(1))
+    assert started.channel.recv(1 << 16) == BELL
+    started.rings.wake_up()
+    assert started.rings.requests() == steps(1).tolist()
+    packed = started.host.packed((3, {"x": 1}))
+    started.host.submit(steps(2)[:1], [packed])
+    assert started.rings.has_frame()
+    (frame,) = started.received()
+    assert (frame.kind, frame.number) == (FrameKind.REQUEST, step(2, 0))
+    assert pickle.loads(frame.payload) == (3, {"x": 1})
+
+
+def test_what_the_channel_does_not_take_at_once_is_written_later(started: Scene) -> None:
+    """In order; the worker is told of nothing that is not there yet."""
+    started.received()
+    started.rings.frame_seen()
+    large = bytes(3 << 20)
+    started.host.submit(steps(1), [large, b"small"])
+    (link,) = started.writable
+    assert not started.rings.has_frame()
+    found: list[Any] = []
+    while len(found) < 2:
+        found += started.received()
+        if started.writable:
+            link.on_writable()
+    assert [(f.number, len(f.payload)) for f in found] == [
+        (step(1, 0), len(large)),
+        (step(1, 1), 5),
+    ]
+    assert not started.writable
+    for _ in range(2):
+        assert started.rings.has_frame()
+        started.rings.frame_seen()
+    assert not started.rings.has_frame()
+
+
+# -- life
+
+
+def test_a_start_forks_a_worker_and_says_what_to_build(scene: Scene) -> None:
+    """And where its rings and its bell are."""
+    scene.start()
+    (order,) = scene.fork_server.orders
+    place = order.place
+    assert (place.host_id, place.num_hosts, place.first_slot, place.num_envs) == (0, 1, 0, 2)
+    assert place.bell_offset == scene.bell_offset
+    scene.host.attach(AttachOrder((), ()))
+    start, attach = scene.received()
+    assert pickle.loads(start.payload).worker_indices == (0, 1)
+    assert pickle.loads(attach.payload) == AttachOrder((), ())
+
+
+def test_a_death_is_told_once_with_what_may_have_been_its_last_request(started: Scene) -> None:
+    """What the worker had said before comes first; what is unanswered is all among the last."""
+    started.host.submit(steps(1))
+    started.serve()
+    started.host.submit(steps(2))
+    started.send(FrameKind.INFO_SCHEMA, 1, pickle.dumps(SCHEMA))
+    started.rings.begin(step(2, 1), 5)
+    assert started.host.executing() == (step(2, 1), 5)
+    started.channel.close()
+    started.read()
+    started.host.on_exit(-signal.SIGSEGV, "last words")
+    schema, reported, died = started.told()
+    assert schema == NewSchema(0, 1, SCHEMA)
+    assert reported == ("reported", steps(1).tolist())
+    assert isinstance(died, Died)
+    assert died.death.cause == "was killed by SIGSEGV"
+    assert (died.death.exit_code, died.death.stderr_tail) == (-signal.SIGSEGV, "last words")
+    assert died.death.requests == (step(2, 1), *steps(1).tolist(), *steps(2).tolist())
+    started.host.on_exit(0, "")
+    started.host.on_fork_server_lost("it ended")
+    assert started.told() == []
+    assert not started.watched
+    assert started.host.executing() == (0, 0)
+    # Nobody is there to be asked, which is no fault of the asker.
+    started.host.submit(steps(3))
+    started.host.poll()
+    assert started.told() == []
+
+
+@pytest.mark.parametrize(
+    ("exit_code", "cause"),
+    [
+        (3, "exited with code 3"),
+        (-9, "was killed by SIGKILL (if"),
+        (-250, "was killed by signal 250"),
+    ],
+)
+def test_a_cause_of_death_is_put_in_words(started: Scene, exit_code: int, cause: str) -> None:
+    """Signals by their names."""
+    started.host.on_exit(exit_code, "")
+    (died,) = started.told()
+    assert died.death.cause.startswith(cause)
+
+
+def test_workers_end_with_their_fork_server(started: Scene) -> None:
+    """Which says why, where it knows."""
+    started.host.on_fork_server_lost("it crashed")
+    (died,) = started.told()
+    assert died.death.cause == "ended with its fork server: it crashed"
+    assert died.death.exit_code is None
+
+
+def test_a_replacement_begins_anew(started: Scene) -> None:
+    """Neither reports nor frames of the worker before it are heard, and counting goes on right."""
+    bell, old = started.bell, started.channel
+    started.host.submit(steps(1))
+    started.serve(step(1, 0))
+    started.host.on_exit(1, "")
+    started.told()
+    started.host.submit(steps(2))
+    started.start()
+    assert started.rings.requests() == []
+    assert bell.unread() == 0
+    with pytest.raises(BrokenPipeError):
+        old.send(encode(FrameKind.RESULT, step(1, 1), b"late"))
+    started.host.submit(steps(3))
+    bell.arm(bell.goal(2), 256)
+    started.serve()
+    assert started.rung == 1
+    started.read()
+    assert started.told() == [("reported", steps(3).tolist())]
+
+
+def test_a_close_is_told_once_with_what_the_envs_have_raised(started: Scene) -> None:
+    """When the worker has gone, and not before."""
+    errors = [(1, ErrorText("ValueError", "text", "traceback"))]
+    started.host.close()
+    assert [frame.kind for frame in started.received()] == [FrameKind.START, FrameKind.CLOSE]
+    started.send(FrameKind.CLOSED, 0, pickle.dumps(errors))
+    started.read()
+    assert started.told() == []
+    started.host.on_exit(0, "")
+    assert started.told() == [Closed(0, errors)]
+    started.host.on_exit(0, "")
+    assert started.told() == []
+
+
+def test_who_dies_in_closing_has_closed_with_an_error(started: Scene) -> None:
+    """Of the env that it was about."""
+    started.host.close()
+    started.rings.begin(entry(0, 1, 0), 5)
+    started.host.on_exit(-signal.SIGSEGV, "last words")
+    (closed,) = started.told()
+    ((index, error),) = closed.errors
+    assert index == 1
+    assert error.text == "its worker was killed by SIGSEGV"
+    assert error.traceback == "last words"
+
+
+def test_who_does_not_close_in_time_is_said_to_have_been_killed(started: Scene) -> None:
+    """By us; only then is a SIGKILL no riddle."""
+    started.host.close()
+    started.host.kill(dump=True)
+    assert started.fork_server.killed == [True]
+    started.host.on_exit(-signal.SIGKILL, "")
+    (closed,) = started.told()
+    ((_, error),) = closed.errors
+    assert error.text == "its worker did not close in time and was killed"
+
+
+def test_a_host_without_a_worker_has_closed_at_once(started: Scene) -> None:
+    """After a death that nobody repaired."""
+    started.host.on_exit(1, "")
+    started.told()
+    started.host.close()
+    assert started.told() == [Closed(0, [])]
+
+
+def test_a_host_that_was_never_started_can_be_closed(scene: Scene) -> None:
+    """As when another one could not be."""
+    scene.host.close()
+    assert scene.told() == [Closed(0, [])]
+    scene.host.release()

@@ -1,0 +1,346 @@
+"""Rows: what one says of itself, by whichever way its result came there."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rlightning_aio.config import EnvConfig
+from rlightning_aio.envs.gymnasium import GymnasiumEnv
+from rlightning_aio.hosts.messages import NO_ACTION
+from rlightning_aio.hosts.row_writer import RowWriter, infos_out_of_band
+from rlightning_aio.hosts.runner import EnvRunner
+from rlightning_aio.protocol.entries import Operation
+from rlightning_aio.protocol.info import INFO_BYTES, NO_INFO, PICKLED, InfoSchema, InfoSchemas
+from rlightning_aio.protocol.slab import RowLayout, Slab
+
+if TYPE_CHECKING:
+    from rlightning_aio.types import Autoreset
+
+CONFIG = EnvConfig(name="plain", backend="gymnasium", task="x")
+SPACE = spaces.Box(-99, 99, (2,), np.float64)
+
+infos = st.one_of(
+    st.just({}),
+    st.fixed_dictionaries({"x": st.floats(-9, 9)}),
+    st.fixed_dictionaries({"x": st.integers(-9, 9), "where": st.just(np.arange(3.0))}),
+    # What doesn't fit a row: nested, a text, an int of more than 64 bits, and too much of it.
+    st.just({"nested": {"a": [1]}}),
+    st.just({"text": "hi"}),
+    st.just({"x": 1 << 70}),
+    st.just({"large": np.zeros(INFO_BYTES)}),
+)
+steps = st.tuples(st.integers(-9, 9), st.booleans(), st.booleans(), infos)
+histories = st.lists(
+    st.one_of(st.tuples(st.just("reset"), infos), st.tuples(st.just("step"), steps))
+)
+
+
+class Scripted(gym.Env[Any, Any]):
+    """Does what it was told to do next; its observation counts that."""
+
+    observation_space = SPACE
+    action_space = spaces.Discrete(3)
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.next: Any = None
+        self.seeds: list[int | None] = []
+
+    def _observation(self) -> Any:
+        self.count += 1
+        return np.array([self.count, -self.count], float)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        self.seeds.append(seed)
+        return self._observation(), self.next
+
+    def step(self, action: Any) -> Any:
+        reward, terminated, truncated, info = self.next
+        return self._observation(), reward, terminated, truncated, info
+
+
+class Plain(GymnasiumEnv):
+    def _make(self) -> Any:
+        return Scripted()
+
+
+def new_slab(layout: RowLayout, rows: int = 2) -> Slab:
+    return Slab(layout, memoryview(bytearray(layout.size(rows))), rows)
+
+
+class Row:
+    """Row 1 of a slab, and the schemas that its writer has announced."""
+
+    def __init__(self, layout: RowLayout) -> None:
+        self.slab = new_slab(layout)
+        self.schemas: dict[int, InfoSchema] = {}
+        self.announce = InfoSchemas(self.schemas.__setitem__).announce
+
+    def info(self, out_of_band: Any) -> Any:
+        mark = int(self.slab.info_mark[1])
+        if mark in (NO_INFO, PICKLED):
+            return (out_of_band or {}).get("info", {})
+        return self.schemas[mark].decode(memoryview(self.slab.info[1]))
+
+    def told(self, out_of_band: Any) -> str:
+        slab = self.slab
+        length = int(slab.episode_length[1])
+        return repr(
+            (
+                slab.observation[1],
+                slab.reward[1],
+                slab.flags[1],
+                length,
+                # Without a step there is nothing that it could be the sum of.
+                slab.episode_return[1] if length else None,
+                int(slab.info_mark[1]),
+                self.info(out_of_band),
+                out_of_band,
+            )
+        )
+
+
+def runner_and_row(*, inline: bool = False) -> tuple[EnvRunner, Scripted, Row]:
+    """A plain env that goes the short way."""
+    runner = EnvRunner(Plain(CONFIG), inline=inline)
+    row = Row(runner.layout)
+    runner.attach(row.slab, 1, row.announce)
+    return runner, runner.env.env, row
+
+
+@given(history=histories)
+def test_the_short_way_writes_what_the_long_way_does(history: list[Any]) -> None:
+    """Whatever happens: ends, steps after an end, resets at any time, infos of any kind."""
+    runner, env, row = runner_and_row()
+    long = Row(runner.layout)
+    writer = RowWriter(long.slab, 1, env_id="plain-0", autoreset="disabled", announce=long.announce)
+    for count, (what, then) in enumerate(history, 1):
+        observation = np.array([count, -count], float)
+        if what == "reset":
+            env.next = then
+            found = runner.reset_from_row()
+            writer.begin_episode(then)
+            expected = writer.write_data(observation, then)
+        else:
+            row.slab.action[1] = 2
+            env.next = then
+            found = runner.step()
+            reward, terminated, truncated, info = then
+            writer.write_ends(*writer.checked_ends(float(reward), terminated, truncated), info)
+            expected = writer.write_data(observation, info)
+        assert row.told(found) == long.told(expected)
+        assert not row.slab.flags[0].any()
+        assert row.slab.done_ns[1] >= row.slab.busy_ns[1] >= 0
+
+
+@given(history=histories, apart=st.sets(st.integers(0, 30)))
+def test_requests_out_of_band_count_as_those_in_the_row_do(
+    history: list[Any], apart: set[int]
+) -> None:
+    """An env may be asked in either way at any time; its episodes are the same."""
+    runner, env, row = runner_and_row()
+    other, other_env, other_row = runner_and_row()
+    for number, (what, then) in enumerate(history):
+        env.next = other_env.next = then
+        if what == "reset":
+            found = runner.reset_from_row()
+            op, arguments = Operation.RESET, (None, {})
+            in_row = other.reset_from_row
+        else:
+            found = runner.step()
+            op, arguments = Operation.STEP, (NO_ACTION, {})
+            in_row = other.step
+        expected = other.execute(op, arguments) if number in apart else in_row()
+        assert row.told(found) == other_row.told(expected)
+
+
+def test_the_seed_of_a_reset_is_the_one_in_the_row() -> None:
+    """Once; the next reset has none."""
+    runner, env, row = runner_and_row()
+    env.next = {}
+    row.slab.seed[1] = 7 + 1
+    runner.reset_from_row()
+    runner.reset_from_row()
+    assert env.seeds == [7, None]
+
+
+def test_what_an_inline_env_tells_may_be_kept() -> None:
+    """Its info may be the env's own dict, which goes on changing."""
+    runner, env, _ = runner_and_row(inline=True)
+    env.next = {"nested": {"list": [1]}}
+    out_of_band = runner.reset_from_row()
+    env.next["nested"]["list"].append(2)
+    assert out_of_band == {"info": {"nested": {"list": [1]}}}
+
+
+# -- what a row says, in each mode
+
+
+def said(slab: Slab, row: int = 0) -> list[Any]:
+    """is_reset, over, return and length; the return only where there is a length."""
+    lengths = slab.episode_length[row]
+    returns = np.where(lengths > 0, slab.episode_return[row], 0)
+    return [
+        slab.is_reset[row].tolist(),
+        slab.over[row].tolist(),
+        returns.tolist(),
+        lengths.tolist(),
+    ]
+
+
+def writer_of(
+    mode: Autoreset, head: tuple[int, ...], agents: tuple[str, ...] = (), **fields: Any
+) -> tuple[RowWriter, Slab]:
+    slab = new_slab(RowLayout(SPACE, spaces.Discrete(2), head, agents), 1)
+    fields = {"env_id": "e-0", "announce": infos_out_of_band, **fields}
+    return RowWriter(slab, 0, autoreset=mode, **fields), slab
+
+
+@pytest.mark.parametrize(
+    ("mode", "after_the_end", "then"),
+    [
+        # Nobody resets: what comes after belongs to no episode.
+        ("disabled", [[False, False], [False, True], [3, 0], [3, 0]],
+                     [[False, False], [False, True], [4, 0], [4, 0]]),
+        # The step after the end is a reset.
+        ("next_step", [[False, True], [False, False], [3, 0], [3, 0]],
+                      [[False, False], [False, False], [4, 1], [4, 1]]),
+        # The result of the end was the first observation of the next episode already.
+        ("same_step", [[False, False], [False, False], [3, 1], [3, 1]],
+                      [[False, False], [False, False], [4, 2], [4, 2]]),
+    ],
+)  # fmt: skip
+def test_a_row_says_what_it_is(mode: Autoreset, after_the_end: list[Any], then: list[Any]) -> None:
+    """Of two sub-environments the second ends in the second step."""
+    writer, slab = writer_of(mode, (2,))
+    writer.begin_episode({})
+    assert said(slab) == [[True] * 2, [False] * 2, [0] * 2, [0] * 2]
+    assert slab.reward[0].tolist() == [0, 0]
+    no = np.zeros(2, bool)
+    writer.write_ends(np.ones(2), no, no, {})
+    assert said(slab) == [[False] * 2, [False] * 2, [1] * 2, [1] * 2]
+    writer.write_ends(np.ones(2), np.array([False, True]), no, {})
+    assert said(slab) == [[False] * 2, [False, True], [2] * 2, [2] * 2]
+    assert slab.terminated[0].tolist() == [False, True]
+    writer.write_ends(np.ones(2), no, no, {})
+    assert said(slab) == after_the_end
+    writer.write_ends(np.ones(2), no, no, {})
+    assert said(slab) == then
+    writer.begin_episode({})
+    assert said(slab) == [[True] * 2, [False] * 2, [0] * 2, [0] * 2]
+
+
+def test_a_sub_environment_resets_itself_for_all_of_its_agents() -> None:
+    """Where only one of them has ended, the step is a step."""
+    writer, slab = writer_of("next_step", (2, 3), ("ann", "bob"))
+    writer.begin_episode({})
+    assert slab.is_reset[0].all()
+    no = np.zeros((2, 3), bool)
+    # Nobody ends in sub-environment 0, one agent in 1, both in 2.
+    writer.write_ends(np.ones((2, 3)), np.array([[0, 1, 1], [0, 0, 1]], bool), no, {})
+    assert not slab.is_reset[0].any()
+    writer.write_ends(np.ones((2, 3)), no, no, {})
+    assert slab.is_reset[0].tolist() == [[False, False, True]] * 2
+
+
+def test_sub_environments_that_take_turns_have_their_own_sums_in_the_row() -> None:
+    """Those that the result is about, in its order."""
+    writer, slab = writer_of("next_step", (2,), turns=4)
+    no = np.zeros(2, bool)
+    writer.begin_episode({"env_id": np.array([3, 1])})
+    assert said(slab) == [[True] * 2, [False] * 2, [0] * 2, [0] * 2]
+    writer.write_ends(np.ones(2), no, no, {"env_id": np.array([1, 2])})
+    # 2 is heard of for the first time: its first observation.
+    assert said(slab) == [[False, True], [False, False], [1, 0], [1, 0]]
+    writer.write_ends(
+        np.array([5.0, 6.0]), np.array([True, False]), no, {"env_id": np.array([2, 1])}
+    )
+    assert said(slab) == [[False, False], [True, False], [5, 7], [1, 2]]
+    writer.write_ends(np.ones(2), no, no, {"env_id": np.array([3, 2])})
+    assert said(slab) == [[False, True], [False, False], [1, 0], [1, 0]]
+
+
+# -- what has no place in the row
+
+
+def test_infos_that_do_not_fit_go_out_of_band() -> None:
+    """So do extras, and observations without a fixed size; the row holds the rest."""
+    row = Row(RowLayout(SPACE, spaces.Discrete(2), (), ()))
+    writer = RowWriter(row.slab, 1, env_id="e-0", autoreset="disabled", announce=row.announce)
+    observation = np.array([1.0, 2.0])
+    assert writer.write_data(observation, {"x": 1.5}) is None
+    assert row.info(None) == {"x": 1.5}
+    assert row.slab.observation[1].tolist() == [1, 2]
+    assert writer.write_data(observation, {}) is None
+    assert row.slab.info_mark[1] == NO_INFO
+    nested = {"nested": {"x": 1}}
+    assert writer.write_data(observation, nested) == {"info": nested}
+    assert row.slab.info_mark[1] == PICKLED
+    assert writer.write_data(observation, {}, {"e": 1}) == {"extra": {"e": 1}}
+    texts = Row(RowLayout(spaces.Text(9), spaces.Discrete(2), (), ()))
+    writer = RowWriter(texts.slab, 1, env_id="e-0", autoreset="disabled", announce=texts.announce)
+    assert writer.write_observation is None
+    assert writer.write_data("abc", {"x": 2.5}) == {"observation": "abc"}
+    assert texts.info(None) == {"x": 2.5}
+
+
+def test_who_announces_no_schemas_packs_no_infos() -> None:
+    """As an env_server, whose clients' infos come in bytes of their own."""
+    writer, slab = writer_of("disabled", ())
+    assert writer.write_data(np.zeros(2), {"x": 1.5}) == {"info": {"x": 1.5}}
+    assert slab.info_mark[0] == PICKLED
+
+
+def test_observations_that_are_handed_over_stay_out_of_the_row() -> None:
+    """They are copied where they stay in this process, for the env may go on writing to them."""
+    layout = RowLayout(SPACE, spaces.Discrete(2), (), (), observations_apart=True)
+    slab, observation = new_slab(layout, 1), np.array([1.0, 2.0])
+    writer = RowWriter(
+        slab, 0, env_id="e-0", autoreset="disabled", announce=infos_out_of_band, copies=True
+    )
+    found = writer.write_data(observation, {"x": [1]})
+    assert found is not None
+    observation[:] = 9
+    assert found["observation"].tolist() == [1, 2]
+    assert found["info"] == {"x": [1]}
+
+
+@pytest.mark.parametrize(
+    ("head", "agents", "value"),
+    [
+        ((), (), np.array([2.0])),
+        ((), (), np.float32(2)),
+        ((3,), (), [2, 2, 2]),
+        ((3,), (), np.full((3, 1), 2)),
+        ((2,), ("a", "b"), {"b": 2, "a": 2.0}),
+        ((2, 3), ("a", "b"), {"a": np.full(3, 2), "b": [2, 2, 2]}),
+    ],
+)
+def test_rewards_of_any_container_get_the_shape_of_the_row(
+    head: Any, agents: Any, value: Any
+) -> None:
+    """An axis of one too many is dropped."""
+    writer, slab = writer_of("disabled", head, agents)
+    ends = dict.fromkeys(agents, False) if agents else False
+    if head and not agents:
+        ends = np.zeros(head, bool)
+    if len(head) == 2:
+        ends = {agent: np.zeros(head[1], bool) for agent in agents}
+    writer.write_ends(*writer.checked_ends(value, ends, ends), {})
+    assert (slab.reward[0] == np.full(head, 2)).all()
+
+
+@pytest.mark.parametrize("what", ["reward", "terminated", "truncated"])
+def test_what_does_not_fit_is_named(what: str) -> None:
+    """With both shapes."""
+    writer, _ = writer_of("disabled", (3,))
+    good = {"reward": np.zeros(3), "terminated": np.zeros(3, bool), "truncated": np.zeros(3, bool)}
+    with pytest.raises(ValueError, match=rf"{what} of env 'e-0' has shape \(2,\), expected \(3,\)"):
+        writer.checked_ends(*{**good, what: np.zeros(2)}.values())

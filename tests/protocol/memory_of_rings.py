@@ -1,0 +1,28 @@
+"""Rings and bell of a group over plain memory."""
+
+from __future__ import annotations
+
+from rlightning_aio.protocol.bell import TrainerBell, WorkerBell, bell_size
+from rlightning_aio.protocol.rings import TrainerRings, WorkerRings, rings_size
+
+
+def both_sides(
+    num_envs: int, memory: memoryview | None = None
+) -> tuple[TrainerBell, TrainerRings, WorkerRings]:
+    """The trainer's side and the worker's, of a group of one worker.
+
+    Args:
+        num_envs: of the worker.
+        memory: `memory_size` zeroed bytes; None for some of this process.
+    """
+    if memory is None:
+        memory = memoryview(bytearray(memory_size(num_envs)))
+    ring, rings = memory[: bell_size(1)], memory[bell_size(1) :]
+    bell = TrainerBell(ring, 1)
+    trainer = TrainerRings(rings, num_envs, bell, 0)
+    return bell, trainer, WorkerRings(rings, num_envs, WorkerBell(ring, 1, 0))
+
+
+def memory_size(num_envs: int) -> int:
+    """Bytes of a group of one worker."""
+    return bell_size(1) + rings_size(num_envs)

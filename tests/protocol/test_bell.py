@@ -1,0 +1,315 @@
+"""The bell: somebody rings when there is enough, and nobody before."""
+
+from __future__ import annotations
+
+import itertools
+import mmap
+import os
+import random
+import select
+import socket
+from typing import Any, NoReturn
+
+import numpy as np
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+
+from rlightning_aio.protocol.bell import TrainerBell, WorkerBell, bell_size
+from rlightning_aio.protocol.entries import Operation, entry
+from rlightning_aio.protocol.rings import TrainerRings, WorkerRings, rings_size
+
+PACES = st.sampled_from([1, 2, 4, 256])
+
+
+class Worker:
+    """One worker between its memory accesses.
+
+    Attributes:
+        waiting: requests that it has still to execute; count: reports in this life.
+        looks: it is about to look at the order.
+        rung: orders that it has rung for in this life.
+    """
+
+    def __init__(self, bell: WorkerBell) -> None:
+        self.bell = bell
+        self.waiting = self.count = 0
+        self.looks = False
+        self.rung: list[tuple[int, int, int]] = []
+
+
+class BellMachine(RuleBasedStateMachine):
+    """A trainer that arms, disarms, reads and restarts, and workers that report and look.
+
+    Looks come between the events of others: what happens at the same time, happens here in
+    one order or another.
+    """
+
+    @initialize(num_workers=st.sampled_from([1, 2, 3, 12, 13, 20]))
+    def start(self, num_workers: int) -> None:
+        self.memory = memoryview(bytearray(bell_size(num_workers)))
+        self.trainer = TrainerBell(self.memory, num_workers)
+        self.workers = [self.new_worker(k) for k in range(num_workers)]
+        self.read = [0] * num_workers
+        # The order that stands: number of its kind of counting, sum to come to, pace.
+        self.order: tuple[int, int, int] | None = None
+        self.restarts = 0
+        self.rung = False
+
+    def new_worker(self, index: int) -> Worker:
+        num_workers = (len(self.memory) // 64) - 1
+        return Worker(WorkerBell(self.memory, num_workers, index))
+
+    def worker(self, data: st.DataObject, among: list[int] | None = None) -> Worker:
+        indices = range(len(self.workers)) if among is None else among
+        return self.workers[data.draw(st.sampled_from(list(indices)))]
+
+    def unread(self) -> list[int]:
+        return [w.count - read for w, read in zip(self.workers, self.read, strict=True)]
+
+    # -- the trainer
+
+    @rule(data=st.data(), count=st.integers(1, 5))
+    def submit(self, data: st.DataObject, count: int) -> None:
+        self.worker(data).waiting += count
+
+    @rule(wanted=st.integers(1, 12), pace=PACES)
+    def arm(self, wanted: int, pace: int) -> None:
+        goal = self.trainer.goal(wanted)
+        assert goal == sum(self.read) + wanted
+        order = (self.restarts, goal, pace)
+        assert self.trainer.arm(goal, pace) == (order != self.order)
+        if order != self.order:
+            self.order, self.rung = order, False
+        if sum(self.unread()) >= wanted:
+            self.rung = True  # Seen by the trainer itself, which does not sleep then.
+
+    @rule()
+    def disarm(self) -> None:
+        self.trainer.disarm()
+        self.order = None
+
+    @rule(data=st.data())
+    def take(self, data: st.DataObject) -> None:
+        for index in self.trainer.with_news():
+            if data.draw(st.booleans()):
+                count = self.trainer.count(index) - self.read[index]
+                self.trainer.took(index, count)
+                self.read[index] += count
+
+    @rule(data=st.data())
+    def restart(self, data: st.DataObject) -> None:
+        index = data.draw(st.sampled_from(range(len(self.workers))))
+        self.trainer.restart(index)
+        self.workers[index] = self.new_worker(index)
+        self.read[index] = 0
+        self.restarts += 1
+        self.order = None
+
+    # -- workers
+
+    def can_report(self) -> list[int]:
+        return [k for k, w in enumerate(self.workers) if w.waiting and not w.looks]
+
+    def can_look(self) -> list[int]:
+        return [k for k, w in enumerate(self.workers) if w.looks]
+
+    @precondition(lambda self: self.can_report())
+    @rule(data=st.data())
+    def report(self, data: st.DataObject) -> None:
+        worker = self.worker(data, self.can_report())
+        worker.waiting -= 1
+        worker.count += 1
+        looks = worker.bell.publish(worker.count)
+        if looks and self.order is not None:
+            assert worker.count % self.order[2] == 0
+        # It looks in any case when it has nothing left to do.
+        worker.looks = looks or not worker.waiting
+
+    @precondition(lambda self: self.can_look())
+    @rule(data=st.data())
+    def look(self, data: st.DataObject) -> None:
+        worker = self.worker(data, self.can_look())
+        worker.looks = False
+        if not worker.bell.is_due():
+            return
+        assert self.order is not None
+        assert sum(w.count for w in self.workers) >= self.order[1]
+        assert self.order not in worker.rung
+        worker.rung.append(self.order)
+        self.rung = True
+
+    # -- what always holds
+
+    @invariant()
+    def nobody_sleeps_on_enough(self) -> None:
+        if getattr(self, "order", None) is None:
+            return
+        _, goal, pace = self.order
+        if self.rung or sum(w.count for w in self.workers) < goal:
+            return
+        # Whoever came to it is about to look, or has more to do and looks seldom.
+        assert self.can_look() or (pace > 1 and any(w.waiting for w in self.workers))
+
+    @invariant()
+    def the_trainer_knows_what_is_unread(self) -> None:
+        if not hasattr(self, "trainer"):
+            return
+        unread = self.unread()
+        assert self.trainer.unread() == sum(unread)
+        assert self.trainer.with_news() == [k for k, count in enumerate(unread) if count]
+        assert [self.trainer.count(k) for k in range(len(unread))] == [
+            w.count for w in self.workers
+        ]
+
+
+TestBell = BellMachine.TestCase
+TestBell.settings = settings(max_examples=200, stateful_step_count=60, deadline=None)
+
+
+def bells(num_workers: int) -> tuple[TrainerBell, list[WorkerBell]]:
+    memory = memoryview(bytearray(bell_size(num_workers)))
+    trainer = TrainerBell(memory, num_workers)
+    return trainer, [WorkerBell(memory, num_workers, k) for k in range(num_workers)]
+
+
+@pytest.mark.parametrize("num_workers", [2, 13])
+@pytest.mark.parametrize("pace", [1, 256])
+def test_of_workers_that_finish_at_the_same_time_one_rings(num_workers: int, pace: int) -> None:
+    """Whichever order their last reports and looks come in, each one's report before its look."""
+    events = [("publish", 0), ("look", 0), ("publish", 1), ("look", 1)]
+    orders = [
+        order
+        for order in itertools.permutations(events)
+        if all(order.index(("publish", k)) < order.index(("look", k)) for k in range(2))
+    ]
+    assert len(orders) == 6
+    for order in orders:
+        trainer, workers = bells(num_workers)
+        trainer.arm(trainer.goal(2), pace)
+        rung = [0, 0]
+        for what, index in order:
+            if what == "publish":
+                workers[index].publish(1)
+            else:
+                rung[index] += workers[index].is_due()
+        assert sum(rung) >= 1, order
+        # Two where neither looked before both had published: that is not told apart.
+        both_first = {what for what, _ in order[:2]} == {"publish"}
+        assert sum(rung) == 1 + both_first, order
+
+
+def test_for_all_results_workers_look_when_they_have_nothing_left_to_do() -> None:
+    """Not after each report, which would cost each of them a fence."""
+    trainer, (worker, _) = bells(2)
+    trainer.arm(trainer.goal(300), 256)
+    assert [count for count in range(1, 300) if worker.publish(count)] == [256]
+
+
+def test_an_order_that_is_withdrawn_is_rung_for_by_nobody() -> None:
+    """The trainer is awake already; the next order, be it the same, is another one."""
+    trainer, (worker,) = bells(1)
+    trainer.arm(trainer.goal(2), 1)
+    trainer.disarm()
+    worker.publish(2)
+    assert not worker.is_due()
+    trainer.took(0, 2)
+    for round_ in (3, 4):
+        assert trainer.arm(trainer.goal(1), 1)
+        worker.publish(round_)
+        assert worker.is_due()
+        assert not worker.is_due()
+        trainer.took(0, 1)
+        trainer.disarm()
+
+
+def test_a_bell_that_was_released_keeps_quiet() -> None:
+    """Its memory may be gone; who asks all the same gets nothing of it."""
+    trainer, (worker,) = bells(1)
+    worker.publish(3)
+    trainer.release()
+    assert trainer.unread() == 0
+    assert trainer.with_news() == []
+    assert trainer.arm(trainer.goal(1), 1)
+    worker.publish(4)
+    assert not worker.is_due()
+
+
+def _work(rings: WorkerRings, channel: socket.socket) -> None:
+    """What a worker does, without envs: ends with its trainer's end of the channel."""
+    while True:
+        if rings.serve(lambda _: True, lambda: channel.send(b"!")):
+            continue
+        if rings.fall_asleep():
+            if not channel.recv(1 << 16):
+                return
+            rings.wake_up()
+
+
+def _work_and_exit(
+    bell: memoryview,
+    num_workers: int,
+    index: int,
+    rings: memoryview,
+    num_envs: int,
+    channel: socket.socket,
+    others: list[socket.socket],
+) -> NoReturn:
+    try:
+        for other in others:
+            other.close()
+        _work(WorkerRings(rings, num_envs, WorkerBell(bell, num_workers, index)), channel)
+    finally:
+        os._exit(0)
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize(("num_workers", "rounds"), [(3, 1500), (13, 300)])
+def test_a_trainer_of_several_processes_is_never_left_asleep(num_workers: int, rounds: int) -> None:
+    """Thousands of rounds in which all finish at about the same time."""
+    envs = 4
+    bell_bytes, ring_bytes = bell_size(num_workers), rings_size(envs)
+    memory = memoryview(mmap.mmap(-1, bell_bytes + num_workers * ring_bytes))
+    bell = TrainerBell(memory[:bell_bytes], num_workers)
+    parts = [memory[bell_bytes + k * ring_bytes :][:ring_bytes] for k in range(num_workers)]
+    rings = [TrainerRings(part, envs, bell, k) for k, part in enumerate(parts)]
+    channels: list[socket.socket] = []
+    pids: list[int] = []
+    for k, part in enumerate(parts):
+        ours, theirs = socket.socketpair()
+        channels.append(ours)
+        pid = os.fork()
+        if pid == 0:
+            _work_and_exit(memory[:bell_bytes], num_workers, k, part, envs, theirs, channels)
+        pids.append(pid)
+        theirs.close()
+    draw, number = random.Random(0), 0
+    try:
+        for _ in range(rounds):
+            asked = [draw.randint(0, envs) for _ in range(num_workers)]
+            for k, count in enumerate(asked):
+                entries = [entry(number + n, n, Operation.STEP) for n in range(count)]
+                if count and rings[k].request(np.array(entries, np.int64)):
+                    channels[k].send(b"!")
+            number += envs
+            found = 0
+            while found < sum(asked):
+                left = sum(asked) - found
+                bell.arm(bell.goal(left), 256)
+                if bell.unread() < left:
+                    _any_bell(channels)
+                found += sum(len(rings[k].reports()) for k in bell.with_news())
+            assert found == sum(asked)
+    finally:
+        for ours in channels:
+            ours.close()
+        ended = [os.waitpid(pid, 0)[1] for pid in pids]
+    assert ended == [0] * num_workers
+
+
+def _any_bell(channels: list[socket.socket]) -> None:
+    """Sleep until a worker rings; take its bells away."""
+    readable: list[Any] = select.select(channels, [], [])[0]
+    for channel in readable:
+        channel.recv(1 << 16)
