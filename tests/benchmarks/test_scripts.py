@@ -63,6 +63,7 @@ def test_script_measures_each_of_its_contenders(
     ("module", "peer"),
     [
         ("gymnasium", "Gymnasium AsyncVectorEnv"),
+        ("gymnasium", "Gymnasium SyncVectorEnv"),
         ("stable_baselines3", "SB3 SubprocVecEnv"),
         ("tianshou", "Tianshou ShmemVectorEnv"),
         ("envpool", "EnvPool, 16 of 32"),
