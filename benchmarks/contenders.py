@@ -250,6 +250,22 @@ class GymnasiumAsync(Stepped):
 
 
 @dataclass
+class GymnasiumSync(Stepped):
+    """`gymnasium.vector.SyncVectorEnv`: all envs in turn, in the trainer's own process."""
+
+    def setup(self) -> None:
+        from gymnasium.vector import SyncVectorEnv
+
+        self._envs = SyncVectorEnv(self.work.makers())
+        self._actions = sampled(self._envs.single_action_space, self.work.num_envs)
+        self._envs.reset(seed=0)
+
+    def step(self) -> int:
+        self._envs.step(next(self._actions))
+        return self.work.num_envs
+
+
+@dataclass
 class StableBaselines3(Stepped):
     """`SubprocVecEnv` of Stable-Baselines3: one process for each env, results pickled."""
 

@@ -54,8 +54,11 @@ class Contender:
     def setup(self) -> None:
         """Called once, before the first round; not measured."""
 
-    def round(self, seconds: float) -> float:
-        """One round of about that length; the figure that was measured."""
+    def round(self, seconds: float) -> Any:
+        """One round of about that length; the figure that was measured.
+
+        What isn't one figure but pickles is for a script that tells its results itself.
+        """
         raise NotImplementedError
 
     def teardown(self) -> None:
@@ -175,8 +178,8 @@ class Stage:
         self._answer()
         return self
 
-    def round(self, seconds: float) -> tuple[float, float]:
-        """The figure of one round, and how many processors it kept busy."""
+    def round(self, seconds: float) -> tuple[Any, float]:
+        """What one round has brought, and how many processors it kept busy."""
         busy, began = self._busy_seconds(), time.perf_counter()
         self._connection.send(seconds)
         value = self._answer()
@@ -188,7 +191,7 @@ class Stage:
         assert self._process.pid is not None
         return sum(_busy_ns(thread) for pid in family(self._process.pid) for thread in pid) / 1e9
 
-    def _answer(self) -> float:
+    def _answer(self) -> Any:
         try:
             value, trouble = self._connection.recv()
         except EOFError:
@@ -261,25 +264,12 @@ def missing(contender: Contender) -> list[str]:
 
 def measure(question: Question, rounds: int, seconds: float, only: Sequence[str]) -> dict[str, Any]:
     """Run a question; its report as plain data."""
-    figures: dict[str, Figures] = {}
-    skipped: dict[str, str] = {}
-    machine = machine_facts({name for c in question.contenders for name in c.requires})
-    with ExitStack() as stack:
-        stages = _stages(question, only, stack, skipped)
-        for number in range(rounds):
-            for stage in list(stages):
-                name = stage.contender.name
-                try:
-                    value, cores = stage.round(seconds)
-                except ContenderFailed as error:
-                    stages.remove(stage)
-                    figures.pop(name, None)
-                    skipped[name] = _last_line(name, error)
-                    continue
-                found = figures.setdefault(name, Figures())
-                found.values.append(value)
-                found.cores.append(cores)
-                say(f"  round {number + 1}/{rounds}  {name:{NAME_WIDTH}} {number_text(value)}")
+    machine = machine_facts(modules_of(question.contenders))
+    turns, skipped = take_turns(question.contenders, rounds, seconds, only)
+    figures = {
+        name: Figures([value for value, _ in found], [cores for _, cores in found])
+        for name, found in turns.items()
+    }
     return {
         "name": question.name,
         "title": question.title,
@@ -300,11 +290,53 @@ def measure(question: Question, rounds: int, seconds: float, only: Sequence[str]
     }
 
 
+def take_turns(
+    contenders: Sequence[Contender],
+    rounds: int,
+    seconds: float,
+    only: Sequence[str],
+    told: Callable[[Any], str] | None = None,
+) -> tuple[dict[str, list[tuple[Any, float]]], dict[str, str]]:
+    """Have contenders take turns, each in a process of its own.
+
+    Args:
+        contenders: in the order of their turns.
+        rounds: how many turns each of them has.
+        seconds: about the length of a turn.
+        only: parts of the names of those that take part; all if empty.
+        told: puts what a round has brought into words.
+
+    Returns by contender what its rounds have brought and how many processors they kept
+    busy, and why others were left out.
+    """
+    found: dict[str, list[tuple[Any, float]]] = {}
+    skipped: dict[str, str] = {}
+    with ExitStack() as stack:
+        stages = _stages(contenders, only, stack, skipped)
+        for number in range(rounds):
+            for stage in list(stages):
+                name = stage.contender.name
+                try:
+                    value, cores = stage.round(seconds)
+                except ContenderFailed as error:
+                    stages.remove(stage)
+                    found.pop(name, None)
+                    skipped[name] = _last_line(name, error)
+                    continue
+                found.setdefault(name, []).append((value, cores))
+                text = (told or number_text)(value)
+                say(f"  round {number + 1}/{rounds}  {name:{NAME_WIDTH}} {text}")
+    return found, skipped
+
+
 def _stages(
-    question: Question, only: Sequence[str], stack: ExitStack, skipped: dict[str, str]
+    contenders: Sequence[Contender],
+    only: Sequence[str],
+    stack: ExitStack,
+    skipped: dict[str, str],
 ) -> list[Stage]:
     stages: list[Stage] = []
-    for contender in question.contenders:
+    for contender in contenders:
         if only and not any(part in contender.name for part in only):
             continue
         if lacking := missing(contender):
@@ -327,6 +359,11 @@ def _judged(target: Target, figures: dict[str, Figures]) -> dict[str, Any]:
     pairs = zip(figures[target.subject].values, figures[target.reference].values, strict=True)
     found = Figures([target.compare(*pair) for pair in pairs])
     return {**asdict(target), **found.as_json(), "met": target.is_met(found.median)}
+
+
+def modules_of(contenders: Iterable[Contender]) -> set[str]:
+    """All that any of them needs."""
+    return {name for contender in contenders for name in contender.requires}
 
 
 def machine_facts(modules: Iterable[str]) -> dict[str, Any]:
@@ -441,15 +478,18 @@ def plot(report: dict[str, Any], path: Path) -> None:
 # ---- the command line of every script
 
 
-def main(question: Question, description: str | None) -> None:
-    """Parse the arguments, run the question, tell the outcome."""
+def arguments(description: str | None, rounds: int, seconds: float | None) -> argparse.Namespace:
+    """What every script takes; `seconds` is None where the work itself gives a round's length.
+
+    Math libraries are kept to one thread from here on.
+    """
     parser = argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--rounds", type=int, default=question.rounds, help="default: %(default)s")
-    if question.seconds is not None:
+    parser.add_argument("--rounds", type=int, default=rounds, help="default: %(default)s")
+    if seconds is not None:
         parser.add_argument(
-            "--seconds", type=float, default=question.seconds,
+            "--seconds", type=float, default=seconds,
             help="length of one contender's round (default: %(default)s)",
         )  # fmt: skip
     parser.add_argument(
@@ -462,6 +502,12 @@ def main(question: Question, description: str | None) -> None:
     if given.plot and importlib.util.find_spec("matplotlib") is None:
         parser.error("--plot needs matplotlib: pip install matplotlib")
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
+    return given
+
+
+def main(question: Question, description: str | None) -> None:
+    """Parse the arguments, run the question, tell the outcome."""
+    given = arguments(description, question.rounds, question.seconds)
     report = measure(question, given.rounds, getattr(given, "seconds", 0.0), given.only)
     print(f"{tables(report)}\n\n{machine_text(report['machine'])}")
     if given.json:

@@ -1,4 +1,6 @@
-"""Environments that do nothing, so that what is left to measure is the runtime around them.
+"""Environments that do nothing, or nothing but let time pass.
+
+So what is left to measure is the runtime around them.
 
 Workers import this module through a config entry's ``imports``.
 """
@@ -15,6 +17,16 @@ from gymnasium.spaces import Box
 
 NO_WORK = "benchmarks/NoWork-v0"
 SLEEPS = "benchmarks/Sleeps-v0"
+SPENDS = "benchmarks/Spends-v0"
+WORKS_5_US = "benchmarks/Works5us-v0"
+WORKS_30_US = "benchmarks/Works30us-v0"
+
+
+def work(seconds: float) -> None:
+    """Keep a core busy for that long, as a simulation does."""
+    until = time.perf_counter() + seconds
+    while time.perf_counter() < until:
+        pass
 
 
 class NoWork(gym.Env[Any, Any]):
@@ -65,5 +77,45 @@ class Sleeps(NoWork):
         return super().step(action)
 
 
-for _id, _entry_point in ((NO_WORK, NoWork), (SLEEPS, Sleeps)):
-    gym.register(_id, _entry_point, disable_env_checker=True, order_enforce=False)
+class Works(NoWork):
+    """Works for the same time in each step."""
+
+    def __init__(self, seconds: float) -> None:
+        super().__init__()
+        self._seconds = seconds
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        work(self._seconds)
+        return super().step(action)
+
+
+class Spends(NoWork):
+    """Works and then sleeps for the seconds that its action tells it; observes when it was done.
+
+    The observation is the monotonic clock's, which all processes of a machine share.
+    """
+
+    observation_space = Box(-np.inf, np.inf, (1,), np.float64)
+    action_space = Box(0.0, np.inf, (2,), np.float64)
+
+    def __init__(self) -> None:
+        self._observation = np.zeros(1)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        seconds, asleep = action.tolist()
+        if seconds:
+            work(seconds)
+        if asleep:
+            time.sleep(asleep)
+        self._observation[0] = time.monotonic()
+        return super().step(action)
+
+
+for _id, _entry_point, _kwargs in (
+    (NO_WORK, NoWork, {}),
+    (SLEEPS, Sleeps, {}),
+    (SPENDS, Spends, {}),
+    (WORKS_5_US, Works, {"seconds": 5e-6}),
+    (WORKS_30_US, Works, {"seconds": 30e-6}),
+):
+    gym.register(_id, _entry_point, disable_env_checker=True, order_enforce=False, kwargs=_kwargs)

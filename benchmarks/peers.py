@@ -1,8 +1,9 @@
 """HalfCheetah-v5, 32 envs: everybody in turn within one run.
 
-Gymnasium's AsyncVectorEnv with shared memory, Stable-Baselines3's SubprocVecEnv, Tianshou's
-ShmemVectorEnv, EnvPool, a plain loop in one process, and this library. Peers that aren't
-installed are left out: pip install 'rlightning-aio[bench]' brings them.
+Gymnasium's AsyncVectorEnv with shared memory and its SyncVectorEnv, Stable-Baselines3's
+SubprocVecEnv, Tianshou's ShmemVectorEnv, EnvPool, a plain loop in one process, and this
+library. Peers that aren't installed are left out: pip install 'rlightning-aio[bench]' brings
+them. Gymnasium is always there.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 from contenders import (
     EnvPool,
     GymnasiumAsync,
+    GymnasiumSync,
     InProcess,
     OursAsync,
     OursSync,
@@ -33,6 +35,7 @@ QUESTION = Question(
         OursSync(SYNC, WORK),
         OursAsync(HALF, WORK, min_results=16),
         GymnasiumAsync(GYMNASIUM, WORK),
+        GymnasiumSync("Gymnasium SyncVectorEnv", WORK),
         StableBaselines3("SB3 SubprocVecEnv", WORK),
         Tianshou("Tianshou ShmemVectorEnv", WORK),
         EnvPool("EnvPool, synchronous", WORK),

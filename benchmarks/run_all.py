@@ -1,6 +1,6 @@
 """Run every benchmark, keep the reports and plots, and renew the tables of the README.
 
-    python benchmarks/run_all.py              # all of them, about twelve minutes
+    python benchmarks/run_all.py              # all of them, about a quarter of an hour
     python benchmarks/run_all.py cheetah pong
 
 Each script runs in an interpreter of its own, one after the other.
@@ -23,7 +23,7 @@ RESULTS = HERE / "results"
 README = HERE / "README.md"
 SCRIPTS = (
     "cheetah", "peers", "humanoid", "cartpole", "pong", "round_trip", "facade", "trainer_cpu",
-    "stragglers", "start", "memory", "remote", "worker", "pool",
+    "stragglers", "uneven", "start", "memory", "remote", "worker", "pool",
 )  # fmt: skip
 
 
@@ -43,7 +43,9 @@ def with_table(text: str, name: str) -> str:
         return text
     report = json.loads(path.read_text())
     machine = machine_text(report["machine"])
-    shown = f"{tables(report)}\n\n{report['rounds']} rounds. {machine}"
+    # A script whose figures are of another shape brings its tables along.
+    shown = report.get("tables") or tables(report)
+    shown += f"\n\n{report['rounds']} rounds. {machine}"
     if path.with_suffix(".png").exists():
         shown += f"\n\n![{report['title']}](results/{name}.png)"
     marks = re.compile(rf"(<!-- {name} -->\n).*?(<!-- end -->)", re.DOTALL)

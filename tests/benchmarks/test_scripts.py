@@ -63,6 +63,7 @@ def test_script_measures_each_of_its_contenders(
     ("module", "peer"),
     [
         ("gymnasium", "Gymnasium AsyncVectorEnv"),
+        ("gymnasium", "Gymnasium SyncVectorEnv"),
         ("stable_baselines3", "SB3 SubprocVecEnv"),
         ("tianshou", "Tianshou ShmemVectorEnv"),
         ("envpool", "EnvPool, 16 of 32"),
@@ -74,6 +75,51 @@ def test_peer_steps(module: str, peer: str, tmp_path: Path) -> None:
         pytest.skip(f"{module} is not installed")
     report = run_script("peers", tmp_path, *SHORT, "--only", peer)
     assert report["results"][peer]["median"] > 0
+
+
+def test_uneven_tells_how_late_each_driver_collects(tmp_path: Path) -> None:
+    """Each number of results has its latenesses, of both drivers and of the bare pipe."""
+    report = run_script("uneven", tmp_path, *SHORT, "--only", "log-normal sleeps, 4")
+    assert not report["skipped"]
+    assert [row["min_results"] for row in report["lateness"]] == [1, 4, 6]
+    for row in report["lateness"]:
+        for who in ("asyncio", "blocking", "bare pipe"):
+            assert row[who]["count"] > 0
+            assert 0 <= row[who]["median"] <= row[who]["p99"] <= row[who]["worst"]
+        assert row["mixture"] in report["tables"]
+
+
+def test_uneven_counts_turns_with_a_rare_slow_step(tmp_path: Path) -> None:
+    """What is collected in the calm turns between is not among the latenesses."""
+    report = run_script("uneven", tmp_path, *SHORT, "--only", "asyncio, all work 50 µs")
+    counts = [row["asyncio"]["count"] for row in report["lateness"]]
+    assert all(0 < count <= 8 for count in counts)
+
+
+def test_uneven_tells_the_rate_at_even_step_times(tmp_path: Path) -> None:
+    """Both drivers and the bare loops have a rate."""
+    report = run_script("uneven", tmp_path, *SHORT, "--only", "5 µs")
+    assert len(report["rates"]) == 3
+    assert all(found["median"] > 0 for found in report["rates"].values())
+
+
+def test_lateness_is_measured_from_the_kth_of_all_outstanding(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A result that was ready and left over counts as ready, whoever is handed out instead."""
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    calls = importlib.import_module("uneven").Calls()
+    now = iter([1.0, 5.0, 6.0, 7.0])
+    monkeypatch.setattr("time.monotonic", lambda: next(now))
+    calls.sent(range(3))
+    for wanted, envs, done in ((2, [0, 2], [2.0, 4.0]), (1, [1], [3.0])):
+        collect = calls.collect(wanted)
+        assert next(collect) == wanted
+        with pytest.raises(StopIteration):
+            collect.send("a batch")
+        calls.came(envs, done)
+    # Called at 1, the second of 2, 3 and 4 was ready at 3; the next at once, called at 6.
+    assert calls.late_ms() == [2000.0, 1000.0]
 
 
 def test_pong(tmp_path: Path) -> None:
