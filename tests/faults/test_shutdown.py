@@ -176,7 +176,7 @@ def test_killed_trainer_takes_its_workers_along(moment: str, tmp_path: Path) -> 
             workers.remove(int(process.stdout.readline()))
         # The others may have closed already.
         assert len(workers) in {"importing": (1,), "closing": (2, 3)}.get(moment, (3,))
-        for pid in workers:
+        for pid in (process.pid, *workers):
             assert "/dev/shm/" not in Path(f"/proc/{pid}/maps").read_text()
         with watched(workers) as ended:
             process.kill()
