@@ -23,9 +23,15 @@ if TYPE_CHECKING:
 # For the loops that tests make themselves; pytest-asyncio has an option for its own.
 os.environ["PYTHONASYNCIODEBUG"] = "1"
 
+# A thousand interpreters start for the tests; none of them shall compile the library anew.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
 # How fast examples come says something of the machine, and nothing of the code.
 settings.register_profile(
-    "any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow]
+    "any machine",
+    deadline=None,
+    max_examples=int(os.environ.get("RLIGHTNING_AIO_EXAMPLES", "40")),
+    suppress_health_check=[HealthCheck.too_slow],
 )
 settings.load_profile("any machine")
 

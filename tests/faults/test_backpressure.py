@@ -8,8 +8,7 @@ import signal
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
-from faults.faulty import Driven, Tokens, marked
-from faults.test_deaths import kill, pid_of, two_workers
+from faults.faulty import Driven, Tokens, kill, marked, pid_of, two_workers
 from faults.test_shutdown import read_until, trainer
 
 if TYPE_CHECKING:

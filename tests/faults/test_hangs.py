@@ -9,8 +9,8 @@ import time
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import pytest
-from faults.faulty import Driven, Tokens, entry, marked
-from faults.test_deaths import pid_of, two_workers
+from faults.drivers import first_on_both_drivers, on_one_driver
+from faults.faulty import Driven, Tokens, entry, marked, pid_of, two_workers
 
 import rlightning_aio
 from rlightning_aio import registry
@@ -33,7 +33,7 @@ STACKS = {
 }
 
 
-@pytest.mark.parametrize("hang", STACKS)
+@first_on_both_drivers("hang", STACKS)
 def test_hung_step_raises_with_the_stack_of_the_worker(start: Start, hang: str) -> None:
     """What held it is in the error, though it held the interpreter's lock and never returned."""
     group, tokens = start(two_workers(step_timeout=LIMIT, on_worker_death="raise")), Tokens()
@@ -51,7 +51,7 @@ def test_hung_step_raises_with_the_stack_of_the_worker(start: Start, hang: str) 
     tokens.check(group.step(tokens.steps(["faulty-2", "faulty-3"]))[0])
 
 
-@pytest.mark.parametrize("hang", [*STACKS, "stop"])
+@first_on_both_drivers("hang", [*STACKS, "stop"])
 def test_hung_step_is_answered_by_its_replacement(start: Start, hang: str) -> None:
     """One marked result each for who owed one; then every env answers what it is asked."""
     group, tokens = start(two_workers(step_timeout=LIMIT)), Tokens()
@@ -77,6 +77,7 @@ def test_hung_reset_is_found_by_its_own_limit(start: Start) -> None:
     tokens.check(group.collect_async()[0])
 
 
+@on_one_driver
 def test_hung_reset_with_options_is_found(start: Start) -> None:
     """It went through the channel and not through the ring."""
     group = start(entry(1, reset_timeout=LIMIT))
@@ -170,6 +171,7 @@ def test_replacement_that_hangs_is_replaced_until_there_are_too_many(
     tokens.check(group.step(tokens.steps(["faulty-2"]))[0])
 
 
+@on_one_driver
 def test_replacement_that_hangs_is_found_though_nobody_was_waiting_for_it(
     start: Start, tmp_path: Path
 ) -> None:

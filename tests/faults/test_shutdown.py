@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import pytest
-from faults.faulty import Driven, Tokens
-from faults.test_deaths import kill, pid_of, two_workers
+from faults.faulty import Driven, Tokens, kill, pid_of, two_workers
 
 import rlightning_aio
 from rlightning_aio.errors import GroupClosed
@@ -32,8 +31,7 @@ SECONDS = 2.0
 
 SCRIPT = """
 import os, signal, sys, time
-from faults.faulty import Tokens, entry
-from faults.test_deaths import kill, pid_of, two_workers
+from faults.faulty import Tokens, entry, kill, pid_of, two_workers
 import rlightning_aio, rlightning_aio.sync
 def build(**fields):
     return rlightning_aio.sync.build_env_group(two_workers(**fields))

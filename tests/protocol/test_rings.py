@@ -146,7 +146,7 @@ class RingsMachine(RuleBasedStateMachine):
 
 
 TestRings = RingsMachine.TestCase
-TestRings.settings = settings(max_examples=100, stateful_step_count=40, deadline=None)
+TestRings.settings = settings(stateful_step_count=40)
 
 
 @given(
