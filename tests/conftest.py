@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import os
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,8 +24,9 @@ if TYPE_CHECKING:
 # For the loops that tests make themselves; pytest-asyncio has an option for its own.
 os.environ["PYTHONASYNCIODEBUG"] = "1"
 
-# A thousand interpreters start for the tests; none of them shall compile the library anew.
+# A thousand interpreters start for the tests; none of them shall compile everything anew.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 # How fast examples come says something of the machine, and nothing of the code.
 settings.register_profile(
@@ -40,11 +42,21 @@ def pytest_asyncio_loop_factories() -> dict[str, Callable[[], asyncio.AbstractEv
     return {"asyncio": asyncio.new_event_loop, "uvloop": uvloop.new_event_loop}
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    repeated = [item for item in items if _repeats(item)]
+    config.hook.pytest_deselected(items=repeated)
+    items[:] = [item for item in items if item not in repeated]
     for item in items:
         if pytest_asyncio.is_async_test(item):
             # First in, last out: the tasks of other fixtures have ended by then.
             item.fixturenames.insert(0, no_task_left_behind.__name__)
+
+
+def _repeats(item: pytest.Item) -> bool:
+    """Whether a test is about a synchronous group, which doesn't know what loop it runs in."""
+    params = item.callspec.params if hasattr(item, "callspec") else {}
+    synchronous = getattr(params.get("place"), "synchronous", False)
+    return synchronous and uvloop.new_event_loop in params.values()
 
 
 def _children() -> set[str]:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from patience import HANG
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 
@@ -23,7 +24,7 @@ def run_script(name: str, folder: Path, *arguments: str) -> dict[str, Any]:
         [sys.executable, BENCHMARKS / f"{name}.py", "--rounds", "1", "--json", out, *arguments],
         capture_output=True,
         text=True,
-        timeout=100,
+        timeout=HANG,
         check=False,
     )
     assert run.returncode == 0, run.stderr

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import uvloop
 from gymnasium import spaces
+from patience import HANG
 
 import rlightning_aio
 import rlightning_aio.sync
@@ -328,7 +329,7 @@ def kill(pid: int) -> None:
     descriptor = os.pidfd_open(pid)
     try:
         signal.pidfd_send_signal(descriptor, signal.SIGKILL)
-        assert select.select([descriptor], [], [], 10)[0], "it lives"
+        assert select.select([descriptor], [], [], HANG)[0], "it lives"
     finally:
         os.close(descriptor)
 

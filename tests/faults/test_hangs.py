@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import pytest
 from faults.drivers import first_on_both_drivers, on_one_driver
 from faults.faulty import Driven, Tokens, entry, marked, pid_of, two_workers
+from patience import HANG
 
 import rlightning_aio
 from rlightning_aio import registry
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
     Start: TypeAlias = Callable[..., Driven]
 
-LIMIT = 0.5
+LIMIT = 1.0
 """Seconds; long enough for whoever doesn't hang, on a machine that is busy."""
 
 STACKS = {
@@ -108,7 +109,7 @@ def test_hang_is_found_while_others_leave_the_trainer_no_time_to_wait(start: Sta
     """Collecting what is always ready must not hide what never comes."""
     group, tokens = start(two_workers(step_timeout=LIMIT)), Tokens()
     group.step_async(tokens.steps(["faulty-0"], {"faulty-0": "sleep"}))
-    until = time.monotonic() + 30
+    until = time.monotonic() + HANG
     found: dict[str, Any] = {}
     while "faulty-0" not in found and time.monotonic() < until:
         group.step_async(tokens.steps(["faulty-2", "faulty-3"]))
@@ -134,8 +135,8 @@ def test_trainer_that_comes_late_takes_nobody_for_hung(start: Start) -> None:
 def test_start_that_hangs_fails_with_the_stack(build: Start) -> None:
     """`init` says which limit was exceeded and where the constructor stands."""
     kwargs = {"faults": {"building": "deadlock"}, "only": 3}
-    group = build(two_workers(env_kwargs=kwargs, start_timeout=5))
-    with pytest.raises(StartFailed, match=r"faulty-3.*did not start within 5") as caught:
+    group = build(two_workers(env_kwargs=kwargs, start_timeout=10))
+    with pytest.raises(StartFailed, match=r"faulty-3.*did not start within 10") as caught:
         group.init()
     assert "in _deadlock" in str(caught.value)
 
@@ -160,7 +161,7 @@ def test_replacement_that_hangs_is_replaced_until_there_are_too_many(
     """`start_timeout` holds for restarts as well."""
     broken = tmp_path / "broken"
     kwargs = {"faults": {"building": "sleep"}, "while_exists": str(broken)}
-    config = two_workers(env_kwargs=kwargs, max_restarts=1, start_timeout=5)
+    config = two_workers(env_kwargs=kwargs, max_restarts=1)
     group, tokens = start(config), Tokens()
     for member in group.group._fleet._members:
         member.config = member.config.model_copy(update={"start_timeout": LIMIT})
@@ -178,7 +179,7 @@ def test_replacement_that_hangs_is_found_though_nobody_was_waiting_for_it(
     """The worker died idle, so the first to ask was a plain reset."""
     broken = tmp_path / "broken"
     kwargs = {"faults": {"building": "sleep"}, "while_exists": str(broken)}
-    group = start(two_workers(env_kwargs=kwargs, max_restarts=1, start_timeout=5))
+    group = start(two_workers(env_kwargs=kwargs, max_restarts=1))
     tokens = Tokens()
     for member in group.group._fleet._members:
         member.config = member.config.model_copy(update={"start_timeout": LIMIT})
