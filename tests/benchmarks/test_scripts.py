@@ -44,7 +44,7 @@ OURS = ("--only", "rlightning_aio")
         ("round_trip", SHORT, 4),
         ("facade", SHORT, 2),
         ("trainer_cpu", (*SHORT, "--only", ", 8 envs"), 3),
-        ("stragglers", SHORT, 3),
+        ("stragglers", (*SHORT, "--only", "rlightning_aio async", "--only", "64 proc"), 2),
         ("start", (), 2),
         ("memory", OURS, 1),
     ],
