@@ -19,7 +19,7 @@ from gymnasium.vector.utils import batch_space, iterate
 
 from rlightning_aio import BatchedData, PolicyResponse, build_env_group, sync
 
-NUM_STEPS = 120
+NUM_STEPS = 160
 NUM_ENVS = 8
 SEED = 11
 

@@ -333,4 +333,4 @@ def test_a_client_without_a_server_says_so() -> None:
             TimeoutError, match=r"tcp://127.0.0.1:1 did not let 'arm' in.*nobody answers"
         ),
     ):
-        client.connect(timeout=0.5)
+        client.connect(timeout=2.0)
