@@ -341,9 +341,9 @@ async def test_close_ends_a_collect_that_waits(tmp_path: Path) -> None:
     group.step_async(tokens.steps(["faulty-0"]))
     collecting = asyncio.ensure_future(group.collect_async())
     await asyncio.sleep(0)
-    closing = asyncio.gather(group.close(), group.close())
-    await asyncio.sleep(0)
-    gate.open("w").close()  # Now the step can end.
+    with gate.open("w"):  # The env has come to it, and goes on when it is closed.
+        closing = asyncio.gather(group.close(), group.close())
+        await asyncio.sleep(0)
     await closing
     with pytest.raises(GroupClosed):
         await collecting
