@@ -20,8 +20,10 @@ help: ## this list
 run: $(VENV)/installed ## collect 100,000 steps of HalfCheetah-v5 asynchronously
 	$(VENV)/bin/rlightning-aio rollout configs/halfcheetah.yaml --steps 100000
 
+# Most tests wait for processes of their own, so four at a time suit two cores. Who has none
+# left takes over another's; until then each keeps to its files, which share what they prepare.
 test: $(VENV)/installed-test ## the tests
-	$(PY) -m pytest
+	$(PY) -m pytest --numprocesses 4 --dist worksteal
 
 # Kernels that Isaac Lab compiled once are found again, by workers and tests alike.
 test-simulators: export WARP_CACHE_PATH := $(CURDIR)/$(ISAAC)/warp-cache

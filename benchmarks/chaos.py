@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from breakable import EPISODE, EXIT, HANG, INDEX, NOTHING, PID, RAISE, STEPS, TOKEN
-from harness import machine_facts, machine_text
+from harness import machine_facts, machine_text, shared_memory
 
 import rlightning_aio as rl
 from rlightning_aio.errors import EnvFault, EnvRaised
@@ -398,7 +398,7 @@ def held() -> set[str]:
     for path in Path("/proc/self/fd").iterdir():
         with suppress(FileNotFoundError):  # The one that the listing itself needs.
             descriptors.add(f"descriptor {path.name}: {path.readlink()}")
-    return children | descriptors | {f"/dev/shm/{p.name}" for p in Path("/dev/shm").iterdir()}
+    return children | descriptors | {f"shared memory {name}" for name in shared_memory()}
 
 
 async def nothing() -> None:

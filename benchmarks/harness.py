@@ -214,7 +214,7 @@ def family(pid: int) -> Iterator[list[Path]]:
     try:
         threads = list(Path(f"/proc/{pid}/task").iterdir())
         children = [thread.joinpath("children").read_text().split() for thread in threads]
-    except FileNotFoundError:
+    except (FileNotFoundError, ProcessLookupError):
         return  # It has just ended.
     yield threads
     for child in chain.from_iterable(children):
@@ -224,8 +224,18 @@ def family(pid: int) -> Iterator[list[Path]]:
 def _busy_ns(thread: Path) -> int:
     try:
         return int(thread.joinpath("schedstat").read_text().split()[0])
-    except FileNotFoundError:
+    except (FileNotFoundError, ProcessLookupError):
         return 0
+
+
+def shared_memory() -> set[str]:
+    """What this process maps of memory that others may map, with and without a name."""
+    found: set[str] = set()
+    for line in Path("/proc/self/maps").read_text().splitlines():
+        _, _, _, _, inode, *path = line.split(maxsplit=5)
+        if path and path[0].startswith(("/memfd:", "/dev/shm/")):
+            found.add(f"{path[0]}, inode {inode}")
+    return found
 
 
 class ContenderFailed(Exception):

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from harness import machine_facts, machine_text
+from harness import machine_facts, machine_text, shared_memory
 
 import rlightning_aio as rl
 from rlightning_aio import sync
@@ -85,7 +85,7 @@ def sample() -> dict[str, float]:
     return {
         "descriptors": descriptors,
         "children": len(children),
-        "shared_memory": len(list(Path("/dev/shm").iterdir())),
+        "shared_memory": len(shared_memory()),
         "rss_mib": rss_kib / 1024,
     }
 
@@ -96,7 +96,7 @@ def soak(cycles: int, steps: int) -> dict[str, Any]:
     samples: list[dict[str, float]] = []
     began, done = time.monotonic(), 0
     shown = {max(1, round(cycles * k / SAMPLES)) for k in range(1, SAMPLES + 1)}
-    print("| cycles | steps | s | descriptors | children | /dev/shm | RSS, MiB |")
+    print("| cycles | steps | s | descriptors | children | shared memory | RSS, MiB |")
     print("|---:|---:|---:|---:|---:|---:|---:|")
     for cycle in range(1, cycles + 1):
         wanted = steps * cycle // cycles - steps * (cycle - 1) // cycles

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import os
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,9 +24,16 @@ if TYPE_CHECKING:
 # For the loops that tests make themselves; pytest-asyncio has an option for its own.
 os.environ["PYTHONASYNCIODEBUG"] = "1"
 
+# A thousand interpreters start for the tests; none of them shall compile everything anew.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
 # How fast examples come says something of the machine, and nothing of the code.
 settings.register_profile(
-    "any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow]
+    "any machine",
+    deadline=None,
+    max_examples=int(os.environ.get("RLIGHTNING_AIO_EXAMPLES", "40")),
+    suppress_health_check=[HealthCheck.too_slow],
 )
 settings.load_profile("any machine")
 
@@ -34,21 +42,35 @@ def pytest_asyncio_loop_factories() -> dict[str, Callable[[], asyncio.AbstractEv
     return {"asyncio": asyncio.new_event_loop, "uvloop": uvloop.new_event_loop}
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    repeated = [item for item in items if _repeats(item)]
+    config.hook.pytest_deselected(items=repeated)
+    items[:] = [item for item in items if item not in repeated]
     for item in items:
         if pytest_asyncio.is_async_test(item):
             # First in, last out: the tasks of other fixtures have ended by then.
             item.fixturenames.insert(0, no_task_left_behind.__name__)
 
 
+def _repeats(item: pytest.Item) -> bool:
+    """Whether a test is about a synchronous group, which doesn't know what loop it runs in."""
+    params = item.callspec.params if hasattr(item, "callspec") else {}
+    synchronous = getattr(params.get("place"), "synchronous", False)
+    return synchronous and uvloop.new_event_loop in params.values()
+
+
 def _children() -> set[str]:
     """Child processes, zombies included."""
     found: set[str] = set()
     for children in Path("/proc/self/task").glob("*/children"):
-        for pid in children.read_text().split():
+        try:
+            pids = children.read_text().split()
+        except (FileNotFoundError, ProcessLookupError):
+            continue  # The thread has ended since it was listed.
+        for pid in pids:
             try:
                 command = Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ")
-            except FileNotFoundError:
+            except (FileNotFoundError, ProcessLookupError):
                 continue
             found.add(f"process {pid}: {command.decode()[:80] or 'a zombie'}")
     return found
@@ -64,9 +86,23 @@ def _descriptors() -> set[str]:
     return found
 
 
+def _shared_memory() -> set[str]:
+    """What this process maps of memory that others may map, with and without a name.
+
+    The library gives its memory no name, so it lasts as long as somebody holds it: this
+    process, in a descriptor or a mapping, or one that it has started, which would itself be
+    left behind. /dev/shm is not listed: what is there may belong to anybody.
+    """
+    found: set[str] = set()
+    for line in Path("/proc/self/maps").read_text().splitlines():
+        _, _, _, _, inode, *path = line.split(maxsplit=5)
+        if path and path[0].startswith(("/memfd:", "/dev/shm/")):
+            found.add(f"shared memory: {path[0]}, inode {inode}")
+    return found
+
+
 def _held() -> set[str]:
-    named = {f"shared memory: {path.name}" for path in Path("/dev/shm").iterdir()}
-    return _children() | _descriptors() | named
+    return _children() | _descriptors() | _shared_memory()
 
 
 @pytest.fixture(autouse=True)

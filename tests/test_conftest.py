@@ -9,10 +9,10 @@ if TYPE_CHECKING:
     import pytest
 
 LEAKS = """
-import asyncio, os, socket, subprocess, sys
-from multiprocessing import resource_tracker
+import asyncio, mmap, os, socket, subprocess, sys
 
 kept = []
+ELSEWHERE = f"/dev/shm/of-somebody-else-{os.getpid()}"
 
 def test_leaves_a_process():
     kept.append(subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE))
@@ -29,16 +29,26 @@ def test_leaves_a_zombie():
 def test_leaves_a_descriptor():
     kept.append(socket.socketpair())
 
-def test_leaves_shared_memory(tmp_path):
-    open(f"/dev/shm/rlightning-aio-{os.getpid()}", "w").close()
+def test_leaves_shared_memory():
+    descriptor = os.memfd_create("left")
+    os.ftruncate(descriptor, 4096)
+    kept.append(mmap.mmap(descriptor, 4096))
+    os.close(descriptor)
 
 async def test_leaves_a_task():
     kept.append(asyncio.create_task(asyncio.Event().wait()))
 
+def test_lets_others_keep_theirs():
+    script = "import sys; open(sys.argv[1], 'w').close()"
+    subprocess.run([sys.executable, "-c", script, ELSEWHERE], check=True)
+    assert os.path.exists(ELSEWHERE)
+
 def test_leaves_nothing(tmp_path):
-    subprocess.run([sys.executable, "-c", ""], check=True)
-    with open(tmp_path / "file", "w"), socket.socket():
-        pass
+    with open(tmp_path / "file", "wb+") as file, socket.socket():
+        descriptor = os.memfd_create("closed")
+        os.ftruncate(descriptor, 4096)
+        mmap.mmap(descriptor, 4096).close()
+        os.close(descriptor)
 
 async def test_ends_its_task():
     task = asyncio.create_task(asyncio.sleep(0))
@@ -49,9 +59,8 @@ CLEAN_UP = """
 from pathlib import Path
 
 def pytest_sessionfinish():
-    for path in Path("/dev/shm").glob("rlightning-aio-*"):
-        path.unlink()
     import test_leaks
+    Path(test_leaks.ELSEWHERE).unlink()
     for thing in test_leaks.kept[:1]:
         thing.communicate(b"")
 """
@@ -63,8 +72,9 @@ def test_what_a_test_leaves_behind_fails_it(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(test_leaks=LEAKS)
     pytester.makeini("[pytest]\nasyncio_mode = auto\nasyncio_default_fixture_loop_scope=function")
     result = pytester.runpytest_subprocess("-q")
-    result.assert_outcomes(passed=9, errors=6)
+    result.assert_outcomes(passed=10, errors=6)
     output = result.stdout.str()
+    assert "shared memory: /memfd:left" in output
     for name in ("process", "zombie", "descriptor", "shared_memory", "task"):
         assert f"ERROR at teardown of test_leaves_a_{name}".replace("a_shared", "shared") in output
 

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from patience import HANG
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
@@ -29,7 +30,12 @@ def test_every_example_runs(program: str, tmp_path: Path) -> None:
     script = tmp_path / "example.py"
     script.write_text(program)
     done = subprocess.run(
-        [sys.executable, script], cwd=ROOT, capture_output=True, text=True, timeout=120, check=False
+        [sys.executable, script],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=HANG,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
 
@@ -38,12 +44,14 @@ def test_every_example_runs(program: str, tmp_path: Path) -> None:
 def test_every_command_runs(command: str) -> None:
     """A command of the README ends with exit code 0."""
     words = [sys.executable, "-c", "from rlightning_aio.cli import main; main()"]
+    # How long a benchmark measures is a matter of patience.
+    short = ["--seconds", "0.05"] if " bench " in command else []
     done = subprocess.run(
-        [*words, *shlex.split(command)[1:]],
+        [*words, *shlex.split(command)[1:], *short],
         cwd=ROOT,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=HANG,
         check=False,
     )
     assert done.returncode == 0, done.stderr
@@ -59,7 +67,7 @@ def test_every_make_target_exists(command: str) -> None:
         env=environment,
         capture_output=True,
         text=True,
-        timeout=30,
+        timeout=HANG,
         check=False,
     )
     assert done.returncode == 0, done.stderr

@@ -19,7 +19,7 @@ from gymnasium.vector.utils import batch_space, iterate
 
 from rlightning_aio import BatchedData, PolicyResponse, build_env_group, sync
 
-NUM_STEPS = 300
+NUM_STEPS = 160
 NUM_ENVS = 8
 SEED = 11
 
@@ -217,10 +217,14 @@ def test_trajectories_stepped_together(task: Task, placement: str) -> None:
 
 
 @pytest.mark.parametrize("placement", PLACEMENTS)
-@pytest.mark.parametrize("task", [CARTPOLE, TREE], ids=lambda task: task.name)
-async def test_trajectories_collected_as_they_come(task: Task, placement: str) -> None:
+async def test_trajectories_collected_as_they_come(placement: str) -> None:
     """A group of each placement of its own, on either event loop."""
-    await run_async(task, [task.entry(placement, PLACEMENTS[placement])])
+    await run_async(CARTPOLE, [CARTPOLE.entry(placement, PLACEMENTS[placement])])
+
+
+async def test_trajectories_of_every_kind_of_space_collected_as_they_come() -> None:
+    """All placements in one group, on either event loop."""
+    await run_async(TREE, all_at_once(TREE))
 
 
 def test_the_bare_trajectories_have_resets_and_ends_of_both_kinds() -> None:

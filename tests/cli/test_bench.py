@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from cli.command import CARTPOLE, invoke, invoke_json, run, start, write_config
+from patience import HANG
 
 from rlightning_aio import EnvConfig, load_config
 from rlightning_aio.cli import measuring
@@ -87,7 +88,7 @@ def test_an_interrupted_bench_prints_what_it_has(tmp_path: Path) -> None:
         while not child.stderr.readline().startswith("measuring"):
             pass
         child.send_signal(signal.SIGINT)
-        stdout, stderr = child.communicate(timeout=30)
+        stdout, stderr = child.communicate(timeout=HANG)
     assert child.returncode == 130
     assert "Traceback" not in stderr
     if stdout:

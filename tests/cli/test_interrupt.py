@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from cli.command import CARTPOLE, run, start, write_config
+from patience import HANG
 
 if TYPE_CHECKING:
     import subprocess
@@ -47,7 +48,7 @@ def stuck(tmp_path: Path, where: str) -> tuple[str, Path]:
 def interrupt(child: subprocess.Popen[str]) -> tuple[str, str]:
     """Press Ctrl-C; all that the command still says."""
     child.send_signal(signal.SIGINT)
-    stdout, stderr = child.communicate(timeout=30)
+    stdout, stderr = child.communicate(timeout=HANG)
     assert child.returncode == 130, stderr
     assert "Traceback" not in stderr
     assert "Warning:" not in stderr  # Python's way of showing one, with a line of code.
@@ -99,7 +100,7 @@ def test_while_results_never_stop_coming(tmp_path: Path, placement: str) -> None
     assert document["steps"] == document["entries"][0]["steps"]
 
 
-@pytest.mark.parametrize("calls", [300, 40_000, 60_000, 75_000, 100_000, 150_000])
+@pytest.mark.parametrize("calls", [300, 50_000, 75_000, 150_000])
 def test_after_any_number_of_calls(tmp_path: Path, calls: int) -> None:
     """Wherever the code is when the signal comes, from the first option read to the last row."""
     config = write_config(tmp_path, {**CARTPOLE, "num_workers": 2})

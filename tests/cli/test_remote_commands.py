@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from cli.command import COMMAND, TESTS, invoke, invoke_json, start, write_config
+from patience import HANG
 
 from rlightning_aio.remote.keys import read_client_keys, read_server_keys
 
@@ -62,9 +63,9 @@ def test_the_two_terminals_of_the_readme() -> None:
     with spawn(f"{server_line} --steps 500 envs.0.env_kwargs.port=0") as server:
         address = line_with(server, "listens at").split()[-1]
         with spawn(client_line.replace(where, address)) as client:
-            stdout, stderr = server.communicate(timeout=60)
+            stdout, stderr = server.communicate(timeout=HANG)
             client.send_signal(signal.SIGINT)
-            client_stdout, client_stderr = client.communicate(timeout=30)
+            client_stdout, client_stderr = client.communicate(timeout=HANG)
     assert server.returncode == 0, stderr
     assert stdout.startswith("500 steps in ")
     assert client.returncode == 130, client_stderr
@@ -82,8 +83,8 @@ def test_keys_let_a_client_in_until_its_env_is_finished(tmp_path: Path) -> None:
         address = line_with(server, "listens at").split()[-1]
         words = ["--connect", address, "--keys", keys["clients"]["left"], "--name", "left"]
         with start("client", finishing(tmp_path, 5), *words, "--json") as client:
-            stdout, stderr = client.communicate(timeout=60)
-        server_stdout, server_stderr = server.communicate(timeout=60)
+            stdout, stderr = client.communicate(timeout=HANG)
+        server_stdout, server_stderr = server.communicate(timeout=HANG)
     assert client.returncode == 0, stderr
     expected = {"name": "left", "interrupted": False, "steps": 5, "sessions": 1}
     assert json.loads(stdout) == expected
@@ -102,7 +103,7 @@ def test_an_interrupt_closes_the_env_while_nobody_answers(
     with start("client", finishing(tmp_path, 1), "--connect", NOBODY, "--json") as client:
         line_with(client, " dials ")
         client.send_signal(number)
-        stdout, stderr = client.communicate(timeout=30)
+        stdout, stderr = client.communicate(timeout=HANG)
     assert client.returncode == 130, stderr
     assert "Traceback" not in stderr
     document = json.loads(stdout)

@@ -6,6 +6,7 @@ import json
 from typing import TYPE_CHECKING, Any
 
 from cli.command import CARTPOLE, start, write_config
+from patience import HANG
 from remote.counting import ClientThread
 
 if TYPE_CHECKING:
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 SERVER = {
     "name": "robots",
     "backend": "env_server",
-    "env_kwargs": {"min_clients": 2, "connect_timeout": 30},
+    "env_kwargs": {"min_clients": 2, "connect_timeout": HANG},
 }
 
 
@@ -28,7 +29,7 @@ def address(child: subprocess.Popen[str]) -> str:
 
 
 def finish(child: subprocess.Popen[str]) -> Any:
-    stdout, stderr = child.communicate(timeout=60)
+    stdout, stderr = child.communicate(timeout=HANG)
     assert child.returncode == 0, stderr
     return json.loads(stdout)
 
@@ -52,7 +53,7 @@ def test_clients_and_local_envs_are_collected_together(tmp_path: Path) -> None:
     """Each gets actions of its own kind."""
     local = {**CARTPOLE, "num_workers": 2}
     config = write_config(tmp_path, local, SERVER)
-    with start("rollout", config, "--steps", 400, "--min-results", 1, "--json") as child:
+    with start("rollout", config, "--steps", 400, "--min-results", 4, "--json") as child:
         where = address(child)
         clients = [ClientThread(where, name) for name in ("left", "right")]
         document = finish(child)

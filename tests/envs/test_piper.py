@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from patience import HANG
 
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.errors import BadAction, ConfigError
@@ -422,4 +423,4 @@ def test_the_arm_can_live_in_another_process(make: Any, monkeypatch: pytest.Monk
         assert env.reset().observation["joint_positions"] == pytest.approx(READY, abs=0.021)
         env.close()
         process.send_signal(signal.SIGTERM)
-        assert process.wait(10) == 0
+        assert process.wait(HANG) == 0

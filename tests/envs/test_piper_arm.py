@@ -116,7 +116,7 @@ class ArmMachine(RuleBasedStateMachine):
 
 
 TestArmMachine = pytest.mark.simulators(ArmMachine.TestCase)
-TestArmMachine.settings = settings(max_examples=50, stateful_step_count=30, deadline=None)
+TestArmMachine.settings = settings(stateful_step_count=30)
 
 
 def test_joints_reach_their_targets_at_the_set_speed() -> None:

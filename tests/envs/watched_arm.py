@@ -5,6 +5,8 @@ from __future__ import annotations
 import threading
 from typing import TYPE_CHECKING, Any
 
+from patience import HANG
+
 from rlightning_aio.envs.piper_arm import Frame, SimulatedArm
 
 if TYPE_CHECKING:
@@ -31,7 +33,7 @@ class WatchedArm(SimulatedArm):
     def feedback(self) -> list[Frame]:
         return [] if self.silent else super().feedback()
 
-    def wait_for(self, predicate: Callable[[], Any], seconds: float = 5) -> bool:
+    def wait_for(self, predicate: Callable[[], Any], seconds: float = HANG) -> bool:
         """Whether `predicate` becomes true after some command, within that time."""
         with self._changed:
             return bool(self._changed.wait_for(predicate, seconds))

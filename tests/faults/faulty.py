@@ -12,6 +12,7 @@ import ctypes
 import inspect
 import os
 import resource
+import select
 import signal
 import sys
 import threading
@@ -22,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import uvloop
 from gymnasium import spaces
+from patience import HANG
 
 import rlightning_aio
 import rlightning_aio.sync
@@ -311,6 +313,26 @@ def entry(num_workers: int = 2, **fields: Any) -> dict[str, Any]:
         "envs_per_process": num_workers,
         **fields,
     }
+
+
+def two_workers(**fields: Any) -> dict[str, Any]:
+    """Four envs, two in each worker."""
+    return entry(4, **{"envs_per_process": 2, **fields})
+
+
+def pid_of(group: Driven, env_id: str) -> int:
+    """The process of an env."""
+    return group.call(env_id, "returns", os.getpid)
+
+
+def kill(pid: int) -> None:
+    """Kill a process; returns when it is dead."""
+    descriptor = os.pidfd_open(pid)
+    try:
+        signal.pidfd_send_signal(descriptor, signal.SIGKILL)
+        assert select.select([descriptor], [], [], HANG)[0], "it lives"
+    finally:
+        os.close(descriptor)
 
 
 class Tokens:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from patience import HANG
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "differences.py"
 
@@ -24,7 +25,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
         [sys.executable, SCRIPT, "--json", out],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=HANG,
         check=False,
     )
     assert run.returncode == 0, run.stderr

@@ -8,9 +8,9 @@ import signal
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
-from faults.faulty import Driven, Tokens, marked
-from faults.test_deaths import kill, pid_of, two_workers
+from faults.faulty import Driven, Tokens, kill, marked, pid_of, two_workers
 from faults.test_shutdown import read_until, trainer
+from patience import HANG
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -93,7 +93,7 @@ def test_megabytes_for_a_trainer_that_is_busy_wait_in_the_worker(start: Start) -
     group.step_async(tokens.steps(group.group.env_ids))
     for host in group.group._core.supervisor.hosts:
         # The first reply of each has begun to fill its channel, which nobody reads yet.
-        assert select.select([host._link.fileno()], [], [], 10)[0]
+        assert select.select([host._link.fileno()], [], [], HANG)[0]
     batch, _ = group.collect_async(wait_all=True)
     assert len(batch) == 4
     for ret in batch.values():

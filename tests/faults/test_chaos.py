@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from patience import HANG
+
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 
 
@@ -18,7 +20,7 @@ def report_of(script: str, folder: Path, *arguments: str) -> dict[str, Any]:
         [sys.executable, BENCHMARKS / script, *arguments, "--json", out],
         capture_output=True,
         text=True,
-        timeout=100,
+        timeout=HANG,
         check=False,
     )
     assert run.returncode == 0, run.stdout + run.stderr

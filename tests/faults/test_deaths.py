@@ -5,14 +5,14 @@ from __future__ import annotations
 import logging
 import os
 import resource
-import select
 import signal
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import pytest
-from faults.faulty import Driven, Tokens, entry, fork_server_of, marked
+from faults.drivers import first_on_both_drivers, on_one_driver
+from faults.faulty import Driven, Tokens, entry, fork_server_of, kill, marked, pid_of, two_workers
 
 from rlightning_aio.errors import EnvRaised, StartFailed, WorkerDied
 
@@ -33,27 +33,7 @@ ELSEWHERE = ["sigkill", "segfault", "exit 3"]
 """One of each sort, for the places other than a step."""
 
 
-def two_workers(**fields: Any) -> dict[str, Any]:
-    """Four envs, two in each worker."""
-    return entry(4, **{"envs_per_process": 2, **fields})
-
-
-def pid_of(group: Driven, env_id: str) -> int:
-    """The process of an env."""
-    return group.call(env_id, "returns", os.getpid)
-
-
-def kill(pid: int) -> None:
-    """Kill a process; returns when it is dead."""
-    descriptor = os.pidfd_open(pid)
-    try:
-        signal.pidfd_send_signal(descriptor, signal.SIGKILL)
-        assert select.select([descriptor], [], [], 10)[0], "it lives"
-    finally:
-        os.close(descriptor)
-
-
-@pytest.mark.parametrize("death", DEATHS)
+@first_on_both_drivers("death", DEATHS)
 def test_death_in_a_step_gives_one_marked_result_for_each_env_that_owed_one(
     start: Start, death: str
 ) -> None:
@@ -73,6 +53,7 @@ def test_death_in_a_step_gives_one_marked_result_for_each_env_that_owed_one(
     assert [ret.observation[3] for ret in batch.values()] == [1, 1, 2, 2]
 
 
+@on_one_driver
 def test_result_that_was_ready_before_the_death_keeps_its_own_info(start: Start) -> None:
     """What an env had answered is handed out as it was, though its worker is another now."""
     group, tokens = start(entry()), Tokens()
@@ -90,7 +71,7 @@ def test_result_that_was_ready_before_the_death_keeps_its_own_info(start: Start)
     tokens.check(batch)
 
 
-@pytest.mark.parametrize("death", ELSEWHERE)
+@first_on_both_drivers("death", ELSEWHERE)
 def test_death_in_a_reset_is_answered_by_another_reset(start: Start, death: str) -> None:
     """The reset that killed its worker has one marked result, the rest of the group none."""
     group, tokens = start(two_workers()), Tokens()
@@ -104,6 +85,7 @@ def test_death_in_a_reset_is_answered_by_another_reset(start: Start, death: str)
     tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
+@on_one_driver
 def test_death_in_a_reset_with_options_is_answered_by_one_without(start: Start) -> None:
     """Options may be what kills; the replacement's reset doesn't repeat them."""
     group = start(two_workers())
@@ -111,7 +93,7 @@ def test_death_in_a_reset_with_options_is_answered_by_one_without(start: Start) 
     assert marked(batch.values()[0])
 
 
-@pytest.mark.parametrize("death", ELSEWHERE)
+@first_on_both_drivers("death", ELSEWHERE)
 def test_death_in_a_call_is_raised_and_the_env_goes_on(start: Start, death: str) -> None:
     """A call can't be answered by a reset, so it raises; the envs tell at their next step."""
     group, tokens = start(entry()), Tokens()
@@ -125,7 +107,7 @@ def test_death_in_a_call_is_raised_and_the_env_goes_on(start: Start, death: str)
     tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
-@pytest.mark.parametrize("death", ELSEWHERE)
+@first_on_both_drivers("death", ELSEWHERE)
 def test_death_in_close_is_told_and_does_not_hold_up_the_others(start: Start, death: str) -> None:
     """`close` returns, warns which env's worker died and how, and leaves nothing."""
     group = start(two_workers())
@@ -135,7 +117,7 @@ def test_death_in_close_is_told_and_does_not_hold_up_the_others(start: Start, de
 
 
 @pytest.mark.parametrize("place", ["building", "spaces"])
-@pytest.mark.parametrize("death", ELSEWHERE)
+@first_on_both_drivers("death", ELSEWHERE)
 def test_death_while_starting_fails_the_start_with_its_cause(
     build: Start, place: str, death: str
 ) -> None:
@@ -146,6 +128,7 @@ def test_death_while_starting_fails_the_start_with_its_cause(
     assert DEATHS[death] in str(caught.value)
 
 
+@on_one_driver
 def test_error_tells_what_the_worker_wrote_and_where_it_crashed(start: Start) -> None:
     """A segmentation fault's Python stack, and what was printed before, are in the error."""
     group = start(entry(on_worker_death="raise"))
@@ -159,6 +142,7 @@ def test_error_tells_what_the_worker_wrote_and_where_it_crashed(start: Start) ->
     assert "in do" in str(caught.value)
 
 
+@on_one_driver
 def test_sigkill_hints_at_the_out_of_memory_killer(start: Start) -> None:
     """Nobody else tells the user why a process was killed out of the blue."""
     group = start(entry(on_worker_death="raise"))
@@ -166,6 +150,7 @@ def test_sigkill_hints_at_the_out_of_memory_killer(start: Start) -> None:
         group.call("faulty-0", "do", "sigkill")
 
 
+@on_one_driver
 def test_raise_names_the_env_that_was_being_executed(start: Start) -> None:
     """Of several envs in the worker, the error is about the one that was stepping."""
     group, tokens = start(two_workers(on_worker_death="raise")), Tokens()
@@ -207,6 +192,7 @@ def test_idle_worker_that_dies_tells_at_the_next_step(start: Start) -> None:
     assert [marked(ret) for ret in batch.values()] == [True, True, False, False]
 
 
+@on_one_driver
 def test_reset_after_an_idle_death_is_a_plain_reset(start: Start) -> None:
     """Who begins a new episode anyway needn't be told, and gets the seed that was asked for."""
     group, tokens = start(two_workers()), Tokens()
@@ -220,6 +206,7 @@ def test_reset_after_an_idle_death_is_a_plain_reset(start: Start) -> None:
     assert marks[:4] in ([False] * 4, [True, True, False, False])
 
 
+@on_one_driver
 def test_env_that_was_idle_at_the_death_tells_however_late_it_is_asked(start: Start) -> None:
     """Its neighbour has told, and has shown that the replacement works; it has still to tell."""
     group, tokens = start(two_workers()), Tokens()
@@ -263,6 +250,7 @@ def test_others_go_on_while_a_worker_is_being_replaced(start: Start, tmp_path: P
     assert marked(batch["faulty-0"])
 
 
+@on_one_driver
 def test_more_than_max_restarts_in_a_row_is_raised(start: Start) -> None:
     """An env that kills its worker again and again is given up, with the count and the cause."""
     group, tokens = start(entry(1, max_restarts=2)), Tokens()
@@ -275,6 +263,7 @@ def test_more_than_max_restarts_in_a_row_is_raised(start: Start) -> None:
         group.step(tokens.steps(["faulty-0"]))
 
 
+@on_one_driver
 def test_a_completed_step_ends_the_row_of_restarts(start: Start) -> None:
     """Deaths that have steps in between may be as many as they like."""
     group, tokens = start(entry(1, max_restarts=1)), Tokens()
@@ -284,6 +273,7 @@ def test_a_completed_step_ends_the_row_of_restarts(start: Start) -> None:
         tokens.check(group.step(tokens.steps(["faulty-0"]))[0])
 
 
+@on_one_driver
 def test_steps_of_its_neighbours_do_not_absolve_an_env_that_always_dies(start: Start) -> None:
     """Restarts count against the env that was being executed, not against its worker."""
     group, tokens = start(entry(2, max_restarts=2)), Tokens()
@@ -295,6 +285,7 @@ def test_steps_of_its_neighbours_do_not_absolve_an_env_that_always_dies(start: S
         group.step(tokens.steps(["faulty-1"], {"faulty-1": "exit 3"}))
 
 
+@on_one_driver
 def test_replacement_that_can_not_be_built_is_raised_with_why(start: Start, tmp_path: Path) -> None:
     """What its constructor raised is in the error, after as many tries as are allowed."""
     broken = tmp_path / "broken"
@@ -306,6 +297,7 @@ def test_replacement_that_can_not_be_built_is_raised_with_why(start: Start, tmp_
     tokens.check(group.step(tokens.steps(["faulty-2", "faulty-3"]))[0])
 
 
+@on_one_driver
 def test_replacement_whose_reset_raises_answers_with_that(start: Start, tmp_path: Path) -> None:
     """The request ends with one error; the next reset is a plain one."""
     broken = tmp_path / "broken"
@@ -336,6 +328,7 @@ def test_fork_server_that_is_killed_is_replaced_with_its_workers(start: Start) -
     tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
+@on_one_driver
 def test_failed_fork_costs_one_worker_and_tells_why(start: Start) -> None:
     """A machine that is out of descriptors can't replace a worker; the others live on."""
     group, tokens = start(two_workers(max_restarts=2)), Tokens()
@@ -362,6 +355,7 @@ def test_worker_that_loses_its_channel_is_replaced(start: Start) -> None:
     tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
+@on_one_driver
 def test_worker_that_is_interrupted_while_idle_is_replaced(start: Start) -> None:
     """The interrupt struck the runtime, not an env: nobody can tell what was lost."""
     group, tokens = start(two_workers()), Tokens()
@@ -372,6 +366,7 @@ def test_worker_that_is_interrupted_while_idle_is_replaced(start: Start) -> None
     tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
+@on_one_driver
 def test_restart_is_logged(start: Start, caplog: pytest.LogCaptureFixture) -> None:
     """A run that quietly loses episodes would be a lie; each restart is a warning."""
     group, tokens = start(two_workers()), Tokens()

@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from patience import HANG
+
 PAGE = Path(__file__).parents[2] / "docs" / "faults.md"
 
 
@@ -17,7 +19,7 @@ def test_example_of_handling_faults_runs() -> None:
         [sys.executable, "-W", "error", "-c", example],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=HANG,
         check=False,
     )
     assert run.returncode == 0, run.stderr

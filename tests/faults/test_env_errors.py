@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import pytest
-from faults.faulty import Driven, Tokens, entry
-from faults.test_deaths import two_workers
+from faults.drivers import first_on_both_drivers, on_one_driver
+from faults.faulty import Driven, Tokens, entry, two_workers
 
 from rlightning_aio.errors import EnvRaised, RemoteTraceback, StartFailed
 
@@ -91,6 +91,7 @@ def test_whatever_is_raised_while_collecting_ends_one_request(start: Start) -> N
 
 
 @pytest.mark.parametrize("by", ["row", "channel"])
+@on_one_driver
 def test_whatever_a_reset_raises_is_told_and_the_next_reset_works(start: Start, by: str) -> None:
     """With options (which go through the channel) and without (the row holds the seed)."""
     group, tokens = start(two_workers()), Tokens()
@@ -106,6 +107,7 @@ def test_whatever_a_reset_raises_is_told_and_the_next_reset_works(start: Start, 
         tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
+@on_one_driver
 def test_whatever_a_call_raises_is_told(start: Start) -> None:
     """Also what looks like the end of the channel, and isn't."""
     group, tokens = start(two_workers()), Tokens()
@@ -116,7 +118,7 @@ def test_whatever_a_call_raises_is_told(start: Start) -> None:
         tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
-@pytest.mark.parametrize("place", ["building", "spaces"])
+@first_on_both_drivers("place", ["building", "spaces"])
 def test_whatever_is_raised_while_starting_fails_the_start(driver: str, place: str) -> None:
     """`init` says which env, and shows the remote traceback; nothing is left running."""
     for name in ("odd constructor", "unpicklable", "unspeakable", "system exit"):
@@ -130,6 +132,7 @@ def test_whatever_is_raised_while_starting_fails_the_start(driver: str, place: s
         group.end()
 
 
+@on_one_driver
 def test_what_a_preprocess_function_raises_is_told(start: Start) -> None:
     """It runs in the worker, in the step."""
 
@@ -146,6 +149,7 @@ def test_what_a_preprocess_function_raises_is_told(start: Start) -> None:
     tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
+@on_one_driver
 def test_what_close_raises_is_a_warning_and_others_are_closed(start: Start) -> None:
     """There is nothing left that could be done about it, but nobody is kept in the dark."""
     for name in ("odd constructor", "unpicklable", "unspeakable", "system exit"):
@@ -166,6 +170,7 @@ def _foreign() -> Any:
     return module.Thing()
 
 
+@on_one_driver
 def test_value_that_can_not_travel_is_the_error_of_its_call(start: Start) -> None:
     """Neither what can't be pickled there nor what can't be unpickled here breaks anything."""
     group, tokens = start(two_workers()), Tokens()
@@ -176,6 +181,7 @@ def test_value_that_can_not_travel_is_the_error_of_its_call(start: Start) -> Non
     tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
+@on_one_driver
 def test_info_that_can_not_travel_is_the_error_of_its_step(start: Start) -> None:
     """The step has been made; its result can't be told."""
     group, tokens = start(two_workers()), Tokens()
@@ -185,6 +191,7 @@ def test_info_that_can_not_travel_is_the_error_of_its_step(start: Start) -> None
     tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
+@on_one_driver
 def test_info_that_can_not_be_read_here_raises_when_it_is_read(start: Start) -> None:
     """Infos are decoded when somebody asks for them; the rest of the batch is sound."""
     group, tokens = start(two_workers()), Tokens()
@@ -224,6 +231,7 @@ MISFITS: dict[str, tuple[dict[str, Any], str]] = {
 }
 
 
+@on_one_driver
 def test_observation_that_does_not_fit_its_space_is_named_with_both_shapes(start: Start) -> None:
     """Expected and found, shape and dtype; the env can be used on, the others notice nothing."""
     group, tokens = start(two_workers()), Tokens()
@@ -257,6 +265,7 @@ def test_infos_of_ten_megabytes_arrive_whole(start: Start) -> None:
         tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
+@on_one_driver
 def test_megabytes_on_stdout_and_stderr_change_nothing(
     start: Start, capfd: pytest.CaptureFixture[str]
 ) -> None:

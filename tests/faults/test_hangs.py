@@ -9,8 +9,9 @@ import time
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import pytest
-from faults.faulty import Driven, Tokens, entry, marked
-from faults.test_deaths import pid_of, two_workers
+from faults.drivers import first_on_both_drivers, on_one_driver
+from faults.faulty import Driven, Tokens, entry, marked, pid_of, two_workers
+from patience import HANG
 
 import rlightning_aio
 from rlightning_aio import registry
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
     Start: TypeAlias = Callable[..., Driven]
 
-LIMIT = 0.5
+LIMIT = 1.0
 """Seconds; long enough for whoever doesn't hang, on a machine that is busy."""
 
 STACKS = {
@@ -33,7 +34,7 @@ STACKS = {
 }
 
 
-@pytest.mark.parametrize("hang", STACKS)
+@first_on_both_drivers("hang", STACKS)
 def test_hung_step_raises_with_the_stack_of_the_worker(start: Start, hang: str) -> None:
     """What held it is in the error, though it held the interpreter's lock and never returned."""
     group, tokens = start(two_workers(step_timeout=LIMIT, on_worker_death="raise")), Tokens()
@@ -51,7 +52,7 @@ def test_hung_step_raises_with_the_stack_of_the_worker(start: Start, hang: str) 
     tokens.check(group.step(tokens.steps(["faulty-2", "faulty-3"]))[0])
 
 
-@pytest.mark.parametrize("hang", [*STACKS, "stop"])
+@first_on_both_drivers("hang", [*STACKS, "stop"])
 def test_hung_step_is_answered_by_its_replacement(start: Start, hang: str) -> None:
     """One marked result each for who owed one; then every env answers what it is asked."""
     group, tokens = start(two_workers(step_timeout=LIMIT)), Tokens()
@@ -77,6 +78,7 @@ def test_hung_reset_is_found_by_its_own_limit(start: Start) -> None:
     tokens.check(group.collect_async()[0])
 
 
+@on_one_driver
 def test_hung_reset_with_options_is_found(start: Start) -> None:
     """It went through the channel and not through the ring."""
     group = start(entry(1, reset_timeout=LIMIT))
@@ -107,7 +109,7 @@ def test_hang_is_found_while_others_leave_the_trainer_no_time_to_wait(start: Sta
     """Collecting what is always ready must not hide what never comes."""
     group, tokens = start(two_workers(step_timeout=LIMIT)), Tokens()
     group.step_async(tokens.steps(["faulty-0"], {"faulty-0": "sleep"}))
-    until = time.monotonic() + 30
+    until = time.monotonic() + HANG
     found: dict[str, Any] = {}
     while "faulty-0" not in found and time.monotonic() < until:
         group.step_async(tokens.steps(["faulty-2", "faulty-3"]))
@@ -133,8 +135,8 @@ def test_trainer_that_comes_late_takes_nobody_for_hung(start: Start) -> None:
 def test_start_that_hangs_fails_with_the_stack(build: Start) -> None:
     """`init` says which limit was exceeded and where the constructor stands."""
     kwargs = {"faults": {"building": "deadlock"}, "only": 3}
-    group = build(two_workers(env_kwargs=kwargs, start_timeout=5))
-    with pytest.raises(StartFailed, match=r"faulty-3.*did not start within 5") as caught:
+    group = build(two_workers(env_kwargs=kwargs, start_timeout=10))
+    with pytest.raises(StartFailed, match=r"faulty-3.*did not start within 10") as caught:
         group.init()
     assert "in _deadlock" in str(caught.value)
 
@@ -159,7 +161,7 @@ def test_replacement_that_hangs_is_replaced_until_there_are_too_many(
     """`start_timeout` holds for restarts as well."""
     broken = tmp_path / "broken"
     kwargs = {"faults": {"building": "sleep"}, "while_exists": str(broken)}
-    config = two_workers(env_kwargs=kwargs, max_restarts=1, start_timeout=5)
+    config = two_workers(env_kwargs=kwargs, max_restarts=1)
     group, tokens = start(config), Tokens()
     for member in group.group._core.supervisor._records:
         member.config = member.config.model_copy(update={"start_timeout": LIMIT})
@@ -170,13 +172,14 @@ def test_replacement_that_hangs_is_replaced_until_there_are_too_many(
     tokens.check(group.step(tokens.steps(["faulty-2"]))[0])
 
 
+@on_one_driver
 def test_replacement_that_hangs_is_found_though_nobody_was_waiting_for_it(
     start: Start, tmp_path: Path
 ) -> None:
     """The worker died idle, so the first to ask was a plain reset."""
     broken = tmp_path / "broken"
     kwargs = {"faults": {"building": "sleep"}, "while_exists": str(broken)}
-    group = start(two_workers(env_kwargs=kwargs, max_restarts=1, start_timeout=5))
+    group = start(two_workers(env_kwargs=kwargs, max_restarts=1))
     tokens = Tokens()
     for member in group.group._core.supervisor._records:
         member.config = member.config.model_copy(update={"start_timeout": LIMIT})

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import pytest
-from faults.faulty import Driven, Tokens, entry
-from faults.test_deaths import two_workers
+from faults.drivers import on_one_driver
+from faults.faulty import Driven, Tokens, entry, two_workers
 
 import rlightning_aio
 from rlightning_aio import BatchedData, PolicyResponse
@@ -52,6 +52,7 @@ def responses(env_ids: list[str], chosen: Any) -> BatchedData:
 
 
 @pytest.mark.parametrize("bad", BAD_ACTIONS)
+@on_one_driver
 def test_bad_actions_are_refused_and_nothing_is_sent(start: Start, bad: str) -> None:
     """As columns and as values, waited for or not; the next request is answered rightly."""
     group, tokens = start(two_workers()), Tokens()
@@ -68,6 +69,7 @@ def test_bad_actions_are_refused_and_nothing_is_sent(start: Start, bad: str) -> 
         tokens.check(group.step(tokens.steps(env_ids))[0])
 
 
+@on_one_driver
 def test_one_bad_action_of_many_is_named(start: Start) -> None:
     """The message is about the env whose action is wrong, and no other env has stepped."""
     group, tokens = start(two_workers()), Tokens()
@@ -80,6 +82,7 @@ def test_one_bad_action_of_many_is_named(start: Start) -> None:
     assert found.observation[:, 3].tolist() == [1, 1, 1, 1]
 
 
+@on_one_driver
 def test_responses_must_be_as_many_as_the_batch(start: Start) -> None:
     """A column of another length is refused where it is given."""
     group, tokens = start(two_workers()), Tokens()
@@ -93,6 +96,7 @@ def test_responses_must_be_as_many_as_the_batch(start: Start) -> None:
 
 
 @pytest.mark.parametrize("form", ["columns", "values"])
+@on_one_driver
 def test_nan_is_found_when_debugging(
     start: Start, monkeypatch: pytest.MonkeyPatch, form: str
 ) -> None:
@@ -124,6 +128,7 @@ def test_debugging_is_switched_by_the_environment(value: str | None, found: str)
     assert result.stdout.strip() == found
 
 
+@on_one_driver
 def test_unknown_and_doubled_ids_are_named(start: Start) -> None:
     """Whichever call they are given to, nothing of it is sent."""
     group, tokens = start(two_workers()), Tokens()
@@ -165,6 +170,7 @@ def test_busy_env_refuses_the_whole_batch(start: Start) -> None:
     assert found.observation[:, 3].tolist() == [1, 2, 1, 1]
 
 
+@on_one_driver
 def test_what_can_not_be_sent_is_refused_before_anything_is(start: Start) -> None:
     """An argument of a call, options of a reset, an extra of one response among many."""
     group, tokens = start(two_workers(), preprocess_fn=lambda response: response.action), Tokens()
@@ -193,16 +199,17 @@ USES: dict[str, Callable[[Any], Any]] = {
 }
 
 
-@pytest.mark.parametrize("use", USES)
-def test_use_before_init_and_after_close_says_so(build: Start, use: str) -> None:
+def test_use_before_init_and_after_close_says_so(build: Start) -> None:
     """Neither hangs, and each says what to do instead."""
     group = build(entry())
-    with pytest.raises(GroupClosed, match="call init"):
-        USES[use](group)
+    for use in USES.values():
+        with pytest.raises(GroupClosed, match="call init"):
+            use(group)
     group.init()
     group.close()
-    with pytest.raises(GroupClosed, match="build a new one"):
-        USES[use](group)
+    for use in USES.values():
+        with pytest.raises(GroupClosed, match="build a new one"):
+            use(group)
     with pytest.raises(GroupClosed, match="build a new one"):
         group.init()
 

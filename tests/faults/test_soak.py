@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from patience import HANG
+
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "soak.py"
 
 
@@ -17,7 +19,7 @@ def test_nothing_piles_up_over_groups(tmp_path: Path) -> None:
         [sys.executable, SCRIPT, "--cycles", "6", "--steps", "3000", "--json", out],
         capture_output=True,
         text=True,
-        timeout=100,
+        timeout=HANG,
         check=False,
     )
     assert run.returncode == 0, run.stdout + run.stderr

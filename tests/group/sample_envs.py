@@ -8,9 +8,10 @@ is drawn anew, so that seeds matter. The others are registered backends; see eac
 from __future__ import annotations
 
 import os
+from contextlib import contextmanager
 from copy import deepcopy
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -18,6 +19,9 @@ from gymnasium import spaces
 
 from rlightning_aio import ENVS, BaseEnv, EnvRet, MultiAgentEnvRet, PolicyResponse
 from rlightning_aio.envs.base import BareStep, result_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 TREE = spaces.Dict(
     place=spaces.Box(-1, 1, (3,), np.float32),
@@ -191,9 +195,15 @@ class Gate:
         with self._path.open("rb") as gate:
             gate.read()
 
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Begins once the env has come to the gate, where it waits meanwhile."""
+        with self._path.open("wb"):
+            yield
+
     def open(self) -> None:
         """Returns once the env has come to the gate, and goes on."""
-        with self._path.open("wb"):
+        with self.held():
             pass
 
 

@@ -325,7 +325,7 @@ async def test_inline_envs_are_served_while_others_are_waited_for(
 
 
 @pytest.mark.asyncio(loop_factories=["uvloop"])
-async def test_closing_wakes_whoever_waits(group: Any) -> None:
+async def test_closing_wakes_whoever_waits(group: Any, gates: list[Gate]) -> None:
     """A collector and a stepper learn at once that nothing will come; envs get their time."""
     group.step_async(responses(0))
     waiting = [
@@ -333,11 +333,12 @@ async def test_closing_wakes_whoever_waits(group: Any) -> None:
         asyncio.create_task(group.step(responses(1))),
     ]
     await asyncio.sleep(0)
-    closing = asyncio.create_task(group.close())
-    await asyncio.wait(waiting)
-    assert not closing.done()
-    for task in waiting:
-        with pytest.raises(GroupClosed):
-            task.result()
-    with pytest.warns(UserWarning, match="did not close in time"):
-        await closing
+    with gates[0].held(), gates[1].held():
+        closing = asyncio.create_task(group.close())
+        await asyncio.wait(waiting)
+        assert not closing.done()
+        for task in waiting:
+            with pytest.raises(GroupClosed):
+                task.result()
+        with pytest.warns(UserWarning, match="did not close in time"):
+            await closing

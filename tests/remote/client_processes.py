@@ -18,7 +18,7 @@ from rlightning_aio.remote import RemoteEnvClient
 def serve(address: str, name: str, task: str) -> None:
     host, _, port = address.removeprefix("tcp://").rpartition(":")
     env = GymnasiumEnv(EnvConfig(name="env", backend="gymnasium", task=task))
-    with RemoteEnvClient(env, host, int(port), name=name, heartbeat=2.0) as client:
+    with RemoteEnvClient(env, host, int(port), name=name, heartbeat=5.0) as client:
         client.run()
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
+from patience import HANG
 
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.envs.base import BaseEnv
@@ -77,7 +78,7 @@ class ClientThread:
         self.env = env or CountingEnv()
         self.error: BaseException | None = None
         self.client = RemoteEnvClient(
-            self.env, host, int(port), name=name, **{"heartbeat": 1.0, **options}
+            self.env, host, int(port), name=name, **{"heartbeat": 5.0, **options}
         )
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
@@ -90,7 +91,7 @@ class ClientThread:
             self.error = error
 
     def join(self) -> None:
-        self._thread.join(20)
+        self._thread.join(HANG)
         assert not self._thread.is_alive(), f"the client did not end: {self.client.state}"
         if self.error is not None:
             raise self.error

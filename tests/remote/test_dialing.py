@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 import zmq
+from patience import HANG
 from remote.counting import CountingEnv
 
 from rlightning_aio.remote import RemoteEnvClient
@@ -35,5 +36,5 @@ def test_an_interrupt_while_dialing_closes_what_is_open(
     assert env.closed
     for thread in threading.enumerate():
         if thread.name == ENDING:
-            thread.join(20)
+            thread.join(HANG)
             assert not thread.is_alive()

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from patience import HANG
 from remote.counting import ClientThread, CountingEnv
 from remote.faulty_proxy import Faults, FaultyProxy
 
@@ -124,4 +125,4 @@ def exchange(group: Any, requests: int) -> dict[str, int]:
                 sent += 1
         if responses:
             group.step_async(BatchedData(["robots-0"] * len(responses), responses))
-        batch, _ = group.collect_async(deadline=60)
+        batch, _ = group.collect_async(deadline=HANG)

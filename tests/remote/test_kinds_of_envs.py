@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
+from patience import HANG
 from remote.counting import ClientThread
 from remote.random_spaces import same, sampled
 
@@ -151,7 +152,7 @@ def trajectory(group: Any, kind: type[_Sampling]) -> Iterator[Any]:
         (env_id,) = batch.env_ids()
         response = PolicyResponse(env_id, actions_of(kind, step), log_prob=-0.5, step=step)
         group.step_async(BatchedData(batch.ids(), [response]))
-        batch, _ = group.collect_async(deadline=20)
+        batch, _ = group.collect_async(deadline=HANG)
         yield batch.values()[0]
     batch, _ = group.reset(options={"where": "here"})
     yield batch.values()[0]

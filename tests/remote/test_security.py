@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 import zmq
+from patience import HANG
 from remote.counting import ClientThread, CountingEnv
 from remote.random_spaces import mutation
 
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
 
 def entry(**env_kwargs: Any) -> dict[str, Any]:
-    kwargs = {"heartbeat": 1.0, "connect_timeout": 20, **env_kwargs}
+    kwargs = {"heartbeat": 5.0, "connect_timeout": HANG, **env_kwargs}
     return {"name": "robots", "backend": "env_server", "env_kwargs": kwargs}
 
 
@@ -145,9 +146,9 @@ def test_who_has_not_the_right_key_gets_nowhere(kind: str, tmp_path: Path) -> No
         batch, _ = group.reset()
         thread = threading.Thread(target=try_to_get_in)
         thread.start()
-        while thread.is_alive():
+        while thread.is_alive() or friend.env.steps <= 10:
             group.step_async(batch.respond(action=np.zeros((1, 2), np.float32)))
-            batch, _ = group.collect_async(deadline=20)
+            batch, _ = group.collect_async(deadline=HANG)
         thread.join()
         assert group["robots-0"].clients == ["robots-0/arm"]
         group.close()
@@ -165,10 +166,10 @@ def test_a_client_is_told_when_its_key_is_not_on_the_list(tmp_path: Path) -> Non
     listed.rename(hidden)
     with sync.build_env_group(entry(keys=str(tmp_path / "server"))) as group:
         friend = ClientThread(group["robots-0"].address, "arm", keys=arm)
-        with pytest.raises(TimeoutError):
-            # Nobody comes; the group only has to listen meanwhile.
-            group.collect_async(deadline=0.5)
-        assert "the server does not know this client's key" in friend.client.state
+        while "the server does not know this client's key" not in friend.client.state:
+            with pytest.raises(TimeoutError):
+                # Nobody comes; the group only has to listen meanwhile.
+                group.collect_async(deadline=0.1)
         hidden.rename(listed)
         batch, _ = group.reset()
         assert batch.values()[0].env_id == "robots-0/arm"
@@ -263,10 +264,10 @@ def test_nonsense_and_pickles_from_strangers_leave_the_service_unharmed(tmp_path
                         stranger.send_multipart(parts)
                 if k % 10 == 0:
                     group.step_async(batch.respond(action=np.zeros((1, 2), np.float32)))
-                    batch, _ = group.collect_async(deadline=20)
+                    batch, _ = group.collect_async(deadline=HANG)
             while remote.malformed < 500:
                 group.step_async(batch.respond(action=np.zeros((1, 2), np.float32)))
-                batch, _ = group.collect_async(deadline=20)
+                batch, _ = group.collect_async(deadline=HANG)
         assert group["robots-0"].clients == ["robots-0/arm"]
         group.close()
         friend.join()
@@ -288,7 +289,7 @@ def test_a_frame_beyond_the_limit_is_not_taken_in() -> None:
             stranger.send(bytes((64 << 20) + 1))
             while not monitor.poll(0):
                 group.step_async(batch.respond(action=np.zeros((1, 2), np.float32)))
-                batch, _ = group.collect_async(deadline=20)
+                batch, _ = group.collect_async(deadline=HANG)
             stranger.disable_monitor()
             monitor.close()
         assert group["robots-0"]._server[0]._listener.malformed == 0
@@ -315,9 +316,9 @@ def test_a_client_survives_a_server_that_talks_nonsense() -> None:
         thread.start()
         env = CountingEnv()
         with RemoteEnvClient(env, "127.0.0.1", port, name="arm") as client:
-            with pytest.raises(TimeoutError, match="asking to be let in"):
-                client.connect(timeout=1.5)
-            assert client._session.malformed > 20
+            while client._session.malformed <= 20:
+                with pytest.raises(TimeoutError, match="asking to be let in"):
+                    client.connect(timeout=0.5)
         done.set()
         thread.join()
     assert env.closed
@@ -332,4 +333,4 @@ def test_a_client_without_a_server_says_so() -> None:
             TimeoutError, match=r"tcp://127.0.0.1:1 did not let 'arm' in.*nobody answers"
         ),
     ):
-        client.connect(timeout=0.5)
+        client.connect(timeout=2.0)

@@ -165,4 +165,4 @@ class UnreliableNetwork(RuleBasedStateMachine):
 
 
 TestUnreliableNetwork = UnreliableNetwork.TestCase
-TestUnreliableNetwork.settings = settings(max_examples=200, stateful_step_count=60, deadline=None)
+TestUnreliableNetwork.settings = settings(stateful_step_count=60)
