@@ -71,7 +71,7 @@ class Doom:
 
 
 @dataclass
-class Tally:
+class Findings:
     """What has happened."""
 
     requests: Counter[str] = field(default_factory=Counter)
@@ -136,7 +136,7 @@ class Chaos:
     def __init__(
         self, group: EnvGroup, deaths: Deaths, clock: Any, faults: int, rng: random.Random
     ) -> None:
-        self.tally = Tally()
+        self.findings = Findings()
         self._group = group
         self._deaths = deaths
         self._clock = clock
@@ -241,7 +241,7 @@ class Chaos:
 
     def _next_fault(self) -> str:
         fault = self._plan.pop()
-        self.tally.faults[fault] += 1
+        self.findings.faults[fault] += 1
         return fault
 
     # -- answers ------------------------------------------------------------------
@@ -267,7 +267,7 @@ class Chaos:
         except TimeoutError:
             if given_up is None:
                 raise Broken(f"no answer within {LONGEST_WAIT} s: {self._owed()}") from None
-            self.tally.interrupted[given_up] += 1
+            self.findings.interrupted[given_up] += 1
         except EnvFault as fault:
             self._failed(fault)
         else:
@@ -301,11 +301,11 @@ class Chaos:
     def _open(self, env: int, request: Request) -> None:
         assert self._envs[env].open is None
         self._envs[env].open = request
-        self.tally.requests[request.kind] += 1
+        self.findings.requests[request.kind] += 1
 
     def _close(self, env: int, how: str) -> Request:
         request, self._envs[env].open = self._envs[env].open, None
-        self.tally.ends[how] += 1
+        self.findings.ends[how] += 1
         if request is None:
             raise Broken(f"e-{env} answered ({how}) although nothing was asked of it")
         return request
@@ -317,7 +317,7 @@ class Chaos:
             request = self._close(env, "marked result" if marked else "result")
             wrong = self._wrong(env, request, ret, marked=marked)
             if wrong:
-                self.tally.broken.append(f"e-{env}, {request}: {wrong} in {ret}")
+                self.findings.broken.append(f"e-{env}, {request}: {wrong} in {ret}")
 
     def _wrong(self, k: int, request: Request, ret: Any, *, marked: bool) -> str | None:
         """What is not as it must be in the result of an env, if anything."""
@@ -350,7 +350,7 @@ class Chaos:
             env = int(name.removeprefix("e-"))
             request = self._close(env, type(fault).__name__)
             if not (isinstance(fault, EnvRaised) and request.raises):
-                self.tally.broken.append(f"e-{env}, {request}: unexpected {fault!r}")
+                self.findings.broken.append(f"e-{env}, {request}: unexpected {fault!r}")
             self._envs[env].to_reset = True
 
     def _owed(self) -> str:
@@ -378,12 +378,12 @@ class Chaos:
             self._forget(worker)
             doom = self._dooms.pop(worker, None)
             if doom is None:
-                self.tally.unasked += 1
+                self.findings.unasked += 1
                 continue
             since = doom.since or float(self._clock[doom.env])
             if doom.fault == "hung":
                 since += STEP_TIMEOUT
-            self.tally.noticed[doom.fault].append(max(0.0, when - since))
+            self.findings.noticed[doom.fault].append(max(0.0, when - since))
         self._deaths.heard.clear()
 
 
@@ -405,7 +405,7 @@ async def nothing() -> None:
     """The first event loop opens descriptors that stay for good."""
 
 
-async def chaos(faults: int, seed: int, clock: str) -> Tally:
+async def chaos(faults: int, seed: int, clock: str) -> Findings:
     """Run it; what has happened."""
     entry = {
         "name": "e",
@@ -426,27 +426,27 @@ async def chaos(faults: int, seed: int, clock: str) -> Tally:
             try:
                 await run.run()
             except Broken as broken:
-                run.tally.broken.append(str(broken))
-    return run.tally
+                run.findings.broken.append(str(broken))
+    return run.findings
 
 
-def report_of(tally: Tally, seconds: float, left: set[str]) -> dict[str, Any]:
+def report_of(findings: Findings, seconds: float, left: set[str]) -> dict[str, Any]:
     """What is told of a run."""
-    deaths = tally.noticed["killed"] + tally.noticed["exited"]
+    deaths = findings.noticed["killed"] + findings.noticed["exited"]
     return {
         "seconds": seconds,
-        "faults": dict(tally.faults),
-        "requests": dict(tally.requests),
-        "ends": dict(tally.ends),
-        "interrupted": dict(tally.interrupted),
-        "unasked_restarts": tally.unasked,
+        "faults": dict(findings.faults),
+        "requests": dict(findings.requests),
+        "ends": dict(findings.ends),
+        "interrupted": dict(findings.interrupted),
+        "unasked_restarts": findings.unasked,
         "noticed_ms": {
             name: {"count": len(times), **_percentiles(times)}
-            for name, times in {**tally.noticed, "deaths": deaths}.items()
+            for name, times in {**findings.noticed, "deaths": deaths}.items()
         },
         "target_ms": 1e3 * TARGET,
         "leaks": sorted(left),
-        "broken": tally.broken,
+        "broken": findings.broken,
         "machine": machine_facts([]),
     }
 
@@ -507,9 +507,9 @@ def main() -> int:
     before, began = held(), time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         clock = str(Path(folder) / "clock")
-        tally = rl.run(chaos(arguments.faults, arguments.seed, clock))
+        findings = rl.run(chaos(arguments.faults, arguments.seed, clock))
     gc.collect()  # The mapping of the clock.
-    report = report_of(tally, time.monotonic() - began, held() - before)
+    report = report_of(findings, time.monotonic() - began, held() - before)
     print(table(report))
     for broken in [*report["broken"], *report["leaks"]]:
         print(f"broken: {broken}")

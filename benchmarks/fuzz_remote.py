@@ -30,12 +30,12 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     logging.disable(logging.WARNING)
-    tally = fuzz(given.frames, given.seed)
-    print(f"{tally.frames:,} spoilt messages to each end")
-    print(f"{tally.malformed:,} dropped as no message")
-    print(f"{tally.steps:,} requests between them, each answered")
-    print(f"{tally.grown:+,} bytes held more after the second half than after the first")
-    return 1 if tally.grown > GROWTH else 0
+    findings = fuzz(given.frames, given.seed)
+    print(f"{findings.frames:,} spoilt messages to each end")
+    print(f"{findings.malformed:,} dropped as no message")
+    print(f"{findings.steps:,} requests between them, each answered")
+    print(f"{findings.grown:+,} bytes held more after the second half than after the first")
+    return 1 if findings.grown > GROWTH else 0
 
 
 if __name__ == "__main__":

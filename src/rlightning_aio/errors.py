@@ -8,10 +8,7 @@ Absent on purpose: exceptions that rebuild a user's own exception type.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from rlightning_aio.batch import BatchedData
+from typing import Any
 
 __all__ = [
     "BadAction",
@@ -19,6 +16,7 @@ __all__ = [
     "ConfigError",
     "EnvAway",
     "EnvBusy",
+    "EnvFault",
     "EnvHung",
     "EnvRaised",
     "GroupClosed",
@@ -83,7 +81,7 @@ class EnvFault(RLightningError):
 
     Attributes:
         env_id: the env at fault.
-        results: for `step` and `reset`, the results of the other envs of the same
+        results: for `step` and `reset`, a `BatchedData` of the other envs of the same
             call, which did succeed; None where the call had no other envs.
         others: further faults of the same call.
     """
@@ -91,7 +89,7 @@ class EnvFault(RLightningError):
     def __init__(self, message: str, *, env_id: str) -> None:
         super().__init__(message)
         self.env_id = env_id
-        self.results: BatchedData | None = None
+        self.results: Any = None
         self.others: tuple[EnvFault, ...] = ()
 
 

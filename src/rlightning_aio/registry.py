@@ -20,13 +20,12 @@ from rlightning_aio.errors import ConfigError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from rlightning_aio.envs.base import BaseEnv
 
 __all__ = ["BACKENDS", "ENVS", "PLACEMENTS", "Backend", "Placement", "Registry", "load"]
 
 ENTRY_POINT_GROUP = "rlightning_aio.envs"
 
-EnvClass = TypeVar("EnvClass", bound="type[BaseEnv]")
+EnvClass = TypeVar("EnvClass", bound="type[Any]")
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +138,7 @@ class Registry:
     """Env classes by backend name."""
 
     def __init__(self) -> None:
-        self._classes: dict[str, type[BaseEnv]] = {}
+        self._classes: dict[str, type[Any]] = {}
 
     def register(self, name: str) -> Callable[[EnvClass], EnvClass]:
         """Class decorator: makes the class known as backend `name`.
@@ -159,7 +158,7 @@ class Registry:
 
         return remember
 
-    def registered(self, name: str) -> type[BaseEnv] | None:
+    def registered(self, name: str) -> type[Any] | None:
         """The class registered in this process under `name`, if any."""
         return self._classes.get(name)
 
@@ -172,7 +171,7 @@ class Registry:
         entry_points = importlib.metadata.entry_points(group=ENTRY_POINT_GROUP)
         return sorted({*self._classes, *BACKENDS, *(ep.name for ep in entry_points)})
 
-    def resolve(self, name: str) -> type[BaseEnv]:
+    def resolve(self, name: str) -> type[Any]:
         """Import and return the class of backend `name`.
 
         Raises:

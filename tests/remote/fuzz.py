@@ -19,7 +19,7 @@ _KEPT = 200
 
 
 @dataclass
-class Tally:
+class Findings:
     """What came of a run.
 
     Attributes:
@@ -35,21 +35,21 @@ class Tally:
     grown: int = 0
 
 
-def fuzz(frames: int, seed: int) -> Tally:
+def fuzz(frames: int, seed: int) -> Findings:
     """Deliver `frames` spoilt messages to each end; every fiftieth time, expect service."""
     rng = np.random.default_rng(seed)
     world = World()
     world.join_all()
     seen = {True: deque[list[bytes]](maxlen=_KEPT), False: deque[list[bytes]](maxlen=_KEPT)}
-    tally = Tally()
+    findings = Findings()
     number = 0
     tracemalloc.start()
     try:
         held = 0
-        while tally.frames < frames:
-            name = "ab"[tally.frames % 2]
+        while findings.frames < frames:
+            name = "ab"[findings.frames % 2]
             number += 1
-            step(world, name, number, tally)
+            step(world, name, number, findings)
             for (_, to_server), said in world.said.items():
                 seen[to_server].extend(said)
             world.said.clear()
@@ -59,16 +59,16 @@ def fuzz(frames: int, seed: int) -> Tally:
                 client.ended.clear()
             for _ in range(25):
                 spoil(world, name, seen, rng)
-                tally.frames += 1
-            if not held and tally.frames >= frames // 2:
+                findings.frames += 1
+            if not held and findings.frames >= frames // 2:
                 held = tracemalloc.get_traced_memory()[0]
-        tally.grown = tracemalloc.get_traced_memory()[0] - held
+        findings.grown = tracemalloc.get_traced_memory()[0] - held
     finally:
         tracemalloc.stop()
-    tally.malformed = world.server.malformed + sum(
+    findings.malformed = world.server.malformed + sum(
         client.session.malformed for client in world.clients.values()
     )
-    return tally
+    return findings
 
 
 def spoil(
@@ -87,7 +87,7 @@ def spoil(
     world.take()
 
 
-def step(world: World, name: str, number: int, tally: Tally) -> None:
+def step(world: World, name: str, number: int, findings: Findings) -> None:
     """Have the client step; it may have been driven out, but must come back and serve."""
     for _ in range(200):
         client = world.clients[name]
@@ -104,7 +104,7 @@ def step(world: World, name: str, number: int, tally: Tally) -> None:
     for _ in range(20):
         world.settle()
         if any(result.number == number for result in world.take()):
-            tally.steps += 1
+            findings.steps += 1
             return
         world.pass_time(1.0)
     raise AssertionError(f"{name} never answered")

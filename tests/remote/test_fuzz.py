@@ -12,7 +12,7 @@ FRAMES = 4_000
 @pytest.mark.parametrize("seed", range(3))
 def test_spoilt_messages_do_no_harm(seed: int) -> None:
     """Between them, every request is answered."""
-    tally = fuzz(FRAMES, seed)
-    assert tally.steps >= FRAMES // 25
-    assert tally.malformed > FRAMES // 2
-    assert tally.grown < 200_000  # pytest keeps what was logged.
+    findings = fuzz(FRAMES, seed)
+    assert findings.steps >= FRAMES // 25
+    assert findings.malformed > FRAMES // 2
+    assert findings.grown < 200_000  # pytest keeps what was logged.

@@ -163,7 +163,7 @@ class ResultColumns:
 
     # -- one row ----------------------------------------------------------------------
 
-    def beside(self, row: int) -> dict[str, Any]:
+    def out_of_band_of(self, row: int) -> dict[str, Any]:
         """What came out of band for `row`; empty if nothing did."""
         found = self.out_of_band.get(row)
         if isinstance(found, bytes):
@@ -172,7 +172,7 @@ class ResultColumns:
 
     def observation_of(self, row: int) -> Any:
         """One env's observation."""
-        kept = self.beside(row) if self.out_of_band else {}
+        kept = self.out_of_band_of(row) if self.out_of_band else {}
         if "ret" in kept:
             return kept["ret"].observation
         if self.observation is not None:
@@ -181,7 +181,7 @@ class ResultColumns:
 
     def info_of(self, row: int) -> dict[str, Any]:
         """One env's info, with the episode's sums if it has just ended."""
-        kept = self.beside(row) if self.out_of_band else {}
+        kept = self.out_of_band_of(row) if self.out_of_band else {}
         if "ret" in kept:
             info = kept["ret"].info
         elif "info" in kept:
@@ -223,7 +223,7 @@ class ResultColumns:
 
     def ret(self, row: int) -> EnvRet | MultiAgentEnvRet:
         """One env's result as a value of its own."""
-        kept = self.beside(row) if self.out_of_band else {}
+        kept = self.out_of_band_of(row) if self.out_of_band else {}
         if "ret" in kept:
             return self._ret_handed_over(row, kept["ret"])
         fields = {

@@ -13,7 +13,7 @@ import time
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from rlightning_aio.group.build import PreprocessFn, plan_group
-from rlightning_aio.group.facade import Facade, ServerView, sole, steps_of
+from rlightning_aio.group.facade import Facade, ServerView, only_result, steps_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Mapping, Sequence
@@ -288,11 +288,11 @@ class EnvHandle:
     ) -> EnvRet | MultiAgentEnvRet:
         """Start a new episode; `seed` is the env's own."""
         seeds = None if seed is None else [seed]
-        return sole(await self._group.reset(seeds, options, [self.env_id]))
+        return only_result(await self._group.reset(seeds, options, [self.env_id]))
 
     async def step(self, response: PolicyResponse | Any) -> EnvRet | MultiAgentEnvRet:
         """Step with a `PolicyResponse`, or with a bare action."""
-        return sole(await self._group.step(steps_of(self.env_id, response)))
+        return only_result(await self._group.step(steps_of(self.env_id, response)))
 
     async def call(self, name: str, *args: Any, **kwargs: Any) -> Any:
         """Call method `name` of the env (or, if it has none, of its simulator); its value.

@@ -330,8 +330,8 @@ class Core:
             if not len(slots):
                 return
         self._check_sendable(slots, "step")
-        beside = write_actions(batch, slots, self.envs, self._layout)
-        packed = [] if beside is None else self._packed_steps(slots, beside)
+        out_of_band = write_actions(batch, slots, self.envs, self._layout)
+        packed = [] if out_of_band is None else self._packed_steps(slots, out_of_band)
         self._results.note_sent(slots, _columns(batch))
         resets = self.auto.due(slots)
         if self._recovery.any_untold:
@@ -342,10 +342,10 @@ class Core:
             self.requests.into_resets(slots, entries, resets)
         else:
             resets = None
-        if beside is None:
+        if out_of_band is None:
             self._hand_over(slots, entries)
         else:
-            self._hand_over_apart(slots, entries, beside.positions, packed, resets)
+            self._hand_over_apart(slots, entries, out_of_band.positions, packed, resets)
         if self.supervisor.has_members:
             self.drain()  # What was withdrawn at once.
 
@@ -364,17 +364,17 @@ class Core:
         env_ids, values = batch.env_ids(), batch.values()
         return BatchedData([env_ids[k] for k in kept], [values[k] for k in kept]), slots[kept]
 
-    def _packed_steps(self, slots: NDArray[np.intp], beside: OutOfBandSteps) -> list[Any]:
+    def _packed_steps(self, slots: NDArray[np.intp], out_of_band: OutOfBandSteps) -> list[Any]:
         """What goes out of band, packed before anything is sent."""
-        chosen = slots[beside.positions].tolist()
+        chosen = slots[out_of_band.positions].tolist()
         try:
-            for slot, (action, _) in zip(chosen, beside.contents, strict=True):
+            for slot, (action, _) in zip(chosen, out_of_band.contents, strict=True):
                 if slot >= len(self.envs.all) and action is not NO_ACTION:
                     host = self._host_of(slot)
                     cast("Membership", host).check_step(slot - host.first_slot, action)
             return [
                 self._packed(slot, content, "the response")
-                for slot, content in zip(chosen, beside.contents, strict=True)
+                for slot, content in zip(chosen, out_of_band.contents, strict=True)
             ]
         except TypeError as error:
             raise BadAction(str(error)) from error

@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from rlightning_aio.group.wait import Procedure
     from rlightning_aio.hosts.base import Membership
 
-__all__ = ["AutoResetContext", "Facade", "ServerView", "sole", "steps_of"]
+__all__ = ["AutoResetContext", "Facade", "ServerView", "only_result", "steps_of"]
 
 
-def sole(results: tuple[BatchedData, Any]) -> EnvRet | MultiAgentEnvRet:
+def only_result(results: tuple[BatchedData, Any]) -> EnvRet | MultiAgentEnvRet:
     """The one result of a batch of one."""
     return results[0].values()[0]
 

@@ -44,9 +44,9 @@ class SingleEnvCore(Core):
         """See `EnvGroup.step`."""
         slots = self._slots_of(batch)
         self._check_sendable(slots, "step")
-        beside = write_actions(batch, slots, self.envs, self._layout)
+        out_of_band = write_actions(batch, slots, self.envs, self._layout)
         columns = columns_of_responses(batch)
-        at_once = beside is None and columns is not None and len(slots) > 0
+        at_once = out_of_band is None and columns is not None and len(slots) > 0
         if not at_once or self.auto.due(slots) is not NO_RESETS:
             return (yield from super().step(batch, now))
         self._results.note_sent(slots, columns)

@@ -18,7 +18,6 @@ from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import rlightning_aio
 from rlightning_aio.hosts.fork_server import BOOTSTRAP, Exited, Fork, Forked, Hello, Kill, Ready
 from rlightning_aio.hosts.link import Link
 from rlightning_aio.hosts.messages import Closed, Death, Died, ErrorText, WorkerPlace
@@ -146,7 +145,7 @@ class ForkServer:
         self._ready = False
         modules = ", ".join(self._preload) or "its modules"
         self._failure = f"it ended while it was importing {modules}"
-        package = str(Path(rlightning_aio.__file__).parent)
+        package = str(Path(__file__).parents[1])
         command = [self._interpreter or sys.executable, "-P", "-c", BOOTSTRAP, package]
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
