@@ -331,6 +331,9 @@ class FakeInline(FakeHost):
         self.finish()
         return True
 
+    def poll(self) -> None:
+        """All of it is told at once."""
+
 
 class FakeGroup:
     """A core over fake hosts, and the clock and driver that its procedures need.

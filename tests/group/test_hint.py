@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 
 from rlightning_aio import EnvConfig, sync
 from rlightning_aio.group.hint import HINT_AFTER_BATCHES, hint
+from rlightning_aio.group.stats import Stats
 
 
 def latencies(step: float, transfer: float) -> dict[str, dict[str, float]]:
@@ -48,7 +50,12 @@ def test_good_settings_are_left_alone(workers: int, step: float, transfer: float
 
 def test_the_hint_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     """It comes at INFO, after a while, and never again."""
-    with caplog.at_level(logging.INFO, "rlightning_aio"), sync.build_env_group(entry()) as group:
+    measured = {"latency_us": latencies(step=10.0, transfer=100.0)}
+    with (
+        caplog.at_level(logging.INFO, "rlightning_aio"),
+        patch.object(Stats, "summary", lambda _: measured),
+        sync.build_env_group(entry()) as group,
+    ):
         batch, _ = group.reset(seed=0)
         with group.auto_reset(max_episode_steps=100):
             for _ in range(2 * HINT_AFTER_BATCHES + 10):

@@ -67,6 +67,9 @@ class Inline:
         self.log.append(self.host_id)
         return True
 
+    def poll(self) -> None:
+        """Nothing is told here."""
+
 
 class Scene:
     """A poller over hosts with so many requests in flight, and a bell that can be looked at."""

@@ -426,7 +426,7 @@ class RequestsMachine(RuleBasedStateMachine):
         if self.late:
             told += data.draw(st.lists(st.sampled_from(self.late), max_size=2))
         entries = np.array(data.draw(st.permutations(told)), np.int64)
-        found = self.table.complete(host, entries).tolist()
+        found = self.table.complete([(host, entries)]).tolist()
         assert sorted(found) == sorted(slots)
         self.deliver(found)
 

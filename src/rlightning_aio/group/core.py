@@ -157,7 +157,11 @@ class Core:
             handlers[type(told)](told)
 
     def _on_reported(self, told: Reported) -> None:
-        slots = self.requests.complete(told.host_id, told.entries)
+        reports = [told]
+        completions = self._completions
+        while completions and type(completions[0]) is Reported:
+            reports.append(cast("Reported", completions.popleft()))
+        slots = self.requests.complete(reports)
         if self.supervisor.recovering:
             self._note_recovered(slots)
 

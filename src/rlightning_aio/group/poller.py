@@ -77,9 +77,8 @@ class Poller:
     def poll(self) -> None:
         """Take in results that wake nobody."""
         workers = self._workers
-        for host_id in self._bell.with_news():
-            if host_id in workers:
-                workers[host_id].poll()
+        for host_id in self._bell.with_news() if workers else ():
+            workers[host_id].poll()
         for host_id, server in self._servers.items():
             if self._requests.in_flight[host_id] and isinstance(server, Polled):
                 server.poll()
@@ -105,6 +104,8 @@ class Poller:
             late = count and until is not None and self._clock() >= until
             if late or not self._execute_next():
                 break
+        for _, host in self._executing:
+            host.poll()
         return True
 
     def _execute_next(self) -> bool:

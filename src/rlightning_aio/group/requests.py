@@ -28,7 +28,7 @@ from rlightning_aio.protocol.entries import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -303,16 +303,25 @@ class Requests:
 
     # -- ending -------------------------------------------------------------------
 
-    def complete(self, host_id: int, entries: NDArray[np.int64]) -> NDArray[np.intp]:
+    def complete(self, reports: Sequence[tuple[int, NDArray[np.int64]]]) -> NDArray[np.intp]:
         """Take note of results that lie in their rows; their slots.
 
         Late replies, to requests that were asked anew, are dropped.
+
+        Args:
+            reports: a host, and the entries of what it has done; in the order of arrival.
         """
+        parts = [entries for _, entries in reports]
+        entries = parts[0] if len(parts) == 1 else np.concatenate(parts)
         slots = (entries >> _OP_BITS) & _SLOT_MASK
         current = self.entry[slots] == entries
         if np.count_nonzero(current) < len(slots):
             slots = slots[current]
-        self.in_flight[host_id] -= len(slots)
+            for host_id in {host_id for host_id, _ in reports}:
+                self.in_flight[host_id] -= int(np.count_nonzero(self._host_of[slots] == host_id))
+        else:
+            for host_id, own in reports:
+                self.in_flight[host_id] -= len(own)
         self._deliver(slots)
         return slots
 

@@ -151,7 +151,14 @@ class Executing(Protocol):
     """A host that executes requests where it is asked to."""
 
     def execute_next(self) -> bool:
-        """Execute one waiting request here and now; False if none waits."""
+        """Execute one waiting request here and now; False if none waits.
+
+        What has come of it is among the completions after `poll`.
+        """
+        ...
+
+    def poll(self) -> None:
+        """See `Polled.poll`."""
         ...
 
 

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 from collections import deque
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
+
+import numpy as np
 
 from rlightning_aio.hosts.arena import map_shared
 from rlightning_aio.hosts.build_env import built_envs
@@ -22,6 +24,7 @@ from rlightning_aio.hosts.messages import (
     NewSchema,
     NotBuilt,
     Raised,
+    Reported,
     Result,
     Value,
 )
@@ -32,7 +35,6 @@ from rlightning_aio.protocol.slab import Slab
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    import numpy as np
     from numpy.typing import NDArray
 
     from rlightning_aio.hosts.base import Wiring
@@ -43,10 +45,11 @@ __all__ = ["InlineHost"]
 
 _Waiting: TypeAlias = "tuple[int, Callable[[], Any]]"
 """An entry, and what executes it."""
+_STEP: Final = int(Operation.STEP)
 
 
 class InlineHost:
-    """See `base.Host` and `Executing`. It has no descriptor and is never watched."""
+    """See `base.Host`, `Executing` and `Polled`. It has no descriptor and is never watched."""
 
     def __init__(self, host_id: int, first_slot: int, order: StartOrder, wiring: Wiring) -> None:
         self.host_id = host_id
@@ -57,6 +60,8 @@ class InlineHost:
         self._tell = wiring.completions.append
         self._runners: list[EnvRunner] = []
         self._queue: deque[_Waiting] = deque()
+        # Entries of results that lie in their rows, and have still to be told.
+        self._done: list[int] = []
         self._schemas = InfoSchemas(self._announce)
 
     def start(self) -> None:
@@ -92,12 +97,13 @@ class InlineHost:
 
     def submit(self, entries: NDArray[np.int64], arguments: Sequence[Any] | None = None) -> None:
         """See `base.Host.submit`."""
-        for position, entry in enumerate(cast("list[int]", entries.tolist())):
-            runner, op = self._runners[slot_of(entry) - self.first_slot], op_of(entry)
+        asked = cast("list[int]", entries.tolist())
+        for position, entry in enumerate(asked):
+            runner = self._runners[slot_of(entry) - self.first_slot]
             if arguments is not None:
-                execute = partial(runner.execute, op, arguments[position])
-            elif op == Operation.STEP:
-                execute = _begun(runner)
+                execute = partial(runner.execute, op_of(entry), arguments[position])
+            elif op_of(entry) == _STEP:
+                execute = runner.step if runner.begin_step is None else _begun(runner.begin_step)
             else:
                 execute = runner.reset_from_row
             self._queue.append((entry, execute))
@@ -110,15 +116,26 @@ class InlineHost:
         try:
             outcome = execute()
         except BaseException as error:
+            self.poll()  # What came before is told before.
             self._tell(Raised(self.host_id, entry, ErrorText.of(error)))
             if isinstance(error, KeyboardInterrupt):
                 raise  # It was meant for the program; the request that it struck ends all the same.
             return True
+        if outcome is None and not answers_with_value(op_of(entry)):
+            self._done.append(entry)
+            return True
+        self.poll()
         if answers_with_value(op_of(entry)):
             self._tell(Value(self.host_id, entry, outcome))
         else:
             self._tell(Result(self.host_id, entry, outcome or {}))
         return True
+
+    def poll(self) -> None:
+        """See `base.Polled.poll`."""
+        if self._done:
+            self._tell(Reported(self.host_id, np.array(self._done, np.int64)))
+            self._done.clear()
 
     def step_now(self) -> OutOfBand | None:
         """Step env 0 with the action in its row, past the queue, which holds nothing for it."""
@@ -141,12 +158,10 @@ class InlineHost:
         self._queue.clear()
 
 
-def _begun(runner: EnvRunner) -> Execute:
-    """Start a step where the simulator computes by itself; what will end it."""
-    if runner.begin_step is None:
-        return runner.step
+def _begun(begin_step: Callable[[], Execute]) -> Execute:
+    """Start a step of a simulator that computes by itself; what will end it."""
     try:
-        return runner.begin_step()
+        return begin_step()
     except BaseException as error:
         # When its result is asked for: of several requests all are to be taken first.
         return partial(_reraise, error)
