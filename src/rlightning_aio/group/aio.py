@@ -1,7 +1,7 @@
 """The asynchronous `EnvGroup` and the driver that waits on an asyncio event loop.
 
 Waiting is `asyncio.wait(..., return_when=FIRST_COMPLETED)` on one future, which any source
-(a worker, a fork server, a server socket) fulfils: with one for each, a collect would cost
+(a worker, a fork server, an env_server) fulfils: with one for each, a collect would cost
 the more the more workers there are, and with one env to a worker, the more envs.
 Absent on purpose: rules. Every one of them is in the core.
 """
@@ -39,7 +39,7 @@ class AioDriver:
     def __init__(self) -> None:
         # Takes in what sources have told; set by the group.
         self.drain: Callable[[], None] = _nothing
-        # Invariant: the future of those who wait now; None while nobody does. Whoever starts
+        # Invariant: the future of those who wait now; None while nobody does. A call that starts
         # to wait gets one that is not done: what was told before is in the core already.
         self._told: asyncio.Future[None] | None = None
         self._loops: dict[Source, asyncio.AbstractEventLoop] = {}
@@ -54,7 +54,7 @@ class AioDriver:
         loop.add_reader(source.fileno(), self._readable, source)
 
     def unwatch(self, source: Source) -> None:
-        """See `base.Watcher.unwatch`. Whoever waits for `source` wakes."""
+        """See `base.Watcher.unwatch`. A call that waits for `source` wakes."""
         loop = self._loops.pop(source, None)
         if loop is None:
             return
@@ -270,7 +270,7 @@ class EnvGroup(Facade):
         Raises:
             UnknownEnv: the group has neither of that id.
         """
-        server = self._core.supervisor.server(env_id)
+        server = self._core.supervisor.env_server(env_id)
         if server is not None:
             return ServerHandle(self, self._core, self._driver, server)
         return EnvHandle(self, self._core, self._driver, self._core.envs.find_one(env_id))

@@ -254,7 +254,7 @@ class EnvGroup(Facade):
         Raises:
             UnknownEnv: the group has neither of that id.
         """
-        server = self._core.supervisor.server(env_id)
+        server = self._core.supervisor.env_server(env_id)
         if server is not None:
             return ServerHandle(self, self._core, self._driver, server)
         return EnvHandle(self, self._core, self._driver, self._core.envs.find_one(env_id))
