@@ -136,11 +136,11 @@ def test_the_same_wait_gives_the_same_order() -> None:
     """Results that are taken in meanwhile change nothing of what it waits for."""
     scene = Scene(16, 16)
     scene.arm(32)
-    order = scene.bell._order
+    armed = scene.bell._armed
     scene.report(0, 16)
     scene.take()
     scene.arm(16)
-    assert scene.bell._order == order
+    assert scene.bell._armed == armed
 
 
 def test_for_some_of_short_steps_a_few_more_are_ordered_at_first() -> None:

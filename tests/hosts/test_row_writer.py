@@ -300,7 +300,7 @@ def test_who_announces_no_schemas_packs_no_infos() -> None:
 
 def test_observations_that_are_handed_over_stay_out_of_the_row() -> None:
     """They are copied where they stay in this process, for the env may go on writing to them."""
-    layout = RowLayout(SPACE, spaces.Discrete(2), (), (), observations_apart=True)
+    layout = RowLayout(SPACE, spaces.Discrete(2), (), (), observations_out_of_band=True)
     slab, observation = new_slab(layout, 1), np.array([1.0, 2.0])
     writer = RowWriter(
         slab, 0, env_id="e-0", autoreset="disabled", announce=infos_out_of_band, copies=True

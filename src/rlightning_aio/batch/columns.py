@@ -44,7 +44,7 @@ class EnvNames(Protocol):
         ...
 
     def batch_ids(self, slots: NDArray[np.intp]) -> list[str]:
-        """Ids of `slots` as a batch has them: a client goes by its server's id."""
+        """Ids of `slots` as a batch has them: a client goes by its env_server's id."""
         ...
 
     def names(self, slots: NDArray[np.intp]) -> list[str]:

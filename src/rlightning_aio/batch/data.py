@@ -97,14 +97,17 @@ class BatchedData:
     # -- ids and values -----------------------------------------------------------
 
     def ids(self) -> list[str]:
-        """The ids, in order. Results of a remote client carry its server's id."""
+        """The ids, in order. Results of a client carry its env_server's id, each the same.
+
+        The list is the batch's own: change a copy.
+        """
         if self._ids is None:
             origin = self._origin
             self._ids = [] if origin is None else origin.names.batch_ids(origin.slots)
         return self._ids
 
     def env_ids(self) -> list[str]:
-        """The env of each value, in order."""
+        """The env of each value, in order; a client's is ``<server id>/<client name>``."""
         if self._origin is not None:
             return self._origin.names.ids(self._origin.slots)
         if self._env_ids is not None:
@@ -115,7 +118,11 @@ class BatchedData:
         ]
 
     def values(self) -> list[Any]:
-        """The values, in order; made on the first call."""
+        """The values, in order; made on the first call, and the same ones afterwards.
+
+        Results are `EnvRet` or `MultiAgentEnvRet`, whose arrays may be views of the columns;
+        responses are `PolicyResponse`.
+        """
         if self._values is None:
             if self._columns is not None:
                 self._values = self._responses(self._columns)
@@ -144,7 +151,11 @@ class BatchedData:
         return id_ in self.ids()
 
     def __getitem__(self, id_: str) -> Any:
-        """The value of `id_`; of the first, if the id comes more than once."""
+        """The value of `id_`; of the first, if the id comes more than once.
+
+        Raises:
+            KeyError: the batch has no such id.
+        """
         try:
             position = self.ids().index(id_)
         except ValueError:
@@ -197,12 +208,16 @@ class BatchedData:
 
     @property
     def terminated(self) -> Any:
-        """Terminations: ``[n]`` bool, ``[n, num_envs]``, or a dict of such by agent."""
+        """Terminations by the env: ``[n]`` bool, ``[n, num_envs]``, or a dict by agent."""
         return self._head("terminated", "last_terminated")
 
     @property
     def truncated(self) -> Any:
-        """Truncations by the env: ``[n]`` bool, ``[n, num_envs]``, or a dict by agent."""
+        """Truncations: ``[n]`` bool, ``[n, num_envs]``, or a dict of such by agent.
+
+        By the env; true, too, where the step limit has cut the episode, if
+        `auto_reset` was asked to mark that, and where `restarted` is.
+        """
         return self._head("truncated", "last_truncated")
 
     def _head(self, column: str, attribute: str) -> Any:
@@ -229,8 +244,13 @@ class BatchedData:
         """Where the row is the first observation of an episode, and no transition ends.
 
         True after a reset that was asked for, after one that `auto_reset` or the simulator
-        itself put in place of a step, and of the result that marks a replaced worker.
-        ``[n]`` bool, ``[n, num_envs]`` with sub-environments.
+        itself put in place of a step, of a client's first result, and of the result that marks
+        a replaced worker or a lost client. ``[n]`` bool, ``[n, num_envs]`` with
+        sub-environments.
+
+        Raises:
+            AttributeError: the batch holds plain values, no results of a group.
+            ValueError: sub-environments are not as many everywhere; use `by_name`.
         """
         return self._by_row(lambda part: part.is_reset)
 
@@ -244,9 +264,9 @@ class BatchedData:
 
     @property
     def restarted(self) -> NDArray[np.bool_]:
-        """Where the episode before was lost with its worker; as `is_reset`.
+        """Where the episode before was lost with its worker or client; as `is_reset`.
 
-        Whoever stores transitions cuts the env's chain there.
+        A learner that stores transitions cuts the env's chain there.
         """
         return self._by_row(lambda part: part.by_sub_env(part.restarted))
 
@@ -282,6 +302,9 @@ class BatchedData:
 
         ``batch.sent.log_prob``, ``batch.sent.action``, …: columns in the batch's order, which
         have stayed in this process. See `Sent`.
+
+        Raises:
+            AttributeError: the batch holds plain values, no results of a group.
         """
         if self._sources is None:
             raise AttributeError("only results of a group tell what was sent for them")
@@ -334,7 +357,10 @@ class BatchedData:
     # -- parts of a batch ---------------------------------------------------------
 
     def by_name(self) -> dict[str, BatchedData]:
-        """One batch for each config entry; each of them stacks."""
+        """One batch for each config entry, in the order in which entries first come.
+
+        Each of them stacks, and keeps the order of its values.
+        """
         names = self._names()
         positions: dict[str, list[int]] = {}
         for position, name in enumerate(names):
@@ -372,7 +398,7 @@ class BatchedData:
     # -- columns of responses -----------------------------------------------------
 
     def respond(self, action: Any, **extras: Any) -> BatchedData:
-        """The matching batch of responses, from columns.
+        """The matching batch of responses, from columns, which it holds uncopied.
 
         Args:
             action: ``[n, *action]`` (a dict or tuple of such arrays for Dict and Tuple
@@ -400,7 +426,11 @@ class BatchedData:
 
     @property
     def action(self) -> Any:
-        """Actions of a batch of responses, stacked."""
+        """Actions of a batch of responses: ``[n, *action]``, or dicts, tuples, lists of such.
+
+        Raises:
+            AttributeError: the batch holds results, which have none; see `sent`.
+        """
         if self._columns is not None:
             return self._columns["action"]
         return stacked_values([value.action for value in self.values()])

@@ -153,7 +153,7 @@ def _joined(trees: list[Any], order: NDArray[np.intp]) -> Any:
         return [rows[k] for k in order.tolist()]
     if isinstance(first, np.ndarray):
         return np.concatenate(trees)[order]
-    # Whoever holds a tensor has imported torch.
+    # A process that holds a tensor has imported torch.
     return sys.modules["torch"].cat(trees)[order]
 
 

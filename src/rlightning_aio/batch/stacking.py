@@ -33,7 +33,7 @@ def stacked_values(values: list[Any]) -> Any:
     if isinstance(first, str):
         return values
     if type(first).__module__.partition(".")[0] == "torch":
-        # Whoever holds a tensor has imported torch.
+        # A process that holds a tensor has imported torch.
         return sys.modules["torch"].stack(values)
     arrays = [np.asarray(value) for value in values]
     if len({array.shape for array in arrays}) > 1:

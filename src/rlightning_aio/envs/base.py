@@ -1,4 +1,4 @@
-"""`BaseEnv`: what every environment is to the runtime, whoever wrote it.
+"""`BaseEnv`: what every environment is to the runtime, one of a user's own, too.
 
 Rule: an env knows its simulator and its config, never its group, its process or
 its channel. `reset` and `step` speak `EnvRet`; a backend whose step is exactly

@@ -1,4 +1,4 @@
-"""`EnvContract`: tests that hold for every env; whoever writes a backend inherits them.
+"""`EnvContract`: tests that hold for every env; the author of a backend inherits them.
 
 Rule: a subclass names a config and gets the tests; no test knows a simulator. Collected
 by pytest, but made without it, so that the package needs no test tools.
@@ -124,7 +124,7 @@ class EnvContract:
                 ended = _awaits_reset(env, outcome)
 
     def test_a_reset_gives_no_reward_and_ends_nothing(self) -> None:
-        """After a reset nobody has been rewarded; whoever takes part has not ended."""
+        """After a reset no agent has been rewarded; those that take part have not ended."""
         with self.opened() as env:
             result = env.reset(seed=self.seed)
             assert isinstance(result, EnvRet | MultiAgentEnvRet), f"reset() gave {result}"

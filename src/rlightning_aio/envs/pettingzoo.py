@@ -101,7 +101,7 @@ class PettingZooEnv(BaseEnv):
             self._terminated[agent] = bool(terminated.get(agent, False))
             self._truncated[agent] = bool(truncated.get(agent, False))
         for agent in set(live) - set(there):
-            # Whoever left has ended, even if the simulator forgot to say so.
+            # An agent that left has ended, even if the simulator forgot to say so.
             self._terminated[agent] |= not self._truncated[agent]
         self._steps += 1
         if self._steps >= (self.config.max_episode_steps or math.inf):

@@ -1,6 +1,6 @@
 """Puts a simulated Piper arm on a bus: in this process, or on a pseudo-terminal.
 
-Rule: whoever drives the arm can't tell; the vendor's unmodified SDK speaks to it over
+Rule: a program that drives the arm can't tell; the vendor's unmodified SDK speaks to it over
 python-can's ``virtual`` bus (same process) or ``slcan`` (any process, the path that
 ``python -m rlightning_aio.envs.piper_sim`` prints).
 Absent on purpose: what the arm does with a frame, which is `piper_arm`'s.

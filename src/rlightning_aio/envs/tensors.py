@@ -1,6 +1,6 @@
 """Torch tensors where NumPy arrays are wanted.
 
-Rule: torch is recognised, never imported; whoever has no torch pays for none.
+Rule: torch is recognised, never imported; a user who has no torch pays for none.
 """
 
 from __future__ import annotations

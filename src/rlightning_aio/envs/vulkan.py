@@ -1,7 +1,7 @@
 """Whether SAPIEN, ManiSkill's engine, can render here, and how to do without.
 
 Rule: the question is asked in another process, once: Vulkan must not be touched in a
-process that forks workers, and a broken driver may crash whoever asks.
+process that forks workers, and a broken driver may crash the process that asks.
 """
 
 from __future__ import annotations

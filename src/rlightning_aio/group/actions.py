@@ -34,7 +34,7 @@ DEBUG: Final = os.environ.get("RLIGHTNING_AIO_DEBUG") == "1"
 
 @dataclass(frozen=True, slots=True)
 class OutOfBandSteps:
-    """What does not fit the rows: for some positions of a batch (action, extras)."""
+    """What travels out of band: (action, extras) for some positions of a batch."""
 
     positions: NDArray[np.intp]
     contents: list[tuple[Any, dict[str, Any]]]

@@ -1,7 +1,7 @@
 """The asynchronous `EnvGroup` and the driver that waits on an asyncio event loop.
 
 Waiting is `asyncio.wait(..., return_when=FIRST_COMPLETED)` on one future, which any source
-(a worker, a fork server, a server socket) fulfils: with one for each, a collect would cost
+(a worker, a fork server, an env_server) fulfils: with one for each, a collect would cost
 the more the more workers there are, and with one env to a worker, the more envs.
 Absent on purpose: rules. Every one of them is in the core.
 """
@@ -39,7 +39,7 @@ class AioDriver:
     def __init__(self) -> None:
         # Takes in what sources have told; set by the group.
         self.drain: Callable[[], None] = _nothing
-        # Invariant: the future of those who wait now; None while nobody does. Whoever starts
+        # Invariant: the future of those who wait now; None while nobody does. A call that starts
         # to wait gets one that is not done: what was told before is in the core already.
         self._told: asyncio.Future[None] | None = None
         self._loops: dict[Source, asyncio.AbstractEventLoop] = {}
@@ -54,7 +54,7 @@ class AioDriver:
         loop.add_reader(source.fileno(), self._readable, source)
 
     def unwatch(self, source: Source) -> None:
-        """See `base.Watcher.unwatch`. Whoever waits for `source` wakes."""
+        """See `base.Watcher.unwatch`. A call that waits for `source` wakes."""
         loop = self._loops.pop(source, None)
         if loop is None:
             return
@@ -142,8 +142,8 @@ class EnvGroup(Facade):
     async def init(self) -> list[EnvMeta]:
         """Start all workers, in parallel, and build their envs.
 
-        Returns one `EnvMeta` for each env, in order. If it fails or is cancelled, nothing is
-        left running.
+        Returns one `EnvMeta` for each local env, then one without spaces for each env_server,
+        in the order of `env_ids`. If it fails or is cancelled, nothing is left running.
 
         Raises:
             StartFailed: an env could not be built, or took longer than ``start_timeout``.
@@ -180,28 +180,44 @@ class EnvGroup(Facade):
             seed: env k of the group gets ``seed + k`` (k counts sub-environments); a sequence
                 gives one seed for each env, a mapping seeds by id.
             options: passed to each env.
-            env_ids: which envs; the results come in this order.
+            env_ids: which envs; the results come in this order. None: all local envs, then the
+                clients of env_servers, for which it waits.
 
-        Returns the first observations, and flags that are all False. Cancelled, it leaves the
-        results to `collect_async`.
+        Returns the first observations, in fresh arrays (views, where the group was built with
+        ``zero_copy``), and flags that are all False. Cancelled, it leaves the results to
+        `collect_async`.
 
         Raises:
-            EnvBusy: an env has a reply outstanding; nothing was sent.
-            EnvRaised, WorkerDied, EnvHung: an env failed; the others' results are in the
-                error's ``results``.
+            EnvBusy: an env has a reply outstanding, or comes twice; nothing was sent.
+            UnknownEnv: no env of this group has that id.
+            ValueError: a seed is no int from 0 to 2**62 - 1, or there are not as many as envs.
+            TypeError: the options can't be sent to a worker.
+            TimeoutError: too few clients of an env_server have joined in time.
+            EnvRaised, WorkerDied, EnvHung, EnvAway: an env failed, or its client is away; the
+                others' results are in the error's ``results``.
+            GroupClosed: the group was not initialised, or is closed.
         """
         return await self._driver.run(self._core.reset(time.monotonic(), seed, options, env_ids))
 
     async def step(self, batch: BatchedData) -> tuple[BatchedData, list[bool] | None]:
         """Step the envs of `batch` and wait for all of them.
 
-        Returns results with the same ids in the same order, and None; inside `auto_reset` a
-        flag for each result. Cancelled, it leaves the results to `collect_async`.
+        Args:
+            batch: a batch of responses, from `BatchedData.respond` (columns, fast) or made of
+                `PolicyResponse` values; any of the local envs, in any order.
+
+        Returns results with the same ids in the same order, in fresh arrays (views, where the
+        group was built with ``zero_copy``), and None; inside `auto_reset` a flag for each
+        result. Cancelled, it leaves the results to `collect_async`.
 
         Raises:
-            BadAction, EnvBusy, UnknownEnv: before anything is sent.
+            BadAction: an action's shape, dtype or count doesn't fit; nothing was sent.
+            EnvBusy: an env has a reply outstanding, or comes twice; nothing was sent.
+            UnknownEnv: no env of this group has that id.
+            NotImplementedError: the env is a client's, which answers when it can.
             EnvRaised, WorkerDied, EnvHung: an env failed; the others' results are in the
                 error's ``results``.
+            GroupClosed: the group was not initialised, or is closed.
         """
         return await self._driver.run(self._core.step(batch, time.monotonic()))
 
@@ -220,7 +236,7 @@ class EnvGroup(Facade):
         Args:
             timeout: seconds of a further window, opened when the first result is ready, in
                 which more results join.
-            wait_all: wait for all that are pending.
+            wait_all: wait for all that are pending; `timeout` is ignored then, with a warning.
             min_results: don't return before that many are ready (or all that are pending).
             max_results: leave what is above to the next call, first come first served.
             deadline: seconds in all, from now.
@@ -228,16 +244,20 @@ class EnvGroup(Facade):
             ordered: in the group's order instead of that of arrival. With ``wait_all`` that
                 makes a run reproducible.
 
-        Returns results, and a flag for each: inside `auto_reset` whether it reached the step
-        limit, which `BatchedData.limit_reached` tells as well. Cancelling loses no result.
+        Returns results, in fresh arrays (views, where the group was built with ``zero_copy``),
+        and a flag for each: inside `auto_reset` whether it reached the step limit, which
+        `BatchedData.limit_reached` tells as well. Cancelling loses no result.
 
         Raises:
-            NothingPending: no request is outstanding (of `entries`).
+            NothingPending: no request is outstanding (of `entries`), and no client can join.
             UnknownEnv: no config entry has such a name.
+            ValueError: a time isn't above 0, a number isn't above 0, or `min_results` is above
+                `max_results`.
             TimeoutError: `deadline` has passed; the next call gets the results.
             EnvRaised, WorkerDied, EnvHung: the answer to one request; the results of others
                 stay for the next call.
-            RuntimeError: another collector is waiting.
+            GroupClosed: the group was not initialised, or is closed.
+            RLightningError: another collector is waiting.
         """
         procedure = self._collect(
             timeout, wait_all, min_results, max_results, deadline, entries, ordered
@@ -245,32 +265,54 @@ class EnvGroup(Facade):
         return await self._driver.run(procedure)
 
     def __getitem__(self, env_id: str) -> EnvHandle:
-        """A handle on one env, or on one env_server; raises `UnknownEnv`."""
-        server = self._core.supervisor.server(env_id)
+        """A handle on one env (an `EnvHandle`), or on one env_server (a `ServerHandle`).
+
+        Raises:
+            UnknownEnv: the group has neither of that id.
+        """
+        server = self._core.supervisor.env_server(env_id)
         if server is not None:
             return ServerHandle(self, self._core, self._driver, server)
         return EnvHandle(self, self._core, self._driver, self._core.envs.find_one(env_id))
 
     async def offload(self) -> None:
-        """Have every env free its device memory until `reload`."""
+        """Have every local env free its device memory until `reload`; done when it returns.
+
+        Cancelled, it leaves the envs to free it by themselves; `collect_async` has nothing of
+        it.
+
+        Raises:
+            EnvBusy: an env has a reply outstanding; nothing was sent.
+            EnvRaised: an env can't, or failed to; what else went wrong is in ``others``.
+            WorkerDied, EnvHung: a worker ended meanwhile; a replacement does not repeat it.
+            GroupClosed: the group was not initialised, or is closed.
+        """
         await self._driver.run(self._core.call_all(time.monotonic(), "offload"))
 
     async def reload(self) -> None:
-        """Have every env take its device memory again."""
+        """Have every local env take its device memory again; done when it returns.
+
+        Cancellation and errors are those of `offload`.
+        """
         await self._driver.run(self._core.call_all(time.monotonic(), "reload"))
 
     async def close(self) -> None:
         """Close all envs and end their workers, by force after a second and a half.
 
-        Idempotent. Whoever waits on the group gets `GroupClosed`; results that were not
-        collected are gone.
+        Idempotent. A task that waits on the group gets `GroupClosed`; results that were not
+        collected are gone. Cancelled, it ends what is left by force. An env that raises in its
+        own `close` is named in a warning.
         """
         await self._driver.run(self._core.close(time.monotonic()))
         self._closed()
 
 
 class EnvHandle:
-    """One env of an asynchronous group."""
+    """One env of an asynchronous group.
+
+    Each method is done when the env has answered, and raises `EnvBusy` while an earlier reply
+    of it is outstanding.
+    """
 
     def __init__(self, group: EnvGroup, core: Core, driver: AioDriver, slot: int) -> None:
         self._group = group
@@ -280,52 +322,83 @@ class EnvHandle:
 
     @property
     def env_id(self) -> str:
-        """Its id."""
+        """Its id, as in `EnvGroup.env_ids`."""
         return self._core.envs.env_ids[self._slot]
 
     async def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> EnvRet | MultiAgentEnvRet:
-        """Start a new episode; `seed` is the env's own."""
+        """Start a new episode and wait for its first observation.
+
+        Args:
+            seed: the env's own; sub-environment k gets ``seed + k``.
+            options: passed to the env.
+
+        Returns the result as a value; its arrays are as those of `EnvGroup.reset`. Cancelled,
+        it leaves the result to the group's `collect_async`. Errors are those of
+        `EnvGroup.reset`.
+        """
         seeds = None if seed is None else [seed]
         return only_result(await self._group.reset(seeds, options, [self.env_id]))
 
     async def step(self, response: PolicyResponse | Any) -> EnvRet | MultiAgentEnvRet:
-        """Step with a `PolicyResponse`, or with a bare action."""
+        """Step with a `PolicyResponse`, or with a bare action, and wait for the result.
+
+        Returns the result as a value, inside `auto_reset` that of a reset where one is due;
+        its arrays are as those of `EnvGroup.step`. Cancelled, it leaves the result to the
+        group's `collect_async`. Errors are those of `EnvGroup.step`.
+        """
         return only_result(await self._group.step(steps_of(self.env_id, response)))
 
     async def call(self, name: str, *args: Any, **kwargs: Any) -> Any:
-        """Call method `name` of the env (or, if it has none, of its simulator); its value.
+        """Call method `name` of the env (or, if it has none, of its simulator).
+
+        Returns its value: from a worker a copy, from an inline env the object itself.
+        Cancelled, it leaves the method to end by itself, and its value is dropped.
 
         Raises:
             EnvRaised: the method raised, or its value can't be pickled.
+            EnvBusy: the env has a reply outstanding; nothing was sent.
+            TypeError: the arguments can't be sent to a worker; nothing was sent.
+            WorkerDied, EnvHung: the worker ended meanwhile; a replacement does not repeat it.
+            GroupClosed: the group was not initialised, or is closed.
         """
         procedure = self._core.call(time.monotonic(), self._slot, name, args, kwargs)
         return await self._driver.run(procedure)
 
     async def get_attr(self, name: str, target: str = "unwrapped") -> Any:
-        """Attribute `name` of the simulator; of its outermost wrapper with target ``outer``."""
+        """Attribute `name` of the simulator; of its outermost wrapper with target ``outer``.
+
+        Returns it as `call` returns a value, and raises what `call` raises.
+        """
         return await self.call("get_attr", name, target)
 
     async def set_attr(self, name: str, value: Any, target: str = "unwrapped") -> None:
-        """Set attribute `name` of the simulator or its outermost wrapper; done on return."""
+        """Set attribute `name` of the simulator or its outermost wrapper; done on return.
+
+        Raises what `call` raises.
+        """
         await self.call("set_attr", name, value, target)
 
     async def render(self) -> Any:
-        """One frame, as the simulator renders it."""
+        """One frame, as the simulator renders it; raises what `call` raises."""
         return await self.call("render")
 
     async def offload(self) -> None:
-        """Free device memory until `reload`."""
+        """Free its device memory until `reload`; done on return. Raises what `call` raises."""
         await self.call("offload")
 
     async def reload(self) -> None:
-        """Take device memory again."""
+        """Take its device memory again; done on return. Raises what `call` raises."""
         await self.call("reload")
 
 
 class ServerHandle(ServerView, EnvHandle):
-    """An env_server of an asynchronous group; its clients' envs have handles of their own."""
+    """An env_server of an asynchronous group; its clients' envs have handles of their own.
+
+    Methods of remote envs can't be called: `call`, `get_attr`, `set_attr`, `render`, `offload`
+    and `reload` raise NotImplementedError.
+    """
 
     def __init__(
         self,
@@ -341,15 +414,21 @@ class ServerHandle(ServerView, EnvHandle):
     async def reset(  # pyright: ignore[reportIncompatibleMethodOverride]  # One for each client.
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> list[EnvRet | MultiAgentEnvRet]:
-        """Reset all clients, of which there must be ``min_clients`` within ``connect_timeout``.
+        """Reset all clients and wait for them; each env_server must have ``min_clients`` first.
 
         Args:
-            seed: client k, in the order of their names, gets ``seed + k`` (counting
-                sub-environments).
+            seed: client k, in the order of their names, gets ``seed + k``.
             options: passed to each.
 
+        Returns one result for each client, in the order of their names. Cancelled while the
+        clients reset, it leaves the results to the group's `collect_async`.
+
         Raises:
-            TimeoutError: too few clients have joined.
+            TimeoutError: too few clients have joined within ``connect_timeout``.
+            EnvBusy: a client has a reply outstanding; nothing was sent.
+            EnvRaised, EnvAway: a client's env failed, or the client is away; the others'
+                results are in the error's ``results``.
+            GroupClosed: the group was not initialised, or is closed.
         """
         procedure = self._core.reset_members(time.monotonic(), self._server, seed, options)
         return (await self._driver.run(procedure))[0].values()
@@ -380,7 +459,7 @@ def build_env_group(
             cloudpickle takes.
         mixed_actions: allow envs whose action spaces have different shapes.
         zero_copy: hand out observations as read-only views, valid until that env's next
-            request, where the rows of a batch are contiguous.
+            request, where the envs' rows are contiguous.
 
     Raises:
         ConfigError: something is wrong with the configuration or a preprocess function.

@@ -119,7 +119,7 @@ class Core:
         self._held_back: dict[int, Joined] = {}
         self._collecting = False
         self._handed_out = 0
-        # How many results each of those who wait wants.
+        # How many results each call that waits wants.
         self._wanted: list[int] = []
         self._now = 0.0
         self._handlers: dict[type, Callable[[Any], None]] = {
@@ -349,7 +349,7 @@ class Core:
         if out_of_band is None:
             self._hand_over(slots, entries)
         else:
-            self._hand_over_apart(slots, entries, out_of_band.positions, packed, resets)
+            self._hand_over_out_of_band(slots, entries, out_of_band.positions, packed, resets)
         if self.supervisor.has_members:
             self.drain()  # What was withdrawn at once.
 
@@ -407,7 +407,7 @@ class Core:
             given = None if arguments is None else arguments[part]
             hosts[host_id].submit(entries[part], given)
 
-    def _hand_over_apart(
+    def _hand_over_out_of_band(
         self,
         slots: NDArray[np.intp],
         entries: NDArray[np.int64],
@@ -416,12 +416,12 @@ class Core:
         resets: NDArray[np.bool_] | None,
     ) -> None:
         """The same where `positions` have arguments out of band, unless they became resets."""
-        apart = np.zeros(len(slots), np.bool_)
-        apart[positions] = True
+        out_of_band = np.zeros(len(slots), np.bool_)
+        out_of_band[positions] = True
         if resets is not None:
-            apart &= ~resets
-        self._hand_over(slots[~apart], entries[~apart])
-        kept = apart[positions]
+            out_of_band &= ~resets
+        self._hand_over(slots[~out_of_band], entries[~out_of_band])
+        kept = out_of_band[positions]
         chosen = positions[kept]
         arguments = [one for one, keep in zip(packed, kept.tolist(), strict=True) if keep]
         self._hand_over(slots[chosen], entries[chosen], arguments)
@@ -431,8 +431,8 @@ class Core:
     def _poll(self) -> None:
         """Take in what hosts have ready.
 
-        Invariant: whoever waits looks again, and orders anew, after every reply that is taken
-        in; here somebody else takes it.
+        Invariant: a call that waits looks again, and arms the bell anew, after every reply that
+        is taken in; here another call takes it.
         """
         self.poller.poll()
         self.drain()
@@ -442,8 +442,8 @@ class Core:
                 self._watcher.wake()
 
     def _check_liveness(self, now: float) -> Procedure[float]:
-        """Look at all hosts now and then: who always finds enough ready never has to wait, and
-        would never hear of the dead and the hung.
+        """Look at all hosts now and then: a caller that always finds enough ready never has to
+        wait, and would never hear of the dead and the hung.
         """
         if self.supervisor.is_overdue(now):
             now = yield Wait(0.0)
@@ -461,7 +461,7 @@ class Core:
         """One turn of waiting for `wanted` more replies; the time after it."""
         self._wanted.append(wanted)
         try:
-            # Whoever else waits meanwhile must be woken as early as it asked for.
+            # The other calls that wait must be woken as early as they asked for.
             poller, first = self.poller, min(self._wanted)
             if poller.execute(wanted, until) or poller.spin(first):
                 return (yield from self._look())
@@ -476,7 +476,7 @@ class Core:
         return now
 
     def _look(self) -> Procedure[float]:
-        """Let whatever else waits have its turn, without blocking."""
+        """Let other calls that wait have their turn, without blocking."""
         now = yield Wait(0.0)
         if self.supervisor.is_overdue(now):
             self._check(now)

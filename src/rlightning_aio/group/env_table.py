@@ -54,7 +54,7 @@ class EnvTable:
         self.local_ids = list(env_ids)
         self.server_ids = [server_id for server_id, _, _ in servers]
         self.configs = list(configs)
-        # What a batch calls a slot: a client goes by its server's id there.
+        # What a batch calls a slot: a client goes by its env_server's id there.
         self._batch_ids = list(env_ids)
         for server_id, config, count in servers:
             self.configs += [config] * count
@@ -121,7 +121,7 @@ class EnvTable:
         self.reads_extras[slot] = traits.reads_extras
         self._note_meta(slot, meta)
         self.num_sub_envs[slot] = meta.num_envs
-        # Clients of one server are of one kind.
+        # Clients of one env_server are of one kind.
         behind = (first_slot - len(self.all)) + (slot - first_slot) * meta.num_envs
         self.index_offset[slot] = self.num_seeds + behind
         self._note_any()
@@ -180,7 +180,7 @@ class EnvTable:
         return [env_ids[slot] for slot in slots.tolist()]
 
     def batch_ids(self, slots: NDArray[np.intp]) -> list[str]:
-        """Ids of `slots` as a batch has them: a client goes by its server's id."""
+        """Ids of `slots` as a batch has them: a client goes by its env_server's id."""
         chosen: list[int] = slots.tolist()
         return [self._batch_ids[slot] for slot in chosen]
 

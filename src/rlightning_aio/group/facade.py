@@ -40,7 +40,10 @@ def steps_of(env_id: str, response: PolicyResponse | Any) -> BatchedData:
 
 
 class AutoResetContext:
-    """Open while envs are reset at their step limit; see `EnvGroup.auto_reset`."""
+    """What `EnvGroup.auto_reset` returns: its rule holds from entry to exit.
+
+    It may be entered again after an exit.
+    """
 
     def __init__(
         self, core: Core, max_episode_steps: int | None, on_done: bool, mark_truncated: bool
@@ -83,12 +86,16 @@ class ServerView:
 
     @property
     def env_id(self) -> str:
-        """Its id."""
+        """Its id, as in `EnvGroup.env_ids`, and what a batch calls its clients' results."""
         return self._membership.server_id
 
     @property
     def address(self) -> str:
-        """Where clients connect to, as ``tcp://host:port``."""
+        """Where clients connect to, as ``tcp://host:port``, with the port that was picked.
+
+        Raises:
+            RuntimeError: it does not listen yet, before `init`.
+        """
         return self._membership.address()
 
     @property
@@ -150,11 +157,19 @@ class Facade:
         return len(self._core.envs.local_ids)
 
     def get_observation_spaces(self) -> list[gym.Space[Any] | None]:
-        """Observation space of each env, in order."""
+        """Observation space of each env, in the order of `env_ids`; None for an env_server.
+
+        Raises:
+            GroupClosed: the group was not initialised, or is closed.
+        """
         return [meta.observation_space for meta in self._metas]
 
     def get_action_spaces(self) -> list[gym.Space[Any] | None]:
-        """Action space of each env, in order."""
+        """Action space of each env, in the order of `env_ids`; None for an env_server.
+
+        Raises:
+            GroupClosed: the group was not initialised, or is closed.
+        """
         return [meta.action_space for meta in self._metas]
 
     # -- requests -----------------------------------------------------------------
@@ -166,10 +181,15 @@ class Facade:
             batch: a batch of responses, from `BatchedData.respond` (columns, fast) or made of
                 `PolicyResponse` values.
 
+        The columns are the caller's again on return: what is sent, and what
+        `BatchedData.sent` gives back, are copies.
+
         Raises (before anything is sent):
             BadAction: an action's shape, dtype or count doesn't fit.
             EnvBusy: an env has a reply outstanding, or comes twice.
             UnknownEnv: no env of this group has that id.
+            WorkerDied, EnvHung: an env's worker is gone and is not replaced.
+            GroupClosed: the group was not initialised, or is closed.
         """
         self._core.step_async(batch, time.monotonic())
 

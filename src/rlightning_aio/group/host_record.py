@@ -41,7 +41,7 @@ class HostRecord:
             last completed a step; None where no env is known. culprit: the last one's.
         hung_slot: the env for which it is being killed.
         idle: how far it had got when it was last seen to do nothing (`Supervisor._progress`).
-        failure: makes the error for whoever asks a host that was given up.
+        failure: makes the error for a caller that asks a host that was given up.
         killable: the host, if it can be ended by force.
         timed: any of its requests has a time limit, which the supervisor must watch.
     """

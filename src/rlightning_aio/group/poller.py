@@ -27,8 +27,8 @@ _WAKE_UP_NS: Final = 160_000
 """What it costs to wake the trainer, about: what it needs itself, and what the worker whose
 core it takes needs to get back into its stride."""
 _LOOK_AGAIN_SECONDS: Final = 0.0006
-"""How long after a new order the trainer looks once by itself; drivers make it up to twice
-as long. No result that was waited for is later than that."""
+"""How long after it has armed the bell anew the trainer looks once by itself; drivers make it
+up to twice as long. No result that was waited for is later than that."""
 _LONGEST_PACE: Final = 256
 
 
@@ -54,7 +54,7 @@ class Poller:
         self._bell = bell
         self._clock = clock
         self._workers: dict[int, Polled] = {}
-        self._servers: dict[int, Membership] = {}
+        self._env_servers: dict[int, Membership] = {}
         self._executing: deque[tuple[int, Executing]] = deque()
         # What a step takes there lately, about; until anything is known, as long as waking us.
         self._step_ns: dict[int, float] = {}
@@ -68,7 +68,7 @@ class Poller:
         if isinstance(host, Executing):
             self._executing.append((host.host_id, host))
         elif isinstance(host, Membership):
-            self._servers[host.host_id] = host
+            self._env_servers[host.host_id] = host
         elif isinstance(host, Polled):
             self._workers[host.host_id] = host
 
@@ -79,8 +79,8 @@ class Poller:
         workers = self._workers
         for host_id in self._bell.with_news() if workers else ():
             workers[host_id].poll()
-        for host_id, server in self._servers.items():
-            if self._requests.in_flight[host_id] and isinstance(server, Polled):
+        for host_id, server in self._env_servers.items():
+            if self._requests.in_flight[host_id]:
                 server.poll()
 
     def execute(self, wanted: int, until: float | None) -> bool:
@@ -127,13 +127,13 @@ class Poller:
         """
         in_flight = self._requests.in_flight
         at_work = sum([1 for host_id in self._workers if in_flight[host_id]])
-        at_work += sum([in_flight[host_id] for host_id in self._servers])
+        at_work += sum([in_flight[host_id] for host_id in self._env_servers])
         self._spun = 0 < at_work < self.num_cores
         if not self._spun:
             return False
         self._bell.disarm()
         unread = self._bell.unread
-        servers = [server for host_id, server in self._servers.items() if in_flight[host_id]]
+        servers = [server for host_id, server in self._env_servers.items() if in_flight[host_id]]
         if not servers:
             return self._spinner.spin(lambda: unread() >= wanted)
         return self._spinner.spin(
@@ -151,11 +151,11 @@ class Poller:
         Where steps are short, a few more are asked for at first: they are there before the
         trainer would be, one wake-up brings them along, and workers lose their stride less
         often. Some half a millisecond later the trainer looks by itself, and asks for no more than
-        it needs from then on; so that costs nobody time who waits for longer. That look also
-        finds what came in the very moment of the order (see `protocol.bell`).
+        it needs from then on; so a wait that is longer loses nothing by it. That look also finds
+        what came in the very moment of arming (see `protocol.bell`).
 
         Args:
-            wanted: by whoever wants the fewest.
+            wanted: by the call that wants the fewest.
             now: monotonic seconds.
 
         Returns:

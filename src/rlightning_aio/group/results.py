@@ -29,7 +29,7 @@ __all__ = ["Results"]
 
 
 class Results:
-    """What lies in the rows of a group, and beside them.
+    """What lies in the rows of a group, and what came out of band.
 
     Args:
         envs: names them; layout: where their rows are.
@@ -107,7 +107,7 @@ class Results:
         found = self._out_of_band.get(slot)
         try:
             kept: dict[str, Any] = pickle.loads(found) if isinstance(found, bytes) else found or {}
-        except Exception:  # noqa: BLE001  # It may hold anything; whoever reads it learns why not.
+        except Exception:  # noqa: BLE001  # It may hold anything; its reader learns why not.
             return
         mark = int(slab.info_mark[row])
         info: dict[str, Any] = kept.get("info", {})
@@ -161,19 +161,19 @@ class Results:
         if restarted is not None:
             # Here and not in the row, where envs write their flags only when they change.
             flags[restarted, ..., TRUNCATED] = True
-        extra, whole = self._take_out_of_band(slots) if self._out_of_band else ({}, False)
+        out_of_band, whole = self._take_out_of_band(slots) if self._out_of_band else ({}, False)
         width = self._info_width
         return ResultColumns(
             slots=slots,
             names=self._envs,
             positions=positions,
-            observation=self._observations(slab, rows, extra),
+            observation=self._observations(slab, rows, out_of_band),
             reward=_copy(slab.reward, rows),
             flags=flags,
             info_marks=_copy(slab.info_mark, rows) if width else None,
             info=_copy(slab.info[:, :width], rows) if width else None,
             schemas=self._schemas,
-            out_of_band=extra,
+            out_of_band=out_of_band,
             restarted=restarted,
             times=gather(slab.times, rows),
             agents=slab.layout.agents,
@@ -205,7 +205,7 @@ class Results:
         copied.
         """
         if slab.observation is None:
-            handed_over = slab.layout.observations_apart and len(out_of_band) > 0
+            handed_over = slab.layout.observations_out_of_band and len(out_of_band) > 0
             if not handed_over or not all("observation" in kept for kept in out_of_band.values()):
                 return None
             return stacked([kept.pop("observation") for kept in out_of_band.values()])

@@ -30,7 +30,7 @@ class StepsAtOnce(Protocol):
     """A host that can step its first env without a request."""
 
     def step_now(self) -> OutOfBand | None:
-        """Step with the action in the row; what of the result is not there."""
+        """Step with the action in the row; what of the result is out of band."""
         ...
 
 
@@ -38,7 +38,7 @@ class SingleEnvCore(Core):
     """A core whose slot 0 is all there is, and executes its steps at once."""
 
     single_host: StepsAtOnce
-    """Set by whoever makes it."""
+    """Set by `assemble`."""
 
     def step(self, batch: BatchedData, now: float) -> Procedure[tuple[BatchedData, Flags | None]]:
         """See `EnvGroup.step`."""

@@ -137,7 +137,7 @@ class Supervisor:
         self._mixed_actions = mixed_actions
         self._num_cores = num_cores
         self._records: list[HostRecord] = []
-        self._servers: list[tuple[Host, Membership]] = []
+        self._env_servers: list[tuple[Host, Membership]] = []
         self._start_fault: Exception | None = None
         self._now = 0.0
         self.timed = False
@@ -150,7 +150,7 @@ class Supervisor:
         self._records.append(HostRecord(host, config))
         self.timed = self.timed or self._records[-1].timed
         if isinstance(host, Membership):
-            self._servers.append((host, host))
+            self._env_servers.append((host, host))
 
     # -- start --------------------------------------------------------------------
 
@@ -180,7 +180,7 @@ class Supervisor:
         self.open = True
         self.metas += [
             EnvMeta(env_id=server.server_id, observation_space=None, action_space=None)
-            for _, server in self._servers
+            for _, server in self._env_servers
         ]
         return self.metas
 
@@ -305,24 +305,24 @@ class Supervisor:
     @property
     def has_members(self) -> bool:
         """Whether envs may come and go."""
-        return bool(self._servers)
+        return bool(self._env_servers)
 
-    def server(self, server_id: str) -> tuple[Host, Membership] | None:
+    def env_server(self, server_id: str) -> tuple[Host, Membership] | None:
         """The env_server of that id, if there is one."""
-        return next((pair for pair in self._servers if pair[1].server_id == server_id), None)
+        return next((pair for pair in self._env_servers if pair[1].server_id == server_id), None)
 
     def member_slots(self) -> list[int]:
-        """Slots of the clients that are here, by server and name."""
+        """Slots of the clients that are here, by env_server and name."""
         return [
             host.first_slot + index
-            for host, server in self._servers
+            for host, server in self._env_servers
             for index in server.member_indices()
         ]
 
     def rank_members(self) -> None:
         """Count the clients' seeds after the local envs', in an order that no race decides."""
         offset = self._envs.num_seeds
-        for host, server in self._servers:
+        for host, server in self._env_servers:
             for index in server.member_indices():
                 self._envs.seed_offset[host.first_slot + index] = offset
                 offset += server.num_sub_envs(index)
@@ -331,14 +331,14 @@ class Supervisor:
         """How long a reset may wait in all for clients; None if there are enough.
 
         Raises:
-            TimeoutError: it has waited for longer than a server's ``connect_timeout``.
+            TimeoutError: it has waited for longer than an env_server's ``connect_timeout``.
         """
-        return earliest(*(server.missing(waited) for _, server in self._servers))
+        return earliest(*(server.missing(waited) for _, server in self._env_servers))
 
     def objection(self, meta: EnvMeta) -> str | None:
         """Why a client's env may not join: all actions must have one shape here."""
         known = [m for m in self.metas if m.action_space is not None]
-        known += [m for _, server in self._servers for m in server.members().values()]
+        known += [m for _, server in self._env_servers for m in server.members().values()]
         try:
             if not self._mixed_actions:
                 check_actions([*known[:1], meta])
@@ -361,7 +361,7 @@ class Supervisor:
         times: list[float | None] = [r.start_by for r in self._records] if self.recovering else []
         if self.timed:
             times += [self._expiry(r) for r in self._records if r.timed and self._in_flight(r)]
-        times += [server.deadline() for _, server in self._servers]
+        times += [server.deadline() for _, server in self._env_servers]
         return earliest(*times)
 
     def _in_flight(self, record: HostRecord) -> int:
@@ -397,7 +397,7 @@ class Supervisor:
         self._looked_at = now
         if self.recovering:
             self._check_start_times()
-        for _, server in self._servers:
+        for _, server in self._env_servers:
             due = server.deadline()
             if due is not None and due <= now:
                 server.tick(now)
@@ -525,7 +525,7 @@ class Supervisor:
         while any(r.stage is not Stage.CLOSED for r in records):
             if now >= by:
                 if killed:
-                    return  # What doesn't even die is left to the end of its fork server.
+                    return  # A worker that does not even die is left to its fork server's end.
                 killed, by = True, now + _KILL_SECONDS
                 for record in records:
                     if record.stage is not Stage.CLOSED:

@@ -102,9 +102,17 @@ class SyncDriver:
 
 
 class EnvGroup(Facade):
-    """Many envs used as one, from plain code; the methods of the asynchronous `EnvGroup`.
+    """Many envs used as one, from plain code: a script, a thread, a notebook cell.
 
-    Make one with `rlightning_aio.sync.build_env_group` and use it in a ``with`` block.
+    Make one with `rlightning_aio.sync.build_env_group` and use it as a context manager, which
+    initialises it on entry and closes it on exit::
+
+        with build_env_group(load_config("configs/halfcheetah.yaml")) as group:
+            batch, _ = group.reset(seed=0)
+
+    Each method returns when it is done; the calling thread waits meanwhile. A wait that Ctrl-C
+    interrupts raises KeyboardInterrupt and leaves its results to `collect_async`; one that
+    comes while a request is being sent leaves only `close` (docs/faults.md).
     Not thread-safe: use it from one thread at a time.
     """
 
@@ -114,7 +122,16 @@ class EnvGroup(Facade):
         return SyncDriver()
 
     def init(self) -> list[EnvMeta]:
-        """See `rlightning_aio.EnvGroup.init`."""
+        """Start all workers, in parallel, and build their envs; return when all are built.
+
+        Returns one `EnvMeta` for each local env, then one without spaces for each env_server,
+        in the order of `env_ids`. If it fails or is interrupted, nothing is left running.
+
+        Raises:
+            StartFailed: an env could not be built, or took longer than ``start_timeout``.
+            ConfigError: the envs' action spaces have different shapes (a `ValueError`).
+            GroupClosed: the group was closed before.
+        """
         try:
             return self._driver.run(self._core.start(time.monotonic()))
         except BaseException:
@@ -139,11 +156,51 @@ class EnvGroup(Facade):
         options: dict[str, Any] | None = None,
         env_ids: Sequence[str] | None = None,
     ) -> tuple[BatchedData, list[bool]]:
-        """See `rlightning_aio.EnvGroup.reset`."""
+        """Start a new episode in all envs, or in those of `env_ids`, and wait for all of them.
+
+        Args:
+            seed: env k of the group gets ``seed + k`` (k counts sub-environments); a sequence
+                gives one seed for each env, a mapping seeds by id.
+            options: passed to each env.
+            env_ids: which envs; the results come in this order. None: all local envs, then the
+                clients of env_servers, for which it waits.
+
+        Returns the first observations, in fresh arrays (views, where the group was built with
+        ``zero_copy``), and flags that are all False. Interrupted, it leaves the results to
+        `collect_async`.
+
+        Raises:
+            EnvBusy: an env has a reply outstanding, or comes twice; nothing was sent.
+            UnknownEnv: no env of this group has that id.
+            ValueError: a seed is no int from 0 to 2**62 - 1, or there are not as many as envs.
+            TypeError: the options can't be sent to a worker.
+            TimeoutError: too few clients of an env_server have joined in time.
+            EnvRaised, WorkerDied, EnvHung, EnvAway: an env failed, or its client is away; the
+                others' results are in the error's ``results``.
+            GroupClosed: the group was not initialised, or is closed.
+        """
         return self._driver.run(self._core.reset(time.monotonic(), seed, options, env_ids))
 
     def step(self, batch: BatchedData) -> tuple[BatchedData, list[bool] | None]:
-        """See `rlightning_aio.EnvGroup.step`."""
+        """Step the envs of `batch` and wait for all of them.
+
+        Args:
+            batch: a batch of responses, from `BatchedData.respond` (columns, fast) or made of
+                `PolicyResponse` values; any of the local envs, in any order.
+
+        Returns results with the same ids in the same order, in fresh arrays (views, where the
+        group was built with ``zero_copy``), and None; inside `auto_reset` a flag for each
+        result. Interrupted, it leaves the results to `collect_async`.
+
+        Raises:
+            BadAction: an action's shape, dtype or count doesn't fit; nothing was sent.
+            EnvBusy: an env has a reply outstanding, or comes twice; nothing was sent.
+            UnknownEnv: no env of this group has that id.
+            NotImplementedError: the env is a client's, which answers when it can.
+            EnvRaised, WorkerDied, EnvHung: an env failed; the others' results are in the
+                error's ``results``.
+            GroupClosed: the group was not initialised, or is closed.
+        """
         return self._driver.run(self._core.step(batch, time.monotonic()))
 
     def collect_async(
@@ -156,35 +213,90 @@ class EnvGroup(Facade):
         entries: Sequence[str] | None = None,
         ordered: bool = False,
     ) -> tuple[BatchedData, list[bool]]:
-        """See `rlightning_aio.EnvGroup.collect_async`."""
+        """Wait for results of `step_async`; never returns an empty batch.
+
+        The name is that of the asynchronous group's method; this one blocks until it returns.
+
+        Args:
+            timeout: seconds of a further window, opened when the first result is ready, in
+                which more results join.
+            wait_all: wait for all that are pending; `timeout` is ignored then, with a warning.
+            min_results: don't return before that many are ready (or all that are pending).
+            max_results: leave what is above to the next call, first come first served.
+            deadline: seconds in all, from now.
+            entries: take results of these config entries only; the others' stay.
+            ordered: in the group's order instead of that of arrival. With ``wait_all`` that
+                makes a run reproducible.
+
+        Returns results, in fresh arrays (views, where the group was built with ``zero_copy``),
+        and a flag for each: inside `auto_reset` whether it reached the step limit, which
+        `BatchedData.limit_reached` tells as well. Interrupted, it loses no result.
+
+        Raises:
+            NothingPending: no request is outstanding (of `entries`), and no client can join.
+            UnknownEnv: no config entry has such a name.
+            ValueError: a time isn't above 0, a number isn't above 0, or `min_results` is above
+                `max_results`.
+            TimeoutError: `deadline` has passed; the next call gets the results.
+            EnvRaised, WorkerDied, EnvHung: the answer to one request; the results of others
+                stay for the next call.
+            GroupClosed: the group was not initialised, or is closed.
+            RLightningError: it was called within itself, as from a signal handler.
+        """
         procedure = self._collect(
             timeout, wait_all, min_results, max_results, deadline, entries, ordered
         )
         return self._driver.run(procedure)
 
     def __getitem__(self, env_id: str) -> EnvHandle:
-        """A handle on one env, or on one env_server; raises `UnknownEnv`."""
-        server = self._core.supervisor.server(env_id)
+        """A handle on one env (an `EnvHandle`), or on one env_server (a `ServerHandle`).
+
+        Raises:
+            UnknownEnv: the group has neither of that id.
+        """
+        server = self._core.supervisor.env_server(env_id)
         if server is not None:
             return ServerHandle(self, self._core, self._driver, server)
         return EnvHandle(self, self._core, self._driver, self._core.envs.find_one(env_id))
 
     def offload(self) -> None:
-        """See `rlightning_aio.EnvGroup.offload`."""
+        """Have every local env free its device memory until `reload`; return when all have.
+
+        Interrupted, it leaves the envs to free it by themselves; `collect_async` has nothing
+        of it.
+
+        Raises:
+            EnvBusy: an env has a reply outstanding; nothing was sent.
+            EnvRaised: an env can't, or failed to; what else went wrong is in ``others``.
+            WorkerDied, EnvHung: a worker ended meanwhile; a replacement does not repeat it.
+            GroupClosed: the group was not initialised, or is closed.
+        """
         self._driver.run(self._core.call_all(time.monotonic(), "offload"))
 
     def reload(self) -> None:
-        """See `rlightning_aio.EnvGroup.reload`."""
+        """Have every local env take its device memory again; return when all have.
+
+        Interruption and errors are those of `offload`.
+        """
         self._driver.run(self._core.call_all(time.monotonic(), "reload"))
 
     def close(self) -> None:
-        """See `rlightning_aio.EnvGroup.close`."""
+        """Close all envs and end their workers, by force after a second and a half.
+
+        Idempotent. Returns when nothing is left running; interrupted, it ends what is left by
+        force. Results that were not collected are gone. An env that raises in its own `close`
+        is named in a warning.
+        """
         self._driver.run(self._core.close(time.monotonic()))
         self._closed()
 
 
 class EnvHandle:
-    """One env of a synchronous group; see `rlightning_aio.EnvHandle` for the methods."""
+    """One env of a synchronous group.
+
+    Each method returns when the env has answered, and raises `EnvBusy` while an earlier reply
+    of it is outstanding.
+    """
 
     def __init__(self, group: EnvGroup, core: Core, driver: SyncDriver, slot: int) -> None:
         self._group = group
@@ -194,48 +306,83 @@ class EnvHandle:
 
     @property
     def env_id(self) -> str:
-        """Its id."""
+        """Its id, as in `EnvGroup.env_ids`."""
         return self._core.envs.env_ids[self._slot]
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> EnvRet | MultiAgentEnvRet:
-        """Start a new episode; `seed` is the env's own."""
+        """Start a new episode and wait for its first observation.
+
+        Args:
+            seed: the env's own; sub-environment k gets ``seed + k``.
+            options: passed to the env.
+
+        Returns the result as a value; its arrays are as those of `EnvGroup.reset`.
+        Interrupted, it leaves the result to the group's `collect_async`. Errors are those of
+        `EnvGroup.reset`.
+        """
         seeds = None if seed is None else [seed]
         return only_result(self._group.reset(seeds, options, [self.env_id]))
 
     def step(self, response: PolicyResponse | Any) -> EnvRet | MultiAgentEnvRet:
-        """Step with a `PolicyResponse`, or with a bare action."""
+        """Step with a `PolicyResponse`, or with a bare action, and wait for the result.
+
+        Returns the result as a value, inside `auto_reset` that of a reset where one is due;
+        its arrays are as those of `EnvGroup.step`. Interrupted, it leaves the result to the
+        group's `collect_async`. Errors are those of `EnvGroup.step`.
+        """
         return only_result(self._group.step(steps_of(self.env_id, response)))
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> Any:
-        """Call method `name` of the env (or, if it has none, of its simulator); its value."""
+        """Call method `name` of the env (or, if it has none, of its simulator).
+
+        Returns its value: from a worker a copy, from an inline env the object itself.
+        Interrupted, it leaves the method to end by itself, and its value is dropped.
+
+        Raises:
+            EnvRaised: the method raised, or its value can't be pickled.
+            EnvBusy: the env has a reply outstanding; nothing was sent.
+            TypeError: the arguments can't be sent to a worker; nothing was sent.
+            WorkerDied, EnvHung: the worker ended meanwhile; a replacement does not repeat it.
+            GroupClosed: the group was not initialised, or is closed.
+        """
         procedure = self._core.call(time.monotonic(), self._slot, name, args, kwargs)
         return self._driver.run(procedure)
 
     def get_attr(self, name: str, target: str = "unwrapped") -> Any:
-        """Attribute `name` of the simulator; of its outermost wrapper with target ``outer``."""
+        """Attribute `name` of the simulator; of its outermost wrapper with target ``outer``.
+
+        Returns it as `call` returns a value, and raises what `call` raises.
+        """
         return self.call("get_attr", name, target)
 
     def set_attr(self, name: str, value: Any, target: str = "unwrapped") -> None:
-        """Set attribute `name` of the simulator or its outermost wrapper; done on return."""
+        """Set attribute `name` of the simulator or its outermost wrapper; done on return.
+
+        Raises what `call` raises.
+        """
         self.call("set_attr", name, value, target)
 
     def render(self) -> Any:
-        """One frame, as the simulator renders it."""
+        """One frame, as the simulator renders it; raises what `call` raises."""
         return self.call("render")
 
     def offload(self) -> None:
-        """Free device memory until `reload`."""
+        """Free its device memory until `reload`; done on return. Raises what `call` raises."""
         self.call("offload")
 
     def reload(self) -> None:
-        """Take device memory again."""
+        """Take its device memory again; done on return. Raises what `call` raises."""
         self.call("reload")
 
 
 class ServerHandle(ServerView, EnvHandle):
-    """An env_server of a synchronous group; see `rlightning_aio.ServerHandle`."""
+    """An env_server of a synchronous group; its clients' envs have handles of their own.
+
+    Methods of remote envs can't be called: `call`, `get_attr`, `set_attr`, `render`, `offload`
+    and `reload` raise NotImplementedError.
+    """
 
     def __init__(
         self,
@@ -251,15 +398,21 @@ class ServerHandle(ServerView, EnvHandle):
     def reset(  # pyright: ignore[reportIncompatibleMethodOverride]  # One for each client.
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> list[EnvRet | MultiAgentEnvRet]:
-        """Reset all clients, of which there must be ``min_clients`` within ``connect_timeout``.
+        """Reset all clients and wait for them; each env_server must have ``min_clients`` first.
 
         Args:
-            seed: client k, in the order of their names, gets ``seed + k`` (counting
-                sub-environments).
+            seed: client k, in the order of their names, gets ``seed + k``.
             options: passed to each.
 
+        Returns one result for each client, in the order of their names. Interrupted while the
+        clients reset, it leaves the results to the group's `collect_async`.
+
         Raises:
-            TimeoutError: too few clients have joined.
+            TimeoutError: too few clients have joined within ``connect_timeout``.
+            EnvBusy: a client has a reply outstanding; nothing was sent.
+            EnvRaised, EnvAway: a client's env failed, or the client is away; the others'
+                results are in the error's ``results``.
+            GroupClosed: the group was not initialised, or is closed.
         """
         procedure = self._core.reset_members(time.monotonic(), self._server, seed, options)
         return self._driver.run(procedure)[0].values()
@@ -281,6 +434,19 @@ def build_env_group(
     mixed_actions: bool = False,
     zero_copy: bool = False,
 ) -> EnvGroup:
-    """A synchronous group; see `rlightning_aio.build_env_group`."""
+    """A synchronous group of the configured envs; nothing is started yet.
+
+    Args:
+        cfgs: an `EnvConfig`, a list of them, plain dicts, or OmegaConf nodes.
+        preprocess_fn: turns a `PolicyResponse` into what the simulator steps with; one for
+            all, a list with one for each entry, or one for each env. Anything that
+            cloudpickle takes.
+        mixed_actions: allow envs whose action spaces have different shapes.
+        zero_copy: hand out observations as read-only views, valid until that env's next
+            request, where the envs' rows are contiguous.
+
+    Raises:
+        ConfigError: something is wrong with the configuration or a preprocess function.
+    """
     plan = plan_group(cfgs, preprocess_fn, mixed_actions=mixed_actions, zero_copy=zero_copy)
     return EnvGroup(plan)

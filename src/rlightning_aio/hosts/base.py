@@ -39,7 +39,7 @@ __all__ = [
 
 
 class Source(Protocol):
-    """Something with a descriptor."""
+    """Something with a descriptor, which stays the same while it is watched."""
 
     def fileno(self) -> int:
         """The descriptor to watch; level-triggered."""
@@ -88,17 +88,30 @@ class Host(Protocol):
     num_envs: int
 
     def start(self) -> None:
-        """Begin to build the envs; `Built` or `NotBuilt` follows, or `Died`."""
+        """Begin to build the envs; `Built` or `NotBuilt` follows, or `Died`.
+
+        Called again after `Died`, for a replacement.
+
+        Raises:
+            OSError: no place for them can be made.
+        """
         ...
 
     def attach(self, order: AttachOrder) -> None:
-        """Give the envs their rows; `Attached` follows."""
+        """Give the envs their rows; `Attached` follows.
+
+        For a replacement it comes before the envs are built, with the rows of the first time.
+        """
         ...
 
     def packed(self, arguments: Any) -> Any:
         """`arguments` as `submit` sends them; nobody's later change reaches them.
 
-        Raises whatever makes it impossible to send, which is why it comes before anything is.
+        Args:
+            arguments: what goes out of band: (action, extras), (seed, options) or (name, args,
+                kwargs).
+
+        Raises what makes it impossible to send them: so it is called before anything is sent.
         """
         ...
 
@@ -116,11 +129,11 @@ class Host(Protocol):
         ...
 
     def close(self) -> None:
-        """Ask the envs to close; `Closed` follows."""
+        """Ask the envs to close, after what they still execute; `Closed` follows."""
         ...
 
     def release(self) -> None:
-        """Give descriptors back; nothing follows."""
+        """Give descriptors and memory back, at once; nothing follows. Idempotent."""
         ...
 
 
@@ -175,15 +188,19 @@ class Membership(Protocol):
     server_id: str
 
     def address(self) -> str:
-        """Where its envs connect to."""
+        """Where its envs connect to, as ``tcp://host:port``.
+
+        Raises:
+            RuntimeError: it does not listen yet.
+        """
         ...
 
     def members(self) -> Mapping[str, EnvMeta]:
-        """The envs that are here, by name."""
+        """The envs that are here, by the name of their client."""
         ...
 
     def member_indices(self) -> list[int]:
-        """Where they are, in the order of their names."""
+        """Indices of the envs that are here, in the order of their names."""
         ...
 
     def num_sub_envs(self, index: int) -> int:
@@ -197,9 +214,16 @@ class Membership(Protocol):
     def missing(self, waited: float) -> float | None:
         """How long a reset may wait in all for envs that are missing; None if none are.
 
+        Args:
+            waited: seconds that it has waited already.
+
         Raises:
             TimeoutError: it has waited longer than that.
         """
+        ...
+
+    def poll(self) -> None:
+        """See `Polled.poll`."""
         ...
 
     def is_readable(self) -> bool:
@@ -207,11 +231,11 @@ class Membership(Protocol):
         ...
 
     def deadline(self) -> float | None:
-        """When `tick` is due at the latest (monotonic seconds)."""
+        """When `tick` is due at the latest (monotonic seconds); None if it need not come."""
         ...
 
     def tick(self, now: float) -> None:
-        """Take in what has come; find those that are gone."""
+        """Take in what has come; find those that are gone. `now` is monotonic seconds."""
         ...
 
 
@@ -247,7 +271,7 @@ class Shared(Protocol):
     """What several hosts use, and none of them ends."""
 
     def release(self, seconds: float) -> None:
-        """Let go of it; what it still does may take so long."""
+        """Let go of it; what it still does may take `seconds`, and is then ended by force."""
         ...
 
 

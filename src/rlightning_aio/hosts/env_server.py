@@ -2,7 +2,7 @@
 
 A client takes a place when it first joins and keeps it, by its name, until the places run
 out. Its first result comes unasked; a request to a client that is known to be away is
-withdrawn, and its next first result is the answer. Clients of one server are of one
+withdrawn, and its next first result is the answer. Clients of one env_server are of one
 kind, so they share one slab, made when the first of them joins.
 """
 
@@ -55,7 +55,7 @@ class _Place:
     Attributes:
         name: of the client.
         entry: of what it owes.
-        read_action: None where actions don't fit the row.
+        read_action: None where actions travel out of band.
     """
 
     def __init__(self, slab: Slab, row: int) -> None:
@@ -79,7 +79,7 @@ class _Place:
         )
 
     def write(self, result: RemoteResult) -> OutOfBand | None:
-        """Put a result into the row; what doesn't fit."""
+        """Put a result into the row; what of it is out of band."""
         writer = self._writer
         ends = writer.checked_ends(result.reward, result.terminated, result.truncated)
         if result.is_reset or result.is_loss:
@@ -179,7 +179,7 @@ class EnvServerHost:
             )
         return settings.connect_timeout
 
-    def _seat(self, name: str, meta: EnvMeta) -> int | None:
+    def _place_of(self, name: str, meta: EnvMeta) -> int | None:
         """The place of a client that joins; None if all are taken."""
         slab = self._slab
         if slab is None:
@@ -293,7 +293,7 @@ class EnvServerHost:
         if meta is None:
             return  # It has left again already.
         known = self._slab
-        index = self._seat(name, meta)
+        index = self._place_of(name, meta)
         if index is None:
             self._listener.dismiss(name, "the server has no place for another client")
             return

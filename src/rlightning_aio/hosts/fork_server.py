@@ -61,7 +61,7 @@ _DUMP_SECONDS: Final = 0.3
 _MESSAGE_BYTES: Final = 1 << 16
 _OUTLET_BYTES: Final = 1 << 20
 _READ_SECONDS: Final = 0.2
-"""Who hasn't read anything for so long reads nothing."""
+"""A trainer that hasn't read anything for so long reads nothing."""
 _STDERR: Final = 2
 
 
@@ -356,7 +356,7 @@ class _ForkServer:
             self._trainer.send(pickle.dumps(message))
 
     def _end_all(self) -> None:
-        """The trainer is gone: workers see their channel close; kill whoever stays."""
+        """The trainer is gone: workers see their channel close; kill those that stay."""
         self._poll.unregister(self._trainer)
         self._trainer.close()
         if self._trainer_process >= 0:

@@ -66,9 +66,9 @@ class ServerSettings(BaseModel):
     heartbeat: float = Field(default=5.0, ge=0.1, le=86400)
     """Seconds within which a dead client is found."""
     keys: Path | None = None
-    """The server's directory of ``rlightning-aio keygen``; only clients listed there come in."""
+    """Its directory, made by ``rlightning-aio keygen``; only clients listed there come in."""
     insecure: bool = False
-    """Listen on a public address without keys: whoever reaches it may be an env."""
+    """Listen on a public address without keys: a machine that reaches it may be an env."""
 
 
 _FIELDS: Final = (*ServerSettings.model_fields, "zmq_port")
@@ -115,7 +115,7 @@ class Listener:
     """Listens for env clients and speaks with them; never blocks.
 
     Args:
-        server_id: env_id of the server; its clients' envs are ``<server_id>/<name>``.
+        server_id: env_id of the env_server; its clients' envs are ``<server_id>/<name>``.
         settings: see `ServerSettings`.
         step_timeout, reset_timeout: seconds after which a client that owes a step or a
             reset counts as lost; None for never.
@@ -353,16 +353,16 @@ def _is_readable(socket: zmq.Socket[bytes]) -> bool:
 
 
 class _Gate:
-    """Lets in whose CURVE key lies in the server's directory of clients (ZAP, RFC 27).
+    """Lets in whose CURVE key lies in the env_server's directory of clients (ZAP, RFC 27).
 
     Args:
         directory: as `remote.keys.make_keys` lays it out.
 
     Attributes:
-        secret: the server's own key.
+        secret: the env_server's own key.
 
     Raises:
-        ConfigError: the server's key can't be read.
+        ConfigError: the env_server's key can't be read.
     """
 
     def __init__(self, directory: Path) -> None:

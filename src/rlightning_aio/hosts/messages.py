@@ -54,9 +54,9 @@ __all__ = [
 ]
 
 NO_ACTION: Final = "the action is in the row"
-"""Travels in place of an action whose extras alone did not fit the row."""
+"""Travels in place of an action whose extras alone go out of band."""
 OutOfBand: TypeAlias = dict[str, Any]
-"""What of a result is not in its row. Keys: ``observation``, ``info``, ``extra`` (the
+"""What of a result has no place in its row. Keys: ``observation``, ``info``, ``extra`` (the
 result's ``_extra``), ``ret`` (all of it)."""
 
 
@@ -181,7 +181,7 @@ class Built(NamedTuple):
 
 
 class NotBuilt(NamedTuple):
-    """Env `env_index` of the host could not be built."""
+    """The env of index `env_index` could not be built."""
 
     host_id: int
     env_index: int
@@ -271,10 +271,10 @@ class Joined(NamedTuple):
     """An env has come by itself, with a first result that nobody has asked for.
 
     Attributes:
-        env_index: its position in the host.
+        env_index: its index in the host.
         slab: where the host's envs have their rows from now on; None if that is known.
         write: puts the result into its row, which may hold one that nobody has collected
-            yet; returns what doesn't fit there.
+            yet; returns what of it is out of band.
     """
 
     host_id: int

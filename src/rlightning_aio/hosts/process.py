@@ -66,18 +66,18 @@ class ForkServer:
     def shared(cls, config: EnvConfig, wiring: Wiring) -> ForkServer:
         """The group's fork server for the interpreter and the environment of an entry."""
         key = (cls, *_surroundings(config))
-        server = wiring.resources.get(key)
-        if server is None:
+        fork_server = wiring.resources.get(key)
+        if fork_server is None:
             preload: dict[str, None] = {}
             for other in wiring.configs:
                 backend = BACKENDS.get(other.backend)
                 if _surroundings(other) == _surroundings(config) and backend is not None:
                     preload.update(dict.fromkeys(backend.preload))
             env_vars = dict(config.env_vars)
-            server = cls(config.interpreter, env_vars, tuple(preload), wiring.watcher)
-            wiring.resources[key] = server
-        assert isinstance(server, ForkServer)
-        return server
+            fork_server = cls(config.interpreter, env_vars, tuple(preload), wiring.watcher)
+            wiring.resources[key] = fork_server
+        assert isinstance(fork_server, ForkServer)
+        return fork_server
 
     def __init__(
         self,

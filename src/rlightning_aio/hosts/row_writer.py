@@ -1,4 +1,4 @@
-"""`RowWriter`: how a result becomes a row, whoever has it: worker, inline host or env_server.
+"""`RowWriter`: how a result becomes a row, in a worker, an inline host and an env_server.
 
 Rule: a row says what it is. Beside observation, reward and ends it tells whether it is a
 reset, whether the episode is over, and the episode's return and length so far. What has no
@@ -158,8 +158,8 @@ class RowWriter:
     def write_data(
         self, observation: Any, info: dict[str, Any], extra: dict[str, Any] | None = None
     ) -> OutOfBand | None:
-        """Write an observation and an info; what has no place in the row."""
-        if self._slab.layout.observations_apart:
+        """Write an observation and an info; what of them is out of band."""
+        if self._slab.layout.observations_out_of_band:
             return self.kept(self.handed_over(observation, info))
         out_of_band: OutOfBand = {}
         if self.write_observation is None:

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 __all__ = ["EnvRunner", "Execute"]
 
 Execute: TypeAlias = "Callable[[], OutOfBand | None]"
-"""Executes a step or a reset; returns what of its result is not in the row."""
+"""Executes a step or a reset; returns what of its result is out of band."""
 
 
 class EnvRunner:
@@ -82,12 +82,13 @@ class EnvRunner:
             meta.action_space,
             (*agents, *sub_envs),
             meta.agents,
-            observations_apart=self._hands_over and leaves(meta.observation_space) is not None,
+            observations_out_of_band=self._hands_over
+            and leaves(meta.observation_space) is not None,
         )
 
     @property
     def _hands_over(self) -> bool:
-        """Whether the results of bare steps may be kept by whoever gets them."""
+        """Whether the results of bare steps may be kept by the one that gets them."""
         return self._inline and self.env.fresh_results and self.env.bare_step() is not None
 
     @property
@@ -131,7 +132,7 @@ class EnvRunner:
     def execute(self, op: int, arguments: Any) -> Any:
         """Execute a request whose arguments came out of band.
 
-        Returns what of the result is not in the row; of a call, its value.
+        Returns what of the result is out of band; of a call, its value.
         """
         if op == Operation.CALL:
             return self._call(*arguments)
@@ -194,7 +195,7 @@ class EnvRunner:
         writer, slab, row, clock = self._writer, self._slab, self._row, time.monotonic_ns
         done_times, busy_times = _view(slab.done_ns), _view(slab.busy_ns)
         # Not copied: `fresh_results` says that they are nobody else's.
-        store_data = writer.handed_over if layout.observations_apart else writer.write_data
+        store_data = writer.handed_over if layout.observations_out_of_band else writer.write_data
 
         def store(result: BareResult, busy_ns: int) -> OutOfBand | None:
             observation, reward, terminated, truncated, info = result

@@ -1,8 +1,8 @@
 """`Spinner`: wait for a moment without sleeping, where that has paid lately.
 
 Putting a process to sleep and waking it takes tens of microseconds and a system call on
-the other side; a reply often comes sooner. So whoever expects one soon looks for it a
-while first. It yields its core in every turn, and leaves off when others want the core
+the other side; a reply often comes sooner. So a process that expects one soon looks for it
+a while first. It yields its core in every turn, and leaves off when others want the core
 (a sleeper is woken before them, one that yields queues behind them) or when replies
 have been taking longer than a spin may last.
 """

@@ -1,15 +1,15 @@
 """The bell of a group: how workers wake a trainer that waits for a number of results.
 
-Shared memory holds a counter of reports for each worker, and the trainer's *order*: "ring
-when all counters together have come to this". The worker whose report gets them there
-rings, by a few bytes in its channel. So the trainer is woken once, when there is enough,
+Shared memory holds a counter of reports for each worker, and one word that the trainer
+*arms*: "ring when all counters together have come to this". The worker whose report gets them
+there rings, by a few bytes in its channel. So the trainer is woken once, when there is enough,
 and by nobody before.
 
 Invariant: every word has one writer. A worker publishes its counter and fences before it
 adds up everybody's; so of two that finish at the same time at least one sees the sum.
-Not fenced: the look at the order after each report. An order that is being written at that
+Not fenced: the look at the armed word after each report. One that is being written at that
 very moment may be overlooked there, and is seen after the next one, or when the worker has
-nothing left to do. Whoever gives a new order for a part of what is in flight therefore
+nothing left to do. A trainer that arms the bell for a part of what is in flight therefore
 looks once more a moment later (see `group.poller`).
 """
 
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 __all__ = [
+    "ARMED",
     "LINE",
-    "ORDER",
     "PACE_MASK",
     "PACE_SHIFT",
     "STORES_STAY_IN_ORDER",
@@ -43,11 +43,11 @@ LINE: Final = 8
 STORES_STAY_IN_ORDER: Final = platform.machine() in ("x86_64", "AMD64")
 """x86 publishes stores in program order; elsewhere an entry could be seen after its count."""
 
-ORDER: Final = 0
+ARMED: Final = 0
 _COUNTERS: Final = LINE
 
-# An order is, from the lowest bit: 1, the pace, the sum at which to ring, and how often
-# counters have begun anew; 0 is none.
+# The armed word is, from the lowest bit: 1, the pace, the sum at which to ring, and how often
+# counters have begun anew; 0 is disarmed.
 PACE_SHIFT: Final = 1
 PACE_MASK: Final = 0xFF
 _GOAL_SHIFT: Final = 9
@@ -100,7 +100,7 @@ def _sum_of(words: memoryview[int]) -> Callable[[], int]:
 
 
 class TrainerBell:
-    """The trainer's side: gives orders, and knows what is unread.
+    """The trainer's side: arms the bell, and knows what is unread.
 
     Args:
         buffer: the bell's memory, zeroed.
@@ -118,7 +118,7 @@ class TrainerBell:
         self._counters: NDArray[np.int64] = np.frombuffer(self._words, np.int64)[_COUNTERS::LINE]
         self._read = [0] * num_workers
         self._read_in_all = 0
-        self._order = 0
+        self._armed = 0
 
     def count(self, index: int) -> int:
         """Reports of one worker so far."""
@@ -132,7 +132,7 @@ class TrainerBell:
     def restart(self, index: int) -> None:
         """The worker is gone, and its replacement counts from 0.
 
-        Whoever waits must give its order anew.
+        It leaves the bell disarmed: a call that waits must arm it anew.
         """
         self._words[_COUNTERS + LINE * index] = 0
         self.took(index, -self._read[index])
@@ -152,30 +152,30 @@ class TrainerBell:
         return [k for k in range(len(read)) if words[_COUNTERS + LINE * k] != read[k]]
 
     def goal(self, wanted: int) -> int:
-        """What to order for so many unread reports; the same until they are read."""
+        """What to arm for so many unread reports; the same until they are read."""
         return self._read_in_all + wanted
 
     def arm(self, goal: int, pace: int) -> bool:
-        """Order one bell for `goal`; whether that is another order than before.
+        """Have one bell rung at `goal`; whether that was not armed before.
 
         Args:
             goal: see there.
             pace: workers look after each 1st, 2nd, 4th, … report: a power of two, 256 at
                 most. They look in any case when they have nothing left to do.
         """
-        order = (
+        armed = (
             (self._epoch << _EPOCH_SHIFT) | (goal << _GOAL_SHIFT) | ((pace - 1) << PACE_SHIFT) | 1
         )
-        if order == self._order:
+        if armed == self._armed:
             return False
-        self._words[ORDER] = self._order = order
+        self._words[ARMED] = self._armed = armed
         self._fence()
         return True
 
     def disarm(self) -> None:
-        """Withdraw the order: the trainer is awake."""
-        if self._order:
-            self._words[ORDER] = self._order = 0
+        """Have no bell rung: the trainer is awake."""
+        if self._armed:
+            self._words[ARMED] = self._armed = 0
 
     def release(self, seconds: float = 0.0) -> None:
         """Let go of the shared memory; what is asked of the bell from now on means nothing."""
@@ -188,7 +188,7 @@ class WorkerBell:
 
     Attributes:
         words, own: the shared memory, and where its own counter lies there.
-        obeyed: the order for which it has rung, or need not ring.
+        settled: the armed word for which it has rung, or need not ring.
     """
 
     def __init__(self, buffer: memoryview, num_workers: int, index: int) -> None:
@@ -196,22 +196,22 @@ class WorkerBell:
         self._sum = _sum_of(self.words)
         self.own = _COUNTERS + LINE * index
         self._fence = new_fence()
-        self.obeyed = 0
+        self.settled = 0
 
     def publish(self, count: int) -> bool:
         """Say how many reports there are; whether it is time to ask `is_due`."""
         words = self.words
         words[self.own] = count
-        order = words[ORDER]
-        return order != self.obeyed and not count & (order >> PACE_SHIFT & PACE_MASK)
+        armed = words[ARMED]
+        return armed != self.settled and not count & (armed >> PACE_SHIFT & PACE_MASK)
 
     def is_due(self) -> bool:
-        """Whether the trainer is to be rung, now and by this worker; True once an order."""
+        """Whether this worker is to ring the trainer, now; True once after each arming."""
         self._fence()
-        order = self.words[ORDER]
-        if order == self.obeyed:
+        armed = self.words[ARMED]
+        if armed == self.settled:
             return False
-        if order and self._sum() < (order >> _GOAL_SHIFT & _GOAL_MASK):
+        if armed and self._sum() < (armed >> _GOAL_SHIFT & _GOAL_MASK):
             return False
-        self.obeyed = order
-        return order != 0
+        self.settled = armed
+        return armed != 0

@@ -1,7 +1,7 @@
 """Entries: how one request, and the reply to it, is named everywhere.
 
 An entry is one int64: the request's number, the slot of its env in the group, and the
-operation. A reply repeats the entry of its request, so whoever compares the two knows
+operation. A reply repeats the entry of its request, so a comparison of the two tells
 whether it is late. An entry of 0 stands for none.
 """
 

@@ -23,11 +23,11 @@ class FrameKind(IntEnum):
     BELL = 0  # both
     START = 1  # trainer: what to build
     STARTED = 2  # worker: what each env is like
-    START_ERROR = 3  # worker; the env's position: why it could not be built
+    START_ERROR = 3  # worker; the env's index: why it could not be built
     ATTACH = 4  # trainer: layouts of the slabs, and the rows of the envs
     ATTACHED = 5  # worker
-    REQUEST = 6  # trainer; its entry: arguments that don't lie in the row
-    RESULT = 7  # worker; the request's entry: what the row doesn't hold
+    REQUEST = 6  # trainer; its entry: arguments out of band
+    RESULT = 7  # worker; the request's entry: its part out of band
     VALUE = 8  # worker; the request's entry: what a call returned
     ERROR = 9  # worker; the request's entry: an exception as text
     INFO_SCHEMA = 10  # worker; its number: a new way in which rows hold infos

@@ -22,7 +22,7 @@ __all__ = ["INFO_BYTES", "NO_INFO", "PICKLED", "InfoSchema", "InfoWriter"]
 INFO_BYTES: Final = 512
 NO_INFO: Final = 0
 PICKLED: Final = 255
-"""Row marks: 0 no info, 1 to 254 the number of a schema, 255 the info is in the frame."""
+"""Row marks: 0 no info, 1 to 254 the number of a schema, 255 the info is out of band."""
 
 _MAX_SCHEMAS: Final = 254
 

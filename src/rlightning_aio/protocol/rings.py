@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from rlightning_aio.protocol.bell import (
+    ARMED,
     LINE,
-    ORDER,
     PACE_MASK,
     PACE_SHIFT,
     STORES_STAY_IN_ORDER,
@@ -213,10 +213,10 @@ class WorkerRings:
                 self._fence()
             # `WorkerBell.publish`, spelt out: it would be felt in every step.
             words[own] = sent
-            order = words[ORDER]
+            armed = words[ARMED]
             if (
-                order != bell.obeyed
-                and not sent & (order >> PACE_SHIFT & PACE_MASK)
+                armed != bell.settled
+                and not sent & (armed >> PACE_SHIFT & PACE_MASK)
                 and bell.is_due()
             ):
                 ring()

@@ -44,19 +44,19 @@ class RowLayout:
         head: shape of reward and flags: ``()``, ``(num_envs,)``, and with agents
             ``(num_agents, ...)``.
         agents: agent names of a multi-agent env.
-        observations_apart: observations are handed over as they are (inline placement).
+        observations_out_of_band: observations are handed over as they are (inline placement).
     """
 
     observation_space: gym.Space[Any]
     action_space: gym.Space[Any]
     head: tuple[int, ...]
     agents: tuple[str, ...]
-    observations_apart: bool = False
+    observations_out_of_band: bool = False
 
     @property
     def observation_leaves(self) -> tuple[Leaf, ...] | None:
         """Arrays of an observation, or None if observations don't travel in the row."""
-        return None if self.observations_apart else leaves(self.observation_space)
+        return None if self.observations_out_of_band else leaves(self.observation_space)
 
     @property
     def action_leaves(self) -> tuple[Leaf, ...] | None:
@@ -69,7 +69,7 @@ class RowLayout:
         observations = leaves(self.observation_space)
         return (
             observations,
-            self.observations_apart,
+            self.observations_out_of_band,
             self.action_leaves,
             self.head,
             self.agents,

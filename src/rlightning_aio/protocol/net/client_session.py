@@ -116,7 +116,7 @@ class ClientSession:
 
     Attributes:
         phase: how things stand.
-        outbox: messages to be sent, oldest first; whoever sends them takes them out.
+        outbox: messages to be sent, oldest first; the sender takes them out.
         malformed: messages dropped because they were none.
         refusal: why the server said no last, until it says yes.
 

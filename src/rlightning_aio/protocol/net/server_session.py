@@ -187,7 +187,7 @@ class ServerSessions:
 
     Attributes:
         clients: the env of each client that has joined (its first result has come).
-        outbox: messages to be sent, oldest first; whoever sends them takes them out.
+        outbox: messages to be sent, oldest first; the sender takes them out.
         malformed: messages dropped because they were none.
         late: replies dropped because nothing asked for them any more.
     """
@@ -418,7 +418,7 @@ class ServerSessions:
         self._lose(session, cause)
 
     def _lose(self, session: _Session, cause: str) -> None:
-        """End `session`; whoever waits for its client, or will, is told `cause`."""
+        """End `session`; a request that waits for its client, or will, is told `cause`."""
         _log.info("%s lost the client %r: %s", self._server_id, session.seat.name, cause)
         seat = session.seat
         seat.session = None
@@ -717,7 +717,7 @@ class ServerSessions:
         return self._next_tick
 
     def tick(self, now: float) -> None:
-        """Ping who is silent, give up who is gone. Call it after all that came was received."""
+        """Ping the silent, give up the gone. Call it after all that came was received."""
         if self._next_tick is None or now < self._next_tick:
             return
         for session in list(self._sessions.values()):
