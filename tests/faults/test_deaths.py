@@ -14,6 +14,7 @@ import pytest
 from faults.drivers import first_on_both_drivers, on_one_driver
 from faults.faulty import Driven, Tokens, entry, fork_server_of, kill, marked, pid_of, two_workers
 
+from rlightning_aio import BatchedData, PolicyResponse
 from rlightning_aio.errors import EnvRaised, StartFailed, WorkerDied
 
 if TYPE_CHECKING:
@@ -51,6 +52,22 @@ def test_death_in_a_step_gives_one_marked_result_for_each_env_that_owed_one(
     batch, _ = group.step(tokens.steps(group.group.env_ids))
     tokens.check(batch)
     assert [ret.observation[3] for ret in batch.values()] == [1, 1, 2, 2]
+
+
+@on_one_driver
+def test_a_marked_result_marks_nothing_but_itself(start: Start) -> None:
+    """What comes after it is an episode like any other, until that ends."""
+    config = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1", "num_workers": 2}
+    group = start({**config, "envs_per_process": 2})
+    pushes = BatchedData(["pole-0", "pole-1"], [PolicyResponse(f"pole-{k}", k) for k in range(2)])
+    kill(group.group._core.supervisor.hosts[0].pid)
+    marks = []
+    for _ in range(4):
+        batch, _ = group.step(pushes)
+        marks.append((batch.restarted.all(), batch.is_reset.all(), batch.truncated.any()))
+        told = [info.get("episode") for info in batch.info()]
+        assert told == [None, None]
+    assert marks == [(True, True, True)] + 3 * [(False, False, False)]
 
 
 @on_one_driver

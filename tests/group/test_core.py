@@ -85,6 +85,33 @@ def test_the_window_opens_when_an_inline_result_is_there(new_group: NewGroup) ->
     assert sorted(ids_of(running)) == ["fake-0", "fake-1"]
 
 
+@pytest.mark.parametrize("rules", [{"deadline": 1.5}, {"timeout": 1.5}])
+def test_inline_envs_are_not_executed_past_a_deadline_or_a_window(
+    new_group: NewGroup, rules: dict[str, float]
+) -> None:
+    """The wait ends after the env that is being executed; the others stay for the next call."""
+    group = new_group(5, inline=[True])
+    host = group.hosts[0]
+    execute_next = host.execute_next
+
+    def execute_slowly() -> bool:
+        group.now += 1.0
+        return execute_next()
+
+    host.execute_next = execute_slowly
+    group.core.step_async(steps(*range(5)), group.now)
+    running = collect(group, min_results=5 if "deadline" in rules else 1, **rules)
+    if "deadline" in rules:
+        with pytest.raises(TimeoutError, match="2 of the 5"):
+            running.result()
+    else:
+        # The window opens when the first result is there.
+        assert ids_of(running) == ["fake-0", "fake-1", "fake-2"]
+    assert len(host.waiting) == (3 if "deadline" in rules else 2)
+    collect(group, wait_all=True).result()
+    assert not host.waiting
+
+
 def test_one_callers_slow_env_does_not_hold_up_another_caller(new_group: NewGroup) -> None:
     """Two calls at once, on envs of one worker: each returns when its own envs have replied."""
     group = new_group(3)

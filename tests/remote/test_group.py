@@ -254,6 +254,37 @@ async def test_a_client_that_returns_while_the_trainer_thinks_is_no_error() -> N
         again.join()
 
 
+async def test_a_client_that_returns_before_its_loss_is_collected_waits_its_turn() -> None:
+    """First the mark that it was gone, as it was left; then the first result of its new life."""
+
+    def leave() -> None:
+        raise SystemExit
+
+    async with rlightning_aio.build_env_group(entry()) as group:
+        address = group["robots-0"].address
+        gone = ClientThread(address, "c0", CountingEnv(0, on_step=leave))
+        batch, _ = await group.reset()
+        group.step_async(batch.respond(action=actions(batch)))
+        with pytest.raises(SystemExit):
+            await asyncio.to_thread(gone.join)
+        again = ClientThread(address, "c0", CountingEnv(5))
+        async with asyncio.timeout(HANG):
+            # Nobody collects, and the event loop goes on.
+            while not group["robots-0"].clients:  # noqa: ASYNC110  # Nothing tells of it.
+                await asyncio.sleep(0)
+        lost, _ = await group.collect_async(deadline=HANG)
+        assert lost.observation.tolist() == [[0, -1, 0]]
+        assert "client_lost" in lost.info()[0]
+        assert lost.is_reset.all()
+        assert lost.restarted.all()
+        first, _ = await group.collect_async(deadline=HANG)
+        assert first.observation.tolist() == [[5, -1, 0]]
+        assert first.is_reset.all()
+        assert not first.restarted.any()
+        await group.close()
+        again.join()
+
+
 def test_an_env_that_raises_at_the_client_can_be_reset_and_used_again() -> None:
     """`EnvRaised` with the remote traceback, in the client's name."""
     env = CountingEnv(0)

@@ -60,6 +60,8 @@ class AutoReset:
         # For so many batches no env can reach its limit.
         self._margin = 0
         self._limits: NDArray[np.int64] | None = None
+        # Whether each env has its own limit, or all the same.
+        self._own_limits = False
         self._on_done = True
         self.mark_truncated = False
 
@@ -80,6 +82,7 @@ class AutoReset:
         if self.active:
             raise RuntimeError("auto_reset contexts don't nest; leave the open one first")
         self._limits = self._chosen_limits(max_episode_steps)
+        self._own_limits = max_episode_steps is None
         self._margin = 0
         self._on_done = on_done
         self.mark_truncated = mark_truncated
@@ -106,6 +109,12 @@ class AutoReset:
                 stacklevel=4,
             )
         return np.full(len(envs), limit, np.int64)
+
+    def note_joined(self, slot: int) -> None:
+        """A client has taken `slot`, and has told what limit its simulator has."""
+        if self._limits is not None and self._own_limits:
+            self._limits[slot] = self._envs.step_limits[slot] or _ENDLESS
+            self._margin = 0
 
     def end(self) -> None:
         """Close the context: steps are plain again."""

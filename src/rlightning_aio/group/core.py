@@ -232,6 +232,7 @@ class Core:
             return
         has_row = self._layout.of(slot)[0].action is not None
         self.envs.note_joined(slot, host.first_slot, told.meta, told.traits, has_row=has_row)
+        self.auto.note_joined(slot)
         self.requests.join(slot, self._now)
         self._results.note_sent(self.requests.alone(slot), None)
         self._results.keep(slot, told.write() or {})
