@@ -53,10 +53,19 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def _repeats(item: pytest.Item) -> bool:
-    """Whether a test is about a synchronous group, which doesn't know what loop it runs in."""
+    """Whether a test shows on one loop what it shows on the other as well.
+
+    A synchronous group doesn't know what loop it runs in. What a module says its loop has no
+    part in (`one_loop_for_each_place`) is shown on asyncio inline and on uvloop with workers.
+    """
     params = item.callspec.params if hasattr(item, "callspec") else {}
-    synchronous = getattr(params.get("place"), "synchronous", False)
-    return synchronous and uvloop.new_event_loop in params.values()
+    place = params.get("place")
+    on_uvloop = uvloop.new_event_loop in params.values()
+    if any(getattr(value, "synchronous", False) for value in params.values()):
+        return on_uvloop
+    if not hasattr(place, "inline") or not item.get_closest_marker("one_loop_for_each_place"):
+        return False
+    return on_uvloop == place.inline
 
 
 def _children() -> set[str]:

@@ -8,7 +8,7 @@ import signal
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
-from faults.faulty import Driven, Tokens, kill, marked, pid_of, two_workers
+from faults.driven import Driven, Tokens, kill, marked, pid_of, two_workers
 from faults.test_shutdown import read_until, trainer
 from patience import HANG
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import pytest
+from faults.driven import Driven, Tokens, entry, fork_server_of, kill, marked, pid_of, two_workers
 from faults.drivers import first_on_both_drivers, on_one_driver
-from faults.faulty import Driven, Tokens, entry, fork_server_of, kill, marked, pid_of, two_workers
 
 from rlightning_aio import BatchedData, PolicyResponse
 from rlightning_aio.errors import EnvRaised, StartFailed, WorkerDied

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import pytest
+from faults.driven import Driven, Tokens, entry, two_workers
 from faults.drivers import first_on_both_drivers, on_one_driver
-from faults.faulty import Driven, Tokens, entry, two_workers
 
 from rlightning_aio.errors import EnvRaised, RemoteTraceback, StartFailed
 

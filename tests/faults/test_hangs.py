@@ -9,8 +9,8 @@ import time
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import pytest
+from faults.driven import Driven, Tokens, entry, marked, pid_of, two_workers
 from faults.drivers import first_on_both_drivers, on_one_driver
-from faults.faulty import Driven, Tokens, entry, marked, pid_of, two_workers
 from patience import HANG
 
 import rlightning_aio

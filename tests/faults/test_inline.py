@@ -6,7 +6,7 @@ import signal
 from typing import TYPE_CHECKING, TypeAlias
 
 import pytest
-from faults.faulty import Driven, Tokens, entry
+from faults.driven import Driven, Tokens, entry
 from faults.test_env_errors import RAISED, check_told
 
 from rlightning_aio.errors import EnvRaised

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import pytest
+from faults.driven import Driven, Tokens, entry, two_workers
 from faults.drivers import on_one_driver
-from faults.faulty import Driven, Tokens, entry, two_workers
 
 import rlightning_aio
 from rlightning_aio import BatchedData, PolicyResponse

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import pytest
-from faults.faulty import Driven, Tokens, fork_server_of, kill, pid_of, two_workers
+from faults.driven import Driven, Tokens, fork_server_of, kill, pid_of, two_workers
 from patience import HANG
 
 import rlightning_aio
@@ -45,7 +45,7 @@ def test_all_that_is_waited_for_on_purpose_is_less_than_two_seconds() -> None:
 
 SCRIPT = """
 import os, signal, sys, time
-from faults.faulty import Tokens, entry, kill, pid_of, two_workers
+from faults.driven import Tokens, entry, kill, pid_of, two_workers
 import rlightning_aio, rlightning_aio.sync
 def build(**fields):
     return rlightning_aio.sync.build_env_group(two_workers(**fields))

@@ -10,6 +10,9 @@ import pytest
 
 from rlightning_aio import BatchedData, EnvRaised, PolicyResponse, sync
 
+# What is reset is decided from results, however they came.
+pytestmark = pytest.mark.one_loop_for_each_place
+
 DO_NOTHING, END, TRUNCATE, RAISE = range(4)
 ENTRY = {"name": "probe", "backend": "probe", "task": "x", "num_workers": 3}
 IDS = [f"probe-{k}" for k in range(3)]

@@ -22,6 +22,9 @@ from rlightning_aio import (
     build_env_group,
 )
 
+# Values are made and read on this side of any loop.
+pytestmark = pytest.mark.one_loop_for_each_place
+
 PROBE = {"name": "probe", "backend": "probe", "task": "x", "num_workers": 2}
 CARTPOLE = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1", "num_workers": 2}
 

@@ -62,6 +62,7 @@ async def test_a_context_initialises_and_closes(place: Any) -> None:
         await group.reset()
 
 
+@pytest.mark.one_loop_for_each_place
 async def test_an_env_that_cannot_be_built_fails_the_start(place: Any) -> None:
     """With what it raised; all others are closed, and the group with them."""
     group = place.build([PROBE, {**PROBE, "name": "bad", "env_kwargs": {"fails": 1}}])
@@ -76,6 +77,7 @@ async def test_an_env_that_cannot_be_built_fails_the_start(place: Any) -> None:
     await group.close()
 
 
+@pytest.mark.one_loop_for_each_place
 @pytest.mark.parametrize("moment", ["before init", "after close"])
 async def test_outside_of_its_life_a_group_says_so(place: Any, moment: str) -> None:
     """To whatever is asked, with what to do; it can be closed any number of times."""
@@ -245,6 +247,7 @@ def test_a_script_may_define_its_own_envs(tmp_path: Path) -> None:
     assert done.stderr == ""
 
 
+@pytest.mark.one_loop_for_each_place
 async def test_a_module_that_only_workers_import_may_define_them(
     place: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -629,4 +629,4 @@ class RequestsMachine(RuleBasedStateMachine):
 
 
 TestRequests = RequestsMachine.TestCase
-TestRequests.settings = settings(max_examples=100, stateful_step_count=30)
+TestRequests.settings = settings(stateful_step_count=30)

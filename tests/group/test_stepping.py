@@ -19,6 +19,9 @@ from rlightning_aio import (
     UnknownEnv,
 )
 
+# For what is decided before anything is waited for, or made of a result that has come.
+one_loop = pytest.mark.one_loop_for_each_place
+
 DO_NOTHING, END, TRUNCATE, RAISE = range(4)
 ENTRY = {"name": "probe", "backend": "probe", "task": "x", "num_workers": 4}
 IDS = [f"probe-{k}" for k in range(4)]
@@ -35,6 +38,7 @@ def responses(ids: list[str], *rewards: float, what: int = DO_NOTHING) -> Batche
     )
 
 
+@one_loop
 async def test_init_describes_every_env_in_order(start: Any) -> None:
     """Ids, spaces and counts, before anything is reset; asked again, it tells the same."""
     group = await start([ENTRY, {**ENTRY, "name": "more", "num_workers": 1}])
@@ -48,6 +52,7 @@ async def test_init_describes_every_env_in_order(start: Any) -> None:
     }
 
 
+@one_loop
 async def test_a_reset_answers_for_the_envs_it_was_asked_for(start: Any) -> None:
     """All in order, or some in the order given; rewards are 0, flags and ends False."""
     group = await start(ENTRY)
@@ -63,6 +68,7 @@ async def test_a_reset_answers_for_the_envs_it_was_asked_for(start: Any) -> None
     assert batch.observation.tolist() == [[3, 2, 0, -1], [1, 2, 0, -1]]
 
 
+@one_loop
 async def test_seeds_are_counted_named_or_listed(start: Any) -> None:
     """An int counts through the whole group, whichever of its envs are reset."""
     group = await start(ENTRY)
@@ -86,6 +92,7 @@ async def test_seeds_are_counted_named_or_listed(start: Any) -> None:
     assert await seeds() == [-1] * 4
 
 
+@one_loop
 async def test_options_reach_every_env_of_a_reset(start: Any) -> None:
     """Together with its seed."""
     group = await start(ENTRY)
@@ -113,6 +120,7 @@ async def test_a_step_returns_the_same_ids_in_the_same_order(start: Any) -> None
     assert (await group.step(by_hand))[0].reward.tolist() == [9]
 
 
+@one_loop
 async def test_flags_extras_and_times_of_a_result(start: Any) -> None:
     """Each part of an `EnvRet` arrives as the env gave it."""
     group = await start(ENTRY)
@@ -144,6 +152,7 @@ async def test_each_result_is_collected_once(start: Any) -> None:
         await group.collect_async()
 
 
+@one_loop
 async def test_a_bad_batch_is_refused_as_a_whole(start: Any) -> None:
     """Nothing is sent: each env can be stepped afterwards, and has not moved."""
     group = await start(ENTRY)
@@ -253,6 +262,7 @@ async def test_a_handle_is_one_env(start: Any) -> None:
         group["probe-9"]
 
 
+@one_loop
 async def test_attributes_of_the_simulator_or_its_wrapper(start: Any) -> None:
     """The target is told, and a value that was set is there when the call returns."""
     group = await start(ENTRY)
@@ -270,6 +280,7 @@ async def test_attributes_of_the_simulator_or_its_wrapper(start: Any) -> None:
         await env.get_attr("no_such")
 
 
+@one_loop
 async def test_frames_memory_and_what_has_none(start: Any) -> None:
     """`render` returns a frame; offload and reload reach every env, or name the one that can't."""
     others = {**ENTRY, "name": "b", "backend": "batched"}
@@ -288,6 +299,7 @@ async def test_frames_memory_and_what_has_none(start: Any) -> None:
     assert await group["probe-0"].call("__getattribute__", "offloaded") is True
 
 
+@one_loop
 async def test_results_are_never_overwritten(start: Any) -> None:
     """Neither arrays, nor infos, nor what envs return in place of new objects."""
     group = await start(
@@ -308,6 +320,7 @@ async def test_results_are_never_overwritten(start: Any) -> None:
     assert all((value.observation["items"][0] == 0).all() for value in values)
 
 
+@one_loop
 async def test_a_sent_action_may_be_changed(start: Any) -> None:
     """What was sent is what is stepped with, also where an env runs only later."""
     group = await start([ENTRY, {**ENTRY, "name": "chunked", "backend": "chunked"}])
@@ -323,6 +336,7 @@ async def test_a_sent_action_may_be_changed(start: Any) -> None:
     assert found["chunked"].reward.tolist() == [5] * 4
 
 
+@one_loop
 async def test_zero_copy_lends_read_only_views(start: Any) -> None:
     """They live until the env's next request; without it, an observation is the caller's own."""
     group = await start(ENTRY, zero_copy=True)
@@ -337,6 +351,7 @@ async def test_zero_copy_lends_read_only_views(start: Any) -> None:
     assert len((await group.step(BatchedData()))[0]) == 0
 
 
+@one_loop
 async def test_what_a_group_has_measured(start: Any, capsys: pytest.CaptureFixture[str]) -> None:
     """Throughput by entry and kind, batch sizes, latencies, and episodes by env."""
     group = await start([ENTRY, {**ENTRY, "name": "more", "num_workers": 1}])
@@ -370,6 +385,7 @@ async def test_what_a_group_has_measured(start: Any, capsys: pytest.CaptureFixtu
     assert "probe" in printed
 
 
+@one_loop
 async def test_what_comes_after_an_end_that_nobody_reset_belongs_to_no_episode(start: Any) -> None:
     """Whoever steps on gets results, and a single episode is counted."""
     entry = {

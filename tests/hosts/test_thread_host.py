@@ -40,10 +40,13 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     assert env_threads() == []
 
 
-@pytest.fixture(params=[False, True], ids=["async", "sync"])
+FACADES = [Place("wherever", {}), Place("wherever", {}, synchronous=True)]
+
+
+@pytest.fixture(params=FACADES, ids=["async", "sync"])
 def facade(request: pytest.FixtureRequest) -> Place:
     """Groups of either facade, whose methods are awaited; the entries say where they live."""
-    return Place("wherever", {}, synchronous=request.param)
+    return request.param
 
 
 def env_threads() -> list[EnvThread]:

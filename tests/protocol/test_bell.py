@@ -165,7 +165,7 @@ class BellMachine(RuleBasedStateMachine):
 
 
 TestBell = BellMachine.TestCase
-TestBell.settings = settings(max_examples=200, stateful_step_count=60, deadline=None)
+TestBell.settings = settings(stateful_step_count=60)
 
 
 def bells(num_workers: int) -> tuple[TrainerBell, list[WorkerBell]]:

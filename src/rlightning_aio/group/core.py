@@ -669,7 +669,11 @@ class Core:
         now = yield from self._await_members(now)
         host, membership = server
         slots = np.array(membership.member_indices(), np.intp) + host.first_slot
-        seeds = None if seed is None else [_checked(seed) + k for k in range(len(slots))]
+        seeds = None
+        if seed is not None:
+            self.supervisor.rank_members()
+            offsets = self.envs.seed_offset[slots]
+            seeds = (_checked(seed) + offsets - offsets[:1]).tolist()
         return (yield from self._reset(now, seeds, options, slots))
 
     def _everyone(self) -> NDArray[np.intp]:

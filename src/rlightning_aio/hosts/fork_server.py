@@ -434,6 +434,8 @@ def _preload(trainer: socket.socket, process: int, modules: tuple[str, ...]) -> 
     error = None
     try:
         importlib.import_module("rlightning_aio.hosts.worker")
+        # Each worker is sent its entry's config, and would import this for itself.
+        importlib.import_module("rlightning_aio.config")
         for module in modules:
             with contextlib.suppress(Exception):
                 importlib.import_module(module)
