@@ -60,7 +60,7 @@ def _repeats(item: pytest.Item) -> bool:
     """
     params = item.callspec.params if hasattr(item, "callspec") else {}
     place = params.get("place")
-    on_uvloop = uvloop.new_event_loop in params.values()
+    on_uvloop = any(value is uvloop.new_event_loop for value in params.values())
     if any(getattr(value, "synchronous", False) for value in params.values()):
         return on_uvloop
     if not hasattr(place, "inline") or not item.get_closest_marker("one_loop_for_each_place"):

@@ -315,7 +315,8 @@ class EnvHandle:
         """Start a new episode and wait for its first observation.
 
         Args:
-            seed: the env's own; sub-environment k gets ``seed + k``.
+            seed: the env's own; sub-environment k gets ``seed + k`` (counting
+                sub-environments).
             options: passed to the env.
 
         Returns the result as a value; its arrays are as those of `EnvGroup.reset`.
@@ -401,7 +402,8 @@ class ServerHandle(ServerView, EnvHandle):
         """Reset all clients and wait for them; each env_server must have ``min_clients`` first.
 
         Args:
-            seed: client k, in the order of their names, gets ``seed + k``.
+            seed: client k, in the order of their names, gets ``seed + k`` (counting
+                sub-environments).
             options: passed to each.
 
         Returns one result for each client, in the order of their names. Interrupted while the
