@@ -43,7 +43,7 @@ class SingleEnvCore(Core):
     def step(self, batch: BatchedData, now: float) -> Procedure[tuple[BatchedData, Flags | None]]:
         """See `EnvGroup.step`."""
         slots = self._slots_of(batch)
-        self._check_sendable(slots, "step")
+        self._dispatch.check_sendable(slots, "step")
         out_of_band = write_actions(batch, slots, self.envs, self._layout)
         columns = columns_of_responses(batch)
         at_once = out_of_band is None and columns is not None and len(slots) > 0
@@ -57,7 +57,7 @@ class SingleEnvCore(Core):
             self.auto.not_completed(slots)
             if isinstance(error, KeyboardInterrupt):
                 raise
-            raise self.raised(0, ErrorText.of(error)) from None
+            raise self._intake.raised(0, ErrorText.of(error)) from None
         self._results.keep(0, out_of_band or {})
         self.drain()  # An info may have come in a new form.
         results, flags = self._hand_out(slots, synchronous=True)

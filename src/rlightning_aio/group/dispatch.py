@@ -1,0 +1,132 @@
+"""`Dispatch`: how requests leave: who may be asked, with what arguments, through which host.
+
+Rule: all or nothing. Everything that can be refused is refused, and all arguments are
+packed, before the first request is handed over.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from rlightning_aio.errors import BadAction, EnvBusy
+from rlightning_aio.group.requests import State
+from rlightning_aio.hosts.messages import NO_ACTION
+from rlightning_aio.protocol.slab import NO_SEED
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from rlightning_aio.group.actions import OutOfBandSteps
+    from rlightning_aio.group.env_table import EnvTable
+    from rlightning_aio.group.requests import Requests
+    from rlightning_aio.group.supervisor import Supervisor
+    from rlightning_aio.hosts.base import Host, Membership
+
+__all__ = ["Dispatch"]
+
+
+class Dispatch:
+    """See the module; its arguments are the group's parts."""
+
+    def __init__(self, envs: EnvTable, requests: Requests, supervisor: Supervisor) -> None:
+        self._envs = envs
+        self._requests = requests
+        self._supervisor = supervisor
+
+    def distinct(self, env_ids: Sequence[str]) -> NDArray[np.intp]:
+        """Slots of `env_ids`, each of which may come once."""
+        slots = self._envs.find(env_ids)
+        if slots is not self._envs.all and len(set(env_ids)) < len(slots):
+            double = next(id_ for k, id_ in enumerate(env_ids) if id_ in env_ids[:k])
+            raise EnvBusy(f"{double!r} comes twice in one call; nothing was sent")
+        return slots
+
+    def check_sendable(self, slots: NDArray[np.intp], what: str) -> None:
+        self._supervisor.check_open()
+        self._supervisor.check_usable(slots)
+        slot = self._requests.first_not_idle(slots)
+        if slot is not None:
+            busy = self._requests.state[slot] == State.BUSY
+            state = "has not replied yet" if busy else "was not collected"
+            raise EnvBusy(
+                f"can't {what} {self._envs.describe(slot)}: its last request {state}; collect it "
+                "first; nothing was sent"
+            )
+
+    def check_local(self, slots: NDArray[np.intp], what: str) -> None:
+        """Raises NotImplementedError if any of `slots` belongs to a client."""
+        if self._supervisor.has_members and (remote := slots[slots >= len(self._envs.all)]).size:
+            raise NotImplementedError(
+                f"can't {what} {self._envs.describe(int(remote[0]))}: remote envs answer when they "
+                "can; use step_async and collect_async"
+            )
+
+    def packed_steps(self, slots: NDArray[np.intp], out_of_band: OutOfBandSteps) -> list[Any]:
+        """What goes out of band, packed before anything is sent."""
+        chosen = slots[out_of_band.positions].tolist()
+        try:
+            for slot, (action, _) in zip(chosen, out_of_band.contents, strict=True):
+                if slot >= len(self._envs.all) and action is not NO_ACTION:
+                    host = self._host_of(slot)
+                    cast("Membership", host).check_step(slot - host.first_slot, action)
+            return [
+                self.packed(slot, content, "the response")
+                for slot, content in zip(chosen, out_of_band.contents, strict=True)
+            ]
+        except TypeError as error:
+            raise BadAction(str(error)) from error
+
+    def packed_resets(
+        self, slots: NDArray[np.intp], seeds: NDArray[np.int64], options: dict[str, Any]
+    ) -> list[Any]:
+        return [
+            self.packed(slot, (None if seed == NO_SEED else seed, options), "the options")
+            for slot, seed in zip(slots.tolist(), seeds.tolist(), strict=True)
+        ]
+
+    def packed(self, slot: int, arguments: Any, what: str) -> Any:
+        try:
+            return self._host_of(slot).packed(arguments)
+        except Exception as error:
+            raise TypeError(
+                f"{what} for {self._envs.describe(slot)} can't be sent to its worker: {error}; "
+                "nothing was sent"
+            ) from error
+
+    def _host_of(self, slot: int) -> Host:
+        return self._supervisor.hosts[self._requests.host_of(slot)]
+
+    def hand_over(
+        self,
+        slots: NDArray[np.intp],
+        entries: NDArray[np.int64],
+        arguments: Sequence[Any] | None = None,
+    ) -> None:
+        """Give submitted requests to their hosts, with one call for each run of one host."""
+        hosts = self._supervisor.hosts
+        for host_id, part in self._requests.by_host(slots):
+            given = None if arguments is None else arguments[part]
+            hosts[host_id].submit(entries[part], given)
+
+    def hand_over_out_of_band(
+        self,
+        slots: NDArray[np.intp],
+        entries: NDArray[np.int64],
+        positions: NDArray[np.intp],
+        packed: Sequence[Any],
+        resets: NDArray[np.bool_] | None,
+    ) -> None:
+        """The same where `positions` have arguments out of band, unless they became resets."""
+        out_of_band = np.zeros(len(slots), np.bool_)
+        out_of_band[positions] = True
+        if resets is not None:
+            out_of_band &= ~resets
+        self.hand_over(slots[~out_of_band], entries[~out_of_band])
+        kept = out_of_band[positions]
+        chosen = positions[kept]
+        arguments = [one for one, keep in zip(packed, kept.tolist(), strict=True) if keep]
+        self.hand_over(slots[chosen], entries[chosen], arguments)

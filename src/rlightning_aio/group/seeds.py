@@ -1,0 +1,44 @@
+"""Which seed each env gets, from what a user gave."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+
+from rlightning_aio.group.auto_reset import as_int
+from rlightning_aio.protocol.slab import NO_SEED
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from rlightning_aio.group.env_table import EnvTable
+
+__all__ = ["Seeds", "checked_seed", "seeds_for"]
+
+Seeds: TypeAlias = "int | Sequence[int] | Mapping[str, int] | None"
+
+
+def seeds_for(envs: EnvTable, seed: Seeds, slots: NDArray[np.intp]) -> NDArray[np.int64]:
+    """One seed for each slot: env k gets ``seed + k``, counting sub-environments."""
+    if seed is None:
+        return np.full(len(slots), NO_SEED)
+    if isinstance(seed, Mapping):
+        given = {envs.find_one(env_id): checked_seed(one) for env_id, one in seed.items()}
+        chosen = [given.get(slot, NO_SEED) for slot in slots.tolist()]
+    elif isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str):
+        if len(seed) != len(slots):
+            raise ValueError(f"{len(seed)} seeds for {len(slots)} envs; give one for each")
+        chosen = [checked_seed(one) for one in seed]
+    else:
+        return envs.seed_offset[slots] + checked_seed(seed)
+    return np.array(chosen, np.int64)
+
+
+def checked_seed(seed: Any) -> int:
+    """`seed` as an int that every env can count on from."""
+    value = as_int(seed)
+    if value is None or not 0 <= value < 1 << 62:
+        raise ValueError(f"a seed must be an int from 0 to 2**62 - 1, not {seed!r}")
+    return value
