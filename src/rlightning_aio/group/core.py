@@ -322,23 +322,22 @@ class Core:
                     part.flags[part.limit_reached, ..., TRUNCATED] = True
             results.add_episodes(part)
         self.stats.account(parts, synchronous=synchronous)
-        if len(slots):
-            self._note_handed_out(parts)
-        if self._intake.any_held_back:
+        self._handed_out += 1
+        if len(slots) and self._handed_out % 8 == 0:
+            self._note_eighth(parts)
+        if self._intake.held_back:
             self._intake.admit(slots)
         origin = Origin(self, slots, self.envs)
         batch = batch_of_results(parts, origin, results.sources(slots))
         return batch, [False] * len(slots) if limits is None else limits.tolist()
 
-    def _note_handed_out(self, parts: Sequence[ResultColumns]) -> None:
-        """Now and then, learn from a result how long steps take there."""
-        self._handed_out += 1
-        turn, is_eighth = self._handed_out // 8, self._handed_out % 8 == 0
-        if is_eighth:
-            part = parts[turn % len(parts)]
-            row = turn % len(part)
-            host_id = self.requests.host_of(part.slots.item(row))
-            self.poller.note_step(host_id, part.times.item(row, 1))
+    def _note_eighth(self, parts: Sequence[ResultColumns]) -> None:
+        """Learn from one result in a while how long steps take there."""
+        turn = self._handed_out // 8
+        part = parts[turn % len(parts)]
+        row = turn % len(part)
+        host_id = self.requests.host_of(part.slots.item(row))
+        self.poller.note_step(host_id, part.times.item(row, 1))
         if self._handed_out == HINT_AFTER_BATCHES:
             self.supervisor.give_hint(self.stats.summary()["latency_us"])
 

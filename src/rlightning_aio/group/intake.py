@@ -58,8 +58,8 @@ class Intake:
 
     Attributes:
         now: when the driver looked last (monotonic seconds).
-        any_held_back: envs have come back before the last result of their going was
-            collected; see `admit`.
+        held_back: envs that have come back before the last result of their going was
+            collected, by slot; see `admit`.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class Intake:
         self._results = results
         self._recovery = recovery
         self._auto = auto
-        self._held_back: dict[int, Joined] = {}
+        self.held_back: dict[int, Joined] = {}
         self._handlers: dict[type, Callable[[Any], None]] = {
             Reported: self._on_reported,
             Result: self._on_result,
@@ -97,11 +97,6 @@ class Intake:
             Died: self._on_died,
             **dict.fromkeys((Built, NotBuilt, Attached, Closed), supervisor.handle),
         }
-
-    @property
-    def any_held_back(self) -> bool:
-        """See the class."""
-        return bool(self._held_back)
 
     def drain(self) -> None:
         """Take in what hosts have told. Here, and nowhere else, completions take effect."""
@@ -182,7 +177,7 @@ class Intake:
         if told.slab is not None:
             self._layout.add(told.slab, host.first_slot)
         if not self._requests.is_idle(slot):
-            self._held_back[slot] = told
+            self.held_back[slot] = told
             return
         has_row = self._layout.of(slot)[0].action is not None
         self._envs.note_joined(slot, host.first_slot, told.meta, told.traits, has_row=has_row)
@@ -245,8 +240,8 @@ class Intake:
     def admit(self, slots: NDArray[np.intp]) -> None:
         """Take in those that have come back to `slots`, whose rows are free now."""
         for slot in slots.tolist():
-            if slot in self._held_back:
-                self._on_joined(self._held_back.pop(slot)._replace(slab=None))
+            if slot in self.held_back:
+                self._on_joined(self.held_back.pop(slot)._replace(slab=None))
 
 
 def _slots_of_host(host: Host) -> range:

@@ -57,7 +57,8 @@ class Results:
 
     def note_sent(self, slots: NDArray[np.intp], columns: Mapping[str, Any] | None) -> None:
         """Keep what a policy has sent to `slots`, one row for each, for their results."""
-        self._enter_last_sent()
+        if self._last_sent is not None and self._last_sent[0] is not slots:
+            self._enter_last_sent()  # Else all of it is replaced.
         self._last_sent = slots, None if columns is None else kept_columns(columns)
 
     def _enter_last_sent(self) -> None:

@@ -55,9 +55,9 @@ class EpisodeSums:
         self.over[begun] = False
         self._any_over = bool(self.over.any())
 
-    def end(self) -> None:
-        """All episodes are over."""
-        self.over[...] = self._any_over = True
+    def look(self) -> None:
+        """Take note of what others have written to the row."""
+        self._any_over = bool(self.over.any())
 
     def step(
         self, reward: NDArray[np.float64], ended: NDArray[np.bool_] | None, which: Which = ...

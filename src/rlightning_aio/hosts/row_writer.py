@@ -92,9 +92,9 @@ class RowWriter:
         else:
             self._sums.begin()
 
-    def end_episode(self) -> None:
-        """Say that the one episode of the row, whose step was written past this, is over."""
-        self._sums.end()
+    def look(self) -> None:
+        """Take note of what was written to the row past this."""
+        self._sums.look()
 
     def write_ends(
         self, reward: Any, terminated: Any, truncated: Any, info: Mapping[str, Any]

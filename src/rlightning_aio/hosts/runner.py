@@ -124,8 +124,9 @@ class EnvRunner:
         self._read_action: Callable[[], Any] | None = None
         if slab.action is not None:
             self._read_action = row_reader(layout.action_space, slab.action, row)
-        # Tells the short way, where there is one, what was written past it.
-        self._wrote_row: Callable[[], None] = _nothing
+        # Where there is a short way, it and the writer tell each other what they have written.
+        self._before_writing: Callable[[], None] = _nothing
+        self._after_writing: Callable[[], None] = _nothing
         self.reset_from_row = self._reset_from_row
         self.step = self._stepper(layout)
 
@@ -183,7 +184,8 @@ class EnvRunner:
         write_observation: Callable[[Any], None],
     ) -> Execute:
         bare_reset = self.env.bare_reset()
-        step, reset, self._wrote_row = _short_steps(
+        self._before_writing = self._writer.look
+        step, reset, self._after_writing = _short_steps(
             bare, bare_reset, read_action, write_observation, self._writer, self._slab, self._row
         )
         if bare_reset is not None:
@@ -245,6 +247,7 @@ class EnvRunner:
                 f"{'step' if stepped else 'reset'}() of env {self.env.env_id!r} must return an "
                 f"EnvRet or a MultiAgentEnvRet, not {type(result).__name__}"
             )
+        self._before_writing()
         if stepped:
             ends = writer.checked_ends(
                 result.last_reward, result.last_terminated, result.last_truncated
@@ -252,7 +255,7 @@ class EnvRunner:
             writer.write_ends(*ends, result.info)
         else:
             writer.begin_episode(result.info)
-        self._wrote_row()
+        self._after_writing()
         observation = result.observation
         if holds_tensor(observation):
             if self._inline:
@@ -279,7 +282,6 @@ def _short_steps(
     costs a fifth of assigning an element of an array. Flags are written when they change.
     """
     write_info, kept = writer.write_info, writer.kept
-    begin_episode, end_episode = writer.begin_episode, writer.end_episode
     rewards, marks = _view(slab.reward), _view(slab.info_mark)
     terminations, truncations = _view(slab.terminated), _view(slab.truncated)
     resets, overs = _view(slab.is_reset), _view(slab.over)
@@ -314,19 +316,21 @@ def _short_steps(
             truncations[row] = truncated
             if over:  # What comes after an end belongs to no episode; see `EpisodeSums`.
                 returns[row] = lengths[row] = 0
-            else:
-                over = True
-                end_episode()
+            overs[row] = over = True
         marks[row] = mark = write_info(info) if info else NO_INFO
         return kept({"info": info}) if mark == PICKLED else None
 
     def reset() -> OutOfBand | None:
+        nonlocal episode_return, episode_length, fresh, over
         assert bare_reset is not None
         began = clock()
         observation, info = bare_reset(seed=slab.take_seed(row), options=None)
         done = clock()
-        begin_episode(info)
-        look()
+        episode_return, episode_length, fresh, over = 0.0, 0, True, False
+        resets[row] = True
+        terminations[row] = truncations[row] = overs[row] = False
+        rewards[row] = returns[row] = 0.0
+        lengths[row] = 0
         done_times[row] = done
         busy_times[row] = done - began
         write_observation(observation)
