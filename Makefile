@@ -31,7 +31,7 @@ test-simulators: export ISAAC_PYTHON := $(CURDIR)/$(ISAAC)/bin/python
 test-simulators: $(SIMULATORS)/installed $(ISAAC)/installed ## the tests of every backend, on the real simulators (5 GB of packages)
 	tests/simulators/install_debian.sh
 	$(ISAAC)/bin/python -m pytest -m simulators -rs tests/envs/test_isaac.py
-	$(SIMULATORS)/bin/python -m pytest -m simulators -rs tests/envs
+	$(SIMULATORS)/bin/python -m pytest -m simulators -rs tests/envs tests/vector
 
 check: $(VENV)/installed-check ## the static checks: ruff, pyright, import-linter
 	$(VENV)/bin/ruff check
@@ -62,7 +62,7 @@ $(VENV)/installed: extras :=
 $(VENV)/installed-test: extras := [test]
 $(VENV)/installed-check: extras := [test,check]
 $(VENV)/installed-bench: extras := [bench]
-$(SIMULATORS)/installed: extras := [test,ale,envpool,maniskill,pettingzoo,piper]
+$(SIMULATORS)/installed: extras := [test,ale,envpool,maniskill,pettingzoo,piper,sb3]
 $(VENV)/installed $(VENV)/installed-test $(VENV)/installed-check $(VENV)/installed-bench: | $(PY)
 $(SIMULATORS)/installed: | $(SIMULATORS)/bin/python
 $(VENV)/installed $(VENV)/installed-test $(VENV)/installed-check $(VENV)/installed-bench \

@@ -2,6 +2,7 @@
 
     python benchmarks/chaos.py
     python benchmarks/chaos.py --faults 100 --seed 7 --json chaos.json
+    python benchmarks/chaos.py --groups 8 --faults 100000
 
 8 environments in 4 workers step as fast as they can while workers are killed, stopped and
 continued, and while environments hang, raise and exit; collects are cancelled and cut short
@@ -30,6 +31,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
+import chaos_groups
 import numpy as np
 from breakable import EPISODE, EXIT, HANG, INDEX, NOTHING, PID, RAISE, STEPS, TOKEN
 from harness import machine_facts, machine_text, shared_memory
@@ -502,7 +504,12 @@ def main() -> int:
     parser.add_argument("--faults", type=int, default=1000, help="default: %(default)s")
     parser.add_argument("--seed", type=int, default=0, help="of the order of faults")
     parser.add_argument("--json", type=Path, help="also write the report to this file")
+    parser.add_argument(
+        "--groups", type=int, help="every kind of fault, against so many groups in one trainer"
+    )
     arguments = parser.parse_args()
+    if arguments.groups:
+        return chaos_groups.main(arguments.groups, arguments.faults, arguments.seed, arguments.json)
     rl.run(nothing())
     before, began = held(), time.monotonic()
     with tempfile.TemporaryDirectory() as folder:

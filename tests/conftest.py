@@ -32,7 +32,7 @@ sys.dont_write_bytecode = False
 settings.register_profile(
     "any machine",
     deadline=None,
-    max_examples=int(os.environ.get("RLIGHTNING_AIO_EXAMPLES", "40")),
+    max_examples=int(os.environ.get("RLIGHTNING_AIO_EXAMPLES", "20")),
     suppress_health_check=[HealthCheck.too_slow],
 )
 settings.load_profile("any machine")
@@ -52,20 +52,26 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.fixturenames.insert(0, no_task_left_behind.__name__)
 
 
-def _repeats(item: pytest.Item) -> bool:
-    """Whether a test shows on one loop what it shows on the other as well.
+def pytest_collection_finish() -> None:
+    # What is imported stays: sparing the collector from walking it saves time in every test.
+    gc.collect()
+    gc.freeze()
 
-    A synchronous group doesn't know what loop it runs in. What a module says its loop has no
-    part in (`one_loop_for_each_place`) is shown on asyncio inline and on uvloop with workers.
+
+def _repeats(item: pytest.Item) -> bool:
+    """Whether a test shows with one driver what it shows with another as well.
+
+    A synchronous group doesn't know what loop it runs in. Where who waits has no part in what
+    is shown (`one_driver_for_each_place`), inline envs are in a synchronous group, and workers
+    in one on uvloop.
     """
     params = item.callspec.params if hasattr(item, "callspec") else {}
     place = params.get("place")
     on_uvloop = any(value is uvloop.new_event_loop for value in params.values())
-    if any(getattr(value, "synchronous", False) for value in params.values()):
-        return on_uvloop
-    if not hasattr(place, "inline") or not item.get_closest_marker("one_loop_for_each_place"):
-        return False
-    return on_uvloop == place.inline
+    if hasattr(place, "inline") and item.get_closest_marker("one_driver_for_each_place"):
+        return place.synchronous != place.inline or on_uvloop == place.inline
+    synchronous = any(getattr(value, "synchronous", False) for value in params.values())
+    return synchronous and on_uvloop
 
 
 def _children() -> set[str]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import copy
 import pickle
 import re
-from types import SimpleNamespace
+import threading
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,11 +24,12 @@ from rlightning_aio.batch.data import (
     parts_of,
     slots_of,
 )
+from rlightning_aio.batch.infos import vector_infos
 from rlightning_aio.batch.sent import columns_of_values, kept_columns
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.errors import BadAction
 from rlightning_aio.group.env_table import EnvTable
-from rlightning_aio.protocol.info import InfoSchema
+from rlightning_aio.protocol.info import INFO_BYTES, InfoSchema, InfoSchemas, InfoWriter
 from rlightning_aio.protocol.slab import IS_RESET, OVER, TERMINATED, TRUNCATED
 from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
 
@@ -36,7 +38,7 @@ PENDULUMS, GRIDS = (
     for name, n in (("pendulum", 3), ("grid-world", 2))
 )
 IDS = ["pendulum-0", "pendulum-1", "pendulum-2", "grid-world-0", "grid-world-1"]
-NAMES = EnvTable([PENDULUMS] * 3 + [GRIDS] * 2, IDS)
+NAMES = EnvTable([PENDULUMS] * 3 + [GRIDS] * 2, IDS).names
 NAMES.index_offset[:] = range(5)
 
 
@@ -377,13 +379,7 @@ def any_results(draw: st.DrawFn) -> tuple[BatchedData, list[dict[str, Any]]]:
     sub_envs = inner[1:] if agents else inner
     slots = draw(st.permutations(range(5)))[: draw(st.integers(1, 5))]
     n = len(slots)
-    names = SimpleNamespace(
-        index_offset=np.arange(5) * (sub_envs or (1,))[0],
-        turns=np.zeros(5, bool),
-        ids=NAMES.ids,
-        batch_ids=NAMES.batch_ids,
-        names=NAMES.names,
-    )
+    names = replace(NAMES, index_offset=np.arange(5) * (sub_envs or (1,))[0])
 
     def bits(shape: tuple[int, ...]) -> Any:
         size = int(np.prod(shape))
@@ -470,9 +466,7 @@ def test_what_each_row_says_is_the_readers_own() -> None:
 
 def test_sub_environments_that_take_turns_say_which_they_are() -> None:
     """Each result holds some of them; their own numbers lie in the infos."""
-    names = copy.copy(NAMES)
-    names.turns = np.array([True] * 5)
-    names.index_offset = np.arange(5) * 4
+    names = replace(NAMES, turns=np.array([True] * 5), index_offset=np.arange(5) * 4)
     batch = results(
         columns(
             [1, 0],
@@ -732,6 +726,45 @@ def test_infos_are_columns_with_masks(infos: list[dict[str, Any]]) -> None:
     assert batch.infos is batch.infos
 
 
+plain_infos = st.fixed_dictionaries(
+    {},
+    optional={
+        "count": st.integers(-9, 9),
+        "speed": st.floats(width=32, allow_nan=False).map(np.float32),
+        "won": st.booleans(),
+        "sure": st.booleans().map(np.bool_),
+        "position": st.lists(st.integers(0, 9), min_size=2, max_size=2).map(np.array),
+        "odd": st.one_of(st.integers(0, 9), st.floats(0, 1)),
+        "episode": st.integers(0, 9),
+    },
+)
+
+
+@given(st.lists(st.lists(plain_infos, min_size=1, max_size=4), min_size=1, max_size=3))
+def test_infos_in_rows_make_the_columns_that_they_make_one_by_one(
+    workers: list[list[dict[str, Any]]],
+) -> None:
+    """Types and all, however the envs are spread over workers, which number schemas themselves."""
+    infos = [info for own in workers for info in own]
+    rows, marks = np.zeros((len(infos), INFO_BYTES), np.uint8), np.zeros(len(infos), np.uint8)
+    schemas: list[dict[int, InfoSchema]] = []
+    for own in workers:
+        known: dict[int, InfoSchema] = {}
+        announced = InfoSchemas(known.__setitem__)
+        for info in own:
+            row = len(schemas)
+            marks[row] = InfoWriter(memoryview(rows[row]), announced.announce).write(info)
+            schemas.append(known)
+    slots = list(range(len(infos)))
+    names = replace(NAMES, turns=np.zeros(len(infos), np.bool_))
+    part = columns(slots, None, info=rows, info_marks=marks, schemas=schemas, names=names)
+    found, expected = results(part).infos, vector_infos(infos)
+    assert found.keys() == expected.keys()
+    for key, column in expected.items():
+        assert found[key].dtype == column.dtype, key
+        np.testing.assert_array_equal(found[key], column)
+
+
 def test_infos_are_those_of_gymnasiums_vector_envs() -> None:
     """A loop written for one reads these."""
     import gymnasium as gym
@@ -776,6 +809,53 @@ def test_one_key_of_all_infos_is_a_column() -> None:
     )
     assert plain.info("k").tolist() == [0, 1]
     assert plain.infos["k"].tolist() == [0, 1]
+
+
+# -- copies
+
+
+def told(batch: BatchedData) -> str:
+    """All that a batch of results tells."""
+    columns = (batch.reward, batch.terminated, batch.truncated, batch.done)
+    rows = (batch.is_reset, batch.limit_reached, batch.restarted, batch.index)
+    sent = {name: batch.sent[name] for name in batch.sent}
+    split = {name: (part.ids(), part.observation) for name, part in batch.by_name().items()}
+    values = [(value.model_dump(), value._extra) for value in batch.values()]
+    return repr((list(batch.ids()), batch.env_ids(), columns, rows, sent, split, values))
+
+
+COPIES = (copy.copy, copy.deepcopy, lambda batch: pickle.loads(pickle.dumps(batch)))
+
+
+@pytest.mark.parametrize("copied", COPIES)
+@pytest.mark.parametrize("read", [False, True])
+def test_a_batch_can_be_copied_and_pickled(copied: Any, read: bool) -> None:
+    """Whatever of it was read before, and without the group, which then goes by the ids."""
+    schema = InfoSchema.of({"speed": 1.5})
+    assert schema is not None
+    speeds = np.arange(2.0).view(np.uint8).reshape(2, 8)
+    infos = {"info": speeds, "info_marks": np.array([1, 1], np.uint8)}
+    schemas = [{}, {}, {}, {1: schema}, {1: schema}]
+    out_of_band = {0: pickle.dumps({"info": {"nested": {"a": 1}}, "extra": {"k": 2}})}
+    group = threading.Lock()
+    batch = results(
+        columns([0, 2], np.array([[0.0, 1.0], [2.0, 3.0]]), [0, 2], out_of_band=out_of_band),
+        columns([4, 3], np.array([7, 8]), [1, 3], schemas=schemas, **infos),
+        sources=(np.full(4, {"action": np.arange(4)}), np.arange(4)[::-1]),
+        group=group,
+    )
+    expected = told(copy.deepcopy(batch))
+    assert "'speed': 1.0" in expected
+    if read:
+        assert told(batch) == expected
+    found = copied(batch)
+    assert told(found) == expected
+    assert slots_of(found, group) is None
+    response = copied(batch.respond(action=np.arange(4), value=[1, None, 2, 3]))
+    assert response.env_ids() == batch.env_ids()
+    assert [value.value for value in response.values()] == [1, None, 2, 3]
+    plain = copied(BatchedData(["a", "a"], [1, 2]))
+    assert plain.items() == [("a", 1), ("a", 2)]
 
 
 # -- what only groups ask, and what people see

@@ -17,12 +17,12 @@ from hypothesis import HealthCheck, example, given, settings
 from omegaconf import OmegaConf
 from pydantic import ValidationError
 
-from rlightning_aio.config import EnvConfig, check_installed, load_config, parse_configs
+from rlightning_aio.config import EnvConfig, check_installed, load_config, moved, parse_configs
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.registry import BACKENDS, ENVS, Backend
+from rlightning_aio.registry import BACKENDS, ENVS, PLACEMENTS, Backend, placement_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     Write = Callable[[object], Path]
 
@@ -99,6 +99,52 @@ def test_imports_of_the_file_come_before_an_entry_s_own(write: Write) -> None:
     first, second = load_config(write(document))
     assert first.imports == ("json", "os.path")
     assert second.imports == ("json", "os.path", "re")
+
+
+EXPERIMENT = """
+defaults: [_self_]
+seed: 7
+engine: {name: sync_rl, total_steps: "???"}
+train: {lr: 3.0e-4, workers: 3}
+log: {dir: "${no_such_resolver:now}"}
+imports: [json]
+env:
+  - name: hopper
+    backend: mujoco
+    task: Hopper-v5
+    num_workers: ${train.workers}
+    num_cpus: 0
+    imports: [re]
+"""
+"""A whole experiment's file."""
+
+
+def test_an_experiment_s_other_sections_are_left_alone(write: Write) -> None:
+    """Entries may refer to them and overrides reach them; what they lack is no problem here."""
+    path = write(EXPERIMENT)
+    (config,) = load_config(path)
+    assert (config.num_workers, config.num_cpus, config.imports) == (3, 0, ("json", "re"))
+    assert load_config(path, ["train.workers=5"])[0].num_workers == 5
+    with pytest.raises(ConfigError, match=r"trane\.workers=5"):
+        load_config(path, ["trane.workers=5"])
+    with pytest.raises(ConfigError, match="import: unknown field; did you mean 'imports'"):
+        load_config(write(EXPERIMENT.replace("imports: [json]", "import: [json]")))
+
+
+def test_a_part_of_an_experiment_has_its_imports(write: Write) -> None:
+    """However the entries are taken out of a document that OmegaConf has read."""
+    config: Any = OmegaConf.load(write(EXPERIMENT))
+    for part in (config, config.env, config.env[0], [config.env[0]]):
+        (entry,) = parse_configs(part)
+        assert (entry.num_workers, entry.imports) == (3, ("json", "re"))
+
+
+def test_one_entry_needs_no_list(write: Write) -> None:
+    """A section may be the entry itself; problems and overrides then name no position."""
+    (config,) = load_config(write({"env": HOPPER}), ["env.num_workers=2"])
+    assert config == EnvConfig(**HOPPER, num_workers=2)
+    with pytest.raises(ConfigError, match=r"env \('hopper'\), num_worker: unknown field"):
+        load_config(write({"env": HOPPER | {"num_worker": 2}}))
 
 
 def test_interpolations_are_resolved(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -178,7 +224,7 @@ words = st.text(st.characters(categories=["L", "N", "P"], exclude_characters="?"
         optional={
             "num_workers": st.integers(1, 10**6),
             "max_episode_steps": st.none() | st.integers(1, 10**9),
-            "num_cpus": st.integers(1, 99) | st.floats(0.01, 99),
+            "num_cpus": st.integers(0, 99) | st.floats(0, 99),
             "num_gpus": st.floats(0, 8),
             "envs_per_process": st.just("auto") | st.integers(1, 99),
             "step_timeout": st.none() | st.floats(1e-3, 1e9),
@@ -307,7 +353,6 @@ def test_an_overridden_field_is_checked_like_any_other(write: Write) -> None:
         ("interpreter", __file__, "is not executable"),
         ("backend", "mujco", "unknown backend 'mujco'; did you mean 'mujoco'? known: "),
         ("backend", "zzz", "unknown backend 'zzz'; known: "),
-        ("num_envs", 4, "backend 'mujoco' makes single envs; use num_workers: 4"),
         ("task", "", "is required"),
         ("task", 5, "should be a valid string, got 5"),
     ],
@@ -324,6 +369,13 @@ def test_a_wrong_field_is_named_with_file_and_entry(
     assert said in message
     assert "\n" not in message
     assert caught.value.__cause__ is None
+
+
+def test_backends_of_single_envs_take_several_workers_instead() -> None:
+    """What to write instead is said."""
+    arm = {"name": "arm", "backend": "piper", "task": "can0", "num_envs": 4}
+    said = "envs.0 ('arm'), num_envs: backend 'piper' makes single envs; use num_workers: 4"
+    assert said in problems_of(arm)
 
 
 @pytest.mark.parametrize("missing", ["name", "backend", "task"])
@@ -344,10 +396,62 @@ def test_two_entries_can_t_share_a_name() -> None:
     assert "envs.2 ('hopper'), name: is the name of envs.0 too" in message
 
 
-def test_inline_envs_share_this_process(write: Write) -> None:
-    """What only a new process could honour is refused, not ignored."""
-    fields = HOPPER | {"placement": "inline", "env_vars": {"A": "1"}}
-    assert "envs.0 ('hopper'), placement: 'inline' is this very process" in problems_of(fields)
+VALUES: dict[str, Any] = {
+    "num_workers": 2,
+    "num_envs": 4,
+    "placement": "inline",
+    "envs_per_process": "auto",
+    "step_timeout": 1.0,
+    "reset_timeout": 1.0,
+    "start_timeout": 120.0,
+    "on_worker_death": "restart",
+    "max_restarts": 0,
+    "interpreter": sys.executable,
+    "env_vars": {"A": "1"},
+    "cpu_affinity": True,
+}
+"""A value for each field that some place for envs refuses."""
+INLINE = HOPPER | {"placement": "inline"}
+SERVER = {"name": "robots", "backend": "env_server"}
+
+
+@pytest.mark.parametrize(
+    ("entry", "refuses"),
+    [(INLINE, PLACEMENTS["inline"].refuses), (SERVER, placement_of("env_server", "").refuses)],
+    ids=["inline", "env_server"],
+)
+def test_what_has_no_meaning_where_the_envs_live_is_refused(
+    entry: dict[str, Any], refuses: Mapping[str, str]
+) -> None:
+    """Each field by its name, with the reason, once; its default as well, if that says anything."""
+    for name, why in refuses.items():
+        message = problems_of(entry | {name: VALUES[name]})
+        place, _, text = message.partition(": ")[2].partition(": ")
+        assert place == f"envs.0 ('{entry['name']}'), {name}"
+        assert text.startswith("has no meaning with ")
+        assert text.endswith(f": {why}")
+
+
+def test_what_a_place_can_honour_is_no_problem_there() -> None:
+    """Nor is a field that asks for nothing: no limit, no variables, one."""
+    asks_nothing = {
+        "step_timeout": None,
+        "interpreter": None,
+        "env_vars": {},
+        "cpu_affinity": False,
+    }
+    parse_configs(INLINE | asks_nothing | {"num_workers": 3, "num_gpus": 0.5})
+    if BACKENDS["env_server"].installed_version() is not None:
+        limits = {"step_timeout": 1.0, "reset_timeout": 1.0, "max_episode_steps": 9}
+        parse_configs(SERVER | limits | {"num_workers": 1, "num_envs": 1})
+
+
+def test_an_entry_can_be_moved_where_some_of_its_fields_have_no_meaning() -> None:
+    """They are left out, and the rest is what it was."""
+    (config,) = parse_configs(HOPPER | {"step_timeout": 1.0, "num_workers": 3})
+    assert moved(config, "inline") == parse_configs(INLINE | {"num_workers": 3})[0]
+    parse_configs(moved(config, "inline"))
+    assert moved(config, "process") == config
 
 
 def test_every_problem_of_a_file_is_in_the_one_message(write: Write) -> None:
@@ -357,7 +461,7 @@ def test_every_problem_of_a_file_is_in_the_one_message(write: Write) -> None:
             "import": ["json"],
             "imports": ["no_such_module"],
             "envs": [
-                HOPPER | {"num_worker": 1, "num_workers": "x", "num_envs": 2, "backend": "mujoco"},
+                HOPPER | {"num_worker": 1, "num_workers": "x", "num_envs": 2, "backend": "piper"},
                 "not an entry",
                 {"backend": "zzz", "interpreter": "/no/such/python"},
                 HOPPER,
@@ -392,7 +496,7 @@ def test_every_problem_of_a_file_is_in_the_one_message(write: Write) -> None:
         ("envs: []", "envs: no entries"),
         ("env: []", "env: no entries"),
         ("envs:", "envs: should be a list of entries, got None"),
-        ("envs: {name: a}", "envs: should be a list of entries, got {'name': 'a'}"),
+        ("envs: {a: b}", "envs: should be a list of entries, got {'a': 'b'}"),
         ("7", "should hold envs: and a list of entries"),
         ("envs: ${no.such.key}", "envs: Interpolation key 'no.such.key' not found"),
         ("envs: [{name: '???'}]", "envs[0].name: Missing mandatory value"),

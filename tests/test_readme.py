@@ -1,4 +1,7 @@
-"""What the README promises, executed."""
+"""What the README promises, executed.
+
+Its commands are in cli/test_documentation.py, its programs in test_examples.py.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,6 @@ import os
 import re
 import shlex
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -22,39 +24,6 @@ def blocks(language: str) -> list[str]:
 
 def commands() -> list[str]:
     return [line for block in blocks("sh") for line in block.splitlines() if line.strip()]
-
-
-@pytest.mark.parametrize("program", blocks("python"), ids=range(len(blocks("python"))))
-def test_every_example_runs(program: str, tmp_path: Path) -> None:
-    """A Python block of the README is a whole program that ends well."""
-    script = tmp_path / "example.py"
-    script.write_text(program)
-    done = subprocess.run(
-        [sys.executable, script],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=HANG,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-
-
-@pytest.mark.parametrize("command", [c for c in commands() if c.startswith("rlightning-aio")])
-def test_every_command_runs(command: str) -> None:
-    """A command of the README ends with exit code 0."""
-    words = [sys.executable, "-c", "from rlightning_aio.cli import main; main()"]
-    # How long a benchmark measures is a matter of patience.
-    short = ["--seconds", "0.05"] if " bench " in command else []
-    done = subprocess.run(
-        [*words, *shlex.split(command)[1:], *short],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=HANG,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize("command", [c for c in commands() if c.startswith("make")])

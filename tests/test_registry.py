@@ -60,6 +60,19 @@ def test_a_later_registration_wins() -> None:
     assert envs.resolve("own") is Again
 
 
+def test_a_registration_says_whether_envs_may_share_a_worker() -> None:
+    """What it leaves open is as the built-in backend of that name; the last one counts."""
+    envs = Registry()
+    assert (envs.is_cpu_bound("mujoco"), envs.is_cpu_bound("piper")) == (True, False)
+    assert envs.is_cpu_bound("own") is False
+    envs.register("own", cpu_bound=True)(OwnEnv)
+    envs.register("mujoco")(OwnEnv)
+    assert envs.is_cpu_bound("own") is envs.is_cpu_bound("mujoco") is True
+    envs.register("own")(OwnEnv)
+    envs.register("mujoco", cpu_bound=False)(OwnEnv)
+    assert envs.is_cpu_bound("own") is envs.is_cpu_bound("mujoco") is False
+
+
 def test_the_decorator_wants_a_name() -> None:
     """Used bare, it would silently replace the class with a function."""
     with pytest.raises(TypeError, match=r"@ENVS\.register\('my_backend'\)"):

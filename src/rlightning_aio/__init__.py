@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.config import EnvConfig, load_config
-    from rlightning_aio.envs.base import BaseEnv, default_env_preprocess_fn
+    from rlightning_aio.envs.base import BaseEnv
     from rlightning_aio.errors import (
         BadAction,
         ConfigError,
@@ -28,14 +28,20 @@ if TYPE_CHECKING:
     )
     from rlightning_aio.group.aio import EnvGroup, EnvHandle, ServerHandle, build_env_group, run
     from rlightning_aio.registry import ENVS
-    from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
+    from rlightning_aio.types import (
+        EnvMeta,
+        EnvRet,
+        MultiAgentEnvRet,
+        PolicyResponse,
+        default_env_preprocess_fn,
+    )
 
 __version__ = "0.1.0"
 
 _HOMES = {
     "batch": ("BatchedData",),
     "config": ("EnvConfig", "load_config"),
-    "envs.base": ("BaseEnv", "default_env_preprocess_fn"),
+    "envs.base": ("BaseEnv",),
     "errors": (
         "BadAction",
         "ConfigError",
@@ -52,7 +58,13 @@ _HOMES = {
     ),
     "group.aio": ("EnvGroup", "EnvHandle", "ServerHandle", "build_env_group", "run"),
     "registry": ("ENVS",),
-    "types": ("EnvMeta", "EnvRet", "MultiAgentEnvRet", "PolicyResponse"),
+    "types": (
+        "EnvMeta",
+        "EnvRet",
+        "MultiAgentEnvRet",
+        "PolicyResponse",
+        "default_env_preprocess_fn",
+    ),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import difflib
 import importlib.util
+import itertools
 import os
 import reprlib
 import shutil
@@ -30,14 +31,18 @@ from pydantic import (
 )
 
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.registry import BACKENDS, ENVS, PLACEMENTS
+from rlightning_aio.registry import BACKENDS, ENVS, PLACEMENTS, placement_of
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
-__all__ = ["EnvConfig", "check_installed", "load_config", "parse_configs"]
+__all__ = ["EnvConfig", "check_installed", "load_config", "moved", "parse_configs"]
 
 _TOP_LEVEL = ("envs", "env", "imports")
+_CALLABLE = "callable"
+"""Name of the backend whose envs come from a callable."""
+_TYPO = 0.8
+"""So much does a misspelt name resemble the right one; other sections of a file do less."""
 
 
 class EnvConfig(BaseModel):
@@ -47,18 +52,25 @@ class EnvConfig(BaseModel):
 
     name: str = Field(min_length=1)
     """Name of the entry; its envs are called ``<name>-0``, ``<name>-1``, …"""
-    backend: str
-    """Simulator backend; see ``rlightning-aio backends``."""
+    backend: str = Field(default="", validate_default=True)
+    """Simulator backend; see ``rlightning-aio backends``. Left out where envs come from a callable:
+    it is ``callable`` then."""
     task: str = ""
-    """Task name within the backend; required by every backend but ``env_server``."""
+    """Task name within the backend; required by every backend but ``env_server``. For the
+    backend ``callable``: ``module:function``, which makes an env of ``env_kwargs``."""
+    make_env: Callable[..., Any] | tuple[Callable[..., Any], ...] | None = Field(
+        default=None, repr=False
+    )
+    """What makes an env, called in the worker with ``env_kwargs``: one callable, or one for each
+    env. It returns a `gymnasium.Env`, a `gymnasium.vector.VectorEnv` or a `BaseEnv`."""
     num_workers: int = Field(default=1, ge=1)
     """Envs of this entry."""
     num_envs: int = Field(default=1, ge=1)
     """Vectorised sub-environments in each env, where the backend supports them."""
     max_episode_steps: int | None = Field(default=None, ge=1)
     """Step limit of an episode; None leaves it to the simulator."""
-    num_cpus: float = Field(default=1, gt=0)
-    """CPUs of each worker (``placement: ray`` only)."""
+    num_cpus: float = Field(default=1, ge=0)
+    """CPUs of each worker, 0 for a share of what others leave (``placement: ray`` only)."""
     num_gpus: float = Field(default=0.0, ge=0)
     """GPUs of each worker (``placement: ray`` only)."""
     env_kwargs: dict[str, Any] = Field(default_factory=dict)
@@ -73,8 +85,10 @@ class EnvConfig(BaseModel):
     """Seconds that one reset may take."""
     start_timeout: float = Field(default=120.0, gt=0)
     """Seconds from the start of a worker until its envs are built."""
-    on_worker_death: Literal["restart", "raise"] = "restart"
-    """What to do when a worker dies or hangs."""
+    on_worker_death: Literal["restart", "raise"] = Field(
+        default_factory=lambda fields: _ending_for(fields.get("backend", ""))
+    )
+    """What to do when a worker dies or hangs; ``raise`` by default for hardware."""
     max_restarts: int = Field(default=3, ge=0)
     """Restarts in a row, without a step in between, before giving up."""
     imports: tuple[str, ...] = Field(default=(), strict=False)
@@ -89,11 +103,25 @@ class EnvConfig(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _suggest_known_names(cls, fields: Any) -> Any:
-        names = cast("Iterable[Any]", fields) if isinstance(fields, Mapping) else ()
-        for name in names:
+        if not isinstance(fields, Mapping):
+            return fields
+        given = cast("Mapping[str, Any]", fields)
+        for name in given:
             if name not in cls.model_fields:
                 raise ValueError(f"{name}: {_unknown_field(name, cls.model_fields)}")
-        return cast("Any", fields)
+        return _with_backend(given)
+
+    @field_validator("backend")
+    @classmethod
+    def _require_backend(cls, backend: str) -> str:
+        if not backend:
+            raise ValueError("is required")
+        return backend
+
+    @field_validator("make_env", mode="before")
+    @classmethod
+    def _accept_lists(cls, makers: Any) -> Any:
+        return tuple(cast("list[Any]", makers)) if isinstance(makers, list) else makers
 
     @field_validator("env_vars", mode="before")
     @classmethod
@@ -128,13 +156,33 @@ class EnvConfig(BaseModel):
         return interpreter and os.path.expanduser(interpreter)  # noqa: PTH111
 
 
+def _ending_for(backend: str) -> Literal["restart", "raise"]:
+    # Nobody but the user has a robot's worker replaced.
+    return "raise" if ENVS.is_hardware(backend) else "restart"
+
+
+def _with_backend(fields: Mapping[str, Any]) -> Mapping[str, Any]:
+    """`fields`, with the backend that goes without saying."""
+    if "backend" in fields or ("make_env" not in fields and ":" not in str(fields.get("task"))):
+        return fields
+    return {**fields, "backend": _CALLABLE}
+
+
+def moved(config: EnvConfig, placement: str) -> EnvConfig:
+    """An entry whose envs live elsewhere, without the fields that have no meaning there."""
+    kept = config.model_fields_set - placement_of(config.backend, placement).refuses.keys()
+    fields = {name: getattr(config, name) for name in kept}
+    return EnvConfig.model_validate({**fields, "placement": placement})
+
+
 def load_config(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> list[EnvConfig]:
     """Read a YAML file with ``envs:`` (or ``env:``) and, optionally, ``imports:``.
 
     Args:
-        path: the file.
+        path: the file. Other sections, as those of a whole experiment, are left alone; entries
+            may refer to them (``${train.seed}``).
         overrides: ``key=value`` each, applied in order; keys are dotted from the top of the
-            file (``envs.0.num_workers=8``), values are YAML.
+            file (``envs.0.num_workers=8``), values are YAML. They reach other sections as well.
 
     Returns:
         The entries in order. The file's ``imports`` come first in each entry's own.
@@ -147,18 +195,18 @@ def load_config(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> 
     return _parse(_read_yaml(source, overrides), source)
 
 
-def parse_configs(cfgs: object) -> list[EnvConfig]:
+def parse_configs(env_cfgs: object) -> list[EnvConfig]:
     """Check what a user configured in Python.
 
     Args:
-        cfgs: an `EnvConfig`, a plain mapping of its fields, or an OmegaConf node of them; a
+        env_cfgs: an `EnvConfig`, a plain mapping of its fields, or an OmegaConf node of them; a
             list of these; or a mapping with ``envs:`` (or ``env:``) and ``imports:`` as in
-            a file.
+            a file. A node that is a part of a document has that document's ``imports``.
 
     Raises:
         ConfigError: something is wrong; every problem found is in the message.
     """
-    return _parse(cfgs, "environment configuration")
+    return _parse(env_cfgs, "environment configuration")
 
 
 def check_installed(configs: Iterable[EnvConfig]) -> None:
@@ -220,14 +268,16 @@ class _Entry:
     faulty: set[str]
 
 
-def _parse(cfgs: object, source: str) -> list[EnvConfig]:
+def _parse(env_cfgs: object, source: str) -> list[EnvConfig]:
     problems = _Problems(source)
-    key, listed, imports = _split(_plain(cfgs, source), problems)
+    listed, imports = _split(env_cfgs, source, problems)
+    imports = _shared_imports(imports, problems)
     entries: list[_Entry] = []
-    for index, fields in enumerate(listed):
-        entry = _read_entry(_plain(fields, source), f"{key}.{index}", problems)
+    for place, given in listed:
+        shared = (*imports, *_shared_imports(_imports_above(given, source), problems))
+        entry = _read_entry(_plain(given, source), place, problems)
         if entry is not None:
-            entry.config = _with_imports(entry.config, imports)
+            entry.config = _with_imports(entry.config, shared)
             entries.append(entry)
             _check_entry(entry, problems)
     _check_names(entries, problems)
@@ -236,34 +286,68 @@ def _parse(cfgs: object, source: str) -> list[EnvConfig]:
     return [entry.config for entry in entries]
 
 
-def _split(document: object, problems: _Problems) -> tuple[str, list[Any], tuple[str, ...]]:
-    """The key of the entries, the entries themselves, and the imports they share."""
-    if isinstance(document, EnvConfig):
-        return "envs", [document], ()
+def _split(env_cfgs: object, source: str, problems: _Problems) -> tuple[list[tuple[str, Any]], Any]:
+    """The entries, each with its place, and the imports they share."""
+    if isinstance(env_cfgs, EnvConfig):
+        return [("envs.0", env_cfgs)], ()
+    if callable(env_cfgs):
+        return [("envs.0", _entry_of([env_cfgs]))], ()
+    document = _sections(env_cfgs, source)
     if not isinstance(document, Mapping):
-        return "envs", _listed(document, "envs", problems), ()
+        if isinstance(document, list | tuple):
+            document = _entries_of_callables(cast("Sequence[Any]", document))
+        return _listed(document, "envs", problems), _imports_above(env_cfgs, source)
     fields = cast("Mapping[Any, Any]", document)
-    if not {"env", "envs"} & fields.keys() and {"name", "backend"} & fields.keys():
-        return "envs", [fields], ()
+    if not {"env", "envs"} & fields.keys():
+        if {"name", "backend"} & fields.keys():
+            return [("envs.0", env_cfgs)], ()
+        closeness = 0.0  # Nothing here is ours: whatever it is, it is not what was meant.
+    else:
+        closeness = _TYPO
     for name in fields:
-        if name not in _TOP_LEVEL:
+        if name not in _TOP_LEVEL and difflib.get_close_matches(
+            str(name), _TOP_LEVEL, cutoff=closeness
+        ):
             problems.add(str(name), _unknown_field(name, _TOP_LEVEL))
     key = "envs" if "envs" in fields or "env" not in fields else "env"
     if {"env", "envs"} <= fields.keys():
         problems.add("env", "means the same as envs, which is there too; keep one of them")
-    imports = _shared_imports(fields.get("imports", ()), problems)
-    return key, _listed(fields.get(key, ()), key, problems), imports
+    listed = _listed(_plain(fields.get(key, ()), source), key, problems)
+    return listed, _plain(fields.get("imports", ()), source)
 
 
-def _listed(entries: object, key: str, problems: _Problems) -> list[Any]:
+def _listed(entries: object, key: str, problems: _Problems) -> list[tuple[str, Any]]:
     shown = _show(entries)
+    if isinstance(entries, Mapping):
+        entry = cast("Mapping[Any, Any]", entries)
+        if {"name", "backend"} & entry.keys():
+            return [(key, entry)]
     if not isinstance(entries, list | tuple):
         hint = "; load_config reads files" if isinstance(entries, str | Path) else ""
         problems.add(key, f"should be a list of entries, got {shown}{hint}")
         return []
     if not entries:
         problems.add(key, "no entries; give at least one, with name, backend and task")
-    return list(cast("Sequence[Any]", entries))
+    found = cast("Sequence[Any]", entries)
+    return [(f"{key}.{index}", entry) for index, entry in enumerate(found)]
+
+
+def _entries_of_callables(listed: Sequence[Any]) -> list[Any]:
+    """`listed`, with one entry for callables that follow one another."""
+    entries: list[Any] = []
+    for are_callable, group in itertools.groupby(listed, callable):
+        values = list(group)
+        entries += [_entry_of(values)] if are_callable else values
+    return entries
+
+
+def _entry_of(makers: list[Any]) -> dict[str, Any]:
+    same = all(maker is makers[0] for maker in makers)
+    return {
+        "name": "env",
+        "make_env": makers[0] if same else tuple(makers),
+        "num_workers": len(makers),
+    }
 
 
 def _shared_imports(imports: object, problems: _Problems) -> tuple[str, ...]:
@@ -300,7 +384,12 @@ def _read_entry(entry: object, place: str, problems: _Problems) -> _Entry | None
     try:
         return _Entry(place, EnvConfig.model_validate(fields), set())
     except ValidationError as error:
-        faults = error.errors(include_url=False)
+        # A default that another field's fault leaves open is no fault of its own.
+        faults = [
+            fault
+            for fault in error.errors(include_url=False)
+            if fault["type"] != "default_factory_not_called"
+        ]
     for path, text in _explain(faults, fields):
         problems.add(f"{place}, {path}", text)
     faulty = {str(fault["loc"][0]) for fault in faults}
@@ -351,6 +440,29 @@ def _check_entry(entry: _Entry, problems: _Problems) -> None:
     for name, check in _CHECKS.items():
         if name not in entry.faulty and (text := check(entry.config)) is not None:
             problems.add(f"{entry.place}, {name}", text)
+    for name, why in _refused(entry.config).items():
+        if name not in entry.faulty:
+            problems.add(f"{entry.place}, {name}", why)
+
+
+def _refused(config: EnvConfig) -> dict[str, str]:
+    """What the entry asks for and would not get where its envs live, by field."""
+    refuses = placement_of(config.backend, config.placement).refuses
+    placed = f"placement {config.placement!r}"
+    where = f"backend {config.backend!r}" if "placement" in refuses else placed
+    return {
+        name: f"has no meaning with {where}: {why}"
+        for name, why in refuses.items()
+        if name in config.model_fields_set and not _asks_for_nothing(config, name)
+    }
+
+
+def _asks_for_nothing(config: EnvConfig, name: str) -> bool:
+    """Whether a field was set to what it says anyway: no limit, nothing, not, or one."""
+    default = EnvConfig.model_fields[name].get_default(
+        call_default_factory=True, validated_data={"backend": config.backend}
+    )
+    return (not default or default == 1) and getattr(config, name) == default
 
 
 def _check_backend(config: EnvConfig) -> str | None:
@@ -361,7 +473,23 @@ def _check_backend(config: EnvConfig) -> str | None:
 
 
 def _check_task(config: EnvConfig) -> str | None:
+    if config.make_env is not None and config.backend == _CALLABLE:
+        return f"make_env makes the envs; leave out {config.task!r}" if config.task else None
+    if config.backend == _CALLABLE and not all(config.task.partition(":")):
+        return f"should read like module:function (or give make_env), got {config.task!r}"
     return None if config.task or config.backend == "env_server" else "is required"
+
+
+def _check_make_env(config: EnvConfig) -> str | None:
+    makers = config.make_env
+    if makers is None:
+        return None
+    if config.backend != _CALLABLE:
+        return f"takes the place of backend {config.backend!r}; leave one of them out"
+    count = len(cast("tuple[Any, ...]", makers)) if isinstance(makers, tuple) else None
+    if count not in (None, config.num_workers):
+        return f"has {count} callables for num_workers: {config.num_workers}"
+    return None
 
 
 def _check_num_envs(config: EnvConfig) -> str | None:
@@ -369,15 +497,6 @@ def _check_num_envs(config: EnvConfig) -> str | None:
     if config.num_envs == 1 or backend is None or backend.vectorized:
         return None
     return f"backend {backend.name!r} makes single envs; use num_workers: {config.num_envs}"
-
-
-def _check_placement(config: EnvConfig) -> str | None:
-    if config.placement != "inline":
-        return None
-    ignored = [name for name in ("interpreter", "env_vars") if getattr(config, name)]
-    if not ignored:
-        return None
-    return f"'inline' is this very process, to which {' and '.join(ignored)} can't apply"
 
 
 def _check_interpreter(config: EnvConfig) -> str | None:
@@ -393,8 +512,8 @@ def _check_interpreter(config: EnvConfig) -> str | None:
 _CHECKS: dict[str, Callable[[EnvConfig], str | None]] = {
     "backend": _check_backend,
     "task": _check_task,
+    "make_env": _check_make_env,
     "num_envs": _check_num_envs,
-    "placement": _check_placement,
     "interpreter": _check_interpreter,
 }
 
@@ -479,6 +598,35 @@ def _plain(value: object, source: str) -> Any:
         raise ConfigError(f"{source}: {_first_line(error)}") from None
 
 
+def _sections(value: object, source: str) -> Any:
+    """`value` as plain containers; of an OmegaConf document only what is ours is looked at.
+
+    What other sections refer to may be missing here.
+    """
+    omegaconf = sys.modules.get("omegaconf")
+    if omegaconf is None or not isinstance(value, omegaconf.DictConfig):
+        return _plain(value, source)
+    document: Any = value
+    if not {"env", "envs"} & document.keys():
+        return _plain(value, source)
+    try:
+        return {k: _plain(document[k], source) if k in _TOP_LEVEL else None for k in document}
+    except omegaconf.errors.OmegaConfBaseException as error:
+        raise ConfigError(f"{source}: {_first_line(error)}") from None
+
+
+def _imports_above(value: object, source: str) -> Any:
+    """``imports:`` of the document that an OmegaConf node is a part of."""
+    omegaconf = sys.modules.get("omegaconf")
+    if omegaconf is None or not isinstance(value, omegaconf.Container):
+        return ()
+    node: Any = value
+    while (node := node._get_parent()) is not None:  # noqa: SLF001  # There is no other way up.
+        if isinstance(node, omegaconf.DictConfig) and "imports" in node:
+            return _plain(node["imports"], source)
+    return ()
+
+
 def _first_line(error: Exception) -> str:
     where = getattr(error, "full_key", None)
     text = str(error).partition("\n")[0]
@@ -503,7 +651,7 @@ def _read_yaml(source: str, overrides: Sequence[str]) -> Any:
     except UnicodeDecodeError as error:
         raise ConfigError(f"{source}: not a UTF-8 text file ({error.reason})") from None
     _override(document, source, overrides)
-    return _plain(document, source)
+    return document
 
 
 def _not_yaml(error: Exception) -> str:
@@ -529,7 +677,7 @@ def _apply(document: Any, override: str) -> str | None:
 
     key, equals, text = override.partition("=")
     top, dot, below = key.partition(".")
-    if not equals or top not in _TOP_LEVEL:
+    if not equals or not (top in _TOP_LEVEL or (OmegaConf.is_dict(document) and top in document)):
         return "should read like envs.0.num_workers=8"
     if top in ("env", "envs"):
         # Either word reaches the entries, whichever the file uses.

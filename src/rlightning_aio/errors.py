@@ -8,9 +8,11 @@ Absent on purpose: exceptions that rebuild a user's own exception type.
 
 from __future__ import annotations
 
+import traceback
 from typing import Any
 
 __all__ = [
+    "ActionRefused",
     "BadAction",
     "ClientRefused",
     "ConfigError",
@@ -30,7 +32,27 @@ __all__ = [
 
 
 class RLightningError(Exception):
-    """Base of every error raised by this package."""
+    """Base of every error raised by this package.
+
+    All of them can be pickled and copied, as a process pool does, with their attributes; a cause
+    that is no error of this package's arrives as its text (`RemoteTraceback`).
+    """
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _made_again, (type(self), self.args), {**self.__dict__, "__cause__": _portable(self)}
+
+
+def _made_again(kind: type[RLightningError], args: tuple[Any, ...]) -> RLightningError:
+    """An error whose attributes are still to be set: its constructor may ask for more."""
+    return kind.__new__(kind, *args)
+
+
+def _portable(error: BaseException) -> BaseException | None:
+    """The cause of `error`, in a form that any process can read."""
+    cause = error.__cause__
+    if cause is None or isinstance(cause, RLightningError | RemoteTraceback):
+        return cause
+    return RemoteTraceback("".join(traceback.format_exception(cause)))
 
 
 class ConfigError(RLightningError, ValueError):
@@ -38,7 +60,10 @@ class ConfigError(RLightningError, ValueError):
 
 
 class BadAction(RLightningError, ValueError):
-    """An action's shape, dtype or count doesn't fit; nothing was sent."""
+    """A response doesn't fit its env: its action's shape, dtype, count or numbers, or its id.
+
+    Nothing was sent.
+    """
 
 
 class UnknownEnv(RLightningError, KeyError):
@@ -116,6 +141,13 @@ class EnvRaised(EnvFault):
         self.exception_text = exception_text
         self.traceback_text = traceback_text
         self.__cause__ = RemoteTraceback(traceback_text)
+
+
+class ActionRefused(EnvRaised, BadAction):
+    """The env itself raised `BadAction`, as a robot does for what is beyond its limits.
+
+    Unlike other bad actions, it comes after the batch was sent: the other envs have stepped.
+    """
 
 
 class WorkerDied(EnvFault):

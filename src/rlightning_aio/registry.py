@@ -12,16 +12,25 @@ import difflib
 import importlib
 import importlib.metadata
 import importlib.util
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from rlightning_aio.errors import ConfigError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
 
-__all__ = ["BACKENDS", "ENVS", "PLACEMENTS", "Backend", "Placement", "Registry", "load"]
+__all__ = [
+    "BACKENDS",
+    "ENVS",
+    "PLACEMENTS",
+    "Backend",
+    "Placement",
+    "Registry",
+    "load",
+    "placement_of",
+]
 
 ENTRY_POINT_GROUP = "rlightning_aio.envs"
 
@@ -41,6 +50,9 @@ class Backend:
         cpu_bound: one core's worth of plain computing for each step, so that several
             envs may share a worker (``envs_per_process: auto``).
         vectorized: whether ``num_envs`` above 1 is supported.
+        hardware: it moves something real, and nothing but an explicit reset may set that in
+            motion after a worker's death: ``on_worker_death`` is ``raise`` by default, and a
+            replacement is not reset by itself. Its envs refuse steps until then.
         own_command: installs the simulator, where no extra of this package does.
         preload: modules that are safe to import before workers are forked and slow to
             import after: no threads, no devices.
@@ -53,6 +65,7 @@ class Backend:
     extra: str = ""
     cpu_bound: bool = False
     vectorized: bool = False
+    hardware: bool = False
     own_command: str = ""
     preload: tuple[str, ...] = ()
 
@@ -81,11 +94,16 @@ BACKENDS: dict[str, Backend] = {
     backend.name: backend
     for backend in (
         Backend("mujoco", "rlightning_aio.envs.gymnasium:MujocoEnv", "mujoco", "mujoco",
-                cpu_bound=True,
+                cpu_bound=True, vectorized=True,
                 preload=("rlightning_aio.envs.gymnasium", "gymnasium.envs.mujoco")),
         Backend("gymnasium", "rlightning_aio.envs.gymnasium:GymnasiumEnv", "gymnasium",
-                "gymnasium", cpu_bound=True, preload=("rlightning_aio.envs.gymnasium",)),
-        Backend("env_server", "rlightning_aio.hosts.env_server:EnvServerHost", "zmq", "pyzmq"),
+                "gymnasium", cpu_bound=True, vectorized=True,
+                preload=("rlightning_aio.envs.gymnasium",)),
+        Backend("callable", "rlightning_aio.envs.callable:env_of_callable", "gymnasium",
+                "gymnasium", cpu_bound=True, vectorized=True,
+                preload=("rlightning_aio.envs.callable",)),
+        Backend("env_server", "rlightning_aio.hosts.env_server:EnvServerHost", "zmq", "pyzmq",
+                vectorized=True),
         Backend("ale", "rlightning_aio.envs.ale:ALEEnv", "ale_py", "ale-py", extra="ale",
                 cpu_bound=True, vectorized=True, preload=("rlightning_aio.envs.ale",)),
         Backend("pettingzoo", "rlightning_aio.envs.pettingzoo:PettingZooEnv", "pettingzoo",
@@ -101,7 +119,7 @@ BACKENDS: dict[str, Backend] = {
         Backend("isaac_marl", "rlightning_aio.envs.isaac:IsaacMarlEnv",
                 "isaaclab", "isaaclab", extra="isaac", vectorized=True, own_command=ISAAC_LAB),
         Backend("piper", "rlightning_aio.envs.piper:PiperEnv", "piper_sdk", "piper-sdk",
-                extra="piper"),
+                extra="piper", hardware=True),
     )
 }
 # fmt: on
@@ -115,17 +133,68 @@ class Placement:
         target: ``module:Class`` of the host; None if there is none yet.
         spreads: an entry's envs may be spread over several hosts, to which functions travel
             by pickle.
+        refuses: fields of an entry that mean nothing there, and why: whoever sets one counts on
+            something that would not happen. (`num_cpus` and `num_gpus` are no promise of ours
+            anywhere but with Ray, and are found in configs for any place.)
     """
 
     target: str | None
     spreads: bool
+    refuses: Mapping[str, str] = field(default_factory=dict[str, str])
 
+
+_THIS_PROCESS = "the envs live in this process, which is as it is"
+_NO_WORKER = "there is no worker that could die or be replaced"
+_NO_LIMIT = "nothing can end what an env does in this process"
+_CLIENTS_OWN = "its envs live with its clients, which start them as they like"
 
 PLACEMENTS: dict[str, Placement] = {
     "process": Placement("rlightning_aio.hosts.process:ProcessHost", spreads=True),
-    "inline": Placement("rlightning_aio.hosts.inline:InlineHost", spreads=False),
+    "inline": Placement(
+        "rlightning_aio.hosts.inline:InlineHost",
+        spreads=False,
+        refuses={
+            "step_timeout": _NO_LIMIT,
+            "reset_timeout": _NO_LIMIT,
+            "start_timeout": _NO_LIMIT,
+            "on_worker_death": _NO_WORKER,
+            "max_restarts": _NO_WORKER,
+            "envs_per_process": "all of the entry's envs live in this process",
+            "interpreter": _THIS_PROCESS,
+            "env_vars": _THIS_PROCESS,
+            "cpu_affinity": _THIS_PROCESS,
+        },
+    ),
     "ray": Placement(None, spreads=True),
 }
+
+_PLACED_BY_BACKEND: dict[str, Placement] = {
+    "env_server": Placement(
+        BACKENDS["env_server"].target,
+        spreads=False,
+        refuses={
+            "num_workers": "an env_server is one, and its clients are as many as connect; "
+            "env_kwargs.min_clients says for how many a reset waits",
+            "num_envs": "each client says itself how many its env has; "
+            "env_kwargs.min_clients says for how many clients a reset waits",
+            "placement": _CLIENTS_OWN,
+            "envs_per_process": _CLIENTS_OWN,
+            "interpreter": _CLIENTS_OWN,
+            "env_vars": _CLIENTS_OWN,
+            "cpu_affinity": _CLIENTS_OWN,
+            "start_timeout": "its envs come when they like; env_kwargs.connect_timeout says how "
+            "long a reset waits for them",
+            "on_worker_death": "it has no workers; what a client owes that is gone is answered by "
+            "a truncated result, and it may come back",
+            "max_restarts": "it has no workers; a client that is gone may come back",
+        },
+    ),
+}
+
+
+def placement_of(backend: str, placement: str) -> Placement:
+    """Where an entry's envs live: as its backend says, or else as the entry does."""
+    return _PLACED_BY_BACKEND.get(backend) or PLACEMENTS[placement]
 
 
 def load(target: str) -> Any:
@@ -139,9 +208,23 @@ class Registry:
 
     def __init__(self) -> None:
         self._classes: dict[str, type[Any]] = {}
+        self._cpu_bound: dict[str, bool] = {}
+        self._hardware: dict[str, bool] = {}
 
-    def register(self, name: str) -> Callable[[EnvClass], EnvClass]:
+    def register(
+        self, name: str, *, cpu_bound: bool | None = None, hardware: bool | None = None
+    ) -> Callable[[EnvClass], EnvClass]:
         """Class decorator: makes the class known as backend `name`.
+
+        Args:
+            name: what a config entry's ``backend`` says.
+            cpu_bound: a step keeps one core busy and waits for nothing (no GPU, no network, no
+                real time): with ``envs_per_process: auto`` as many workers as there are cores
+                hold all envs of such entries, instead of one each. None: as the built-in backend
+                of that name, else False. Only a registration in the trainer's process tells:
+                where ``imports`` alone bring the class, workers know it, and nobody before.
+            hardware: it moves something real, see `Backend`; None, and where it is told, as for
+                `cpu_bound`.
 
         Registering another class under a taken name replaces it: a module that is
         reloaded, or imported under two names, is not an error.
@@ -154,13 +237,29 @@ class Registry:
 
         def remember(env_class: EnvClass) -> EnvClass:
             self._classes[name] = env_class
+            self._cpu_bound.pop(name, None)
+            self._hardware.pop(name, None)
+            if cpu_bound is not None:
+                self._cpu_bound[name] = cpu_bound
+            if hardware is not None:
+                self._hardware[name] = hardware
             return env_class
 
         return remember
 
+    def is_cpu_bound(self, name: str) -> bool:
+        """Whether envs of backend `name` may share a worker; False where nobody has said so."""
+        backend = BACKENDS.get(name)
+        return self._cpu_bound.get(name, backend is not None and backend.cpu_bound)
+
     def registered(self, name: str) -> type[Any] | None:
         """The class registered in this process under `name`, if any."""
         return self._classes.get(name)
+
+    def is_hardware(self, name: str) -> bool:
+        """Whether backend `name` moves something real, as far as this process knows it."""
+        backend = BACKENDS.get(name)
+        return self._hardware.get(name, backend is not None and backend.hardware)
 
     def knows(self, name: str) -> bool:
         """Whether `name` can be resolved, without importing anything."""

@@ -45,6 +45,11 @@ class PolicyResponse:
         return f"PolicyResponse({fields})"
 
 
+def default_env_preprocess_fn(policy_resp: PolicyResponse) -> Any:
+    """The action as the policy gave it."""
+    return policy_resp.action
+
+
 class _Ret(BaseModel):
     """What single-agent and multi-agent results share."""
 
@@ -73,7 +78,8 @@ class EnvRet(_Ret):
         last_truncated: bool, or ``[num_envs]`` bool.
         info: what the env reported beside.
         _extra: free for extensions.
-        ts_env_sent_ns: when the env produced it, in ns since the epoch.
+        ts_env_sent_ns: when the env produced it, in ns since the epoch; that of an env_server's
+            client is by the client's clock, which may differ from the trainer's.
     """
 
     last_reward: Any = 0.0

@@ -9,54 +9,110 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import pytest
 from patience import HANG
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    ReportOf: TypeAlias = Callable[[str], dict[str, Any]]
+
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+ONE_STAGE = Path(__file__).with_name("one_stage.py")
+
+# Of each script the contenders that take part, by parts of their names; all if there are none.
+ASKED = {
+    "cheetah": ["rlightning_aio async"],
+    "cartpole": ["rlightning_aio sync", "loop"],
+    "humanoid": ["rlightning_aio sync"],
+    "round_trip": [],
+    "facade": [],
+    "trainer_cpu": ["sync, 8 envs", "batches of 8, 8 envs"],
+    "stragglers": ["rlightning_aio async"],
+    "uneven": ["log-normal sleeps, 4", "asyncio, all work 50 µs", "5 µs"],
+    "start": [],
+    "memory": ["rlightning_aio"],
+    "pong": ["rlightning_aio"],
+    "peers": ["Gymnasium", "SB3", "Tianshou", "EnvPool, 16 of 32"],
+}
+# Here the work itself gives the length.
+WITHOUT_SECONDS = ("start", "memory")
+TOGETHER = (
+    ("cheetah", "cartpole", "humanoid", "start", "memory"),
+    ("round_trip", "facade", "trainer_cpu", "stragglers", "uneven", "peers", "pong"),
+)
+RARELY_SLOW = "all work 50 µs, 2 of 8 rarely take 100 ms, 4 to a worker"
 
 
-def run_script(name: str, folder: Path, *arguments: str) -> dict[str, Any]:
-    """The report of one short round."""
-    out = folder / f"{name}.json"
-    run = subprocess.run(
-        [sys.executable, BENCHMARKS / f"{name}.py", "--rounds", "1", "--json", out, *arguments],
+def short_round(script: str, folder: Path) -> list[str]:
+    """A script and its arguments for one round, which writes its report into the folder."""
+    only = [argument for part in ASKED[script] for argument in ("--only", part)]
+    seconds = [] if script in WITHOUT_SECONDS else ["--seconds", "0.05"]
+    return [script, "--rounds", "1", *seconds, "--json", str(folder / f"{script}.json"), *only]
+
+
+def run(*command: str | Path, folder: Path) -> None:
+    found = subprocess.run(
+        [sys.executable, *command],
+        cwd=folder,
         capture_output=True,
         text=True,
         timeout=HANG,
         check=False,
     )
-    assert run.returncode == 0, run.stderr
-    return json.loads(out.read_text())
+    assert found.returncode == 0, found.stderr
 
 
-SHORT = ("--seconds", "0.05")
-OURS = ("--only", "rlightning_aio")
+@pytest.fixture(scope="module")
+def report_of(tmp_path_factory: pytest.TempPathFactory) -> ReportOf:
+    """What a script reports of one short round; those of `TOGETHER` are run in one process."""
+    folder = tmp_path_factory.mktemp("reports")
+    reports: dict[str, dict[str, Any]] = {}
+
+    def report_of(script: str) -> dict[str, Any]:
+        if script not in reports:
+            (scripts,) = (scripts for scripts in TOGETHER if script in scripts)
+            run(ONE_STAGE, json.dumps([short_round(s, folder) for s in scripts]), folder=folder)
+            reports.update({s: json.loads((folder / f"{s}.json").read_text()) for s in scripts})
+        return reports[script]
+
+    return report_of
+
+
+def test_a_script_run_by_itself(tmp_path: Path) -> None:
+    """Contenders have processes of their own then, and their figures come from there."""
+    script, *arguments = short_round("cartpole", tmp_path)
+    run(BENCHMARKS / f"{script}.py", *arguments, folder=tmp_path)
+    report = json.loads((tmp_path / "cartpole.json").read_text())
+    assert report["results"].keys() == {"rlightning_aio sync", "in-process loop"}
+    assert all(found["median"] > 0 for found in report["results"].values())
+    assert all(found["cores_used"] > 0 for found in report["results"].values())
 
 
 @pytest.mark.parametrize(
-    ("name", "arguments", "contenders"),
+    ("script", "contenders"),
     [
-        ("cheetah", (*SHORT, "--only", "rlightning_aio async", "--only", "limit"), 2),
-        ("cartpole", (*SHORT, "--only", "rlightning_aio sync", "--only", "loop"), 2),
-        ("humanoid", (*SHORT, "--only", "rlightning_aio sync"), 1),
-        ("round_trip", SHORT, 4),
-        ("facade", SHORT, 2),
-        ("trainer_cpu", (*SHORT, "--only", ", 8 envs"), 3),
-        ("stragglers", (*SHORT, "--only", "rlightning_aio async", "--only", "64 proc"), 2),
-        ("start", (), 2),
-        ("memory", OURS, 1),
+        ("cheetah", 1),
+        ("cartpole", 2),
+        ("humanoid", 1),
+        ("round_trip", 4),
+        ("facade", 2),
+        ("trainer_cpu", 2),
+        ("stragglers", 1),
+        ("start", 2),
+        ("memory", 1),
     ],
 )
 def test_script_measures_each_of_its_contenders(
-    name: str, arguments: tuple[str, ...], contenders: int, tmp_path: Path
+    script: str, contenders: int, report_of: ReportOf
 ) -> None:
     """A short run ends with a positive figure for every contender that was asked for."""
-    report = run_script(name, tmp_path, *arguments)
+    report = report_of(script)
     assert not report["skipped"]
     assert len(report["results"]) == contenders
-    if name != "facade":  # Both of its sides are alike.
+    if script != "facade":  # Both of its sides are alike.
         assert all(found["median"] > 0 for found in report["results"].values())
 
 
@@ -70,38 +126,38 @@ def test_script_measures_each_of_its_contenders(
         ("envpool", "EnvPool, 16 of 32"),
     ],
 )
-def test_peer_steps(module: str, peer: str, tmp_path: Path) -> None:
+def test_peer_steps(module: str, peer: str, report_of: ReportOf) -> None:
     """Each peer that is installed can be measured."""
     if importlib.util.find_spec(module) is None:
         pytest.skip(f"{module} is not installed")
-    report = run_script("peers", tmp_path, *SHORT, "--only", peer)
-    assert report["results"][peer]["median"] > 0
+    assert report_of("peers")["results"][peer]["median"] > 0
 
 
-def test_uneven_tells_how_late_each_driver_collects(tmp_path: Path) -> None:
+def test_uneven_tells_how_late_each_driver_collects(report_of: ReportOf) -> None:
     """Each number of results has its latenesses, of both drivers and of the bare pipe."""
-    report = run_script("uneven", tmp_path, *SHORT, "--only", "log-normal sleeps, 4")
+    report = report_of("uneven")
     assert not report["skipped"]
-    assert [row["min_results"] for row in report["lateness"]] == [1, 4, 6]
-    for row in report["lateness"]:
+    rows = [row for row in report["lateness"] if row["mixture"] != RARELY_SLOW]
+    assert [row["min_results"] for row in rows] == [1, 4, 6]
+    for row in rows:
         for who in ("asyncio", "blocking", "bare pipe"):
             assert row[who]["count"] > 0
             assert 0 <= row[who]["median"] <= row[who]["p99"] <= row[who]["worst"]
         assert row["mixture"] in report["tables"]
 
 
-def test_uneven_counts_turns_with_a_rare_slow_step(tmp_path: Path) -> None:
+def test_uneven_counts_turns_with_a_rare_slow_step(report_of: ReportOf) -> None:
     """What is collected in the calm turns between is not among the latenesses."""
-    report = run_script("uneven", tmp_path, *SHORT, "--only", "asyncio, all work 50 µs")
-    counts = [row["asyncio"]["count"] for row in report["lateness"]]
-    assert all(0 < count <= 8 for count in counts)
+    rows = [row for row in report_of("uneven")["lateness"] if row["mixture"] == RARELY_SLOW]
+    assert len(rows) == 3
+    assert all(0 < row["asyncio"]["count"] <= 8 for row in rows)
 
 
-def test_uneven_tells_the_rate_at_even_step_times(tmp_path: Path) -> None:
+def test_uneven_tells_the_rate_at_even_step_times(report_of: ReportOf) -> None:
     """Both drivers and the bare loops have a rate."""
-    report = run_script("uneven", tmp_path, *SHORT, "--only", "5 µs")
-    assert len(report["rates"]) == 3
-    assert all(found["median"] > 0 for found in report["rates"].values())
+    rates = report_of("uneven")["rates"]
+    assert len(rates) == 3
+    assert all(found["median"] > 0 for found in rates.values())
 
 
 def test_lateness_is_measured_from_the_kth_of_all_outstanding(
@@ -123,12 +179,11 @@ def test_lateness_is_measured_from_the_kth_of_all_outstanding(
     assert calls.late_ms() == [2000.0, 1000.0]
 
 
-def test_pong(tmp_path: Path) -> None:
+def test_pong(report_of: ReportOf) -> None:
     """Raw frames pass through the synchronous and the asynchronous group."""
     if importlib.util.find_spec("ale_py") is None:
         pytest.skip("ale_py is not installed")
-    report = run_script("pong", tmp_path, *SHORT, *OURS)
-    assert len(report["results"]) == 2
+    assert len(report_of("pong")["results"]) == 2
 
 
 def test_every_script_has_its_place_in_the_readme(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import importlib.util
 import json
-from typing import TYPE_CHECKING, Any
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 from cli.command import CARTPOLE, invoke, invoke_json, run, start, write_config
 from patience import HANG
 
 from rlightning_aio import EnvConfig, load_config
-from rlightning_aio.cli import measuring
+from rlightning_aio.cli import measuring, tune
+from rlightning_aio.config import moved
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -119,6 +121,17 @@ def test_the_plot_is_an_image(tmp_path: Path) -> None:
     assert path.read_bytes().startswith(b"\x89PNG")
 
 
+def test_what_tune_prints_of_inline_envs_loads(tmp_path: Path) -> None:
+    """It leaves out what has no meaning there, defaults included."""
+    entry = EnvConfig(name="a", backend="gymnasium", task="CartPole-v1", step_timeout=3.0)
+    setting = measuring.Setting((moved(entry, "inline"),))
+    best = SimpleNamespace(setting=setting, steps_per_second=1.0, rule=measuring.Rule("step", None))
+    path = tmp_path / "tuned.yaml"
+    path.write_text(tune._as_yaml(path, cast("Any", best)))
+    (loaded,) = load_config(path)
+    assert (loaded.placement, loaded.step_timeout) == ("inline", None)
+
+
 def test_tune_prints_a_config_that_loads(tmp_path: Path) -> None:
     """Stdout is YAML that differs from the config in where the envs live, and nowhere else."""
     config = write_config(tmp_path, {**STUB, "max_episode_steps": 20})
@@ -129,7 +142,7 @@ def test_tune_prints_a_config_that_loads(tmp_path: Path) -> None:
     (entry,), (asked_for,) = load_config(tuned), load_config(config)
     chosen = {"placement", "envs_per_process"}
     assert entry.model_dump(exclude=chosen) == asked_for.model_dump(exclude=chosen)
-    assert isinstance(entry.envs_per_process, int)
+    assert entry.placement == "inline" or isinstance(entry.envs_per_process, int)
     assert "collect_async(min_results=" in done.stdout
     assert "Where the envs live" in done.stderr
 

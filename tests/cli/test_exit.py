@@ -34,7 +34,7 @@ WRONG: dict[str, tuple[str, list[str], list[str]]] = {
         ["envs.0 ('a')", "backend", "'mujoco'"],
     ),
     "vectorised where there is no such thing": (
-        "envs: [{name: a, backend: mujoco, task: HalfCheetah-v5, num_envs: 4}]",
+        "envs: [{name: a, backend: piper, task: can0, num_envs: 4}]",
         [],
         ["envs.0 ('a')", "num_envs", "num_workers: 4"],
     ),

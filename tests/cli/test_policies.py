@@ -16,7 +16,9 @@ from rlightning_aio.cli.policies import RandomPolicy
 from rlightning_aio.errors import ConfigError
 
 shapes = st.lists(st.integers(1, 3), min_size=1, max_size=2).map(tuple)
-floats = st.floats(-1e6, 1e6, width=32) | st.sampled_from([-np.inf, np.inf, 3e38, -3e38])
+extremes = st.sampled_from([-np.inf, np.inf, 3e38, -3e38])
+# Adding 0.0 leaves no -0.0: Gymnasium can't sample between 0.0 and -0.0.
+floats = (st.floats(-1e6, 1e6, width=32) | extremes).map(lambda bound: bound + 0.0)
 wholes = st.integers(-120, 120)
 
 

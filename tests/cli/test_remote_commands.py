@@ -93,12 +93,12 @@ def test_keys_let_a_client_in_until_its_env_is_finished(tmp_path: Path) -> None:
     assert json.loads(server_stdout)["steps"] == 5
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
 def test_an_interrupt_closes_the_env_while_nobody_answers(
     tmp_path: Path, number: signal.Signals
 ) -> None:
-    """A client without a server waits for one; interrupted, by a person or by a service
-    manager, it leaves its env in order.
+    """A client without a server waits for one; interrupted, by a person, by a service manager
+    or by the end of a terminal's session, it leaves its env in order.
     """
     with start("client", finishing(tmp_path, 1), "--connect", NOBODY, "--json") as client:
         line_with(client, " dials ")

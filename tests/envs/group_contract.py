@@ -24,42 +24,31 @@ class GroupContract(EnvContract):
     """The tests of `EnvContract`, and the same env in worker processes and inline."""
 
     @pytest.mark.parametrize("placement", ["process", "inline"])
-    def test_in_a_group_it_goes_its_own_way(self, placement: str) -> None:
-        """Each env of a group goes, bit for bit, as it goes alone with its seed."""
+    def test_in_a_group_it_is_what_it_is_alone(self, placement: str) -> None:
+        """Each env has its spaces, goes bit for bit its seed's way, and counts its episodes."""
         with self.opened() as env:
-            actions = self.actions(env)
+            meta, actions = env.get_metadata(), self.actions(env)
+            spaces = env.get_observation_space(), env.get_action_space()
             seeds = self.seed, self.seed + self.config.num_envs
             alone = [list(self.outcomes(env, actions, seed=seed)) for seed in seeds]
         config = self.config.model_copy(update={"placement": placement, "num_workers": 2})
         with sync.build_env_group(config) as group:
+            assert group.get_observation_spaces() == [spaces[0]] * 2
+            assert group.get_action_spaces() == [spaces[1]] * 2
             together = list(batches(group, self.seed, actions))
-        for index, batch in enumerate(together):
-            for k, result in enumerate(batch.values()):
-                assert same_outcome(outcome_of(result), alone[k][index]), (
-                    f"env {k}, outcome {index}: {result} is not {alone[k][index]}"
+            stats = [group.get_env_stats()[env_id] for env_id in group.env_ids]
+        for k, outcomes in enumerate(alone):
+            for index, (batch, outcome) in enumerate(zip(together, outcomes, strict=True)):
+                result = batch.values()[k]
+                assert same_outcome(outcome_of(result), outcome), (
+                    f"env {k}, outcome {index}: {result} is not {outcome}"
                 )
-
-    def test_a_group_knows_the_envs_spaces(self) -> None:
-        """They cross processes unchanged."""
-        with self.opened() as env, sync.build_env_group(self.config) as group:
-            assert group.get_observation_spaces() == [env.get_observation_space()]
-            assert group.get_action_spaces() == [env.get_action_space()]
-
-    def test_a_group_counts_episodes(self) -> None:
-        """Returns and lengths are sums over the steps between a start and an end."""
-        with self.opened() as env:
-            actions = self.actions(env)
-            meta = env.get_metadata()
-            expected = list(episodes(meta, self.outcomes(env, actions)))
-        with sync.build_env_group(self.config) as group:
-            for _ in batches(group, self.seed, actions):
-                pass
-            stats = group.get_env_stats()[meta.env_id]
-        assert stats["episodes"] == len(expected)
-        if expected:
-            returns, lengths = np.array(expected).T
-            assert stats["mean_return"] == pytest.approx(returns.mean())
-            assert stats["mean_length"] == pytest.approx(lengths.mean())
+            expected = list(episodes(meta, outcomes))
+            assert stats[k]["episodes"] == len(expected)
+            if expected:
+                returns, lengths = np.array(expected).T
+                assert stats[k]["mean_return"] == pytest.approx(returns.mean())
+                assert stats[k]["mean_length"] == pytest.approx(lengths.mean())
 
 
 def batches(group: sync.EnvGroup, seed: int, actions: Sequence[Any]) -> Iterator[BatchedData]:

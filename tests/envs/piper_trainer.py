@@ -21,6 +21,8 @@ def main(channel: str) -> None:
             "speed": 5,
             "safe_stop": "emergency_stop",
             "feedback_timeout": 5.0,
+            # A busy machine lets no thread run in time.
+            "watchdog_timeout": 5.0,
         },
     }
     with sync.build_env_group(entry) as group:

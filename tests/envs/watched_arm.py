@@ -14,13 +14,18 @@ if TYPE_CHECKING:
 
 
 class WatchedArm(SimulatedArm):
-    """Remembers every command, and can be made deaf to some or fall silent."""
+    """Remembers every command, and can be made deaf to some or fall silent.
+
+    Attributes:
+        in_the_grip: what the gripper can't close any further than, in m.
+    """
 
     def __init__(self) -> None:
         super().__init__()
         self.commands: list[Frame] = []
         self.deaf_to: set[int] = set()
         self.silent = False
+        self.in_the_grip = 0.0
         self._changed = threading.Condition()
 
     def receive(self, frame: Frame) -> list[Frame]:
@@ -29,6 +34,11 @@ class WatchedArm(SimulatedArm):
             answers = [] if frame.can_id in self.deaf_to else super().receive(frame)
             self._changed.notify_all()
         return answers
+
+    def advance(self, seconds: float) -> None:
+        super().advance(seconds)
+        if self.in_the_grip:
+            self.gripper = max(self.gripper, self.in_the_grip)
 
     def feedback(self) -> list[Frame]:
         return [] if self.silent else super().feedback()

@@ -68,7 +68,7 @@ def entry(num_workers: int = 2, **fields: Any) -> dict[str, Any]:
         "backend": "faulty",
         "task": "anything",
         "num_workers": num_workers,
-        "envs_per_process": num_workers,
+        **({} if fields.get("placement") == "inline" else {"envs_per_process": num_workers}),
         **fields,
     }
 

@@ -16,11 +16,11 @@ on_one_driver = pytest.mark.parametrize("driver", ["sync"])
 """For what is decided before anything is waited for, or in the worker alone."""
 
 
-def first_on_both_drivers(name: str, values: Iterable[str]) -> pytest.MarkDecorator:
-    """All `values` of parameter `name`, the first of them on either driver.
+def kinds_on_both_drivers(name: str, values: Iterable[str]) -> pytest.MarkDecorator:
+    """Parameter `name` is a list: of all `values`, and on the other driver of the first alone.
 
-    For kinds of one thing that are all alike to whoever waits.
+    For kinds of one thing that are all alike to whoever waits, shown one after another.
     """
-    listed = list(values)
-    pairs = [("sync", value) for value in listed] + [("uvloop", listed[0])]
-    return pytest.mark.parametrize(("driver", name), pairs)
+    kinds = list(values)
+    cases = [pytest.param("sync", kinds, id="sync"), pytest.param("uvloop", kinds[:1], id="uvloop")]
+    return pytest.mark.parametrize(("driver", name), cases)

@@ -64,6 +64,47 @@ class Unspeakable(Exception):
         raise SystemExit(3)
 
 
+class OddText(str):
+    """Text that no pickle takes."""
+
+    __slots__ = ()
+
+    def __reduce__(self) -> str:
+        raise SystemExit(4)
+
+
+class OddlySpoken(Exception):
+    """Its words are no plain text, and neither is where it is from."""
+
+    def __str__(self) -> str:
+        return OddText("odd words")
+
+
+OddlySpoken.__module__ = OddText("faults.faulty")
+OddlySpoken.__qualname__ = OddText("OddlySpoken")
+
+
+class Wordless(Exception):
+    """Its words are none."""
+
+    def __str__(self) -> str:
+        return self.args  # pyright: ignore[reportReturnType]  # That is odd.
+
+
+class OddlyPickled(Exception):
+    """Pickling it tries to end the program."""
+
+    def __reduce__(self) -> str:
+        raise SystemExit(4)
+
+
+class Untraceable(Exception):
+    """Nobody gets to see where it came from."""
+
+    __cause__ = property(lambda _: 7)  # pyright: ignore[reportAssignmentType]
+    __traceback__ = property(lambda _: 1 / 0)  # pyright: ignore[reportAssignmentType]
+
+
 class NotAnException(BaseException):
     """What ``except Exception`` lets through."""
 
@@ -90,13 +131,26 @@ def _tell_and_sleep() -> None:
     time.sleep(3600)
 
 
-def _interrupt_trainer() -> None:
-    """Send the trainer Ctrl-C, once it has gone to sleep to wait for this very reply."""
+def _signal_trainer(number: int) -> None:
+    """Send the trainer a signal, once it has gone to sleep to wait for this very reply."""
     server = Path(f"/proc/{os.getppid()}/stat").read_text().rpartition(")")[2].split()
     trainer = int(server[1])
     while Path(f"/proc/{trainer}/stat").read_text().rpartition(")")[2].split()[0] != "S":
         os.sched_yield()
-    os.kill(trainer, signal.SIGINT)
+    os.kill(trainer, number)
+
+
+def _fork(end: Callable[[], object], exit_code: int) -> Callable[[], None]:
+    """Fork a child that goes on by itself from here, and wait until it has ended."""
+
+    def fault() -> None:
+        child = os.fork()
+        if child == 0:
+            end()
+        else:
+            assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == exit_code
+
+    return fault
 
 
 def _deadlock() -> None:
@@ -142,13 +196,18 @@ FAULTS: dict[str, Callable[[], object]] = {
     "close descriptors": lambda: os.closerange(3, 1000),
     "stop": _signal(signal.SIGSTOP),
     "tell and sleep": _tell_and_sleep,
-    "interrupt the trainer": _interrupt_trainer,
+    "interrupt the trainer": lambda: _signal_trainer(signal.SIGINT),
+    "call the trainer": lambda: _signal_trainer(signal.SIGUSR1),
     # Exceptions.
     "raise": _raise(ValueError, "as asked for"),
     "odd constructor": _raise(OddConstructor, 7, where="step"),
     "unpicklable": _raise(Unpicklable),
     "unprintable": _raise(Unprintable),
     "unspeakable": _raise(Unspeakable),
+    "oddly spoken": _raise(OddlySpoken),
+    "wordless": _raise(Wordless),
+    "oddly pickled": _raise(OddlyPickled, "as it is"),
+    "untraceable": _raise(Untraceable, "from nowhere"),
     "not an exception": _raise(NotAnException, "but raised"),
     "system exit": _raise(SystemExit, 5),
     "keyboard interrupt": _raise(KeyboardInterrupt),
@@ -160,6 +219,10 @@ FAULTS: dict[str, Callable[[], object]] = {
     "broken pipe": _raise(BrokenPipeError, "the simulator's, not ours"),
     "recursion": _recurse,
     "memory": _exhaust_memory,
+    # Children.
+    "fork and raise": _fork(_raise(ValueError, "in a child"), 1),
+    "fork and return": _fork(lambda: None, 1),
+    "fork and exit": _fork(lambda: sys.exit(5), 5),
     # Noise.
     "print": _print_megabytes,
 }

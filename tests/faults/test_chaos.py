@@ -36,3 +36,15 @@ def test_every_request_ends_once_and_truly_whatever_breaks(tmp_path: Path) -> No
     assert report["noticed_ms"]["hung"]["count"] == 4
     assert not report["broken"]
     assert not report["leaks"]
+
+
+def test_groups_side_by_side_keep_their_promises_through_every_kind_of_fault(
+    tmp_path: Path,
+) -> None:
+    """Sixty faults against three groups, each on a driver of its own, and their clients."""
+    report = report_of("chaos.py", tmp_path, "--groups", "3", "--faults", "60")
+    assert sum(report["faults"].values()) >= 60
+    assert sum(report["ends"].values()) == sum(report["requests"].values()) > 60
+    assert all(report["drivers"][name] for name in ("asyncio", "uvloop", "sync"))
+    assert not report["broken"]
+    assert not report["leaks"]

@@ -6,13 +6,16 @@ import logging
 import os
 import resource
 import signal
+import subprocess
+import sys
 import warnings
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import pytest
 from faults.driven import Driven, Tokens, entry, fork_server_of, kill, marked, pid_of, two_workers
-from faults.drivers import first_on_both_drivers, on_one_driver
+from faults.drivers import kinds_on_both_drivers, on_one_driver
 
 from rlightning_aio import BatchedData, PolicyResponse
 from rlightning_aio.errors import EnvRaised, StartFailed, WorkerDied
@@ -34,24 +37,26 @@ ELSEWHERE = ["sigkill", "segfault", "exit 3"]
 """One of each sort, for the places other than a step."""
 
 
-@first_on_both_drivers("death", DEATHS)
+@kinds_on_both_drivers("deaths", DEATHS)
 def test_death_in_a_step_gives_one_marked_result_for_each_env_that_owed_one(
-    start: Start, death: str
+    start: Start, deaths: list[str]
 ) -> None:
     """Envs of the dead worker begin anew and say why; those of the other worker just step."""
     group, tokens = start(two_workers()), Tokens()
-    batch, _ = group.step(tokens.steps(group.group.env_ids, {"faulty-1": death}))
-    assert batch.ids() == ["faulty-0", "faulty-1", "faulty-2", "faulty-3"]
-    first, second, *others = batch.values()
-    assert marked(second)
-    assert second.info["worker_restarted"].startswith(DEATHS[death])
-    assert not any(map(marked, others))
-    if not marked(first):  # It had replied before; then its next step has to tell.
-        again, _ = group.step(tokens.steps(["faulty-0"]))
-        assert marked(again.values()[0])
-    batch, _ = group.step(tokens.steps(group.group.env_ids))
-    tokens.check(batch)
-    assert [ret.observation[3] for ret in batch.values()] == [1, 1, 2, 2]
+    for death in deaths:
+        group.reset()
+        batch, _ = group.step(tokens.steps(group.group.env_ids, {"faulty-1": death}))
+        assert batch.ids() == ["faulty-0", "faulty-1", "faulty-2", "faulty-3"]
+        first, second, *others = batch.values()
+        assert marked(second)
+        assert second.info["worker_restarted"].startswith(DEATHS[death])
+        assert not any(map(marked, others))
+        if not marked(first):  # It had replied before; then its next step has to tell.
+            again, _ = group.step(tokens.steps(["faulty-0"]))
+            assert marked(again.values()[0])
+        batch, _ = group.step(tokens.steps(group.group.env_ids))
+        tokens.check(batch)
+        assert [ret.observation[3] for ret in batch.values()] == [1, 1, 2, 2]
 
 
 @on_one_driver
@@ -71,9 +76,13 @@ def test_a_marked_result_marks_nothing_but_itself(start: Start) -> None:
 
 
 @on_one_driver
-def test_result_that_was_ready_before_the_death_keeps_its_own_info(start: Start) -> None:
-    """What an env had answered is handed out as it was, though its worker is another now."""
-    group, tokens = start(entry()), Tokens()
+def test_result_that_was_ready_before_deaths_keeps_its_own_info(
+    start: Start, tmp_path: Path
+) -> None:
+    """However often its worker dies meanwhile, or fails to come up, and whatever others tell."""
+    broken = tmp_path / "broken"
+    kwargs = {"faults": {"building": "raise"}, "while_exists": str(broken)}
+    group, tokens = start(entry(env_kwargs=kwargs, max_restarts=2)), Tokens()
     group.step(tokens.steps(group.group.env_ids))
     group.step_async(tokens.steps(["faulty-0"]))
     batch, _ = group.collect_async()
@@ -81,25 +90,34 @@ def test_result_that_was_ready_before_the_death_keeps_its_own_info(start: Start)
     pid = pid_of(group, "faulty-1")
     group.step_async(tokens.steps(["faulty-0"]))
     group.step(tokens.steps(["faulty-1"]))  # The same worker executes it after the other.
-    kill(pid)
-    assert marked(group.step(tokens.steps(["faulty-1"]))[0].values()[0])
+    for _ in range(2):
+        kill(pid)
+        assert marked(group.step(tokens.steps(["faulty-1"]))[0].values()[0])
+        pid = pid_of(group, "faulty-1")
+    # The row's info had the second form of its worker's; the second of this one is another.
+    group.call("faulty-1", "answer_with", info=partial(dict, other=7.0))
+    assert group.step(tokens.steps(["faulty-1"]))[0].info() == [{"other": 7.0}]
+    broken.touch()  # From now on, no replacement can be built.
+    with pytest.raises(WorkerDied, match="2 restarts in a row"):
+        group.step(tokens.steps(["faulty-1"], {"faulty-1": "exit 3"}))
     batch, _ = group.collect_async()
     assert batch.values()[0].info == {"steps": before.info["steps"] + 1, "name": 0}
     tokens.check(batch)
 
 
-@first_on_both_drivers("death", ELSEWHERE)
-def test_death_in_a_reset_is_answered_by_another_reset(start: Start, death: str) -> None:
+@kinds_on_both_drivers("deaths", ELSEWHERE)
+def test_death_in_a_reset_is_answered_by_another_reset(start: Start, deaths: list[str]) -> None:
     """The reset that killed its worker has one marked result, the rest of the group none."""
     group, tokens = start(two_workers()), Tokens()
-    group.call("faulty-0", "arm", "resetting", death)
-    batch, _ = group.reset()
-    first, second, *others = batch.values()
-    assert marked(first)
-    assert first.info["worker_restarted"].startswith(DEATHS[death])
-    assert marked(second)
-    assert [ret.info for ret in others] == [{"resets": 2}, {"resets": 2}]
-    tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
+    for resets, death in enumerate(deaths, start=2):
+        group.call("faulty-0", "arm", "resetting", death)
+        batch, _ = group.reset()
+        first, second, *others = batch.values()
+        assert marked(first)
+        assert first.info["worker_restarted"].startswith(DEATHS[death])
+        assert marked(second)
+        assert [ret.info for ret in others] == [{"resets": resets}] * 2
+        tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
 @on_one_driver
@@ -110,31 +128,43 @@ def test_death_in_a_reset_with_options_is_answered_by_one_without(start: Start) 
     assert marked(batch.values()[0])
 
 
-@first_on_both_drivers("death", ELSEWHERE)
-def test_death_in_a_call_is_raised_and_the_env_goes_on(start: Start, death: str) -> None:
+@kinds_on_both_drivers("deaths", ELSEWHERE)
+def test_death_in_a_call_is_raised_and_the_env_goes_on(start: Start, deaths: list[str]) -> None:
     """A call can't be answered by a reset, so it raises; the envs tell at their next step."""
     group, tokens = start(entry()), Tokens()
-    with pytest.raises(WorkerDied, match="faulty-0") as caught:
-        group.call("faulty-0", "do", death)
-    assert DEATHS[death] in str(caught.value)
-    assert caught.value.env_ids == ("faulty-0",)
-    assert caught.value.exit_code is not None
-    batch, _ = group.step(tokens.steps(group.group.env_ids))
-    assert all(map(marked, batch.values()))
-    tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
+    for death in deaths:
+        with pytest.raises(WorkerDied, match="faulty-0") as caught:
+            group.call("faulty-0", "do", death)
+        assert DEATHS[death] in str(caught.value)
+        assert caught.value.env_ids == ("faulty-0",)
+        assert caught.value.exit_code is not None
+        batch, _ = group.step(tokens.steps(group.group.env_ids))
+        assert all(map(marked, batch.values()))
+        tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
-@first_on_both_drivers("death", ELSEWHERE)
-def test_death_in_close_is_told_and_does_not_hold_up_the_others(start: Start, death: str) -> None:
+@kinds_on_both_drivers("deaths", ELSEWHERE)
+def test_death_in_close_is_told_and_does_not_hold_up_the_others(
+    start: Start, deaths: list[str]
+) -> None:
     """`close` returns, warns which env's worker died and how, and leaves nothing."""
-    group = start(two_workers())
-    group.call("faulty-1", "arm", "closing", death)
-    with pytest.warns(UserWarning, match="faulty-1.*" + DEATHS[death]):
+    group = start(entry(1 + len(deaths), envs_per_process=1))
+    dying = dict(zip(group.group.env_ids[1:], deaths, strict=True))
+    for env_id, death in dying.items():
+        group.call(env_id, "arm", "closing", death)
+    with pytest.warns(UserWarning, match="raised WorkerDied") as caught:
         group.close()
+    told = sorted(str(warning.message) for warning in caught)
+    for message, (env_id, death) in zip(told, dying.items(), strict=True):
+        assert env_id in message
+        assert DEATHS[death] in message
 
 
-@pytest.mark.parametrize("place", ["building", "spaces"])
-@first_on_both_drivers("death", ELSEWHERE)
+@pytest.mark.parametrize(
+    ("driver", "place", "death"),
+    [("sync", "building", death) for death in ELSEWHERE]
+    + [(driver, "spaces", ELSEWHERE[0]) for driver in ("sync", "uvloop")],
+)
 def test_death_while_starting_fails_the_start_with_its_cause(
     build: Start, place: str, death: str
 ) -> None:
@@ -182,6 +212,7 @@ def test_raise_names_the_env_that_was_being_executed(start: Start) -> None:
     tokens.check(error.results)
 
 
+@on_one_driver
 def test_raise_gives_up_the_envs_of_the_dead_worker_alone(start: Start) -> None:
     """They raise their worker's end from then on; the others go on, in every way of asking."""
     group, tokens = start(two_workers(on_worker_death="raise")), Tokens()
@@ -329,6 +360,28 @@ def test_replacement_whose_reset_raises_answers_with_that(start: Start, tmp_path
     tokens.check(group.step(tokens.steps(["faulty-0"]))[0])
 
 
+@on_one_driver
+def test_env_that_was_replaced_tells_until_a_reset_has_succeeded(
+    start: Start, tmp_path: Path
+) -> None:
+    """A reset that raises, asked for or not, begins no episode that a step could go on with."""
+    broken = tmp_path / "broken"
+    kwargs = {"faults": {"resetting": "raise"}, "while_exists": str(broken)}
+    group, tokens = start(two_workers(env_kwargs=kwargs)), Tokens()
+    kill(pid_of(group, "faulty-0"))
+    # Its death is known when its neighbour has told of it.
+    assert marked(group.step(tokens.steps(["faulty-1"]))[0].values()[0])
+    broken.touch()
+    with pytest.raises(EnvRaised, match="raised in reset"):
+        group.reset(seed=3, env_ids=["faulty-0"])
+    with pytest.raises(EnvRaised, match=r"raised in reset.*was killed by SIGKILL"):
+        group.step(tokens.steps(["faulty-0"]))
+    broken.unlink()
+    assert marked(group.step(tokens.steps(["faulty-0"]))[0].values()[0])
+    for _ in range(2):
+        tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
+
+
 def test_fork_server_that_is_killed_is_replaced_with_its_workers(start: Start) -> None:
     """Everything of it is gone at once; every env answers once, and goes on."""
     group, tokens = start(two_workers()), Tokens()
@@ -359,6 +412,32 @@ def test_failed_fork_costs_one_worker_and_tells_why(start: Start) -> None:
     assert "no worker could be forked" in caught.value.stderr_tail
     resource.prlimit(pid, resource.RLIMIT_NOFILE, kept)
     tokens.check(group.step(tokens.steps(["faulty-2", "faulty-3"]))[0])
+
+
+@on_one_driver
+def test_restarts_outlast_a_moment_without_descriptors(
+    start: Start, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Attempts that fail are made again, less and less often; the others step meanwhile."""
+    group, tokens = start(two_workers(max_restarts=50)), Tokens()
+    kept = resource.getrlimit(resource.RLIMIT_NOFILE)
+    lowest_free = os.dup(0)
+    os.close(lowest_free)
+    group.step_async(tokens.steps(["faulty-0"], {"faulty-0": "exit 3"}))
+    resource.setrlimit(resource.RLIMIT_NOFILE, (lowest_free, kept[1]))
+    try:
+        with caplog.at_level(logging.WARNING, "rlightning_aio"):
+            while "restart 3 of 50 in a row, in 0.2 s" not in caplog.text:
+                tokens.check(group.step(tokens.steps(["faulty-2", "faulty-3"]))[0])
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, kept)
+    assert "could not be replaced: can't start a worker for entry 'faulty'" in caplog.text
+    assert "Too many open files" in caplog.text
+    batch, _ = group.collect_async()
+    assert marked(batch["faulty-0"])
+    assert batch["faulty-0"].info["worker_restarted"] == "exited with code 3"
+    again, _ = group.step(tokens.steps(["faulty-0", "faulty-1"]))
+    assert [marked(ret) for ret in again.values()] == [False, True]
 
 
 def test_worker_that_loses_its_channel_is_replaced(start: Start) -> None:
@@ -395,6 +474,32 @@ def test_restart_is_logged(start: Start, caplog: pytest.LogCaptureFixture) -> No
     assert "restart 1 of 3" in record.getMessage()
 
 
+def test_death_needs_no_module_that_is_not_there_yet() -> None:
+    """An import takes descriptors, and at a death there may be none left."""
+    script = """
+import sys
+from faults.driven import Tokens, two_workers
+import rlightning_aio.sync
+with rlightning_aio.sync.build_env_group(two_workers()) as group:
+    tokens = Tokens()
+    batch, _ = group.step(tokens.steps(group.env_ids))
+    before = set(sys.modules)
+    batch, _ = group.step(tokens.steps(group.env_ids, {"faulty-0": "sigkill"}))
+    assert batch.restarted.any()
+    print(*sorted(set(sys.modules) - before))
+"""
+    tests = str(Path(__file__).parents[1])
+    ran = subprocess.run(
+        [sys.executable, "-c", script],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([tests, *sys.path])},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert ran.stdout.split() == []
+
+
+@on_one_driver
 def test_group_of_many_workers_starts_and_closes(build: Start) -> None:
     """More workers than a socket queues messages for must not block anybody."""
     group = build(entry(40, envs_per_process=1))

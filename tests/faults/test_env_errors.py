@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import os
+import select
 import sys
 import threading
 import types
+from itertools import product
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import pytest
 from faults.driven import Driven, Tokens, entry, two_workers
-from faults.drivers import first_on_both_drivers, on_one_driver
+from faults.drivers import on_one_driver
+from patience import HANG
 
 from rlightning_aio.errors import EnvRaised, RemoteTraceback, StartFailed
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
     Start: TypeAlias = Callable[..., Driven]
 
@@ -26,6 +31,10 @@ RAISED = {
     "unpicklable": ("faults.faulty.Unpicklable", "it holds a lock"),
     "unprintable": ("faults.faulty.Unprintable", "<its __str__ raised RuntimeError>"),
     "unspeakable": ("faults.faulty.Unspeakable", "<its __str__ raised SystemExit>"),
+    "oddly spoken": ("faults.faulty.OddlySpoken", "odd words"),
+    "wordless": ("faults.faulty.Wordless", "<its __str__ raised TypeError>"),
+    "oddly pickled": ("faults.faulty.OddlyPickled", "as it is"),
+    "untraceable": ("faults.faulty.Untraceable", "from nowhere"),
     "not an exception": ("faults.faulty.NotAnException", "but raised"),
     "system exit": ("SystemExit", "5"),
     "keyboard interrupt": ("KeyboardInterrupt", ""),
@@ -90,12 +99,11 @@ def test_whatever_is_raised_while_collecting_ends_one_request(start: Start) -> N
         check_told(errors[0], name, "step")
 
 
-@pytest.mark.parametrize("by", ["row", "channel"])
 @on_one_driver
-def test_whatever_a_reset_raises_is_told_and_the_next_reset_works(start: Start, by: str) -> None:
+def test_whatever_a_reset_raises_is_told_and_the_next_reset_works(start: Start) -> None:
     """With options (which go through the channel) and without (the row holds the seed)."""
     group, tokens = start(two_workers()), Tokens()
-    for name in RAISED:
+    for name, by in product(RAISED, ("row", "channel")):
         if by == "row":
             group.call("faulty-1", "arm", "resetting", name)
         options = {"fault": name} if by == "channel" else None
@@ -118,18 +126,26 @@ def test_whatever_a_call_raises_is_told(start: Start) -> None:
         tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
-@first_on_both_drivers("place", ["building", "spaces"])
-def test_whatever_is_raised_while_starting_fails_the_start(driver: str, place: str) -> None:
+ODDLY_RAISED = ["system exit", "odd constructor", "unpicklable", "unspeakable", "oddly spoken"]
+"""For what costs a group each: the rest of `RAISED` is told in the same way."""
+
+
+@pytest.mark.parametrize(
+    ("driver", "place", "name"),
+    [("sync", "building", name) for name in ODDLY_RAISED]
+    + [(driver, "spaces", ODDLY_RAISED[0]) for driver in ("sync", "uvloop")],
+)
+def test_whatever_is_raised_while_starting_fails_the_start(
+    build: Start, place: str, name: str
+) -> None:
     """`init` says which env, and shows the remote traceback; nothing is left running."""
-    for name in ("odd constructor", "unpicklable", "unspeakable", "system exit"):
-        type_name, text = RAISED[name]
-        group = Driven(driver, two_workers(env_kwargs={"faults": {place: name}, "only": 1}))
-        with pytest.raises(StartFailed) as caught:
-            group.init()
-        assert caught.value.env_id == "faulty-1"
-        assert f"could not be built: {type_name}: {text}" in str(caught.value)
-        assert "faulty.py" in str(caught.value.__cause__)
-        group.end()
+    type_name, text = RAISED[name]
+    group = build(two_workers(env_kwargs={"faults": {place: name}, "only": 1}))
+    with pytest.raises(StartFailed) as caught:
+        group.init()
+    assert caught.value.env_id == "faulty-1"
+    assert f"could not be built: {type_name}: {text}" in str(caught.value)
+    assert "faulty.py" in str(caught.value.__cause__)
 
 
 @on_one_driver
@@ -152,14 +168,67 @@ def test_what_a_preprocess_function_raises_is_told(start: Start) -> None:
 @on_one_driver
 def test_what_close_raises_is_a_warning_and_others_are_closed(start: Start) -> None:
     """There is nothing left that could be done about it, but nobody is kept in the dark."""
-    for name in ("odd constructor", "unpicklable", "unspeakable", "system exit"):
+    group = start(entry(len(ODDLY_RAISED)))
+    for env_id, name in zip(group.group.env_ids, ODDLY_RAISED, strict=True):
+        group.call(env_id, "arm", "closing", name)
+    with pytest.warns(UserWarning, match="close") as caught:
+        group.close()
+    for env_id, name, warning in zip(group.group.env_ids, ODDLY_RAISED, caught, strict=True):
         type_name, text = RAISED[name]
-        group = start(entry(2))
-        group.call("faulty-0", "arm", "closing", name)
-        with pytest.warns(UserWarning, match="close") as caught:
-            group.close()
-        (warning,) = caught
-        assert f"close() of env 'faulty-0' raised {type_name}: {text}" in str(warning.message)
+        assert f"close() of env {env_id!r} raised {type_name}: {text}" in str(warning.message)
+
+
+CHILDREN = ["fork and raise", "fork and return", "fork and exit"]
+
+
+@on_one_driver
+def test_children_that_an_env_forks_answer_nobody(
+    build: Start, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """They end where they come back from the env's code, and only the env itself answers."""
+    faults = {"building": "fork and raise", "spaces": "fork and return"}
+    group, tokens = build(two_workers(env_kwargs={"faults": faults})), Tokens()
+    group.init()
+    group.reset()
+    for name in CHILDREN:
+        batch, _ = group.step(tokens.steps(group.group.env_ids, {"faulty-1": name}))
+        tokens.check(batch)
+        batch, _ = group.reset(options={"fault": name}, env_ids=["faulty-1"])
+        assert batch.ids() == ["faulty-1"]
+        group.call("faulty-1", "arm", "resetting", name)
+        group.reset()
+        group.call("faulty-1", "arm", "resetting", "nothing")
+        assert group.call("faulty-1", "do", name) == f"faulty-1 did {name}"
+    group.call("faulty-1", "arm", "closing", "fork and return")
+    tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
+    group.close()
+    written = capfd.readouterr().err
+    assert "ValueError: in a child" in written
+    assert "os._exit" in written
+
+
+@on_one_driver
+def test_child_of_an_env_writes_into_no_row(start: Start, tmp_path: Path) -> None:
+    """However late it comes back: what it has of the shared memory is its own."""
+    gate = tmp_path / "gate"
+    os.mkfifo(gate)
+
+    def forked() -> np.ndarray:
+        child = os.fork()
+        if child == 0:
+            gate.read_bytes()
+        return np.full(5, child, float)
+
+    group, tokens = start(entry(1), zero_copy=True), Tokens()
+    group.call("faulty-0", "answer_with", observation=forked)
+    batch, _ = group.step(tokens.steps(["faulty-0"]))
+    child = int(batch.observation[0, 0])
+    watch = os.pidfd_open(child)
+    gate.open("w").close()
+    assert select.select([watch], [], [], HANG)[0], "the child lives on"
+    os.close(watch)
+    assert batch.observation.tolist() == [[child] * 5]
+    tokens.check(group.step(tokens.steps(["faulty-0"]))[0])
 
 
 def _foreign() -> Any:
@@ -245,6 +314,7 @@ def test_observation_that_does_not_fit_its_space_is_named_with_both_shapes(start
         tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
+@on_one_driver
 def test_infos_of_ten_megabytes_arrive_whole(start: Start) -> None:
     """As an array, as text and nested; and the others' results with them."""
     group, tokens = start(two_workers()), Tokens()

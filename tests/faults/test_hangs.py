@@ -9,13 +9,14 @@ import time
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import pytest
-from faults.driven import Driven, Tokens, entry, marked, pid_of, two_workers
-from faults.drivers import first_on_both_drivers, on_one_driver
+from faults.driven import Driven, Tokens, entry, fork_server_of, marked, pid_of, two_workers
+from faults.drivers import kinds_on_both_drivers, on_one_driver
 from patience import HANG
 
 import rlightning_aio
 from rlightning_aio import registry
 from rlightning_aio.errors import EnvHung, NothingPending, StartFailed, WorkerDied
+from rlightning_aio.group import supervisor
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -34,37 +35,42 @@ STACKS = {
 }
 
 
-@first_on_both_drivers("hang", STACKS)
-def test_hung_step_raises_with_the_stack_of_the_worker(start: Start, hang: str) -> None:
+@kinds_on_both_drivers("hangs", STACKS)
+def test_hung_step_raises_with_the_stack_of_the_worker(start: Start, hangs: list[str]) -> None:
     """What held it is in the error, though it held the interpreter's lock and never returned."""
-    group, tokens = start(two_workers(step_timeout=LIMIT, on_worker_death="raise")), Tokens()
-    with pytest.raises(
-        EnvHung, match=f"env 'faulty-1'.*longer than {LIMIT} s for a step"
-    ) as caught:
-        group.step(tokens.steps(group.group.env_ids, {"faulty-1": hang}))
-    error = caught.value
-    assert error.env_id == "faulty-1"
-    assert error.exit_code == -signal.SIGKILL
-    assert STACKS[hang] in error.stderr_tail
-    assert "faulty.py" in error.stderr_tail
-    assert error.results is not None
-    tokens.check(error.results)
-    tokens.check(group.step(tokens.steps(["faulty-2", "faulty-3"]))[0])
+    ends = {"step_timeout": LIMIT, "on_worker_death": "raise"}
+    group, tokens = start(entry(1 + len(hangs), envs_per_process=1, **ends)), Tokens()
+    alive = list(group.group.env_ids)
+    for env_id, hang in zip(group.group.env_ids[1:], hangs, strict=True):
+        with pytest.raises(
+            EnvHung, match=f"env '{env_id}'.*longer than {LIMIT} s for a step"
+        ) as caught:
+            group.step(tokens.steps(alive, {env_id: hang}))
+        error = caught.value
+        assert error.env_id == env_id
+        assert error.exit_code == -signal.SIGKILL
+        assert STACKS[hang] in error.stderr_tail
+        assert "faulty.py" in error.stderr_tail
+        assert error.results is not None
+        tokens.check(error.results)
+        alive.remove(env_id)
+        tokens.check(group.step(tokens.steps(alive))[0])
 
 
-@first_on_both_drivers("hang", [*STACKS, "stop"])
-def test_hung_step_is_answered_by_its_replacement(start: Start, hang: str) -> None:
+@kinds_on_both_drivers("hangs", [*STACKS, "stop"])
+def test_hung_step_is_answered_by_its_replacement(start: Start, hangs: list[str]) -> None:
     """One marked result each for who owed one; then every env answers what it is asked."""
     group, tokens = start(two_workers(step_timeout=LIMIT)), Tokens()
-    batch, _ = group.step(tokens.steps(group.group.env_ids, {"faulty-1": hang}))
-    results = batch.values()
-    assert marked(results[1])
-    assert results[1].info["worker_restarted"] == "hung in a step and was killed"
-    assert not marked(results[2])
-    assert not marked(results[3])
-    for _ in range(3):
-        batch, _ = group.step(tokens.steps(group.group.env_ids))
-    tokens.check(batch)
+    for hang in hangs:
+        batch, _ = group.step(tokens.steps(group.group.env_ids, {"faulty-1": hang}))
+        results = batch.values()
+        assert marked(results[1])
+        assert results[1].info["worker_restarted"] == "hung in a step and was killed"
+        assert not marked(results[2])
+        assert not marked(results[3])
+        for _ in range(3):
+            batch, _ = group.step(tokens.steps(group.group.env_ids))
+        tokens.check(batch)
 
 
 def test_hung_reset_is_found_by_its_own_limit(start: Start) -> None:
@@ -86,6 +92,7 @@ def test_hung_reset_with_options_is_found(start: Start) -> None:
     assert marked(batch["faulty-0"])
 
 
+@on_one_driver
 def test_reset_that_hangs_after_a_step_without_limit_is_found(start: Start) -> None:
     """The worker was looked at while it did something that may take for ever."""
     group, tokens = start(entry(2, reset_timeout=LIMIT)), Tokens()
@@ -103,6 +110,23 @@ def test_worker_that_is_stopped_before_it_is_asked_is_found(start: Start) -> Non
     os.kill(pid_of(group, "faulty-0"), signal.SIGSTOP)
     batch, _ = group.step(tokens.steps(group.group.env_ids))
     assert [marked(ret) for ret in batch.values()] == [True, True, False, False]
+
+
+def test_hang_is_ended_though_the_fork_server_has_hung_as_well(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It would kill the worker, and can't; so it goes with all of its workers."""
+    monkeypatch.setattr(supervisor, "_OBEY_SECONDS", LIMIT)
+    group, tokens = start(two_workers(step_timeout=LIMIT)), Tokens()
+    os.kill(pid_of(group, "faulty-0"), signal.SIGSTOP)
+    os.kill(fork_server_of(group.group)._process.pid, signal.SIGSTOP)
+    batch, _ = group.step(tokens.steps(group.group.env_ids))
+    assert [marked(ret) for ret in batch.values()] == [True, True, False, False]
+    assert batch["faulty-0"].info["worker_restarted"] == "hung in a step and was killed"
+    batch, _ = group.step(tokens.steps(group.group.env_ids))
+    assert [marked(ret) for ret in batch.values()] == [False, False, True, True]
+    assert "its fork server: it did nothing" in batch["faulty-2"].info["worker_restarted"]
+    tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
 def test_hang_is_found_while_others_leave_the_trainer_no_time_to_wait(start: Start) -> None:
@@ -141,6 +165,7 @@ def test_start_that_hangs_fails_with_the_stack(build: Start) -> None:
     assert "in _deadlock" in str(caught.value)
 
 
+@on_one_driver
 def test_fork_server_that_hangs_in_an_import_fails_the_start(
     build: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -191,29 +216,28 @@ def test_replacement_that_hangs_is_found_though_nobody_was_waiting_for_it(
         group.reset()
 
 
-@pytest.mark.parametrize("waiting", [{}, {"wait_all": True}, {"timeout": 5}, {"min_results": 2}])
-def test_after_a_missed_deadline_the_next_results_are_right(
-    start: Start, waiting: dict[str, Any]
-) -> None:
+def test_after_a_missed_deadline_the_next_results_are_right(start: Start) -> None:
     """Nothing is lost, nothing comes twice, nothing answers another request."""
     group, tokens = start(two_workers(step_timeout=60)), Tokens()
-    os.kill(pid_of(group, "faulty-0"), signal.SIGSTOP)
-    pid = group.group._core.supervisor.hosts[0].pid
-    group.step_async(tokens.steps(["faulty-0", "faulty-1"]))
-    for _ in range(3):
-        with pytest.raises(TimeoutError, match="nothing is lost"):
-            group.collect_async(deadline=0.05, **waiting)
-    os.kill(pid, signal.SIGCONT)
-    ids: list[str] = []
-    while len(ids) < 2:
-        batch, _ = group.collect_async(**waiting)
-        tokens.check(batch)
-        ids += batch.ids()
-    assert sorted(ids) == ["faulty-0", "faulty-1"]
-    with pytest.raises(NothingPending):
-        group.collect_async()
-    for _ in range(3):
-        tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
+    pid = pid_of(group, "faulty-0")
+    waits: list[dict[str, Any]] = [{}, {"wait_all": True}, {"timeout": 5}, {"min_results": 2}]
+    for waiting in waits:
+        os.kill(pid, signal.SIGSTOP)
+        group.step_async(tokens.steps(["faulty-0", "faulty-1"]))
+        for _ in range(3):
+            with pytest.raises(TimeoutError, match="nothing is lost"):
+                group.collect_async(deadline=0.05, **waiting)
+        os.kill(pid, signal.SIGCONT)
+        ids: list[str] = []
+        while len(ids) < 2:
+            batch, _ = group.collect_async(**waiting)
+            tokens.check(batch)
+            ids += batch.ids()
+        assert sorted(ids) == ["faulty-0", "faulty-1"]
+        with pytest.raises(NothingPending):
+            group.collect_async()
+        for _ in range(3):
+            tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
 async def test_cancelled_step_leaves_its_results_to_collect() -> None:
@@ -266,3 +290,25 @@ async def test_cancelled_collect_loses_nothing() -> None:
         batch, _ = await group.collect_async(wait_all=True)
         assert sorted(batch.ids()) == group.env_ids
         tokens.check(batch)
+
+
+@on_one_driver
+def test_signals_that_the_trainer_blocks_reach_its_workers(build: Start) -> None:
+    """Whatever the thread that starts them keeps from itself: deaths are heard of at once, hangs
+    show their stacks, and SIGTERM ends a worker.
+    """
+    every = signal.valid_signals() - {signal.SIGINT, signal.SIGALRM}
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, every)
+    try:
+        alone = entry(3, envs_per_process=1, step_timeout=LIMIT, on_worker_death="raise")
+        group, tokens = build(alone), Tokens()
+        group.init()
+        group.reset()
+        for env_id, fault in (("faulty-0", "sigkill"), ("faulty-1", "sigterm")):
+            with pytest.raises(WorkerDied, match=f"was killed by {fault.upper()}"):
+                group.step(tokens.steps([env_id], {env_id: fault}))
+        with pytest.raises(EnvHung, match="faulty-2") as caught:
+            group.step(tokens.steps(["faulty-2"], {"faulty-2": "sleep"}))
+        assert STACKS["sleep"] in caught.value.stderr_tail
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -40,7 +40,7 @@ class Strike:
 
 
 # A step runs through some 500 lines; these are a sample, the last of which come after its end.
-@pytest.mark.parametrize("line", range(1, 800, 73))
+@pytest.mark.parametrize("line", range(1, 800, 113))
 def test_a_group_can_be_closed_wherever_its_step_was_interrupted(line: int) -> None:
     """And the interrupt reaches the program as what it is. (No worker is left: see conftest.)"""
     strike = Strike(line)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
-import subprocess
-import sys
 import threading
+from itertools import product
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -25,7 +24,6 @@ from rlightning_aio.errors import (
     RLightningError,
     UnknownEnv,
 )
-from rlightning_aio.group import actions
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -41,6 +39,7 @@ BAD_ACTIONS: dict[str, tuple[Any, str]] = {
     "dtype": (np.zeros((4, 2), complex), "dtype float64, found .* dtype complex128"),
     "text": (np.full((4, 2), "x"), "dtype float64, found .* dtype <U1"),
     "nothing": ([None] * 4, "found .* dtype object"),
+    "NaN": ([[0.0, 1.0], [0.0, 1.0], [0.0, np.nan], [0.0, 1.0]], "faulty-2.*holds nan"),
     "ragged": ([[1.0], [1.0, 2.0], [1.0], [1.0]], "action"),
 }
 
@@ -51,15 +50,13 @@ def responses(env_ids: list[str], chosen: Any) -> BatchedData:
     return BatchedData(env_ids, values)
 
 
-@pytest.mark.parametrize("bad", BAD_ACTIONS)
 @on_one_driver
-def test_bad_actions_are_refused_and_nothing_is_sent(start: Start, bad: str) -> None:
+def test_bad_actions_are_refused_and_nothing_is_sent(start: Start) -> None:
     """As columns and as values, waited for or not; the next request is answered rightly."""
     group, tokens = start(two_workers()), Tokens()
     env_ids = group.group.env_ids
     first, _ = group.step(tokens.steps(env_ids))
-    chosen, message = BAD_ACTIONS[bad]
-    for send in (group.step, group.step_async):
+    for send, (chosen, message) in product((group.step, group.step_async), BAD_ACTIONS.values()):
         with pytest.raises(BadAction, match=message):
             send(first.respond(action=chosen))
         with pytest.raises(BadAction, match="action"):
@@ -95,37 +92,19 @@ def test_responses_must_be_as_many_as_the_batch(start: Start) -> None:
     tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
-@pytest.mark.parametrize("form", ["columns", "values"])
 @on_one_driver
-def test_nan_is_found_when_debugging(
-    start: Start, monkeypatch: pytest.MonkeyPatch, form: str
-) -> None:
-    """The message names the env; without the switch nobody pays for looking."""
+def test_what_is_no_batch_of_responses_is_refused(start: Start) -> None:
+    """It is said what to give; and a handle takes no response to another env."""
     group, tokens = start(two_workers()), Tokens()
-    env_ids = group.group.env_ids
-    first, _ = group.step(tokens.steps(env_ids))
-    chosen = np.zeros((4, 2))
-    chosen[2, 1] = np.nan
-    batch = first.respond(action=chosen) if form == "columns" else responses(env_ids, chosen)
-    monkeypatch.setattr(actions, "DEBUG", True)
-    with pytest.raises(BadAction, match=r"faulty-2.*NaN"):
-        group.step(batch)
-    tokens.check(group.step(tokens.steps(env_ids))[0])
-    monkeypatch.setattr(actions, "DEBUG", False)
-    assert np.isnan(group.step(batch)[0].reward[2])
-
-
-@pytest.mark.parametrize(("value", "found"), [("1", "True"), ("0", "False"), (None, "False")])
-def test_debugging_is_switched_by_the_environment(value: str | None, found: str) -> None:
-    """``RLIGHTNING_AIO_DEBUG=1``, read when the package is imported."""
-    environment = {k: v for k, v in os.environ.items() if k != "RLIGHTNING_AIO_DEBUG"}
-    if value is not None:
-        environment["RLIGHTNING_AIO_DEBUG"] = value
-    script = "from rlightning_aio.group import actions; print(actions.DEBUG)"
-    result = subprocess.run(
-        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True
-    )
-    assert result.stdout.strip() == found
+    for ask in (group.step, group.step_async):
+        for odd in (np.zeros((4, 2)), None, [PolicyResponse("faulty-0", np.zeros(2))]):
+            with pytest.raises(BadAction, match=r"not a \w+: .*batch.respond\(action=...\)"):
+                ask(odd)
+    with pytest.raises(BadAction, match=r"response is for env 'faulty-1'.*handle of 'faulty-0'"):
+        group.group["faulty-0"].step(PolicyResponse("faulty-1", np.zeros(2)))
+    found, _ = group.step(tokens.steps(group.group.env_ids))
+    tokens.check(found)
+    assert found.observation[:, 3].tolist() == [1, 1, 1, 1]
 
 
 @on_one_driver

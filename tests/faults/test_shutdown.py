@@ -239,6 +239,46 @@ def test_group_that_nobody_closes_is_ended_with_its_owner(end: str) -> None:
         }.get(end, 0)
 
 
+STREAMS = {
+    "no stderr": ("2>&-", ""),
+    "none": ("0<&- 1>&- 2>&-", ""),
+    "none since it was built": ("", "os.closerange(0, 3)"),
+}
+
+
+@pytest.mark.parametrize("streams", STREAMS)
+def test_program_without_standard_streams_trains_like_any_other(
+    streams: str, tmp_path: Path
+) -> None:
+    """Nothing of ours lands where stderr would be, in whatever process."""
+    script, said = tmp_path / "script.py", tmp_path / "said"
+    redirected, closed = STREAMS[streams]
+    script.write_text(
+        SCRIPT
+        + textwrap.dedent(f"""
+        def say(text):
+            with open(sys.argv[1], "a") as said:
+                said.write(text + "\\n")
+        group = build()
+        {closed}
+        group.init()
+        group.reset()
+        for _ in range(3):
+            tokens.check(group.step(tokens.steps(group.env_ids, {{"faulty-0": "print"}}))[0])
+        batch, _ = group.step(tokens.steps(group.env_ids, {{"faulty-0": "segfault"}}))
+        say(batch["faulty-0"].info["worker_restarted"])
+        os.write(2, b"into nothing")
+        tokens.check(group.step(tokens.steps(group.env_ids))[0])
+        group.close()
+        say("closed")
+    """)
+    )
+    program = ["sh", "-c", f'exec "$@" {redirected}', "sh", sys.executable, str(script), str(said)]
+    path = os.pathsep.join(sys.path)
+    subprocess.run(program, env={**os.environ, "PYTHONPATH": path}, check=True, timeout=HANG)
+    assert said.read_text() == "was killed by SIGSEGV\nclosed\n"
+
+
 def test_forgotten_group_warns_and_leaves_nothing(build: Start) -> None:
     """The collector ends what nobody can close any more."""
     group = build(two_workers())
@@ -254,22 +294,84 @@ def test_forgotten_group_warns_and_leaves_nothing(build: Start) -> None:
         ended()
 
 
-@pytest.mark.parametrize("end", ["os._exit(0)", "sys.exit(0)", "del group; os._exit(0)"])
-def test_child_of_the_trainer_does_not_end_its_group(end: str) -> None:
+def test_child_of_the_trainer_does_not_end_its_group() -> None:
     """A forked child that drops its copy of the group leaves the parent's alone."""
-    script = f"""
+    script = """
         group = build(); group.init(); group.reset()
-        child = os.fork()
-        if child == 0:
-            {end}
-        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
-        for _ in range(3):
-            tokens.check(group.step(tokens.steps(group.env_ids))[0])
-        kill(group["faulty-0"].call("returns", os.getpid))
-        batch, _ = group.step(tokens.steps(group.env_ids))
-        say(batch["faulty-0"].info["worker_restarted"])
+        for end in ("os._exit(0)", "sys.exit(0)", "del group; os._exit(0)"):
+            child = os.fork()
+            if child == 0:
+                exec(end)
+            assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+            for _ in range(3):
+                tokens.check(group.step(tokens.steps(group.env_ids))[0])
+            kill(group["faulty-0"].call("returns", os.getpid))
+            batch, _ = group.step(tokens.steps(group.env_ids))
+            say(batch["faulty-0"].info["worker_restarted"])
         group.close()
         say("closed")
+    """
+    with trainer(script, stderr=None) as process:
+        assert process.stdout is not None
+        *restarts, _ = read_until(process.stdout, "closed")
+        assert ["SIGKILL" in restart for restart in restarts] == [True] * 3
+        assert process.wait(HANG) == 0
+
+
+USES_IN_A_CHILD = """
+async def use_in_child(group):
+    for use in (
+        lambda: group.init(),
+        lambda: group.reset(),
+        lambda: group.step(tokens.steps(group.env_ids)),
+        lambda: group.step_async(tokens.steps(group.env_ids)),
+        lambda: group.collect_async(),
+        lambda: group["faulty-0"].call("do", "nothing"),
+        lambda: group.close(),
+    ):
+        try:
+            given = use()
+            if inspect.iscoroutine(given):
+                await given
+        except RLightningError as error:
+            assert f"belongs to process {os.getppid()}, which has forked this one" in str(error)
+        else:
+            raise AssertionError("it was of use")
+"""
+
+
+@pytest.mark.parametrize("driver", ["sync", "asyncio"])
+def test_child_of_the_trainer_can_not_use_its_group(driver: str) -> None:
+    """Calls are refused with a reason; leaving a `with` block and ending do nothing to it."""
+    module, wait = ("rlightning_aio.sync", "") if driver == "sync" else ("rlightning_aio", "await")
+    context = "with" if driver == "sync" else "async with"
+    script = f"""
+        import asyncio, inspect
+        from rlightning_aio.errors import RLightningError
+        {textwrap.indent(USES_IN_A_CHILD, "        ").strip()}
+        async def main():
+            never_started = {module}.build_env_group(two_workers())
+            {context} {module}.build_env_group(two_workers()) as group:
+                {wait}(group.reset())
+                group.step_async(tokens.steps(group.env_ids))
+                child = os.fork()
+                if child == 0:
+                    await use_in_child(never_started)
+                    await use_in_child(group)
+                    return
+                assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+                batch, _ = {wait}(group.collect_async(wait_all=True))
+                tokens.check(batch)
+                for _ in range(3):
+                    batch, _ = {wait}(group.step(tokens.steps(group.env_ids)))
+                    tokens.check(batch)
+                kill({wait}(group["faulty-0"].call("returns", os.getpid)))
+                batch, _ = {wait}(group.step(tokens.steps(group.env_ids)))
+                say(batch["faulty-0"].info["worker_restarted"])
+            {wait}(never_started.init())
+            {wait}(never_started.close())
+            say("closed")
+        asyncio.run(main())
     """
     with trainer(script, stderr=None) as process:
         assert process.stdout is not None
@@ -277,7 +379,10 @@ def test_child_of_the_trainer_does_not_end_its_group(end: str) -> None:
         assert process.wait(HANG) == 0
 
 
-@pytest.mark.parametrize("moment", ["new", "up", "busy", "ready", "dead"])
+@pytest.mark.parametrize(
+    ("driver", "moment"),
+    [*(("sync", moment) for moment in ("new", "up", "busy", "ready", "dead")), ("uvloop", "busy")],
+)
 def test_close_works_at_any_moment_and_twice(build: Start, moment: str) -> None:
     """Results that nobody has collected are gone; nothing else is left of the group."""
     group, tokens = build(two_workers()), Tokens()
@@ -311,7 +416,7 @@ def test_env_that_hangs_in_close_is_killed(start: Start) -> None:
 def test_env_that_hangs_in_a_step_does_not_hold_up_close(start: Start) -> None:
     """Whatever its own timeout says."""
     group, tokens = start(two_workers(step_timeout=10 * HANG)), Tokens()
-    group.step_async(tokens.steps(["faulty-1"], {"faulty-1": "loop in C"}))
+    group.step_async(tokens.steps(["faulty-1"], {"faulty-1": "deadlock with the GIL"}))
     while not group.group._core.supervisor.hosts[0].executing()[0]:
         os.sched_yield()
     with pytest.warns(UserWarning, match="did not close in time and was killed"):
@@ -418,3 +523,21 @@ def test_replaced_workers_leave_no_zombies(start: Start) -> None:
     group.reset()
     tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
     assert held() == before
+
+
+@pytest.mark.parametrize("waiting", ["init", "step"])
+def test_close_from_a_signal_handler_ends_the_wait_that_it_interrupts(waiting: str) -> None:
+    """As it does from another task: the wait is told that the group is closed."""
+    places = {"building": "call the trainer"} if waiting == "init" else {}
+    group, tokens = Driven("sync", two_workers(env_kwargs={"faults": places, "only": 1})), Tokens()
+    before = signal.signal(signal.SIGUSR1, lambda *_: group.close())
+    try:
+        if waiting == "step":
+            group.init()
+            group.reset()
+        steps = tokens.steps(group.group.env_ids, {"faulty-1": "call the trainer"})
+        with pytest.raises(GroupClosed, match="closed while"):
+            _ = group.init() if waiting == "init" else group.step(steps)
+    finally:
+        signal.signal(signal.SIGUSR1, before)
+        group.end()

@@ -261,9 +261,18 @@ class FakeWorker(FakeHost):
         reports, frames: replies that nobody has read.
         rung: its descriptor would be readable now.
         killed: whether with a dump, for each time.
+        alive: it was started, and has not died since.
+        refusals: so many more starts fail.
     """
 
+    alive = False
+    refusals = 0
+
     def start(self) -> None:
+        if self.refusals:
+            self.refusals -= 1
+            raise OSError("no more processes")
+        self.alive = True
         self.reports: list[int] = []
         self.frames: list[Any] = []
         self.killed: list[bool] = []
@@ -308,9 +317,14 @@ class FakeWorker(FakeHost):
     def kill(self, *, dump: bool) -> None:
         self.killed.append(dump)
 
+    def destroy(self) -> None:
+        raise NotImplementedError("a kill is all it takes")
+
     def die(self, cause: str = "was killed by SIGKILL") -> None:
         """The worker ends; what it had replied is heard first."""
         self.on_readable()
+        self.alive = False
+        self.waiting.clear()
         self.tell(Died(self.host_id, Death(cause, -9)))
 
 
@@ -369,7 +383,16 @@ class FakeGroup:
         envs = EnvTable([self.config] * size, self.env_ids)
         requests = Requests(np.repeat(np.arange(len(rows)), rows), len(rows))
         layout = SlabLayout(size)
-        supervisor = Supervisor(envs, requests, layout, arena, mixed_actions=False, num_cores=0)
+        supervisor = Supervisor(
+            envs,
+            requests,
+            layout,
+            arena,
+            completions.append,
+            mixed_actions=False,
+            num_cores=0,
+            clock=lambda: self.now,
+        )
         poller = Poller(requests, bell, 0, clock=lambda: self.now)
         shared = Shared(completions, arena, bell, bell_memory, len(rows))
         self.hosts: list[Any] = []

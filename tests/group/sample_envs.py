@@ -165,8 +165,12 @@ class ProbedSimulator(gym.Wrapper[Any, Any, Any, Any]):
         inner = DrawnEnv(spaces.Discrete(2), spaces.Discrete(2))
         inner.label = "inner"  # type: ignore[attr-defined]
         inner.render = lambda: np.full((2, 2, 3), 7, np.uint8)  # type: ignore[method-assign]
-        super().__init__(inner)
+        inner.weigh = lambda factor: 3 * factor  # type: ignore[attr-defined]
+        super().__init__(gym.Wrapper(inner))
         self.label = "outer"
+
+    def stack(self) -> str:
+        return "wrapped"
 
 
 @ENVS.register("gated")

@@ -11,7 +11,7 @@ import pytest
 from rlightning_aio import BatchedData, EnvRaised, PolicyResponse, sync
 
 # What is reset is decided from results, however they came.
-pytestmark = pytest.mark.one_loop_for_each_place
+pytestmark = pytest.mark.one_driver_for_each_place
 
 DO_NOTHING, END, TRUNCATE, RAISE = range(4)
 ENTRY = {"name": "probe", "backend": "probe", "task": "x", "num_workers": 3}

@@ -134,6 +134,17 @@ def test_a_window_ends_while_others_are_pending(sync_group: Any, gates: list[Gat
         assert sync_group.collect_async(timeout=60)[0].ids() == ["gated-1"]
 
 
+def test_past_its_deadline_a_call_is_still_collected(sync_group: Any, gates: list[Gate]) -> None:
+    """Its value is the next call's, and the envs stay in step."""
+    sync_group.call_async("wait_at_gate")
+    with gates[0].held(), pytest.raises(TimeoutError, match="calls have not returned within"):
+        sync_group.collect_calls(deadline=0.02)
+    with pytest.raises(ValueError, match="deadline must be a positive"):
+        sync_group.collect_calls(deadline=0)
+    with opened(*gates[1:]):
+        assert sync_group.collect_calls() == [None] * len(gates)
+
+
 def test_past_its_deadline_a_collect_loses_nothing(sync_group: Any, gates: list[Gate]) -> None:
     """What was ready, and what gets ready later, comes with the next call."""
     sync_group.step_async(responses(0, 1))
@@ -169,7 +180,7 @@ def test_rules_that_make_no_sense_are_refused(rules: dict[str, Any], said: str) 
         assert len(group.collect_async()[0]) == 1
 
 
-# -- awaited
+# -- awaited (cancellation and a second collector: on either loop in tests/faults)
 
 
 async def test_whoever_is_ready_first_is_first(group: Any, gates: list[Gate]) -> None:
@@ -194,6 +205,7 @@ async def test_results_join_while_the_window_is_open(group: Any, gates: list[Gat
     assert sorted(batch.ids()) == IDS[:3]
 
 
+@pytest.mark.asyncio(loop_factories=["uvloop"])
 async def test_cancelling_a_collect_loses_no_result(group: Any, gates: list[Gate]) -> None:
     """Neither what was ready already, nor what was still to come."""
     group.step_async(responses(0, 1, 2))
@@ -210,6 +222,7 @@ async def test_cancelling_a_collect_loses_no_result(group: Any, gates: list[Gate
     assert sorted(batch.ids()) == IDS[:3]
 
 
+@pytest.mark.asyncio(loop_factories=["uvloop"])
 async def test_a_cancelled_step_is_collected(group: Any, gates: list[Gate]) -> None:
     """The envs have been asked; their results go to whoever collects."""
     stepping = asyncio.create_task(group.step(responses(0, 1)))
@@ -243,6 +256,7 @@ async def test_the_value_of_a_cancelled_call_goes_to_nobody(group: Any, gates: l
             await group["gated-2"].call("double", 1)
 
 
+@pytest.mark.asyncio(loop_factories=["uvloop"])
 async def test_one_collects_at_a_time(group: Any, gates: list[Gate]) -> None:
     """The second is sent away; the first gets its result."""
     group.step_async(responses(0))

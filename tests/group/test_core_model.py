@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from group.fake_host import PLAIN, RAISES, TELLS, TERMINATES, TRUNCATES, FakeEnv, FakeGroup
+from group.fake_host import (
+    PLAIN,
+    RAISES,
+    TELLS,
+    TERMINATES,
+    TRUNCATES,
+    FakeEnv,
+    FakeGroup,
+    FakeWorker,
+)
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import (
@@ -393,11 +402,18 @@ class CoreMachine(RuleBasedStateMachine):
         self.group.pass_time(seconds)
         self.settle()
 
-    @precondition(lambda self: any(not h.inline for h in self.group.hosts))
-    @rule(data=st.data())
-    def die(self, data: st.DataObject) -> None:
-        """A worker dies: each of its envs that owed a reply gives one marked result."""
-        host = data.draw(st.sampled_from([h for h in self.group.hosts if not h.inline]))
+    def alive(self) -> list[FakeWorker]:
+        return [h for h in self.group.hosts if isinstance(h, FakeWorker) and h.alive]
+
+    @precondition(alive)
+    @rule(data=st.data(), refusals=st.integers(0, 2))
+    def die(self, data: st.DataObject, refusals: int) -> None:
+        """A worker dies: each of its envs that owed a reply gives one marked result.
+
+        What is asked until a replacement is up, which may take attempts and time, it executes.
+        """
+        host = data.draw(st.sampled_from(self.alive()))
+        host.refusals = refusals
         for slot in range(host.first_slot, host.first_slot + host.num_envs):
             model = self.envs[slot]
             model.env = FakeEnv(slot, host.life + 1)

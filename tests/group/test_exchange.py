@@ -23,7 +23,7 @@ from rlightning_aio import (
 )
 
 # Values are made and read on this side of any loop.
-pytestmark = pytest.mark.one_loop_for_each_place
+pytestmark = pytest.mark.one_driver_for_each_place
 
 PROBE = {"name": "probe", "backend": "probe", "task": "x", "num_workers": 2}
 CARTPOLE = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1", "num_workers": 2}
@@ -151,6 +151,29 @@ async def test_extras_reach_the_function_and_the_step(start: Any) -> None:
     batch, _ = await group.collect_async()
     assert batch.reward.tolist() == [8.0]
     assert batch.info()[0]["extras"]["thought"].depth == 3
+
+
+async def test_actions_come_with_extras_whole_or_one_by_one(start: Any) -> None:
+    """A column that fits the rows, one that only fits in part, and an entry without readers."""
+    plain = {**CARTPOLE, "num_workers": 1}
+    group = await start(
+        [PROBE, plain],
+        preprocess_fn=[lambda r: [0, np.sum(r.action) * r.weight], None],
+        mixed_actions=True,
+    )
+    batch, _ = await group.reset()
+    probes = batch.by_name()["probe"]
+    weight = np.array([10.0, 20.0])
+    for action in (np.array([[0, 2.0], [0, 3.0]]), [[0, 2.0], 3.0], [[0, np.nan], [1, 2.0]]):
+        batch, _ = await group.step(probes.respond(action=action, weight=weight))
+        expected = [10 * np.sum(action[0]), 20 * np.sum(action[1])]
+        assert np.array_equal(batch.reward, expected, equal_nan=True)
+    values = [
+        PolicyResponse("pole-0", 1, weight=1.0),
+        PolicyResponse("probe-1", [0, 4.0], weight=2.0),
+    ]
+    batch, _ = await group.step(BatchedData(["pole-0", "probe-1"], values))
+    assert batch.reward.tolist() == [1.0, 8.0]
 
 
 async def test_extras_that_nothing_can_read_are_not_sent(start: Any) -> None:

@@ -6,10 +6,12 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from group import sample_envs
 from group.sample_envs import HALVED
+from gymnasium import spaces
 
 import rlightning_aio.sync
 from rlightning_aio.batch.data import parts_of
@@ -89,19 +91,36 @@ def test_what_the_trainer_does_between_the_halves_is_not_the_envs_time() -> None
         assert part.busy_ns.tolist() == [12]
 
 
-@pytest.mark.parametrize("task", sample_envs.Fresh.SPACES)
-@pytest.mark.parametrize("num_workers", [1, 2])
-def test_fresh_observations_are_those_of_a_worker(task: str, num_workers: int) -> None:
+@pytest.mark.filterwarnings("ignore:.*Casting input x to numpy array:UserWarning")
+def test_fresh_observations_are_those_of_a_worker() -> None:
     """Arrays or not, one or several; what they look like doesn't depend on where the env lives."""
-    found: list[Any] = []
-    for placement in ("inline", "process"):
-        entry = fresh(task, num_workers=num_workers, placement=placement)
-        with rlightning_aio.sync.build_env_group(entry) as group:
-            batch, _ = group.reset()
-            batches = [batch, step(group, batch), step(group, batch)]
-            found.append([(b.observation, [v.observation for v in b.values()]) for b in batches])
-    assert same(*found)
-    assert repr(found[0]) == repr(found[1])
+    entries = {
+        f"{task} of {count}": fresh(task, name=f"{task} of {count}", num_workers=count)
+        for task in sample_envs.Fresh.SPACES
+        for count in (1, 2)
+    }
+
+    def seen(group: Any) -> list[dict[str, Any]]:
+        batch, _ = group.reset()
+        batches = [batch, step(group, batch), step(group, batch)]
+        return [
+            {
+                name: (part.observation, [value.observation for value in part.values()])
+                for name, part in batch.by_name().items()
+            }
+            for batch in batches
+        ]
+
+    with rlightning_aio.sync.build_env_group(
+        [{**entry, "placement": "process"} for entry in entries.values()]
+    ) as group:
+        in_workers = seen(group)
+    for name, entry in entries.items():
+        with rlightning_aio.sync.build_env_group(entry) as group:  # Alone: none is copied.
+            handed_over = seen(group)
+        expected = [{name: found[name]} for found in in_workers]
+        assert same(handed_over, expected)
+        assert repr(handed_over) == repr(expected)
 
 
 def test_fresh_observations_are_handed_over_uncopied() -> None:
@@ -150,3 +169,41 @@ def test_a_step_of_ones_own_promises_nothing() -> None:
         batch, _ = group.reset()
         batches = [batch := step(group, batch) for _ in range(3)]
     assert [b.observation[0, 0] for b in batches] == [0.25, 0.5, 0.75]
+
+
+class Telling(gym.Env[Any, Any]):
+    """Its observations are what was done to it, in a space too small for all of them."""
+
+    observation_space = spaces.Dict(told=spaces.Box(-128, 127, (2,), np.int8))
+    action_space = spaces.Discrete(1000)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        return {"told": np.array([0, -128])}, {"none": np.zeros((0, 3), np.float32)}
+
+    def step(self, action: Any) -> Any:
+        info = {"none": np.zeros((0, 3), np.float32)}
+        return {"told": np.array([action, 127])}, 1.0, False, False, info
+
+
+def test_numbers_that_an_observation_space_can_not_hold_are_an_error() -> None:
+    """Named, and not another number; what it can hold may come in a wider dtype."""
+    with rlightning_aio.sync.build_env_group(
+        {"name": "t", "make_env": Telling, "placement": "inline"}
+    ) as group:
+        batch, _ = group.reset()
+        assert batch.observation["told"].tolist() == [[0, -128]]
+        with pytest.raises(EnvRaised, match=r"'t-0'.*observation\['told'\] .*holds 300.*int8"):
+            group.step(batch.respond(action=np.array([300])))
+        batch, _ = group.step(batch.respond(action=np.array([0])))
+        assert batch.observation["told"].tolist() == [[0, 127]]
+
+
+def test_an_info_of_empty_arrays_alone_comes_as_it_is() -> None:
+    """It takes no byte of a row."""
+    with rlightning_aio.sync.build_env_group(
+        {"name": "t", "make_env": Telling, "placement": "inline"}
+    ) as group:
+        batch, _ = group.reset()
+        (info,) = batch.info()
+        assert [*info] == ["none"]
+        assert (info["none"].shape, info["none"].dtype) == ((0, 3), np.float32)

@@ -56,8 +56,9 @@ def test_interrupting_a_synchronous_init_raises_the_interrupt() -> None:
 
         launch = process.ForkServer._launch
         def announced(server):
-            launch(server)
+            messages = launch(server)
             print("started", flush=True)
+            return messages
         process.ForkServer._launch = announced
 
         group = rlightning_aio.sync.build_env_group({ENTRY!r})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import subprocess
 import sys
 import threading
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import uvloop
+from group import sample_envs
 
 import rlightning_aio
 from rlightning_aio import BatchedData, GroupClosed, PolicyResponse, StartFailed, sync
@@ -62,7 +64,7 @@ async def test_a_context_initialises_and_closes(place: Any) -> None:
         await group.reset()
 
 
-@pytest.mark.one_loop_for_each_place
+@pytest.mark.one_driver_for_each_place
 async def test_an_env_that_cannot_be_built_fails_the_start(place: Any) -> None:
     """With what it raised; all others are closed, and the group with them."""
     group = place.build([PROBE, {**PROBE, "name": "bad", "env_kwargs": {"fails": 1}}])
@@ -77,7 +79,7 @@ async def test_an_env_that_cannot_be_built_fails_the_start(place: Any) -> None:
     await group.close()
 
 
-@pytest.mark.one_loop_for_each_place
+@pytest.mark.one_driver_for_each_place
 @pytest.mark.parametrize("moment", ["before init", "after close"])
 async def test_outside_of_its_life_a_group_says_so(place: Any, moment: str) -> None:
     """To whatever is asked, with what to do; it can be closed any number of times."""
@@ -110,6 +112,17 @@ async def test_outside_of_its_life_a_group_says_so(place: Any, moment: str) -> N
     await group.close()
     with pytest.raises(GroupClosed, match="build a new one"):
         await group.init()
+
+
+def test_a_group_that_can_not_be_built_holds_nothing() -> None:
+    """What was made before its second entry turned out to be wrong is given back."""
+    held = len(list(Path("/proc/self/fd").iterdir()))
+    wrong = {**PROBE, "name": "other", "env_kwargs": {"lock": threading.Lock()}}
+    for build in (sync.build_env_group, rlightning_aio.build_env_group):
+        with pytest.raises(TypeError, match="lock"):
+            build([PROBE, wrong])
+    gc.collect()
+    assert len(list(Path("/proc/self/fd").iterdir())) == held
 
 
 def test_a_group_that_is_dropped_open_is_ended_with_a_warning() -> None:
@@ -247,7 +260,7 @@ def test_a_script_may_define_its_own_envs(tmp_path: Path) -> None:
     assert done.stderr == ""
 
 
-@pytest.mark.one_loop_for_each_place
+@pytest.mark.one_driver_for_each_place
 async def test_a_module_that_only_workers_import_may_define_them(
     place: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -301,3 +314,15 @@ def test_a_class_registered_here_reaches_workers_by_value() -> None:
     with sync.build_env_group({"name": "l", "backend": "local", "task": "x"}) as group:
         group.reset()
         assert group["l-0"].step(42).observation == 42
+
+
+def test_workers_collect_garbage() -> None:
+    """As any process does; the fork server leaves it off only while it imports."""
+
+    class Asked(sample_envs.Probe):
+        def collects_garbage(self) -> bool:
+            return gc.isenabled()
+
+    rlightning_aio.ENVS.register("asked")(Asked)
+    with sync.build_env_group({"name": "a", "backend": "asked", "task": "x"}) as group:
+        assert group["a-0"].call("collects_garbage")

@@ -443,7 +443,7 @@ class RequestsMachine(RuleBasedStateMachine):
         assert self.table.end(host, asked.entry) == slot
         self.table.set_value(slot, slot)
         if asked.owner is not None:
-            assert asked.owner.ticket.value == slot
+            assert asked.owner.ticket.values[slot] == slot
         self.finish(slot)
 
     def finish(self, slot: int) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 import time
 from typing import Any
 
@@ -20,7 +22,7 @@ from rlightning_aio import (
 )
 
 # For what is decided before anything is waited for, or made of a result that has come.
-one_loop = pytest.mark.one_loop_for_each_place
+one_driver = pytest.mark.one_driver_for_each_place
 
 DO_NOTHING, END, TRUNCATE, RAISE = range(4)
 ENTRY = {"name": "probe", "backend": "probe", "task": "x", "num_workers": 4}
@@ -38,7 +40,7 @@ def responses(ids: list[str], *rewards: float, what: int = DO_NOTHING) -> Batche
     )
 
 
-@one_loop
+@one_driver
 async def test_init_describes_every_env_in_order(start: Any) -> None:
     """Ids, spaces and counts, before anything is reset; asked again, it tells the same."""
     group = await start([ENTRY, {**ENTRY, "name": "more", "num_workers": 1}])
@@ -52,7 +54,7 @@ async def test_init_describes_every_env_in_order(start: Any) -> None:
     }
 
 
-@one_loop
+@one_driver
 async def test_a_reset_answers_for_the_envs_it_was_asked_for(start: Any) -> None:
     """All in order, or some in the order given; rewards are 0, flags and ends False."""
     group = await start(ENTRY)
@@ -68,7 +70,7 @@ async def test_a_reset_answers_for_the_envs_it_was_asked_for(start: Any) -> None
     assert batch.observation.tolist() == [[3, 2, 0, -1], [1, 2, 0, -1]]
 
 
-@one_loop
+@one_driver
 async def test_seeds_are_counted_named_or_listed(start: Any) -> None:
     """An int counts through the whole group, whichever of its envs are reset."""
     group = await start(ENTRY)
@@ -92,7 +94,7 @@ async def test_seeds_are_counted_named_or_listed(start: Any) -> None:
     assert await seeds() == [-1] * 4
 
 
-@one_loop
+@one_driver
 async def test_options_reach_every_env_of_a_reset(start: Any) -> None:
     """Together with its seed."""
     group = await start(ENTRY)
@@ -120,7 +122,7 @@ async def test_a_step_returns_the_same_ids_in_the_same_order(start: Any) -> None
     assert (await group.step(by_hand))[0].reward.tolist() == [9]
 
 
-@one_loop
+@one_driver
 async def test_flags_extras_and_times_of_a_result(start: Any) -> None:
     """Each part of an `EnvRet` arrives as the env gave it."""
     group = await start(ENTRY)
@@ -152,7 +154,7 @@ async def test_each_result_is_collected_once(start: Any) -> None:
         await group.collect_async()
 
 
-@one_loop
+@one_driver
 async def test_a_bad_batch_is_refused_as_a_whole(start: Any) -> None:
     """Nothing is sent: each env can be stepped afterwards, and has not moved."""
     group = await start(ENTRY)
@@ -179,6 +181,7 @@ async def test_a_bad_batch_is_refused_as_a_whole(start: Any) -> None:
     assert batch.observation[:, 2].tolist() == [1] * 4
 
 
+@one_driver
 async def test_an_env_that_owes_a_reply_is_busy(start: Any) -> None:
     """Until it was collected; the other envs of the refused batch are untouched."""
     group = await start(ENTRY)
@@ -202,6 +205,7 @@ async def test_an_env_that_owes_a_reply_is_busy(start: Any) -> None:
     assert batch.observation[:, 2].tolist() == [2, 2, 2, 1]
 
 
+@one_driver
 async def test_what_an_env_raises_arrives_with_its_traceback(start: Any) -> None:
     """Named, with what the others returned; the exception's own type is not rebuilt."""
     group = await start(ENTRY)
@@ -218,6 +222,9 @@ async def test_what_an_env_raises_arrives_with_its_traceback(start: Any) -> None
     assert error.results is not None
     assert error.results.ids() == ["probe-0", "probe-2", "probe-3"]
     assert error.results.reward.tolist() == [1, 3, 4]
+    pickled = pickle.loads(pickle.dumps(error))
+    assert (str(pickled), str(pickled.__cause__)) == (str(error), str(error.__cause__))
+    assert pickled.results.reward.tolist() == [1, 3, 4]
     batch, _ = await group.step(batch.respond(action=actions(1, 2, 3, 4)))
     assert batch.observation[:, 2].tolist() == [2, 1, 2, 2]
 
@@ -242,6 +249,7 @@ async def test_an_error_answers_one_request_of_a_collect(start: Any) -> None:
         await group.collect_async()
 
 
+@one_driver
 async def test_a_handle_is_one_env(start: Any) -> None:
     """It resets, steps and calls methods, with bare actions and seeds of its own."""
     group = await start(ENTRY)
@@ -256,13 +264,52 @@ async def test_a_handle_is_one_env(start: Any) -> None:
     assert (ret.last_reward, ret.info) == (4.5, {"extras": {"tag": 1}})
     assert await env.call("double", 4) == 8
     assert await env.call("double", "ab", times=3) == "ababab"
-    with pytest.raises(EnvRaised, match="no_such_method"):
+    assert await env.call("stack") == "wrapped"
+    assert await env.call("weigh", 2) == 6, "of the simulator, within two wrappers"
+    with pytest.raises(EnvRaised, match=r"nor its simulator.*has no_such_method\(\)"):
         await env.call("no_such_method")
     with pytest.raises(UnknownEnv, match="'probe-9'"):
         group["probe-9"]
 
 
-@one_loop
+@one_driver
+async def test_resets_can_be_sent_and_collected_like_steps(start: Any) -> None:
+    """Beside steps of other envs; what can't be sent is refused as a whole."""
+    group = await start(ENTRY)
+    batch, _ = await group.reset(seed=5)
+    group.reset_async(seed={"probe-2": 9}, env_ids=["probe-2", "probe-0"])
+    group.step_async(responses(["probe-1"], 3))
+    with pytest.raises(EnvBusy, match=r"can't reset env 'probe-0'.*nothing was sent"):
+        group.reset_async()
+    batch, _ = await group.collect_async(wait_all=True, ordered=True)
+    assert batch.ids() == ["probe-0", "probe-1", "probe-2"]
+    assert batch.is_reset.tolist() == [True, False, True]
+    assert batch.observation[:, 3].tolist() == [-1, 6, 9]
+    group.reset_async(options={"pose": 1})
+    batch, _ = await group.collect_async(wait_all=True)
+    assert batch.info() == [{"options": {"pose": 1}}] * 4
+
+
+@one_driver
+async def test_calls_of_methods_run_at_once_and_are_collected_together(start: Any) -> None:
+    """Their values come in the order in which they were sent; an error leaves none behind."""
+    group = await start(ENTRY)
+    with pytest.raises(NothingPending, match="no call is outstanding"):
+        await group.collect_calls()
+    group.call_async("double", 1, env_ids=["probe-3", "probe-1"])
+    group.call_async("double", "ab", times=3, env_ids=["probe-0"])
+    with pytest.raises(EnvBusy, match="probe-0"):
+        group.call_async("double", 1)
+    assert await group.collect_calls() == [2, 2, "ababab"]
+    group.call_async("double", "ab", times="ab")
+    with pytest.raises(EnvRaised, match="TypeError") as caught:
+        await group.collect_calls()
+    assert sorted(error.env_id for error in (caught.value, *caught.value.others)) == IDS
+    group.call_async("double", 4)
+    assert await group.collect_calls() == [8] * 4
+
+
+@one_driver
 async def test_attributes_of_the_simulator_or_its_wrapper(start: Any) -> None:
     """The target is told, and a value that was set is there when the call returns."""
     group = await start(ENTRY)
@@ -280,7 +327,7 @@ async def test_attributes_of_the_simulator_or_its_wrapper(start: Any) -> None:
         await env.get_attr("no_such")
 
 
-@one_loop
+@one_driver
 async def test_frames_memory_and_what_has_none(start: Any) -> None:
     """`render` returns a frame; offload and reload reach every env, or name the one that can't."""
     others = {**ENTRY, "name": "b", "backend": "batched"}
@@ -299,7 +346,7 @@ async def test_frames_memory_and_what_has_none(start: Any) -> None:
     assert await group["probe-0"].call("__getattribute__", "offloaded") is True
 
 
-@one_loop
+@one_driver
 async def test_results_are_never_overwritten(start: Any) -> None:
     """Neither arrays, nor infos, nor what envs return in place of new objects."""
     group = await start(
@@ -320,7 +367,7 @@ async def test_results_are_never_overwritten(start: Any) -> None:
     assert all((value.observation["items"][0] == 0).all() for value in values)
 
 
-@one_loop
+@one_driver
 async def test_a_sent_action_may_be_changed(start: Any) -> None:
     """What was sent is what is stepped with, also where an env runs only later."""
     group = await start([ENTRY, {**ENTRY, "name": "chunked", "backend": "chunked"}])
@@ -336,7 +383,7 @@ async def test_a_sent_action_may_be_changed(start: Any) -> None:
     assert found["chunked"].reward.tolist() == [5] * 4
 
 
-@one_loop
+@one_driver
 async def test_zero_copy_lends_read_only_views(start: Any) -> None:
     """They live until the env's next request; without it, an observation is the caller's own."""
     group = await start(ENTRY, zero_copy=True)
@@ -344,14 +391,20 @@ async def test_zero_copy_lends_read_only_views(start: Any) -> None:
     lent = batch.observation
     with pytest.raises(ValueError, match="read-only"):
         lent[0, 0] = 1.0
+    copies = [copy.deepcopy(batch), pickle.loads(pickle.dumps(batch))]
     await group.step(batch.respond(action=actions(1, 2, 3, 4)))
     assert lent[:, 2].tolist() == [1] * 4, "it is a view of the rows"
+    for owned in copies:
+        assert owned.observation[:, 2].tolist() == [0] * 4
+        owned.observation[0, 0] = 7.0
+        answered, _ = await group.step(owned.respond(action=actions(1, 2, 3, 4)))
+        assert answered.ids() == batch.ids()
     owned, _ = await group.step(responses(["probe-3", "probe-0"], 1, 2))
     assert owned.observation[:, 0].tolist() == [3, 0]
     assert len((await group.step(BatchedData()))[0]) == 0
 
 
-@one_loop
+@one_driver
 async def test_what_a_group_has_measured(start: Any, capsys: pytest.CaptureFixture[str]) -> None:
     """Throughput by entry and kind, batch sizes, latencies, and episodes by env."""
     group = await start([ENTRY, {**ENTRY, "name": "more", "num_workers": 1}])
@@ -385,7 +438,7 @@ async def test_what_a_group_has_measured(start: Any, capsys: pytest.CaptureFixtu
     assert "probe" in printed
 
 
-@one_loop
+@one_driver
 async def test_what_comes_after_an_end_that_nobody_reset_belongs_to_no_episode(start: Any) -> None:
     """Whoever steps on gets results, and a single episode is counted."""
     entry = {

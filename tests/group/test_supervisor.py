@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from group.fake_host import ACTION_SPACE, LAYOUT, OBSERVATION_SPACE, Running
 
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.errors import ConfigError, EnvHung, GroupClosed, StartFailed, WorkerDied
+from rlightning_aio.group import supervisor
 from rlightning_aio.group.env_table import EnvTable
 from rlightning_aio.group.requests import COLLECTOR, Requests
 from rlightning_aio.group.slab_layout import SlabLayout
@@ -28,6 +29,7 @@ from rlightning_aio.hosts.messages import (
     NotBuilt,
 )
 from rlightning_aio.protocol.entries import Operation
+from rlightning_aio.protocol.slab import RowLayout
 from rlightning_aio.types import EnvMeta
 
 if TYPE_CHECKING:
@@ -47,6 +49,7 @@ class StandIn:
         builds, closes: it does so at once; otherwise not before it is killed.
         dies: a kill works.
         refusal: what a start raises.
+        asked: entries that it was given.
         close_errors: of its envs.
         current: the entry that it executes, and since when (ns).
     """
@@ -63,15 +66,19 @@ class StandIn:
     close_errors: list[tuple[int, ErrorText]] = field(default_factory=list)
     current: tuple[int, int] = (0, 0)
     closing: bool = False
+    built: bool = False
+    asked: list[int] = field(default_factory=list[int])
 
     def start(self) -> None:
         if self.refusal is not None:
             raise self.refusal
         self.log.append(f"start {self.host_id}")
+        self.built = False
         if self.builds:
             self.build()
 
     def build(self) -> None:
+        self.built = True
         metas = [
             EnvMeta(
                 env_id=f"{self.host_id}.{k}",
@@ -88,7 +95,12 @@ class StandIn:
     def attach(self, order: Any) -> None:
         self.log.append(f"attach {self.host_id}")
         assert len(order.rows) == self.num_envs
-        self.tell(Attached(self.host_id))
+        if self.built:
+            self.tell(Attached(self.host_id))
+
+    def submit(self, entries: np.ndarray, arguments: Any = None) -> None:
+        assert len(arguments or entries) == len(entries)
+        self.asked += entries.tolist()
 
     def executing(self) -> tuple[int, int]:
         return self.current
@@ -97,6 +109,9 @@ class StandIn:
         self.log.append(f"dump and kill {self.host_id}" if dump else f"kill {self.host_id}")
         if self.dies:
             self.end()
+
+    def destroy(self) -> None:
+        self.log.append(f"destroy {self.host_id}")
 
     def end(self) -> None:
         self.current = (0, 0)
@@ -136,7 +151,14 @@ class Fleet:
         envs = EnvTable([config] * size, [f"e-{slot}" for slot in range(size)])
         self.requests = Requests(np.repeat(np.arange(len(counts)), counts), len(counts))
         self.supervisor = Supervisor(
-            envs, self.requests, SlabLayout(size), Arena(), mixed_actions=False, num_cores=1
+            envs,
+            self.requests,
+            SlabLayout(size),
+            Arena(),
+            self.told.append,
+            mixed_actions=False,
+            num_cores=1,
+            clock=lambda: self.now,
         )
         self.hosts: list[StandIn] = []
         for host_id, count in enumerate(counts):
@@ -174,8 +196,7 @@ class Fleet:
             verdict = self.supervisor.bury(told)
             self.verdicts.append(verdict)
             if isinstance(verdict, Replaced):
-                self.requests.restart(verdict.owed)
-                assert len(list(self.requests.by_host(verdict.owed))) <= 1
+                self._hand_over(verdict.owed, self.requests.restart(verdict.owed))
             elif verdict is not None:
                 self.requests.fail(verdict.owed, COLLECTOR, verdict.error_for(verdict.owed))
 
@@ -190,12 +211,24 @@ class Fleet:
         """Send steps; their entries."""
         asked = np.array(slots)
         entries = self.requests.submit(asked, Operation.STEP, COLLECTOR, self.now)
-        assert list(self.requests.by_host(asked))
+        self._hand_over(asked, entries)
         return entries.tolist()
+
+    def _hand_over(self, slots: np.ndarray, entries: np.ndarray) -> None:
+        for host_id, part in self.requests.by_host(slots):
+            self.supervisor.submit(host_id, entries[part], None)
 
     def check(self) -> None:
         self.supervisor.check(self.now)
         self.drain()
+
+    def wait(self) -> float:
+        """Let the time pass until the supervisor has something to do; how long that takes."""
+        due = self.supervisor.next_check()
+        assert due is not None
+        passed, self.now = due - self.now, due
+        self.check()
+        return passed
 
     def die(self, host_id: int, *requests: int) -> GivenUp | Replaced | None:
         """A worker dies while it executes `requests`; what becomes of that."""
@@ -315,7 +348,7 @@ def test_a_death_in_the_start_fails_it(fleet: Callable[..., Fleet]) -> None:
     start = ours.start()
     assert ours.die(0) is None
     ours.turn()
-    with pytest.raises(StartFailed, match=r"(?s)'e-0'.* SIGKILL while it started.*last words"):
+    with pytest.raises(StartFailed, match=r"(?s)'e-0'.* started: .* SIGKILL.*last words"):
         start.result()
 
 
@@ -333,6 +366,36 @@ def test_closing_ends_a_start(fleet: Callable[..., Fleet]) -> None:
 
 
 # -- hangs
+
+
+def test_what_a_kill_does_not_end_is_ended_with_what_it_stands_on(
+    fleet: Callable[..., Fleet],
+) -> None:
+    """A few seconds after it was first seen to live on, and again if that has no effect, either."""
+    ours = fleet((1,), step_timeout=5.0)
+    (entry,) = ours.ask(0)
+    ours.hosts[0].current = (entry, int(ours.now * 1e9))
+    ours.hosts[0].dies = False
+    ours.now += 60  # However late the trainer comes.
+    ours.check()
+    for destroyed in range(1, 3):
+        ours.check()
+        due = ours.supervisor.next_check()
+        assert due == pytest.approx(ours.now + supervisor._OBEY_SECONDS)
+        ours.now = due - 0.1
+        ours.check()
+        assert len(ours.log) == destroyed
+        ours.now = due
+        ours.check()
+        assert ours.log == ["dump and kill 0"] + destroyed * ["destroy 0"]
+        ours.check()
+    verdict = ours.die(0)
+    assert isinstance(verdict, Replaced)
+    assert verdict.cause == "hung in a step and was killed"
+    assert ours.supervisor.next_check() is None or ours.supervisor.next_check() > ours.now
+    ours.now += 60
+    ours.check()
+    assert ours.log.count("destroy 0") == 2
 
 
 def test_an_env_that_executes_too_long_is_killed(fleet: Callable[..., Fleet]) -> None:
@@ -447,6 +510,8 @@ def test_restarts_are_counted_for_each_culprit(fleet: Callable[..., Fleet]) -> N
     for slot in (0, 1, 0, 1):
         (entry,) = ours.ask(slot)
         assert isinstance(ours.die(0, entry), Replaced)
+        if ours.supervisor.next_check() is not None:
+            ours.wait()
         # Its replacement's reset: that shows nothing yet.
         assert ours.requests.complete_one(0, ours.requests.entry.item(slot)) == slot
         ours.requests.hand_out(ours.requests.take(1))
@@ -459,32 +524,113 @@ def test_restarts_are_counted_for_each_culprit(fleet: Callable[..., Fleet]) -> N
     assert isinstance(ours.die(0, entry), GivenUp)
 
 
-def test_a_replacement_that_cannot_be_started_counts_as_a_death(
+def test_restarts_that_fail_are_put_off_for_longer_each_time(fleet: Callable[..., Fleet]) -> None:
+    """Each counts; the last says why it failed. Others go on, and no attempt comes too soon."""
+    ours = fleet(max_restarts=9)
+    ours.hosts[0].refusal = OSError("too many open files")
+    ours.ask(0, 1)
+    verdict = ours.die(0)
+    assert verdict is None, "a replacement that was never up owes nothing"
+    assert isinstance(ours.verdicts[0], Replaced)
+    pauses = []
+    while not isinstance(verdict, GivenUp):
+        ours.reply(1)
+        ours.ask(1)
+        ours.now += 1e-3
+        ours.check()
+        pauses.append(round(ours.wait() + 1e-3, 6))
+        verdict = ours.verdicts[-1]
+    assert pauses == [0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0]
+    assert verdict.owed.tolist() == [0]
+    error = str(verdict.error_for(verdict.owed))
+    assert "could not be replaced: can't start a worker for entry 'e': too many open" in error
+    assert "after 9 restarts in a row" in error
+    assert ours.requests.in_flight == [0, 1]
+    ours.supervisor.note_recovery(any_telling=False)
+    assert ours.supervisor.next_check() is None
+
+
+def test_thousands_of_restarts_are_attempts_like_the_first(fleet: Callable[..., Fleet]) -> None:
+    """They are as many as were allowed, one after the other."""
+    ours = fleet(max_restarts=5000)
+    ours.hosts[0].refusal = OSError("no such program")
+    ours.ask(0)
+    ours.die(0)
+    attempts = 1
+    while not isinstance(ours.verdicts[-1], GivenUp):
+        ours.wait()
+        attempts += 1
+    assert attempts == 5000
+    assert "after 5000 restarts in a row" in str(ours.requests.faults[0])
+
+
+def test_what_is_asked_of_a_host_that_is_down_waits_for_its_replacement(
     fleet: Callable[..., Fleet],
 ) -> None:
-    """Until it is given up; there is no end to it otherwise."""
-    ours = fleet(max_restarts=3)
+    """No attempt that fails touches it; what the dead worker owed is asked anew, once."""
+    ours = fleet((2, 1), max_restarts=9, step_timeout=1.0)
+    (entry,) = ours.ask(0)
     ours.hosts[0].refusal = OSError("no more processes")
+    ours.die(0, entry)
+    (later,) = ours.ask(1)
+    asked = [ours.requests.entry.item(0), later]
+    ours.wait()
+    ours.hosts[0].refusal, ours.hosts[0].builds = None, False
+    ours.wait()
+    assert ours.log == ["start 0", "attach 0"]
+    ours.now += 5
+    ours.check()
+    ours.die(0)
+    ours.hosts[0].builds = True
+    ours.wait()
+    assert ours.hosts[0].asked == [entry, *asked]
+    assert ours.requests.in_flight == [2, 0]
+    assert [type(verdict) for verdict in ours.verdicts] == [Replaced] + 3 * [type(None)]
+    # Its time begins when it is up: until then it had nothing to execute.
+    ours.check()
+    assert ours.log[-2:] == ["start 0", "attach 0"]
+    assert ours.supervisor.next_check() == ours.now + 1
+
+
+def test_the_time_of_a_start_counts_from_the_death(fleet: Callable[..., Fleet]) -> None:
+    """Not from when anybody looked last, which may be long ago."""
+    ours = fleet()
+    ours.now += 1000
+    ours.hosts[0].attach = lambda _: None  # type: ignore[method-assign]
     ours.ask(0)
-    verdict = ours.die(0)
-    assert isinstance(verdict, GivenUp)
-    error = str(verdict.error_for(verdict.owed))
-    assert "could not be replaced" in error
-    assert "no more processes" in error
-    assert "after 3 restarts" in error
+    ours.die(0)
+    ours.check()
+    assert ours.log == ["start 0"]
+    assert ours.supervisor.next_check() == ours.now + 10
 
 
 def test_a_replacement_that_cannot_be_built_is_killed(fleet: Callable[..., Fleet]) -> None:
-    """Its death says what was wrong; so does that of one that is late."""
-    ours = fleet(max_restarts=2)
+    """Its death says what was wrong, and it is no more up than one that could not be started."""
+    ours = fleet(max_restarts=1)
     ours.hosts[0].builds = False
-    ours.ask(0)
+    (entry,) = ours.ask(0)
     ours.die(0)
     ours.told.append(NotBuilt(0, 0, ErrorText("ValueError", "no licence", "")))
     ours.drain()
-    assert ours.log == ["start 0", "attach 0", "kill 0", "start 0", "attach 0"]
-    assert isinstance(ours.verdicts[1], Replaced)
-    assert ours.verdicts[1].cause == "could not be rebuilt: ValueError: no licence"
+    assert ours.log == ["start 0", "attach 0", "kill 0"]
+    assert ours.hosts[0].asked == [entry]
+    assert "could not be rebuilt: ValueError: no licence" in str(ours.requests.faults[0])
+
+
+def test_a_replacement_with_other_spaces_is_asked_nothing(fleet: Callable[..., Fleet]) -> None:
+    """Its rows would not fit, though it had taken them before it was told to die."""
+    ours = fleet(max_restarts=1)
+    ours.hosts[0].dies = False
+    (entry,) = ours.ask(0)
+    started = ours.supervisor._records[0].started
+    other = RowLayout(ACTION_SPACE, ACTION_SPACE, (), ())
+    started[0] = replace(started[0], layout=other)
+    ours.die(0)
+    assert ours.log == ["start 0", "attach 0", "kill 0"]
+    assert ours.hosts[0].asked == [entry]
+    ours.hosts[0].end()
+    ours.drain()
+    assert "its spaces changed with the restart" in str(ours.requests.faults[0])
 
 
 def test_a_replacement_that_is_late_is_killed(fleet: Callable[..., Fleet]) -> None:
@@ -492,8 +638,6 @@ def test_a_replacement_that_is_late_is_killed(fleet: Callable[..., Fleet]) -> No
     ours = fleet(max_restarts=1)
     ours.hosts[0].attach = lambda _: None  # type: ignore[method-assign]
     ours.ask(0)
-    ours.now += 50
-    ours.check()
     ours.die(0)
     assert ours.supervisor.next_check() == ours.now + 10
     ours.now += 10
@@ -551,3 +695,17 @@ def test_a_death_while_closing_is_an_end_like_any_other(fleet: Callable[..., Fle
     assert ours.log == ["close 0", "release 0", "release 1"]
     with pytest.raises(GroupClosed, match="while this call was waiting"):
         ours.check()
+
+
+def test_closing_waits_for_no_restart(fleet: Callable[..., Fleet]) -> None:
+    """A host that is down has nothing to close, and is not started any more."""
+    ours = fleet(max_restarts=9)
+    ours.hosts[0].refusal = OSError("no more processes")
+    ours.die(0)
+    closing = ours.close()
+    assert closing.done
+    assert ours.log == ["close 1", "release 0", "release 1"]
+    ours.now += 50
+    with pytest.raises(GroupClosed):
+        ours.check()
+    assert "start 0" not in ours.log

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from gymnasium.vector.utils import batch_space
 
-from rlightning_aio import ENVS, BaseEnv, EnvConfig, EnvRet, PolicyResponse, sync
+from rlightning_aio import ENVS, BaseEnv, BatchedData, EnvConfig, EnvRet, PolicyResponse, sync
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -65,28 +65,36 @@ class JudgingEnv(BaseEnv):
 
 
 @pytest.mark.parametrize("placement", ["process", "inline"])
-@pytest.mark.parametrize("env_kwargs", [{}, {"nested": True}], ids=["in the row", "pickled"])
-@pytest.mark.parametrize(("num_envs", "episodes"), [(1, 12), (3, 12 + 6 + 4)])
-def test_success_is_counted_where_an_episode_ends(
-    backend: str, placement: str, env_kwargs: dict[str, Any], num_envs: int, episodes: int
-) -> None:
-    """Only what is said at an end counts, for each sub-environment that has ended."""
-    config = EnvConfig(
-        name="judging",
-        backend=backend,
-        task="any",
-        num_envs=num_envs,
-        placement=placement,
-        env_kwargs=env_kwargs,
-    )
-    with sync.build_env_group(config) as group:
-        batch, _ = group.reset()
-        action = np.zeros((1, *group.get_action_spaces()[0].shape), np.int64)
+def test_success_is_counted_where_an_episode_ends(backend: str, placement: str) -> None:
+    """Only what is said at an end counts, for each sub-environment that has ended.
+
+    Whether infos travel in the row or pickled.
+    """
+    episodes = {1: 12, 3: 12 + 6 + 4}
+    configs = [
+        EnvConfig(
+            name=f"{way}-{num_envs}",
+            backend=backend,
+            task="any",
+            num_envs=num_envs,
+            placement=placement,
+            env_kwargs=env_kwargs,
+        )
+        for way, env_kwargs in (("row", {}), ("pickled", {"nested": True}))
+        for num_envs in episodes
+    ]
+    with sync.build_env_group(configs) as group:
+        group.reset()
+        responses = [
+            PolicyResponse(env_id, np.zeros(space.shape, np.int64))
+            for env_id, space in zip(group.env_ids, group.get_action_spaces(), strict=True)
+        ]
         for _ in range(12):
-            batch, _ = group.step(batch.respond(action=action))
-        stats = group.get_env_stats(reset=True)["judging-0"]
-        again = group.get_env_stats()["judging-0"]
-    assert stats["episodes"] == episodes
-    assert stats["success_rate"] == 0.5
-    assert stats["fail_rate"] is None
-    assert again["success_rate"] is None
+            group.step(BatchedData(group.env_ids, responses))
+        stats, again = group.get_env_stats(reset=True), group.get_env_stats()
+    for config in configs:
+        found = stats[f"{config.name}-0"]
+        assert found["episodes"] == episodes[config.num_envs]
+        assert found["success_rate"] == 0.5
+        assert found["fail_rate"] is None
+        assert again[f"{config.name}-0"]["success_rate"] is None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import signal
+import sys
 from collections import deque
 from typing import TYPE_CHECKING, Any
 
@@ -39,10 +40,17 @@ if TYPE_CHECKING:
     import socket
     from collections.abc import Iterator
 
-    from rlightning_aio.hosts.fork_server import Fork
+    from rlightning_aio.hosts.fork_messages import Fork
 
 CONFIG = EnvConfig(name="two", backend="gymnasium", task="CartPole-v1", num_workers=2)
 SCHEMA = InfoSchema.of({"x": 1.5})
+
+
+class EndsTheProgram:
+    """Where it is unpickled, it tries to."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return sys.exit, (3,)
 
 
 class StandIn(ForkServer):
@@ -258,10 +266,12 @@ def test_each_frame_is_told_as_what_it_is(started: Scene) -> None:
         started.read()
         assert started.told() == [expected]
     started.send(FrameKind.VALUE, step(4, 0), broken)
+    started.send(FrameKind.VALUE, step(4, 1), pickle.dumps(EndsTheProgram()))
     started.send(FrameKind.STARTED, 0, broken)
     started.read()
-    raised, not_built = started.told()
+    raised, ended, not_built = started.told()
     assert (type(raised), raised.entry) == (Raised, step(4, 0))
+    assert (ended.entry, ended.error.type_name) == (step(4, 1), "SystemExit")
     assert (type(not_built), not_built.env_index) == (NotBuilt, 0)
 
 

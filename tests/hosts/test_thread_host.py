@@ -75,8 +75,10 @@ def test_it_is_short() -> None:
 async def test_trajectories_are_those_of_inline_envs_and_of_processes(facade: Place) -> None:
     """In one group, to the last bit, however results are waited for."""
     entries = [
-        entry(place, "gymnasium", place, **CARTPOLE, num_workers=2, envs_per_process=1)
-        for place in THREE_PLACES
+        entry(place, "gymnasium", place, **CARTPOLE, num_workers=2, **apart)
+        for place, apart in zip(
+            THREE_PLACES, ({}, {"envs_per_process": 1}, {"envs_per_process": 1}), strict=True
+        )
     ]
     draw = np.random.default_rng(0)
     resets = ends = 0
@@ -204,7 +206,7 @@ async def test_a_thread_that_ends_while_it_starts_fails_the_start(
         raise MemoryError("no more rows")
 
     monkeypatch.setattr(EnvThread, "attach", attach)
-    with pytest.raises(StartFailed, match=r"'one-0'.* ended in MemoryError: no more rows while"):
+    with pytest.raises(StartFailed, match=r"'one-0'.* ended in MemoryError: no more rows"):
         await facade.build(entry("one")).init()
 
 

@@ -51,7 +51,10 @@ class RingsMachine(RuleBasedStateMachine):
         self.reported: deque[int] = deque()
         self.frames = [0, 0]
         self.asleep = False
-        self.ordered: int | None = None
+        # Reports at which a bell is armed, and for which the worker has rung or need not ring.
+        self.armed: int | None = None
+        self.settled: int | None = None
+        self.read = 0
 
     @precondition(lambda self: self.room())
     @rule(data=st.data())
@@ -82,30 +85,45 @@ class RingsMachine(RuleBasedStateMachine):
         assert executed == list(self.requested)
         self.reported += [done for done, in_row in zip(executed, in_rows, strict=True) if in_row]
         self.requested.clear()
-        # One bell for each order, once there is enough; never for what nobody waits for.
-        enough = self.ordered is not None and len(self.reported) >= self.ordered
-        assert len(bells) == (served and enough)
-        if bells:
-            self.ordered = None
+        assert len(bells) == (served and self.look())
+
+    def look(self) -> bool:
+        """What the worker does after a report: one bell for each arming, once there is enough,
+        and none for what nobody waits for.
+        """
+        enough = self.armed is None or self.read + len(self.reported) >= self.armed
+        if self.armed == self.settled or not enough:
+            return False
+        self.settled = self.armed
+        return self.armed is not None
+
+    @precondition(lambda self: self.room())
+    @rule()
+    def report(self) -> None:
+        """What came in a frame is reported as what came by the ring is."""
+        self.number += 1
+        done = entry(self.number, 0, Operation.RESET)
+        bells: list[int] = []
+        self.worker.report(done, lambda: bells.append(done))
+        self.reported.append(done)
+        assert len(bells) == self.look()
 
     @rule()
     def read_reports(self) -> None:
         assert self.trainer.reports().tolist() == list(self.reported)
-        if self.ordered is not None:
-            # What is read counts towards the order: it is for so many in all.
-            self.ordered -= len(self.reported)
+        self.read += len(self.reported)
         self.reported.clear()
 
     @rule(count=st.integers(1, 6))
     def order(self, count: int) -> None:
         self.bell.arm(self.bell.goal(count), 1)
         # One that came too late is obeyed at the next look, if it still fits then.
-        self.ordered = count
+        self.armed = self.read + count
 
     @rule()
     def withdraw(self) -> None:
         self.bell.disarm()
-        self.ordered = None
+        self.armed = None
 
     @rule()
     def send_frame(self) -> None:

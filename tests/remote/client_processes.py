@@ -1,4 +1,4 @@
-"""``client_processes.py ADDRESS COUNT TASK``: that many clients, named c0, c1, …
+"""``client_processes.py ADDRESS COUNT TASK [KEYS]``: that many clients, named c0, c1, …
 
 It loads what they need once and forks them; it prints their pids and ends with them all.
 """
@@ -15,21 +15,21 @@ from rlightning_aio.envs.gymnasium import GymnasiumEnv
 from rlightning_aio.remote import RemoteEnvClient
 
 
-def serve(address: str, name: str, task: str) -> None:
+def serve(address: str, name: str, task: str, keys: str | None) -> None:
     host, _, port = address.removeprefix("tcp://").rpartition(":")
     env = GymnasiumEnv(EnvConfig(name="env", backend="gymnasium", task=task))
-    with RemoteEnvClient(env, host, int(port), name=name, heartbeat=5.0) as client:
+    with RemoteEnvClient(env, host, int(port), name=name, heartbeat=5.0, keys=keys) as client:
         client.run()
 
 
-def main(address: str, count: int, task: str) -> None:
+def main(address: str, count: int, task: str, keys: str | None = None) -> None:
     children: list[int] = []
     for k in range(count):
         pid = os.fork()
         if not pid:
             # Whoever started all this may be killed.
             try:
-                serve(address, f"c{k}", task)
+                serve(address, f"c{k}", task, keys)
             finally:
                 os._exit(0)
         children.append(pid)
@@ -50,4 +50,4 @@ def main(address: str, count: int, task: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]), sys.argv[3])
+    main(sys.argv[1], int(sys.argv[2]), *sys.argv[3:])

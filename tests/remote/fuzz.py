@@ -5,15 +5,23 @@ The tests run a few thousand; ``benchmarks/fuzz_remote.py`` runs as many as aske
 
 from __future__ import annotations
 
+import os
 import tracemalloc
 from collections import deque
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from remote.random_spaces import mutation
+from remote.strangers import hello
 from remote.unreliable import World
 
 from rlightning_aio.protocol.net.client_session import Refused
+from rlightning_aio.remote import make_keys
+from rlightning_aio.remote.keys import AllowedKeys, read_client_keys
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 _KEPT = 200
 
@@ -71,13 +79,36 @@ def fuzz(frames: int, seed: int) -> Findings:
     return findings
 
 
+def fuzz_keys(files: int, seed: int, directory: Path) -> int:
+    """Write `files` spoilt key files beside an honest one; how often that was not known."""
+    rng = np.random.default_rng(seed)
+    (arm,) = make_keys(directory, ["arm"])
+    allowed = directory / "server" / "clients"
+    listed, key = AllowedKeys(allowed), read_client_keys(arm).public
+    honest = [(allowed / "arm.key").read_bytes()]
+    unknown = 0
+    for k in range(files):
+        name = rng.bytes(int(rng.integers(1, 9))).replace(b"/", b"_").replace(b"\0", b"_")
+        path = allowed / os.fsdecode(b"%d%s.key" % (k % 20, name))
+        path.write_bytes(b"".join(mutation(rng)(honest)))
+        unknown += listed.owner(key) is None
+        if k % 20 == 19:
+            for file in allowed.iterdir():
+                if file.name != "arm.key":
+                    file.unlink()
+    return unknown
+
+
 def spoil(
     world: World, name: str, seen: dict[bool, deque[list[bytes]]], rng: np.random.Generator
 ) -> None:
     """One spoilt message to each end."""
     client = world.clients[name]
     for to_server, said in seen.items():
-        parts = mutation(rng)(said[int(rng.integers(len(said)))])
+        # What is said last is seldom a hello.
+        is_hello = to_server and rng.random() < 0.2
+        whole = hello(rng) if is_hello else said[int(rng.integers(len(said)))]
+        parts = mutation(rng)(whole)
         if to_server:
             world.server.receive(client.route or b"?", None, parts, world.clock.now)
             world.flush()

@@ -6,6 +6,7 @@ import asyncio
 import os
 import subprocess
 import sys
+import threading
 import time
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -18,10 +19,12 @@ from remote.counting import ClientThread, CountingEnv
 
 import rlightning_aio
 from rlightning_aio import sync
-from rlightning_aio.errors import ClientRefused, EnvRaised
+from rlightning_aio.errors import ClientRefused, EnvRaised, GroupClosed, UnknownEnv
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+    from rlightning_aio.types import EnvRet
 
 HEARTBEAT = 5.0
 """Seconds; nobody who is merely waiting for its turn is taken for dead."""
@@ -83,6 +86,28 @@ async def test_the_same_awaited() -> None:
             await group.close()
 
 
+def test_results_say_when_their_client_sent_them_by_its_own_clock() -> None:
+    """However wrong that goes, and however late the trainer reads; statistics go by its own."""
+    year_ns = 365 * 24 * 3600 * 10**9
+
+    class Behind(CountingEnv):
+        def ret(self) -> EnvRet:
+            ret = super().ret()
+            ret.ts_env_sent_ns = time.time_ns() - 10 * year_ns
+            return ret
+
+    with sync.build_env_group(entry()) as group, clients(group, Behind()):
+        batch, _ = group.reset()
+        for _ in range(3):
+            before = time.time_ns()
+            group.step_async(batch.respond(action=actions(batch)))
+            batch, _ = group.collect_async(deadline=HANG)
+            (ret,) = batch.values()
+            assert before <= ret.ts_env_sent_ns + 10 * year_ns <= time.time_ns()
+        assert all(0 <= v["p99"] < 1e6 * HANG for v in group.get_stats()["latency_us"].values())
+        group.close()
+
+
 def test_a_step_of_a_client_must_be_asynchronous() -> None:
     """The message names the calls to use."""
     with (
@@ -92,6 +117,8 @@ def test_a_step_of_a_client_must_be_asynchronous() -> None:
         batch, _ = group.reset()
         with pytest.raises(NotImplementedError, match=r"step_async and collect_async"):
             group.step(batch.respond(action=actions(batch)))
+        with pytest.raises(NotImplementedError, match=r"step_async and collect_async"):
+            group["robots-0"].step(batch.respond(action=actions(batch)).values()[0])
         group.close()
 
 
@@ -227,6 +254,50 @@ def test_a_client_that_returns_starts_a_new_episode() -> None:
         again.join()
 
 
+def test_a_client_that_takes_anothers_place_takes_nothing_else_of_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Batches that are held, handles and statistics go on naming the one whose they are."""
+    monkeypatch.setattr("rlightning_aio.group.build.MAX_CLIENTS", 1)
+    with sync.build_env_group(entry()) as group:
+        address = group["robots-0"].address
+        with clients(group, env := CountingEnv(0)), group.auto_reset(2):
+            first, _ = group.reset()
+            group.step_async(first.respond(action=actions(first)))
+            batch, _ = group.collect_async(deadline=HANG)
+            env.on_step = lambda: setattr(env, "finished", True)
+            group.step_async(batch.respond(action=actions(batch)))
+            held, _ = group.collect_async(deadline=HANG)
+        handle = group["robots-0/c0"]
+        before = group.get_env_stats(by_entry=True)["robots"]
+        assert (before["episodes"], before["mean_return"]) == (1, 3.0)
+        other = ClientThread(address, "other", CountingEnv(5))
+        batch, _ = group.collect_async(deadline=HANG)
+        assert held.env_ids() == ["robots-0/c0"]
+        assert held.values()[0].env_id == "robots-0/c0"
+        assert batch.env_ids() == ["robots-0/other"]
+        # What answers the old one is not for the new one.
+        for answered in (held, first):
+            group.step_async(answered.respond(action=actions(answered)))
+        with pytest.raises(UnknownEnv, match="robots-0/c0"):
+            handle.step(np.zeros(2))
+        with pytest.raises(UnknownEnv, match="robots-0/c0"):
+            handle.call("get_wrapper_attr")
+        group.step_async(batch.respond(action=actions(batch)))
+        batch, _ = group.collect_async(deadline=HANG)
+        assert batch.observation.tolist() == [[5, -1, 1]]
+        # The first result, which nobody asked for, counts as an answered request, too.
+        assert {id_: one["requests"] for id_, one in group.get_env_stats().items()} == {
+            "robots-0/other": 2
+        }
+        after = group.get_env_stats(by_entry=True)["robots"]
+        assert after == before | {"requests": before["requests"] + 2}
+        group.get_env_stats(reset=True)
+        assert group.get_env_stats(by_entry=True)["robots"]["requests"] == 0
+        group.close()
+        other.join()
+
+
 async def test_a_client_that_returns_while_the_trainer_thinks_is_no_error() -> None:
     """An answer to the old life's last result is not taken for one to the new life's first."""
     async with rlightning_aio.build_env_group(entry()) as group:
@@ -283,6 +354,24 @@ async def test_a_client_that_returns_before_its_loss_is_collected_waits_its_turn
         assert not first.restarted.any()
         await group.close()
         again.join()
+
+
+async def test_closing_a_group_tells_a_collector_that_waits_for_clients() -> None:
+    """With time limits to watch, it looks at all hosts again; the env_server is gone by then."""
+    released = threading.Event()
+    env = CountingEnv(on_step=lambda: released.wait(HANG))
+    timed = {**CARTPOLE, "num_workers": 1, "step_timeout": HANG}
+    async with rlightning_aio.build_env_group([timed, entry()], mixed_actions=True) as group:
+        with clients(group, env):
+            batch, _ = await group.reset(env_ids=None)
+            theirs = batch.by_name()["robots"]
+            group.step_async(theirs.respond(action=actions(theirs)))
+            collecting = asyncio.create_task(group.collect_async())
+            await asyncio.sleep(0)
+            await group.close()
+            with pytest.raises(GroupClosed):
+                await collecting
+            released.set()
 
 
 def test_an_env_that_raises_at_the_client_can_be_reset_and_used_again() -> None:

@@ -6,6 +6,7 @@ import os
 import pickle
 import shutil
 import threading
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,7 +26,6 @@ from rlightning_aio.remote.keys import read_client_keys, read_server_keys
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
 
 def entry(**env_kwargs: Any) -> dict[str, Any]:
@@ -177,6 +177,50 @@ def test_a_client_is_told_when_its_key_is_not_on_the_list(tmp_path: Path) -> Non
         friend.join()
 
 
+def refused(address: str, keys: Path) -> str:
+    """What a client is told that dials in with `keys` and isn't let in."""
+    host, _, port = address.removeprefix("tcp://").rpartition(":")
+    with (
+        RemoteEnvClient(CountingEnv(), host, int(port), keys=keys, name="again") as client,
+        pytest.raises(TimeoutError) as caught,
+    ):
+        client.connect(timeout=1.5)
+    return str(caught.value)
+
+
+def test_a_key_that_is_overwritten_in_place_gets_in_no_more(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Nor does a file whose name is no text keep anybody else out."""
+    arm, leg = make_keys(tmp_path, ["arm", "leg"])
+    listed = tmp_path / "server" / "clients"
+    Path(os.fsdecode(os.fsencode(listed) + b"/\xff\x1b.key")).write_text("x")
+    told: list[str] = []
+    with sync.build_env_group(entry(keys=str(tmp_path / "server"))) as group:
+        address = group["robots-0"].address
+        friend = ClientThread(address, "arm", keys=arm)
+        batch, _ = group.reset()
+        with (listed / "arm.key").open("r+") as file:
+            file.write((listed / "leg.key").read_text())
+        thread = threading.Thread(target=lambda: told.append(refused(address, arm)))
+        thread.start()
+        while thread.is_alive():
+            group.step_async(batch.respond(action=np.zeros((1, 2), np.float32)))
+            batch, _ = group.collect_async(deadline=HANG)
+        thread.join()
+        another = ClientThread(address, "leg", keys=leg)
+        while len(group["robots-0"].clients) < 2:
+            group.step_async(batch.respond(action=np.zeros((len(batch), 2), np.float32)))
+            batch, _ = group.collect_async(deadline=HANG)
+        group.close()
+        friend.join()
+        another.join()
+    assert "the server does not know this client's key" in told[0]
+    warnings = [r.getMessage() for r in caplog.records if "can't be a client's" in r.getMessage()]
+    assert len(warnings) == 1
+    assert "\\udcff\\x1b.key" in warnings[0]
+
+
 # Addresses and settings
 
 
@@ -265,7 +309,9 @@ def test_nonsense_and_pickles_from_strangers_leave_the_service_unharmed(tmp_path
                 if k % 10 == 0:
                     group.step_async(batch.respond(action=np.zeros((1, 2), np.float32)))
                     batch, _ = group.collect_async(deadline=HANG)
-            while remote.malformed < 500:
+            # It is cut off again and again, and dials anew.
+            while remote.malformed < 100 or remote.num_cut < 3:
+                stranger.send_multipart([bomb])
                 group.step_async(batch.respond(action=np.zeros((1, 2), np.float32)))
                 batch, _ = group.collect_async(deadline=HANG)
         assert group["robots-0"].clients == ["robots-0/arm"]

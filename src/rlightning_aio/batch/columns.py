@@ -5,7 +5,7 @@ from __future__ import annotations
 import pickle
 import time
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -20,36 +20,12 @@ if TYPE_CHECKING:
     import gymnasium as gym
     from numpy.typing import NDArray
 
-__all__ = ["EnvNames", "ResultColumns"]
+    from rlightning_aio.batch.names import EnvNames
+
+__all__ = ["ResultColumns"]
 
 # The monotonic clock's distance to the epoch; workers stamp results with the former.
 _EPOCH_NS = time.time_ns() - time.monotonic_ns()
-
-
-class EnvNames(Protocol):
-    """Names of a group's envs, by slot."""
-
-    @property
-    def index_offset(self) -> NDArray[np.int64]:
-        """Sub-environments of the group before each slot's."""
-        ...
-
-    @property
-    def turns(self) -> NDArray[np.bool_]:
-        """Whether results of a slot come from some of its sub-environments at a time."""
-        ...
-
-    def ids(self, slots: NDArray[np.intp]) -> list[str]:
-        """Ids of `slots`, in order."""
-        ...
-
-    def batch_ids(self, slots: NDArray[np.intp]) -> list[str]:
-        """Ids of `slots` as a batch has them: a client goes by its env_server's id."""
-        ...
-
-    def names(self, slots: NDArray[np.intp]) -> list[str]:
-        """Config entries of `slots`, in order."""
-        ...
 
 
 @dataclass(slots=True)
@@ -72,6 +48,7 @@ class ResultColumns:
         restarted: ``[n]``, where the episode before was lost with its worker; likewise.
         times: ``[n, 2]``: when each result was ready (monotonic), and the time the env took,
             in ns.
+        sent_ns: ``[n]``, see `protocol.slab`; None where the trainer's clock is the env's.
         agents: names of a multi-agent env's agents.
         observation_space: of one env; None if it isn't known.
     """
@@ -91,12 +68,23 @@ class ResultColumns:
     episode_length: NDArray[np.int64] | None = None
     limit_reached: NDArray[np.bool_] | None = None
     restarted: NDArray[np.bool_] | None = None
+    sent_ns: NDArray[np.int64] | None = None
     agents: tuple[str, ...] = ()
     observation_space: gym.Space[Any] | None = None
     whole_results: bool = False
 
     def __len__(self) -> int:
         return len(self.slots)
+
+    def apart(self) -> ResultColumns:
+        """The same results without a group around them: slots 0, 1, 2, … are its own rows."""
+        slots: list[int] = self.slots.tolist()
+        return replace(
+            self,
+            slots=np.arange(len(slots)),
+            names=self.names.of(self.slots),
+            schemas=[self.schemas[slot] for slot in slots],
+        )
 
     # -- what each row is -------------------------------------------------------------
 
@@ -181,15 +169,16 @@ class ResultColumns:
 
     def info_of(self, row: int) -> dict[str, Any]:
         """One env's info, with the episode's sums if it has just ended."""
+        info = self.reported_info_of(row)
+        episode = self.episode(row)
+        return {"episode": episode, **info} if episode else info
+
+    def reported_info_of(self, row: int) -> dict[str, Any]:
+        """One env's info, as the env told it."""
         kept = self.out_of_band_of(row) if self.out_of_band else {}
         if "ret" in kept:
-            info = kept["ret"].info
-        elif "info" in kept:
-            info = kept["info"]
-        else:
-            info = self._info_in_row(row)
-        episode = self._episode(row)
-        return {"episode": episode, **info} if episode else info
+            return kept["ret"].info
+        return kept["info"] if "info" in kept else self._info_in_row(row)
 
     def may_hold(self, row: int, keys: Iterable[str]) -> bool:
         """Whether the info of `row` may hold any of `keys`; tells without decoding it."""
@@ -207,7 +196,8 @@ class ResultColumns:
             return {}
         return self.schemas[int(self.slots[row])][mark].decode(memoryview(self.info[row]))
 
-    def _episode(self, row: int) -> dict[str, Any]:
+    def episode(self, row: int) -> dict[str, Any]:
+        """The sums of the episode that has just ended; empty if none has."""
         if self.episode_return is None or self.episode_length is None:
             return {}
         ended = self.ended[row]
@@ -233,18 +223,27 @@ class ResultColumns:
             "last_terminated": self._head(self.terminated, row),
             "last_truncated": self._head(self.truncated, row),
             "info": self.info_of(row),
-            "ts_env_sent_ns": int(self.times[row, 0]) + _EPOCH_NS,
+            "ts_env_sent_ns": self._sent_ns_of(row),
         }
         return (MultiAgentEnvRet if self.agents else EnvRet)(_extra=kept.get("extra"), **fields)
 
     def _ret_handed_over(self, row: int, ret: Any) -> Any:
         changed: dict[str, Any] = {}
-        if self._episode(row):
+        for name in ("reward", "terminated", "truncated"):
+            field = f"last_{name}"
+            if _stands_for_all(getattr(ret, field)) and self.reward.ndim > 1:
+                changed[field] = self._head(getattr(self, name), row)
+        if self.episode(row):
             changed["info"] = self.info_of(row)
         if self.limit_reached is not None and self.limit_reached[row]:
             # `auto_reset` may have marked the cut.
             changed["last_truncated"] = _like(ret.last_truncated, self._head(self.truncated, row))
         return ret.model_copy(update=changed) if changed else ret
+
+    def _sent_ns_of(self, row: int) -> int:
+        if self.sent_ns is None:
+            return int(self.times[row, 0]) + _EPOCH_NS
+        return int(self.sent_ns[row])
 
     def _head(self, column: NDArray[Any], row: int) -> Any:
         value = column[row]
@@ -282,6 +281,11 @@ class ResultColumns:
         return array
 
 
+def _stands_for_all(told: Any) -> bool:
+    """Whether a reward or an end was left out, by all sub-environments or by all agents."""
+    return type(told) in (float, bool) or (isinstance(told, dict) and not told)
+
+
 def _like(told: Any, value: Any) -> Any:
     """`value` as what was told in its place: a tensor on its device, or an array."""
     if isinstance(told, dict):
@@ -299,4 +303,5 @@ _BY_ROW = (
     "limit_reached",
     "restarted",
     "times",
+    "sent_ns",
 )

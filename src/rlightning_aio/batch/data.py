@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast, overload
 
 import numpy as np
 
-from rlightning_aio.batch.infos import vector_infos
+from rlightning_aio.batch.infos import infos_of_rows, vector_infos
 from rlightning_aio.batch.sent import Sent, taken_sources
 from rlightning_aio.batch.stacking import columns_where_possible, differing, stacked_values
 from rlightning_aio.errors import BadAction
@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     import gymnasium as gym
     from numpy.typing import NDArray
 
-    from rlightning_aio.batch.columns import EnvNames, ResultColumns
+    from rlightning_aio.batch.columns import ResultColumns
+    from rlightning_aio.batch.names import EnvNames
     from rlightning_aio.batch.sent import Sources
 
 __all__ = [
@@ -31,7 +32,10 @@ __all__ = [
     "Origin",
     "batch_of_results",
     "columns_of_responses",
+    "names_of",
     "parts_of",
+    "reported_info_list",
+    "reported_infos",
     "slots_of",
 ]
 
@@ -93,6 +97,22 @@ class BatchedData:
         batch._origin = self._origin
         batch._env_ids = None if self._origin is not None else self.env_ids()
         return batch
+
+    # -- copies ---------------------------------------------------------------------
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What copies and pickles hold: all but the group, which then goes by the ids."""
+        state = {name: getattr(self, name) for name in self.__slots__}
+        origin = self._origin
+        if origin is not None:
+            names, slots = origin.names.of(origin.slots), np.arange(len(origin.slots))
+            state["_origin"] = Origin(None, slots, names)
+            state["_parts"] = [part.apart() for part in self._parts]
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        for name, value in state.items():
+            setattr(self, name, value)
 
     # -- ids and values -----------------------------------------------------------
 
@@ -318,7 +338,10 @@ class BatchedData:
         numbers), ``infos["_" + key]`` tells which rows have the key; nested dicts likewise.
         """
         if self._infos is None:
-            self._infos = vector_infos(self.info())
+            whole = len(self._parts) == 1 and self._parts[0].positions is None
+            self._infos = (
+                infos_of_rows(self._parts[0], episodes=True) if whole else vector_infos(self.info())
+            )
         return self._infos
 
     @overload
@@ -462,6 +485,28 @@ def _blank() -> BatchedData:
     return batch
 
 
+def reported_infos(batch: BatchedData) -> dict[str, Any]:
+    """`BatchedData.infos` of a batch of results, without the sums of episodes."""
+    return _infos_of(batch, episodes=False)
+
+
+def reported_info_list(batch: BatchedData) -> list[dict[str, Any]]:
+    """`BatchedData.info` of a batch of results, without the sums of episodes."""
+    places = _by_position(batch._parts, len(batch))
+    return [part.reported_info_of(row) for part, row in places]
+
+
+def _infos_of(batch: BatchedData, *, episodes: bool) -> dict[str, Any]:
+    parts = batch._parts
+    if len(parts) == 1 and parts[0].positions is None:
+        return infos_of_rows(parts[0], episodes=episodes)
+    if episodes or not parts:
+        return vector_infos(batch.info())
+    return vector_infos(
+        [part.reported_info_of(row) for part, row in _by_position(parts, len(batch))]
+    )
+
+
 def parts_of(batch: BatchedData) -> Sequence[ResultColumns]:
     """The columns of a batch of results; empty for any other batch."""
     return batch._parts
@@ -471,6 +516,11 @@ def slots_of(batch: BatchedData, group: object) -> NDArray[np.intp] | None:
     """Slots of the envs, if the batch is of `group`'s own making."""
     origin = batch._origin
     return origin.slots if origin is not None and origin.group is group else None
+
+
+def names_of(batch: BatchedData) -> EnvNames | None:
+    """The names of its group's envs when it was handed out; None for plain values."""
+    return None if batch._origin is None else batch._origin.names
 
 
 def columns_of_responses(batch: BatchedData) -> Mapping[str, Any] | None:

@@ -1,15 +1,26 @@
-"""Infos as columns, in the form of Gymnasium's vector environments, by its own code."""
+"""Infos as columns, in the form of Gymnasium's vector environments.
+
+Where envs put theirs into their rows, whole columns are taken out at once; Gymnasium's own code,
+which goes env by env and key by key, says what they mean and does the rest.
+"""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from gymnasium.vector import VectorEnv
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
-__all__ = ["vector_infos"]
+    from rlightning_aio.batch.columns import ResultColumns
+    from rlightning_aio.protocol.info import InfoSchema
+
+__all__ = ["infos_of_rows", "vector_infos"]
+
+_AS_OBJECTS = np.bool_
+"""A kind of number of which Gymnasium makes no typed array."""
 
 
 class _Columns(VectorEnv[Any, Any, Any]):
@@ -18,13 +29,89 @@ class _Columns(VectorEnv[Any, Any, Any]):
     def __init__(self, num_envs: int) -> None:
         self.num_envs = num_envs
 
-    def of(self, infos: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    def of(self, infos: Iterable[tuple[int, dict[str, Any]]]) -> dict[str, Any]:
         columns: dict[str, Any] = {}
-        for place, info in enumerate(infos):
+        for place, info in infos:
             columns = self._add_info(columns, info, place)
         return columns
 
 
 def vector_infos(infos: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """One dict of columns for `infos`: a typed array for each key, and a mask ``_key``."""
-    return _Columns(len(infos)).of(infos)
+    return _Columns(len(infos)).of(enumerate(infos))
+
+
+def infos_of_rows(part: ResultColumns, *, episodes: bool) -> dict[str, Any]:
+    """The same for the rows of `part`, in its own order.
+
+    Args:
+        part: results.
+        episodes: with ``episode``, the sums of each that has just ended.
+    """
+    rows = range(len(part))
+    columns = None if part.out_of_band else _taken_at_once(part)
+    if columns is None:
+        told = part.info_of if episodes else part.reported_info_of
+        return vector_infos([told(row) for row in rows])
+    if episodes and part.episode_length is not None:
+        if "episode" in columns:  # What an env reports under that key goes before.
+            return vector_infos([part.info_of(row) for row in rows])
+        sums = [(row, {"episode": sums}) for row in rows if (sums := part.episode(row))]
+        columns = {**_Columns(len(part)).of(sums), **columns}
+    return columns
+
+
+def _taken_at_once(part: ResultColumns) -> dict[str, Any] | None:
+    """Columns of infos that all lie in the rows; None where they need to be looked at singly."""
+    if part.info is None or part.info_marks is None:
+        return {}
+    rows: dict[InfoSchema, list[int]] = {}
+    # A worker's schema is one object: few need to be compared.
+    rows_of: dict[int, list[int]] = {}
+    slots: list[int] = part.slots.tolist()
+    marks: list[int] = part.info_marks.tolist()
+    for row, (slot, mark) in enumerate(zip(slots, marks, strict=True)):
+        if not mark:
+            continue
+        schema = part.schemas[slot][mark]
+        chosen = rows_of.get(id(schema))
+        if chosen is None:
+            chosen = rows_of[id(schema)] = rows.setdefault(schema, [])
+        chosen.append(row)
+    if len(rows) == 1:
+        ((schema, chosen),) = rows.items()
+        if len(chosen) == len(slots) and _agree(rows):
+            return _of_all(schema.fields(part.info))
+    return _of_some(part.info, rows) if _agree(rows) else None
+
+
+def _agree(schemas: Iterable[InfoSchema]) -> bool:
+    """Whether each key has one typed column in all of `schemas`."""
+    kinds: dict[str, tuple[Any, Any]] = {}
+    for schema in schemas:
+        for key, kind, array in zip(schema.keys, schema.types, schema.arrays, strict=True):
+            if kinds.setdefault(key, (kind, array)) != (kind, array) or kind is _AS_OBJECTS:
+                return False
+            if key == "final_obs" or (array is not None and 0 in array[0]):
+                return False
+    return True
+
+
+def _of_all(fields: dict[str, Any]) -> dict[str, Any]:
+    columns: dict[str, Any] = {}
+    for key, values in fields.items():
+        columns[key] = values.copy()
+        columns[f"_{key}"] = np.ones(len(values), np.bool_)
+    return columns
+
+
+def _of_some(info: Any, rows: dict[InfoSchema, list[int]]) -> dict[str, Any]:
+    columns: dict[str, Any] = {}
+    for schema, chosen in rows.items():
+        for key, values in schema.fields(info[chosen]).items():
+            if key not in columns:
+                columns[key] = np.zeros((len(info), *values.shape[1:]), values.dtype)
+                columns[f"_{key}"] = np.zeros(len(info), np.bool_)
+            columns[key][chosen] = values
+            columns[f"_{key}"][chosen] = True
+    return columns

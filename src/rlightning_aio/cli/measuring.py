@@ -23,6 +23,7 @@ from rlightning_aio.batch.data import parts_of
 from rlightning_aio.cli.collecting import Roster, resetting, respond_to_all, responder
 from rlightning_aio.cli.rollout_statistics import RolloutStatistics
 from rlightning_aio.cli.terminal import counted
+from rlightning_aio.config import moved
 from rlightning_aio.errors import ConfigError, RLightningError
 from rlightning_aio.registry import BACKENDS
 
@@ -88,7 +89,9 @@ class Setting:
         return {
             "placement": "inline" if self.inline else "process",
             "workers": self.workers,
-            "envs_per_process": {c.name: c.envs_per_process for c in self.configs},
+            "envs_per_process": (
+                {} if self.inline else {c.name: c.envs_per_process for c in self.configs}
+            ),
         }
 
 
@@ -114,8 +117,7 @@ def possible_settings(configs: Sequence[EnvConfig]) -> list[Setting]:
         setting = Setting(tuple(_with_workers(config, count) for config in configs))
         settings.setdefault(setting.workers, setting)
     if not any(config.interpreter or config.env_vars for config in configs):
-        inline = {"placement": "inline", "envs_per_process": 1}
-        settings[0] = Setting(tuple(config.model_copy(update=inline) for config in configs))
+        settings[0] = Setting(tuple(moved(config, "inline") for config in configs))
     return list(settings.values())
 
 

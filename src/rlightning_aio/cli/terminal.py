@@ -79,10 +79,14 @@ def guarded(command: Callable[..., None]) -> Callable[..., None]:
 def interruptible() -> Generator[None]:
     """Ctrl-C raises KeyboardInterrupt in here, where there is something to clean up.
 
-    So does SIGTERM, with which a service manager stops a robot's client. Anywhere else both
-    end the command on the spot (see `cli.main`).
+    So does every other signal that ends a command: SIGTERM, with which a service manager stops
+    a robot's client, SIGHUP, which comes when a terminal or an SSH session closes (unless it is
+    ignored, as under nohup), and SIGQUIT. Anywhere else they end the command on the spot (see
+    `cli.main`).
     """
-    numbers = (signal.SIGINT, signal.SIGTERM)
+    numbers = [signal.SIGINT, signal.SIGTERM, signal.SIGQUIT]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
     before = [signal.signal(number, signal.default_int_handler) for number in numbers]
     try:
         yield

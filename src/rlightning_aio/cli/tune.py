@@ -208,9 +208,12 @@ def _report(config: Path, search: _Search, *, interrupted: bool, as_json: bool) 
 def _as_yaml(config: Path, best: Contender) -> str:
     entries: list[dict[str, Any]] = [
         {
-            **entry.model_dump(mode="json", exclude_defaults=True),
+            # What was given; a default may be a robot's, or mean nothing where the envs live.
+            **entry.model_dump(
+                mode="json", exclude_defaults=True, include=set(entry.model_fields_set)
+            ),
             "placement": entry.placement,
-            "envs_per_process": entry.envs_per_process,
+            **({} if best.setting.inline else {"envs_per_process": entry.envs_per_process}),
         }
         for entry in best.setting.configs
     ]

@@ -9,10 +9,19 @@ from __future__ import annotations
 
 import abc
 import copy
+import gc
+import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from rlightning_aio.types import Autoreset, EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
+from rlightning_aio.types import (
+    Autoreset,
+    EnvMeta,
+    EnvRet,
+    MultiAgentEnvRet,
+    PolicyResponse,
+    default_env_preprocess_fn,
+)
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -28,7 +37,6 @@ __all__ = [
     "BaseEnv",
     "PreprocessFn",
     "Result",
-    "default_env_preprocess_fn",
     "result_of",
 ]
 
@@ -55,11 +63,6 @@ def result_of(env_id: str, outcome: BareResult) -> EnvRet:
     )
 
 
-def default_env_preprocess_fn(policy_resp: PolicyResponse) -> Any:
-    """The action as the policy gave it."""
-    return policy_resp.action
-
-
 class BaseEnv(abc.ABC):
     """One environment (or ``num_envs`` vectorised ones) behind one interface.
 
@@ -74,6 +77,8 @@ class BaseEnv(abc.ABC):
 
     Attributes:
         env_id: ``<entry name>-<worker index>``, the same after a restart.
+        trainer_pid: the trainer's process, where it is another one of this machine: set by the
+            worker once the env is built. A robot stops when that process is stopped.
         transforms_actions: set it on a subclass whose `step` takes actions that need not
             fit the action space (chunks, logits, dicts).
         agents: agent names of a multi-agent env, in order; empty otherwise.
@@ -89,6 +94,7 @@ class BaseEnv(abc.ABC):
     fresh_results: ClassVar[bool] = False
 
     env: Any = None
+    trainer_pid: int | None = None
     agents: tuple[str, ...] = ()
     autoreset: Autoreset = "disabled"
 
@@ -116,17 +122,37 @@ class BaseEnv(abc.ABC):
         Args:
             seed: for the simulator; with ``num_envs > 1`` sub-environment k takes ``seed + k``.
             options: simulator-specific.
+
+        Returns one result, of which only id and observation count. With ``num_envs > 1`` it may
+        be a list with one for each sub-environment, in order; so may that of a step.
         """
 
     @abc.abstractmethod
     def step(self, policy_resp: PolicyResponse) -> Result:
-        """Advance by one step with the action that the preprocess function makes."""
+        """Advance by one step with the action that ``self._preprocess_fn`` makes.
+
+        A reward of 0.0 and ends of False, which are the defaults, hold for all sub-environments
+        and agents.
+        """
+
+    def step_async(self, policy_resp: PolicyResponse) -> None:
+        """Start a step, for an env that answers later: a machine elsewhere, say.
+
+        An env with this and `collect_async` is stepped by the two in place of `step`, which may
+        raise NotImplementedError then. With inline placement a step starts when it is sent.
+        """
+        raise NotImplementedError(f"env {self.env_id!r} has no step_async()")
+
+    def collect_async(self) -> Result:
+        """Wait for the end of the step that `step_async` has started; what it gave."""
+        raise NotImplementedError(f"env {self.env_id!r} has no collect_async()")
 
     def bare_step(self) -> BareStep | None:
         """The simulator's own ``action -> (obs, reward, terminated, truncated, info)``.
 
-        Return it only if `step` adds nothing to it; None (the default) has the runtime
-        call `step`. The action is its own: nobody writes to it again.
+        Return it only if `step` adds nothing to it but a call of ``self._preprocess_fn``, which
+        the runtime makes by itself; None (the default) has the runtime call `step`. The action
+        is its own: nobody writes to it again.
         """
         return None
 
@@ -146,9 +172,14 @@ class BaseEnv(abc.ABC):
         """
         return None
 
-    def init(self) -> EnvMeta:
-        """Called once after construction, in the worker; returns `get_metadata`."""
+    def init(self) -> EnvMeta | None:
+        """Called once after construction, where the env lives; None stands for `get_metadata`."""
         return self.get_metadata()
+
+    def initialised(self) -> EnvMeta:
+        """Call `init`, as whoever runs an env does; what the env is like from then on."""
+        meta = self.init()
+        return self.get_metadata() if meta is None else meta
 
     def get_metadata(self) -> EnvMeta:
         """Id, spaces and counts of this env."""
@@ -195,8 +226,18 @@ class BaseEnv(abc.ABC):
         """Take the memory freed by `offload` again."""
         raise NotImplementedError(f"backend {self.config.backend!r} has no reload()")
 
+    def clear_memory(self) -> None:
+        """Give memory back that nothing uses any more; for `offload` to call at its end.
+
+        Collects garbage, then has torch, where it was imported, empty its cache of CUDA memory.
+        """
+        gc.collect()
+        torch: Any = sys.modules.get("torch")
+        if torch is not None and torch.cuda.is_available():
+            torch.cuda.empty_cache()
+
     def is_finish(self) -> bool:
-        """Whether a remote client's loop should end; asked after every step."""
+        """Whether `RemoteEnvClient.run` should end; asked after every reset and step."""
         return False
 
     def on_disconnect(self) -> None:

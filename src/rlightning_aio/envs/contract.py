@@ -13,6 +13,7 @@ from unittest import SkipTest
 
 import numpy as np
 
+from rlightning_aio.envs.results import step_of
 from rlightning_aio.envs.tensors import as_numpy
 from rlightning_aio.protocol.columns import mapped
 from rlightning_aio.registry import ENVS
@@ -68,7 +69,7 @@ class EnvContract:
     def make_env(self) -> BaseEnv:
         """The env under test, initialised."""
         env = ENVS.resolve(self.config.backend)(self.config)
-        env.init()
+        env.initialised()
         return env
 
     @contextlib.contextmanager
@@ -90,7 +91,7 @@ class EnvContract:
         """
 
         def step(action: Any) -> Outcome:
-            return outcome_of(env.step(PolicyResponse(env.env_id, action)))
+            return outcome_of(_step(env, action))
 
         yield outcome_of(env.reset(seed=self.seed if seed is None else seed))
         ended = False
@@ -273,7 +274,7 @@ def _joined_halves(env: BaseEnv) -> BareStep | None:
 
 
 def _step(env: BaseEnv, action: Any) -> Any:
-    return env.step(PolicyResponse(env.env_id, action))
+    return step_of(env)(PolicyResponse(env.env_id, action))
 
 
 def _entries(value: Any, agents: Sequence[str]) -> list[Any]:

@@ -20,9 +20,9 @@ from rlightning_aio.envs.base import (
     BareStepWait,
     BaseEnv,
     PreprocessFn,
-    default_env_preprocess_fn,
     result_of,
 )
+from rlightning_aio.envs.results import has_preprocess_fn
 from rlightning_aio.envs.tensors import as_numpy
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.protocol.columns import index, is_dict
@@ -148,7 +148,7 @@ class EnvPoolEnv(BaseEnv):
     @property
     def _is_bare(self) -> bool:
         plain = type(self).step is EnvPoolEnv.step
-        return plain and self._preprocess_fn is default_env_preprocess_fn
+        return plain and not has_preprocess_fn(self)
 
     def _step(self, action: Any) -> BareResult:
         self._send(action)

@@ -1,4 +1,4 @@
-"""`gymnasium` and `mujoco`: any environment that `gymnasium.make` can make."""
+"""`gymnasium` and `mujoco`: any environment that `gymnasium.make` or `make_vec` can make."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import warnings
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
+from gymnasium.vector import AutoresetMode
 
 from rlightning_aio.envs.base import (
     BareReset,
     BareStep,
     BaseEnv,
     PreprocessFn,
-    default_env_preprocess_fn,
     result_of,
 )
 from rlightning_aio.envs.tensors import as_numpy
@@ -23,15 +23,19 @@ from rlightning_aio.types import EnvRet, PolicyResponse
 if TYPE_CHECKING:
     from collections.abc import Generator
 
+    from gymnasium.envs.registration import EnvSpec
+
     from rlightning_aio.config import EnvConfig
 
-__all__ = ["GymnasiumEnv", "MujocoEnv"]
+__all__ = ["GymnasiumEnv", "MujocoEnv", "outdated_assets_accepted", "spec_of"]
 
 
 class GymnasiumEnv(BaseEnv):
-    """A single Gymnasium environment; ``env_kwargs`` go to `gymnasium.make`.
+    """A Gymnasium environment, or ``num_envs`` of them; ``env_kwargs`` go to `gymnasium.make`.
 
-    The step limit is the config's ``max_episode_steps``, or the registered one.
+    The step limit is the config's ``max_episode_steps``, or the registered one. Several are the
+    task's own vector environment, where it has one (its ``vector_entry_point``, to which
+    ``env_kwargs`` go then), and a loop over as many envs otherwise.
     """
 
     def __init__(
@@ -43,17 +47,30 @@ class GymnasiumEnv(BaseEnv):
     ) -> None:
         super().__init__(config, worker_index, preprocess_fn, **kwargs)
         self.env = self._make()
+        self._is_vector = isinstance(self.env, gym.vector.VectorEnv)
+        if self._is_vector:
+            self.num_envs = int(self.env.num_envs)
+        mode = self.env.metadata.get("autoreset_mode", AutoresetMode.DISABLED)
+        self.autoreset = AutoresetMode(mode).name.lower()  # pyright: ignore[reportAttributeAccessIssue]
         if self.max_episode_steps is None and self.env.spec is not None:
             self.max_episode_steps = self.env.spec.max_episode_steps
 
     def _make(self) -> Any:
         """Make the simulator that the config names; subclasses wrap or replace it."""
+        config = self.config
         # The runtime checks observations against the space itself, once, where it
         # copies them; Gymnasium's checker would stay in the path of every step.
-        make_kwargs = {"disable_env_checker": True, **self.config.env_kwargs}
-        return gym.make(
-            self.config.task, max_episode_steps=self.config.max_episode_steps, **make_kwargs
-        )
+        make_kwargs: dict[str, Any] = {"disable_env_checker": True, **config.env_kwargs}
+        if config.num_envs == 1:
+            return gym.make(config.task, max_episode_steps=config.max_episode_steps, **make_kwargs)
+        if config.max_episode_steps is not None:
+            make_kwargs["max_episode_steps"] = config.max_episode_steps
+        if spec_of(config.task).vector_entry_point is None:
+            # Results are copied where the runtime takes them.
+            make_kwargs["vector_kwargs"] = {"copy": False}
+        else:
+            del make_kwargs["disable_env_checker"]
+        return gym.make_vec(config.task, config.num_envs, **make_kwargs)
 
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
@@ -66,26 +83,51 @@ class GymnasiumEnv(BaseEnv):
         return result_of(self.env_id, self.env.step(action))
 
     def bare_step(self) -> BareStep | None:
-        plain = type(self).step is GymnasiumEnv.step
-        return self.env.step if plain and self._preprocess_fn is default_env_preprocess_fn else None
+        # The one sub-environment of a vector env has an axis that its row lacks.
+        plain = type(self).step is GymnasiumEnv.step and self._is_vector == (self.num_envs > 1)
+        return self.env.step if plain else None
 
     def bare_reset(self) -> BareReset | None:
         return self.env.reset if type(self).reset is GymnasiumEnv.reset else None
 
+    def call_wrapped(self, name: str, *args: Any, **kwargs: Any) -> Any:
+        """Call method `name` of the outermost wrapper that has it; an attribute's value is
+        returned as it is.
+        """
+        found = self.env.get_wrapper_attr(name)
+        return found(*args, **kwargs) if callable(found) else found
+
+    def is_wrapped(self, wrapper_class: type[Any]) -> bool:
+        """Whether `wrapper_class` is among the env's wrappers."""
+        env = self.env
+        while isinstance(env, gym.Wrapper):
+            if isinstance(env, wrapper_class):
+                return True
+            env = env.env  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
+        return False
+
     def close(self) -> None:
         self.env.close()
+
+
+def spec_of(task: str) -> EnvSpec:
+    """What Gymnasium knows of `task`, whose module is imported first if it names one."""
+    module, _, name = task.rpartition(":")
+    if module:
+        importlib.import_module(module)
+    return gym.spec(name)
 
 
 class MujocoEnv(GymnasiumEnv):
     """Gymnasium's MuJoCo tasks (HalfCheetah-v5, Ant-v5, …)."""
 
     def _make(self) -> Any:
-        with _outdated_assets_accepted():
+        with outdated_assets_accepted():
             return super()._make()
 
 
 @contextlib.contextmanager
-def _outdated_assets_accepted() -> Generator[None]:
+def outdated_assets_accepted() -> Generator[None]:
     """Silence MuJoCo about deprecated attributes in a task's XML; nothing else.
 
     Gymnasium's own assets use them, so each env of each worker would tell a user who can't

@@ -8,7 +8,6 @@ Absent on purpose: batches on the CPU, which ManiSkill doesn't have; use more wo
 
 from __future__ import annotations
 
-import gc
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, cast
 
@@ -219,9 +218,7 @@ class ManiskillEnv(BaseEnv):
             return
         self._is_offloaded = True
         self.close()
-        gc.collect()
-        if torch.cuda.is_available():
-            torch.cuda.empty_cache()
+        self.clear_memory()
 
     def reload(self) -> None:
         """Make the simulator again; it has to be reset before it is stepped."""

@@ -24,8 +24,9 @@ from rlightning_aio.envs.piper_link import (
     POSE_FRAMES,
     STATUS_FRAMES,
     ArmLink,
+    InUse,
 )
-from rlightning_aio.envs.piper_options import PiperOptions, action_limits, check_reset_joints
+from rlightning_aio.envs.piper_options import PiperOptions, action_limits, check_reset_position
 from rlightning_aio.envs.tensors import as_numpy
 from rlightning_aio.errors import BadAction, ConfigError
 from rlightning_aio.types import EnvRet, PolicyResponse
@@ -43,7 +44,8 @@ MAX_LENGTH, MAX_ANGLE, MAX_GRIPPER = 1.0, math.radians(361), 0.15
 REFUSALS = frozenset({"NO_SOLUTION", "SINGULARITY_POINT", "TARGET_POS_EXCEEDS_LIMIT"})
 """States in which the arm declined one target and waits for another."""
 
-_channels: dict[str, str] = {}
+GRIPPER_TOLERANCE = 0.002
+"""How near to its reset position the gripper must come, in m."""
 
 
 class PiperEnv(BaseEnv):
@@ -61,10 +63,8 @@ class PiperEnv(BaseEnv):
 
     The arm moves only between a `reset` and the next safe stop. The stop is made on any
     exception in `reset` or `step` (the preprocess function's and a camera's included), in
-    `close`, and in `on_disconnect`. For the last this class relies on its host: a worker
-    calls `on_disconnect` and then `close` when its channel to the trainer closes, which the
-    trainer's death does too. A worker that is itself killed can stop nothing; the arm then
-    ends at its last target.
+    `close`, and in `on_disconnect`; and by the arm's watchdog, a process of its own, when
+    this process or the trainer ends in any way, SIGKILL included, or is stopped.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class PiperEnv(BaseEnv):
         super().__init__(config, worker_index, preprocess_fn, **kwargs)
         options = self._options = read_options(PiperOptions, self.env_id, config.env_kwargs)
         self._limits = action_limits(self.env_id, options)
-        check_reset_joints(self.env_id, options)
+        check_reset_position(self.env_id, options)
         cameras, reward = options.cameras, options.reward
         self._read_images = self._load("cameras.read", cameras.read) if cameras else None
         self._reward = self._load("reward", reward) if reward else None
@@ -87,11 +87,10 @@ class PiperEnv(BaseEnv):
         self._stopped = True
         self._num_steps = 0
         self._pace = Pace(options.control_hz)
-        self._channel = self._claim_channel()
         self._link: ArmLink | None = None
         try:
-            self._link = ArmLink(options.can_interface, self._channel)
-            self._link.wait_for_feedback(self._frames, 0.0, options.connect_timeout)
+            self._link = self._linked(self._own_channel())
+            self._link.wait_for_feedback(self._frames, 0, options.connect_timeout)
         except BaseException:
             self.close()
             raise
@@ -99,22 +98,32 @@ class PiperEnv(BaseEnv):
     def _load(self, field: str, name: str) -> Any:
         return load_named(self.env_id, f"env_kwargs.{field}", name)
 
-    def _claim_channel(self) -> str:
+    def _own_channel(self) -> str:
         given = self._options.channel
-        if isinstance(given, list):
-            if len(given) != self.config.num_workers:
-                raise ConfigError(
-                    f"{self.env_id}: env_kwargs.channel: {len(given)} channels for "
-                    f"{self.config.num_workers} envs"
-                )
-            given = given[self.worker_index]
-        if (other := _channels.get(given)) is not None:
+        if not isinstance(given, list):
+            return given
+        if len(given) != self.config.num_workers:
             raise ConfigError(
-                f"{self.env_id}: env_kwargs.channel: {given!r} is in use by {other}; "
-                "give a list with one channel for each env"
+                f"{self.env_id}: env_kwargs.channel: {len(given)} channels for "
+                f"{self.config.num_workers} envs"
             )
-        _channels[given] = self.env_id
-        return given
+        return given[self.worker_index]
+
+    def _linked(self, channel: str) -> ArmLink:
+        options = self._options
+        orders = {
+            "stop": options.safe_stop,
+            "timeout": options.watchdog_timeout,
+            "speed": options.speed,
+            "gripper_effort": round(options.gripper_effort * 1000) if options.gripper else None,
+        }
+        try:
+            return ArmLink(options.can_interface, channel, orders)
+        except InUse as error:
+            raise ConfigError(
+                f"{self.env_id}: env_kwargs.channel: {error}; an arm has one env, and several "
+                "envs need a list with one channel for each"
+            ) from None
 
     def get_observation_space(self) -> gym.Space[Any]:
         reach = np.array([MAX_LENGTH] * 3 + [MAX_ANGLE] * 3, np.float32)
@@ -131,8 +140,8 @@ class PiperEnv(BaseEnv):
 
     def get_action_space(self) -> gym.Space[Any]:
         return gym.spaces.Box(
-            np.array([limit.low for limit in self._limits], np.float32),
-            np.array([limit.high for limit in self._limits], np.float32),
+            np.array([limit.low32 for limit in self._limits]),
+            np.array([limit.high32 for limit in self._limits]),
             dtype=np.float32,
         )
 
@@ -154,8 +163,11 @@ class PiperEnv(BaseEnv):
         del seed
         link = self._require_link()
         with self._stopping_on_error():
-            self._leave_emergency_stop(link, resume=bool((options or {}).get("resume")))
+            is_resumed = self._is_to_be_resumed(link, bool((options or {}).get("resume")))
             self._stopped = False
+            link.arm(self.trainer_pid, self._options.connect_timeout)
+            if is_resumed:
+                self._resume(link)
             link.enable(self._options.connect_timeout)
             self._go_to_reset_position(link)
             self._num_steps = 0
@@ -174,11 +186,13 @@ class PiperEnv(BaseEnv):
         with self._stopping_on_error():
             if self._stopped:
                 raise RuntimeError(f"{self.env_id}: the arm is stopped; reset() starts it again")
+            self._check_watchdog(link)
             action = self._checked(self._preprocess_fn(policy_resp))
-            sent = time.monotonic()
             self._send(link, action)
+            sent = link.mark()
             late = self._pace.wait()
             link.wait_for_feedback(self._frames, sent, self._options.feedback_timeout)
+            self._check_watchdog(link)
             self._raise_faults(link)
             observation = self._observe(link)
             self._num_steps += 1
@@ -202,8 +216,6 @@ class PiperEnv(BaseEnv):
             if self._link is not None:
                 self._link.close()
                 self._link = None
-            if _channels.get(self._channel) == self.env_id:
-                del _channels[self._channel]
 
     def _require_link(self) -> ArmLink:
         if self._link is None:
@@ -222,22 +234,27 @@ class PiperEnv(BaseEnv):
         if self._stopped or self._link is None:
             return
         self._stopped = True
-        if self._options.safe_stop == "hold":
-            self._link.hold(self._options.speed)
-        elif self._options.safe_stop == "emergency_stop":
-            self._link.emergency_stop()
-        else:
-            self._link.disable()
+        self._link.stop()
 
-    def _leave_emergency_stop(self, link: ArmLink, *, resume: bool) -> None:
-        link.wait_for_feedback(STATUS_FRAMES, time.monotonic(), self._options.feedback_timeout)
+    def _check_watchdog(self, link: ArmLink) -> None:
+        if cause := link.stopped_because:
+            raise RuntimeError(
+                f"{self.env_id}: the arm's watchdog stopped it: {cause}; reset() starts it again"
+            )
+
+    def _is_to_be_resumed(self, link: ArmLink, is_asked: bool) -> bool:
+        """Whether an emergency stop is to be ended."""
+        link.wait_for_feedback(STATUS_FRAMES, link.mark(), self._options.feedback_timeout)
         if link.status() != "EMERGENCY_STOP":
-            return
-        if not resume:
+            return False
+        if not is_asked:
             raise RuntimeError(
                 f"{self.env_id}: the arm is under emergency stop; when it is safe that the arm "
                 'falls, call reset(options={"resume": True})'
             )
+        return True
+
+    def _resume(self, link: ArmLink) -> None:
         link.resume()
         timeout = self._options.connect_timeout
         if not link.wait_until(lambda: link.status() != "EMERGENCY_STOP", timeout):
@@ -245,30 +262,38 @@ class PiperEnv(BaseEnv):
 
     def _go_to_reset_position(self, link: ArmLink) -> None:
         options = self._options
-        target = np.array(options.reset_joints)
-
-        def distances() -> Any:
-            return np.abs(link.joints() - target)
-
         deadline = time.monotonic() + options.move_timeout
         while True:
-            sent = time.monotonic()
             link.command_joints(options.reset_joints, options.speed)
             if options.gripper:
                 link.command_gripper(options.reset_gripper, options.gripper_effort)
+            sent = link.mark()
             # Said again until the arm is there, since a bus may lose it.
-            reached = link.wait_until(lambda: distances().max() <= options.reset_tolerance, 0.2)
+            link.wait_until(lambda: not self._way_to_go(link), 0.2)
             link.wait_for_feedback(self._frames, sent, options.feedback_timeout)
+            self._check_watchdog(link)
             self._raise_faults(link)
-            if reached:
+            if not (missing := self._way_to_go(link)):
                 return
             if time.monotonic() >= deadline:
-                index = int(distances().argmax())
                 raise TimeoutError(
                     f"{self.env_id}: reset position not reached in {options.move_timeout:g} s: "
-                    f"joint_{index + 1} is at {link.joints()[index]:.3f} rad, not "
-                    f"{target[index]:.3f}; the arm reports {link.status()}"
+                    f"{missing}; the arm reports {link.status()}"
                 )
+
+    def _way_to_go(self, link: ArmLink) -> str:
+        """What is furthest from its reset position; empty if all is there."""
+        options = self._options
+        distances = np.abs(link.joints() - np.array(options.reset_joints))
+        index = int(distances.argmax())
+        if distances[index] > options.reset_tolerance:
+            return (
+                f"joint_{index + 1} is at {link.joints()[index]:.3f} rad, not "
+                f"{options.reset_joints[index]:.3f}"
+            )
+        if options.gripper and abs(link.gripper() - options.reset_gripper) > GRIPPER_TOLERANCE:
+            return f"the gripper is at {link.gripper():.3f} m, not {options.reset_gripper:.3f}"
+        return ""
 
     def _checked(self, action: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
         values = np.asarray(as_numpy(action), np.float64)
@@ -278,14 +303,16 @@ class PiperEnv(BaseEnv):
                 f"{self.env_id}: an action has shape ({len(self._limits)},): {names}; "
                 f"got {values.shape}"
             )
-        for limit, value in zip(self._limits, values.tolist(), strict=True):
-            # Written so that NaN is out of bounds.
-            if not limit.low <= value <= limit.high:
+        within = [
+            limit.within(value) for limit, value in zip(self._limits, values.tolist(), strict=True)
+        ]
+        for limit, value, sent in zip(self._limits, values.tolist(), within, strict=True):
+            if sent is None:
                 raise BadAction(
                     f"{self.env_id}: {limit.name} = {value:.6g} {limit.unit} is outside "
                     f"[{limit.low:.6g}, {limit.high:.6g}]; the action was not sent"
                 )
-        return values
+        return np.array(within, np.float64)
 
     def _send(self, link: ArmLink, action: np.ndarray[Any, np.dtype[np.float64]]) -> None:
         values = action.tolist()

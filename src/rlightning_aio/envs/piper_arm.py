@@ -11,9 +11,11 @@ from __future__ import annotations
 import math
 import struct
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from rlightning_aio.envs.piper_guard import JOINT_LIMITS, Frame
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -27,15 +29,6 @@ piper_sdk: Any = import_module("piper_sdk")
 
 __all__ = ["GRIPPER_RANGE", "JOINT_LIMITS", "Frame", "SimulatedArm"]
 
-JOINT_LIMITS = (
-    (-2.6179, 2.6179),
-    (0.0, 3.14),
-    (-2.967, 0.0),
-    (-1.745, 1.745),
-    (-1.22, 1.22),
-    (-2.09439, 2.09439),
-)
-"""Of each joint, in rad, as the vendor's SDK states them."""
 GRIPPER_RANGE = (0.0, 0.07)
 """Opening, in m."""
 
@@ -59,13 +52,6 @@ _LOWS, _HIGHS = np.array(JOINT_LIMITS).T
 _STARTS = tuple(
     np.array([turn, 1.5, -1.3, wrist, 0.6, 0.0]) for turn in (0, 1.3, -1.3) for wrist in (0, 1)
 )
-
-
-class Frame(NamedTuple):
-    """One standard CAN frame."""
-
-    can_id: int
-    data: bytes
 
 
 class SimulatedArm:

@@ -1,22 +1,40 @@
 """The connection to a Piper arm through the vendor's SDK, in SI units.
 
 Rule: metres, radians and seconds on this side; the SDK's 0.001 mm and 0.001 degrees
-stay in here. Frames are read by a thread of ours, so that a wait ends with the frame it
-waits for and a lost bus is noticed; the SDK parses and sends.
+stay in here. The bus itself belongs to the arm's watchdog (`piper_watchdog`), a process of
+its own: the SDK encodes what goes there and parses what comes. A thread of ours reads, so
+that a wait ends with the frame it waits for, and gives the signs of life.
 Absent on purpose: limits, rates and episodes, which are `piper`'s.
 """
 
 from __future__ import annotations
 
 import contextlib
+import json
 import math
+import os
+import select
+import socket
+import subprocess
+import sys
 import threading
 import time
 from importlib import import_module
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+
+from rlightning_aio.envs.piper_guard import Frame
+from rlightning_aio.envs.piper_watchdog import (
+    BITRATE,
+    MESSAGE_BYTES,
+    Kind,
+    feedback,
+    packed,
+    serve,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -24,9 +42,10 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
 # Optional and untyped, so imported by name.
+can: Any = import_module("can")
 piper_sdk: Any = import_module("piper_sdk")
 
-__all__ = ["GRIPPER_FRAMES", "JOINT_FRAMES", "POSE_FRAMES", "STATUS_FRAMES", "ArmLink"]
+__all__ = ["GRIPPER_FRAMES", "JOINT_FRAMES", "POSE_FRAMES", "STATUS_FRAMES", "ArmLink", "InUse"]
 
 STATUS_FRAMES = frozenset({0x2A1})
 POSE_FRAMES = frozenset({0x2A2, 0x2A3, 0x2A4})
@@ -34,105 +53,249 @@ JOINT_FRAMES = frozenset({0x2A5, 0x2A6, 0x2A7})
 GRIPPER_FRAMES = frozenset({0x2A8})
 POWER_FRAMES = frozenset(range(0x261, 0x267))
 
-BITRATE = 1_000_000
-FRESH = 0.5
-"""Feedback older than this, in seconds, says nothing about where the arm is."""
 MOVE_P, MOVE_J = 0, 1
-ALL_MOTORS = 7
+
+_BEATS: Final = 5
+"""Signs of life within the watchdog's timeout."""
+_OPEN_SECONDS: Final = 30.0
+"""A serial adapter takes seconds."""
+_STOP_SECONDS: Final = 1.0
+"""How long a watchdog may take to stop the arm before another one is started to do it."""
+_END_SECONDS: Final = 5.0
+_CLAIM_SECONDS: Final = 1.0
+"""How long the last holder of a channel may take to stop the arm and let go."""
+_BOOTSTRAP: Final = """
+import json, sys
+sys.path[:] = json.loads(sys.argv[2])
+from rlightning_aio.envs.piper_watchdog import main
+main(sys.argv[1])
+"""
+
+
+class InUse(Exception):
+    """Another program, or another env of this one, has the channel."""
 
 
 class ArmLink:
-    """One arm on one CAN channel.
+    """One arm on one CAN channel, which no other link has, in whatever process.
 
     The SDK keeps one interface object for each channel name and process, with what it
     last heard; that is why a new link waits for new frames before it believes anything.
 
     Args:
-        interface: python-can's name: ``socketcan``, ``slcan`` or ``virtual``. On
-            ``virtual``, which reaches this process only, the link brings a simulated arm.
+        interface: python-can's name: ``socketcan`` or ``slcan``; on ``virtual``, which
+            reaches this process only, the link brings a simulated arm.
         channel: the CAN interface or serial port.
+        orders: for the watchdog: ``stop``, ``timeout``, ``speed``, ``gripper_effort``; see
+            `piper_guard.ArmGuard`.
 
     Raises:
+        InUse: somebody else has the channel.
         ConnectionError: the channel can't be opened; nothing is left open.
     """
 
-    def __init__(self, interface: str, channel: str) -> None:
+    def __init__(self, interface: str, channel: str, orders: dict[str, Any]) -> None:
+        self._interface, self._channel, self._orders = interface, channel, orders
         self._name = f"{interface} channel {channel!r}"
-        self._arrived = threading.Condition()
-        self._arrivals: dict[int, float] = {}
+        self._period: float = orders["timeout"] / _BEATS
+        self._changed = threading.Condition()
+        self._arrivals: dict[int, int] = {}
+        self._commanded: list[Frame] = []
+        self._num_sent = 0
+        self._told: set[bytes] = set()
+        self._stopped_because = ""
         self._fault: Exception | None = None
         self._closing = threading.Event()
+        self._process: subprocess.Popen[bytes] | None = None
         with contextlib.ExitStack() as cleanup:
+            self._lock = _claimed(interface, channel)
+            cleanup.callback(self._lock.close)
             if interface == "virtual":
-                sim: Any = import_module("rlightning_aio.envs.piper_sim")
-                port = sim.VirtualPort(channel)
-                cleanup.callback(port.close)
-                cleanup.enter_context(sim.running(sim.SimulatedArm(), port))
-            self._sdk: Any = piper_sdk.C_PiperInterface_V2(
-                can_name=channel, judge_flag=False, can_auto_init=False
-            )
-            bus = self._open(interface, channel)
-            cleanup.callback(self._sdk.DisconnectPort)
-            self._sdk.ConnectPort(start_thread=False)
-            reader = threading.Thread(
-                target=self._read, args=(bus,), name=f"feedback of {channel}", daemon=True
-            )
+                self._program = self._watch_simulated_arm(cleanup)
+            else:
+                self._program = self._start_watchdog(armed=False)
+                cleanup.callback(self._end_watchdog)
+            self._poll = select.poll()
+            self._poll.register(self._program, select.POLLIN)
+            self._sdk = self._own_sdk(cleanup)
+            reader = threading.Thread(target=self._read, name=f"feedback of {channel}", daemon=True)
             reader.start()
             cleanup.callback(self._stop_reading, reader)
+            if not self._wait(lambda: Kind.OPEN in self._told, _OPEN_SECONDS):
+                raise ConnectionError(self._closed_hint()) from self._fault
             self._cleanup = cleanup.pop_all()
 
-    def _open(self, interface: str, channel: str) -> Any:
-        try:
-            self._sdk.CreateCanBus(
-                channel, bustype=interface, expected_bitrate=BITRATE, judge_flag=False
-            )
-        except ConnectionError as error:
-            raise ConnectionError(self._closed_hint(interface, channel)) from error
-        opened = self._sdk.GetCanBus()
-        if opened.recv_bus is None:
-            raise ConnectionError(self._closed_hint(interface, channel))
-        if interface == "virtual":
-            # The SDK opens one bus to receive and one to send. Nobody reads the second,
-            # and on this interface what isn't read is kept for ever.
-            opened.send_bus.shutdown()
-            opened.send_bus = opened.recv_bus
-        return opened.recv_bus
+    def _watch_simulated_arm(self, cleanup: contextlib.ExitStack) -> socket.socket:
+        """Have a thread be the watchdog of an arm that ends with this process anyway."""
+        sim: Any = import_module("rlightning_aio.envs.piper_sim")
+        port = sim.VirtualPort()
+        cleanup.callback(port.close)
+        cleanup.enter_context(sim.running(sim.SimulatedArm(), port))
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        watchdog = threading.Thread(
+            target=serve,
+            args=(theirs, port.bus, {**self._orders, "armed": False}),
+            name=f"watchdog of {self._channel}",
+            daemon=True,
+        )
+        watchdog.start()
+        cleanup.callback(watchdog.join)
+        cleanup.callback(ours.close)
+        return ours
 
-    def _closed_hint(self, interface: str, channel: str) -> str:
-        if interface == "socketcan":
+    def _start_watchdog(self, *, armed: bool) -> socket.socket:
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        orders = {
+            "interface": self._interface,
+            "channel": self._channel,
+            "program": theirs.fileno(),
+            "armed": armed,
+            **self._orders,
+        }
+        path = json.dumps([str(Path(entry).absolute()) for entry in sys.path])
+        with theirs, self._lock as lock:
+            # The channel is the watchdog's from here on, and free when that has ended.
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", "-c", _BOOTSTRAP, json.dumps(orders), path],
+                pass_fds=[theirs.fileno(), lock.fileno()],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                # Neither Ctrl-C nor Ctrl-Z nor the end of a terminal's session reaches it.
+                start_new_session=True,
+            )
+        return ours
+
+    def _end_watchdog(self) -> None:
+        self._program.close()
+        assert self._process is not None
+        try:
+            self._process.wait(_END_SECONDS)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def _own_sdk(self, cleanup: contextlib.ExitStack) -> Any:
+        """The SDK's interface, sending to the watchdog."""
+        sdk = piper_sdk.C_PiperInterface_V2(
+            can_name=self._channel, judge_flag=False, can_auto_init=False
+        )
+        # It insists on opening a bus of python-can's; this kind reaches this process only.
+        sdk.CreateCanBus(self._channel, bustype="virtual", judge_flag=False)
+        opened = sdk.GetCanBus()
+        for bus in (opened.recv_bus, opened.send_bus):
+            bus.shutdown()
+        opened.recv_bus = opened.send_bus = _Sender(self._commanded)
+        sdk.ConnectPort(piper_init=False, start_thread=False)
+        cleanup.callback(sdk.DisconnectPort)
+        return sdk
+
+    def _closed_hint(self) -> str:
+        if self._interface == "socketcan":
             return (
                 f"{self._name} can't be opened; bring it up first: "
-                f"ip link set {channel} up type can bitrate {BITRATE}"
+                f"ip link set {self._channel} up type can bitrate {BITRATE}"
             )
-        if interface == "slcan" and find_spec("serial") is None:
+        if self._interface == "slcan" and find_spec("serial") is None:
             return f"{self._name} needs pyserial: pip install 'python-can[serial]<5'"
         return f"{self._name} can't be opened; is it there, and may this user read and write it?"
 
-    def _read(self, bus: Any) -> None:
+    def _read(self) -> None:
+        due = 0.0
         try:
             while not self._closing.is_set():
-                message = bus.recv(0.1)
-                if message is None or len(message.data) != 8:
-                    continue
-                self._sdk.ParseCANFrame(message)
-                with self._arrived:
-                    self._arrivals[message.arbitration_id] = time.monotonic()
-                    self._arrived.notify_all()
+                now = time.monotonic()
+                if now >= due:
+                    due = now + self._period
+                    # One that is behind has signs enough to read.
+                    with contextlib.suppress(BlockingIOError):
+                        self._program.send(Kind.BEAT, socket.MSG_DONTWAIT)
+                if self._poll.poll(1000 * self._period):
+                    data = self._program.recv(MESSAGE_BYTES)
+                    if not data:
+                        raise ConnectionError("its watchdog has ended")
+                    self._hear(data[:1], data[1:])
         except Exception as error:  # noqa: BLE001 - whatever ends the reading reaches the waiter
-            with self._arrived:
-                self._fault = error
-                self._arrived.notify_all()
+            with self._changed:
+                self._fault = self._fault or error
+                self._changed.notify_all()
+
+    def _hear(self, kind: bytes, content: bytes) -> None:
+        taken, frames = feedback(content) if kind == Kind.FRAMES else (0, [])
+        now = time.time()
+        for frame in frames:
+            self._sdk.ParseCANFrame(
+                can.Message(timestamp=now, arbitration_id=frame.can_id, data=frame.data)
+            )
+        with self._changed:
+            self._arrivals.update((frame.can_id, taken) for frame in frames)
+            if kind == Kind.FAULT:
+                self._fault = ConnectionError(content.decode())
+            elif kind == Kind.STOP:
+                self._stopped_because = content.decode()
+            elif kind == Kind.ARM:
+                self._stopped_because = ""
+            self._told.add(kind)
+            self._changed.notify_all()
 
     def _stop_reading(self, reader: threading.Thread) -> None:
         self._closing.set()
         reader.join()
 
     def close(self) -> None:
-        """Leave the channel; the arm keeps doing what it was last told."""
+        """Leave the channel, which stops an arm that is not stopped yet."""
         self._cleanup.close()
 
-    def wait_for_feedback(self, frames: Iterable[int], since: float, timeout: float) -> None:
-        """Wait until each of these frames has come after `since` (on the monotonic clock).
+    def _ask(self, kind: bytes, content: bytes, timeout: float) -> bool:
+        """Have the watchdog do something; whether it has in time."""
+        self._told.discard(kind)
+        try:
+            self._program.send(kind + content)
+        except OSError:
+            return False
+        return self._wait(lambda: kind in self._told, timeout)
+
+    def arm(self, trainer_pid: int | None, timeout: float) -> None:
+        """Let commands reach the arm from now on, until `stop` or the watchdog stops it.
+
+        Args:
+            trainer_pid: a process that must live, and not be stopped, beside this one.
+            timeout: seconds until the watchdog must have heard of it.
+
+        Raises:
+            ConnectionError: the watchdog didn't answer.
+        """
+        if not self._ask(Kind.ARM, b"%d" % (trainer_pid or 0), timeout):
+            cause = self._fault or f"it did not answer for {timeout:g} s"
+            raise ConnectionError(f"the watchdog of the arm on {self._name} is gone: {cause}")
+
+    def stop(self) -> None:
+        """Make the safe stop. A watchdog that can't is replaced by one that does nothing else."""
+        if self._ask(Kind.STOP, b"", _STOP_SECONDS) or self._process is None:
+            return
+        self._process.kill()
+        self._process.wait()
+        with contextlib.suppress(InUse):
+            self._lock = _claimed(self._interface, self._channel)
+            self._start_watchdog(armed=True).close()
+            self._process.wait(_END_SECONDS)
+
+    @property
+    def stopped_because(self) -> str:
+        """Why the watchdog has stopped the arm unasked; empty if it has not."""
+        return self._stopped_because
+
+    def mark(self) -> int:
+        """Send what was commanded, if anything was; feedback after it is newer than that."""
+        self._num_sent += 1
+        data = Kind.FRAMES + packed(self._commanded)
+        self._commanded.clear()
+        # A watchdog that is gone is noticed where feedback is waited for.
+        with contextlib.suppress(OSError):
+            self._program.send(data)
+        return self._num_sent
+
+    def wait_for_feedback(self, frames: Iterable[int], since: int, timeout: float) -> None:
+        """Wait until each of these frames has come after that `mark`.
 
         Raises:
             ConnectionError: the bus failed, or `timeout` seconds passed first.
@@ -145,12 +308,12 @@ class ArmLink:
             f"no feedback from the arm on {self._name}{cause}; is it powered and connected?"
         ) from self._fault
 
-    def _missing(self, frames: Iterable[int], since: float) -> set[int]:
-        return {frame for frame in frames if self._arrivals.get(frame, -math.inf) <= since}
+    def _missing(self, frames: Iterable[int], since: int) -> set[int]:
+        return {frame for frame in frames if self._arrivals.get(frame, -1) < since}
 
     def _wait(self, done: Callable[[], bool], timeout: float) -> bool:
-        with self._arrived:
-            self._arrived.wait_for(lambda: done() or self._fault is not None, timeout)
+        with self._changed:
+            self._changed.wait_for(lambda: done() or self._fault is not None, timeout)
             return done()
 
     def wait_until(self, done: Callable[[], bool], timeout: float) -> bool:
@@ -189,8 +352,8 @@ class ArmLink:
         """
         deadline = time.monotonic() + timeout
         while True:
-            asked = time.monotonic()
             self._sdk.EnablePiper()
+            asked = self.mark()
             # The command is repeated, since a bus may lose it; motors report ten times a
             # second or more.
             self._wait(lambda since=asked: not self._missing(POWER_FRAMES, since), 0.2)
@@ -206,35 +369,76 @@ class ArmLink:
         """Go to joint positions [6] in rad, at `speed` percent."""
         self._sdk.MotionCtrl_2(1, MOVE_J, speed, 0)
         self._sdk.JointCtrl(*(_to_millidegrees(angle) for angle in joints))
+        self.mark()
 
     def command_pose(self, pose: Sequence[float], speed: int) -> None:
         """Go to an end pose [6] in m and rad, at `speed` percent."""
         self._sdk.MotionCtrl_2(1, MOVE_P, speed, 0)
         position = (round(value * 1e6) for value in pose[:3])
         self._sdk.EndPoseCtrl(*position, *(_to_millidegrees(angle) for angle in pose[3:]))
+        self.mark()
 
     def command_gripper(self, opening: float, effort: float) -> None:
         """Open or close to `opening` in m, with at most `effort` in N·m."""
         self._sdk.GripperCtrl(round(opening * 1e6), round(effort * 1000), 1, 0)
-
-    def hold(self, speed: int) -> None:
-        """Stay where the arm is; without fresh feedback that is unknown, so stop it instead."""
-        if self._missing(JOINT_FRAMES, time.monotonic() - FRESH):
-            self.emergency_stop()
-        else:
-            self.command_joints(self.joints().tolist(), speed)
-
-    def emergency_stop(self) -> None:
-        """The arm's own emergency stop, which lasts until `resume`."""
-        self._sdk.MotionCtrl_1(1, 0, 0)
+        self.mark()
 
     def resume(self) -> None:
         """End an emergency stop. The arm drops its power and falls, if it hasn't yet."""
         self._sdk.MotionCtrl_1(2, 0, 0)
+        self.mark()
 
-    def disable(self) -> None:
-        """Switch the motors off. The arm falls."""
-        self._sdk.DisableArm(ALL_MOTORS)
+
+class _Sender(can.BusABC):
+    """What the SDK takes for its bus: it only notes what is to be sent."""
+
+    def __init__(self, commanded: list[Frame]) -> None:
+        super().__init__("the watchdog")  # pyright: ignore[reportUnknownMemberType]
+        self._commanded = commanded
+
+    def send(self, msg: Any, timeout: float | None = None) -> None:
+        del timeout
+        self._commanded.append(Frame(msg.arbitration_id, bytes(msg.data)))
+
+
+def _claimed(interface: str, channel: str) -> socket.socket:
+    """A lock on a channel, which lasts until the last process that holds it has closed it.
+
+    Raises:
+        InUse: somebody has it, and hasn't let go in time; the message says which process.
+    """
+    name = channel
+    if interface == "virtual":
+        name = f"{os.getpid()}:{channel}"  # Each process has its own.
+    elif interface == "slcan":
+        name = str(Path(channel).resolve())  # A serial port has many names.
+    address = f"\0rlightning_aio.piper:{interface}:{name}"
+    lock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    until = time.monotonic() + _CLAIM_SECONDS
+    while True:
+        try:
+            lock.bind(address)
+            # So that others can ask who has it.
+            lock.listen(0)
+        except OSError:
+            if time.monotonic() < until:
+                time.sleep(0.02)
+                continue
+            lock.close()
+            raise InUse(f"{channel!r} is in use by {_holder(address)}") from None
+        return lock
+
+
+def _holder(address: str) -> str:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as caller:
+        try:
+            caller.setblocking(False)
+            caller.connect(address)
+            credentials = caller.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)
+        except OSError:
+            return "another process"
+        pid = int.from_bytes(credentials[:4], sys.byteorder)
+    return "another env of this process" if pid == os.getpid() else f"process {pid}"
 
 
 def _to_millidegrees(angle: float) -> int:

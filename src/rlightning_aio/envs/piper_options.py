@@ -11,20 +11,15 @@ from typing import Literal, NamedTuple
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from rlightning_aio.envs import piper_guard
+from rlightning_aio.envs.piper_guard import SafeStop
 from rlightning_aio.errors import ConfigError
 
-__all__ = ["CameraOptions", "Limit", "PiperOptions", "action_limits", "check_reset_joints"]
+__all__ = ["CameraOptions", "Limit", "PiperOptions", "action_limits", "check_reset_position"]
 
-# As the SDK's `JointCtrl` and `GripperCtrl` state them. The end pose is bounded by the
-# arm's reach; what it can't reach within that, the arm itself refuses.
-JOINT_LIMITS = {
-    "joint_1": (-2.6179, 2.6179),
-    "joint_2": (0.0, 3.14),
-    "joint_3": (-2.967, 0.0),
-    "joint_4": (-1.745, 1.745),
-    "joint_5": (-1.22, 1.22),
-    "joint_6": (-2.09439, 2.09439),
-}
+# The end pose is bounded by the arm's reach; what it can't reach within that, the arm itself
+# refuses.
+JOINT_LIMITS = {f"joint_{i}": limits for i, limits in enumerate(piper_guard.JOINT_LIMITS, 1)}
 POSE_LIMITS = {
     "x": (-0.7, 0.7),
     "y": (-0.7, 0.7),
@@ -35,6 +30,10 @@ POSE_LIMITS = {
 }
 GRIPPER_LIMITS = {"gripper": (0.0, 0.07)}
 IN_METRES = frozenset({"x", "y", "z", "gripper"})
+ORIENTATION = frozenset({"rx", "ry", "rz"})
+"""Angles that mean the same after a whole turn."""
+HALF_UNIT = {"m": 0.5e-6, "rad": math.radians(0.0005)}
+"""What the bus's units, 0.001 mm and 0.001 degrees, can't tell."""
 
 
 class CameraOptions(BaseModel):
@@ -81,15 +80,17 @@ class PiperOptions(BaseModel):
     """Seconds until the first feedback, and until the motors are on."""
     feedback_timeout: float = Field(default=0.5, gt=0)
     """Seconds without feedback after which the arm counts as lost."""
-    safe_stop: Literal["hold", "emergency_stop", "disable"] = "hold"
-    """What is done on an exception, at `close`, and when the trainer is gone."""
+    safe_stop: SafeStop = "hold"
+    """What is done on an exception, at `close`, and when the trainer or this process is gone."""
+    watchdog_timeout: float = Field(default=0.5, ge=0.1, le=10)
+    """Seconds for which this process, or the trainer's, may be stopped before the arm is."""
     cameras: CameraOptions | None = None
     reward: str | None = None
     """``module:callable`` of (observation, action) that returns a float; else rewards are 0."""
 
 
 class Limit(NamedTuple):
-    """Bounds of one number of an action, as float32 can express them."""
+    """Bounds of one number of an action, in rad or m."""
 
     name: str
     low: float
@@ -98,6 +99,32 @@ class Limit(NamedTuple):
     @property
     def unit(self) -> str:
         return "m" if self.name in IN_METRES else "rad"
+
+    @property
+    def low32(self) -> np.float32:
+        """`low` as float32, rounded outwards."""
+        rounded = np.float32(self.low)
+        return rounded if float(rounded) <= self.low else np.nextafter(rounded, np.float32(-np.inf))
+
+    @property
+    def high32(self) -> np.float32:
+        """`high` as float32, rounded outwards."""
+        rounded = np.float32(self.high)
+        return rounded if float(rounded) >= self.high else np.nextafter(rounded, np.float32(np.inf))
+
+    def within(self, value: float) -> float | None:
+        """`value` as it is sent, which is never beyond a bound; None if it is outside.
+
+        What exceeds a bound by no more than float32 or the bus's units can tell is at the
+        bound. An orientation may be given with any number of whole turns.
+        """
+        if self.name in ORIENTATION and math.isfinite(value):
+            value += math.tau * round(((self.low + self.high) / 2 - value) / math.tau)
+        slack = HALF_UNIT[self.unit] + float(np.spacing(np.float32(max(-self.low, self.high, 0))))
+        # Written so that NaN is outside.
+        if not self.low - slack <= value <= self.high + slack:
+            return None
+        return min(max(value, self.low), self.high)
 
 
 def action_limits(env_id: str, options: PiperOptions) -> tuple[Limit, ...]:
@@ -113,33 +140,36 @@ def action_limits(env_id: str, options: PiperOptions) -> tuple[Limit, ...]:
             raise ConfigError(
                 f"{env_id}: env_kwargs.limits.{name}: an action of this env has {', '.join(widest)}"
             )
-        if not widest[name][0] <= low < high <= widest[name][1]:
+        if not _is_narrower(name, low, high, widest[name]):
             raise ConfigError(
                 f"{env_id}: env_kwargs.limits.{name}: [{low}, {high}] is not within the arm's own "
                 f"{list(widest[name])}"
             )
-    return tuple(_rounded_inwards(name, *(widest | options.limits)[name]) for name in widest)
+    return tuple(Limit(name, *(widest | options.limits)[name]) for name in widest)
 
 
-def check_reset_joints(env_id: str, options: PiperOptions) -> None:
-    """Refuse a reset position that the arm can't take.
+def _is_narrower(name: str, low: float, high: float, widest: tuple[float, float]) -> bool:
+    if name in ORIENTATION:
+        # Bounds may lie around half a turn, where the hand points down.
+        return -math.tau <= low < high <= math.tau and high - low <= math.tau
+    return widest[0] <= low < high <= widest[1]
+
+
+def check_reset_position(env_id: str, options: PiperOptions) -> None:
+    """Refuse a reset position that is outside the limits of the arm or of the config.
 
     Raises:
-        ConfigError: it is outside the limits of a joint.
+        ConfigError: it is.
     """
-    for (name, (low, high)), angle in zip(JOINT_LIMITS.items(), options.reset_joints, strict=True):
-        if not low <= angle <= high:
+    limits = {**JOINT_LIMITS, **GRIPPER_LIMITS, **options.limits}
+    positions = dict(zip(JOINT_LIMITS, options.reset_joints, strict=True))
+    if options.gripper:
+        positions["gripper"] = options.reset_gripper
+    for name, position in positions.items():
+        limit = Limit(name, *limits[name])
+        if limit.within(position) is None:
+            field = "reset_gripper" if name == "gripper" else "reset_joints"
             raise ConfigError(
-                f"{env_id}: env_kwargs.reset_joints: {name} = {angle} rad is outside "
-                f"[{low}, {high}]"
+                f"{env_id}: env_kwargs.{field}: {name} = {position} {limit.unit} is outside "
+                f"[{limit.low}, {limit.high}]; name a reset position within the limits"
             )
-
-
-def _rounded_inwards(name: str, low: float, high: float) -> Limit:
-    """Bounds as float32, none outside the given ones."""
-    low32, high32 = np.float32(low), np.float32(high)
-    if float(low32) < low:
-        low32 = np.nextafter(low32, np.float32(np.inf))
-    if float(high32) > high:
-        high32 = np.nextafter(high32, np.float32(-np.inf))
-    return Limit(name, float(low32), float(high32))

@@ -1,8 +1,7 @@
 """Puts a simulated Piper arm on a bus: in this process, or on a pseudo-terminal.
 
-Rule: a program that drives the arm can't tell; the vendor's unmodified SDK speaks to it over
-python-can's ``virtual`` bus (same process) or ``slcan`` (any process, the path that
-``python -m rlightning_aio.envs.piper_sim`` prints).
+Rule: a program that drives the arm can't tell. Over ``slcan`` any process can speak to it (the
+path that ``python -m rlightning_aio.envs.piper_sim`` prints); over a `VirtualBus` this one.
 Absent on purpose: what the arm does with a frame, which is `piper_arm`'s.
 """
 
@@ -13,12 +12,12 @@ import contextlib
 import os
 import select
 import signal
+import socket
 import sys
 import threading
 import time
 import tty
-from importlib import import_module
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from rlightning_aio.envs.piper_arm import Frame, SimulatedArm
 
@@ -26,10 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Generator
     from types import FrameType
 
-# Optional and untyped, so imported by name.
-can: Any = import_module("can")
-
-__all__ = ["FEEDBACK_HZ", "SlcanPort", "VirtualPort", "run", "running"]
+__all__ = ["FEEDBACK_HZ", "SlcanPort", "VirtualBus", "VirtualPort", "run", "running"]
 
 FEEDBACK_HZ = 100.0
 """How often joints, pose and status are reported; motors report a fifth as often."""
@@ -42,8 +38,8 @@ class Port(Protocol):
         """The next frame, waiting up to `timeout` seconds for it."""
         ...
 
-    def send(self, frame: Frame) -> None:
-        """Send a frame, or drop it if nobody takes it."""
+    def send(self, frames: list[Frame]) -> None:
+        """Send frames at once, or drop them if nobody takes them."""
         ...
 
     def close(self) -> None:
@@ -52,22 +48,50 @@ class Port(Protocol):
 
 
 class VirtualPort:
-    """A channel of python-can's ``virtual`` bus, which reaches this process only."""
+    """The arm's end of a bus within one process; `bus` is the other end."""
 
-    def __init__(self, channel: str) -> None:
-        self._bus = can.Bus(interface="virtual", channel=channel)
+    def __init__(self) -> None:
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._end, self.bus = VirtualBus(ours), VirtualBus(theirs)
 
     def receive(self, timeout: float) -> Frame | None:
-        message = self._bus.recv(timeout)
-        return None if message is None else Frame(message.arbitration_id, bytes(message.data))
+        if not select.select([self._end], [], [], timeout)[0]:
+            return None
+        frames = self._end.receive(most=1)
+        return frames[0] if frames else None
 
-    def send(self, frame: Frame) -> None:
-        self._bus.send(
-            can.Message(arbitration_id=frame.can_id, data=frame.data, is_extended_id=False)
-        )
+    def send(self, frames: list[Frame]) -> None:
+        # A bus that nobody reads loses what comes.
+        with contextlib.suppress(OSError):
+            for frame in frames:
+                self._end.send(frame)
 
     def close(self) -> None:
-        self._bus.shutdown()
+        self._end.close()
+
+
+class VirtualBus:
+    """One end of such a bus; see `piper_watchdog.Bus`."""
+
+    def __init__(self, end: socket.socket) -> None:
+        end.setblocking(False)
+        self._socket = end
+
+    def fileno(self) -> int:
+        return self._socket.fileno()
+
+    def receive(self, most: int = 64) -> list[Frame]:
+        frames: list[Frame] = []
+        with contextlib.suppress(BlockingIOError, ConnectionResetError):
+            while len(frames) < most and (data := self._socket.recv(64)):
+                frames.append(Frame(int.from_bytes(data[:2], "big"), data[2:]))
+        return frames
+
+    def send(self, frame: Frame) -> None:
+        self._socket.send(frame.can_id.to_bytes(2, "big") + frame.data)
+
+    def close(self) -> None:
+        self._socket.close()
 
 
 class SlcanPort:
@@ -106,12 +130,12 @@ class SlcanPort:
             self._open = line == b"O"
         return None
 
-    def send(self, frame: Frame) -> None:
+    def send(self, frames: list[Frame]) -> None:
         if self._open:
+            lines = [f"t{f.can_id:03X}{len(f.data)}{f.data.hex().upper()}\r" for f in frames]
             # A full terminal means that nobody reads; a real bus would lose it as well.
             with contextlib.suppress(BlockingIOError):
-                text = f"t{frame.can_id:03X}{len(frame.data)}{frame.data.hex().upper()}\r"
-                os.write(self._master, text.encode("ascii"))
+                os.write(self._master, "".join(lines).encode("ascii"))
 
     def close(self) -> None:
         os.close(self._master)
@@ -124,13 +148,11 @@ def run(arm: SimulatedArm, port: Port, feedback_hz: float, stopped: Callable[[],
     tick = 0
     while not stopped():
         while (frame := port.receive(max(0.0, due - time.monotonic()))) is not None:
-            for answer in arm.receive(frame):
-                port.send(answer)
+            port.send(arm.receive(frame))
         now = time.monotonic()
         arm.advance(now - last)
         last, due = now, max(due + 1 / feedback_hz, now)
-        for frame in arm.feedback() + (arm.motor_feedback() if tick % 5 == 0 else []):
-            port.send(frame)
+        port.send(arm.feedback() + (arm.motor_feedback() if tick % 5 == 0 else []))
         tick += 1
 
 

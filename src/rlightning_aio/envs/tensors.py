@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from typing import Any, cast
 
+from rlightning_aio.protocol.columns import array_of_tensor
+
 __all__ = ["as_numpy", "holds_tensor", "is_tensor"]
 
 
@@ -30,7 +32,7 @@ def as_numpy(value: Any) -> Any:
     Looks into dicts, tuples and lists; anything else is returned as it is.
     """
     if is_tensor(value):
-        return value.detach().cpu().numpy()
+        return array_of_tensor(value)
     if isinstance(value, dict):
         return {key: as_numpy(inner) for key, inner in cast("dict[Any, Any]", value).items()}
     if type(value) in (tuple, list):

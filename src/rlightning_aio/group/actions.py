@@ -1,24 +1,24 @@
 """Responses become requests: actions are checked and written before anything is sent.
 
-Rule: all or nothing. A batch is looked through as a whole first (in O(1) where it
-comes as columns), and only then does the first byte leave. What would cost more than
-that, looking at every number, is done only where ``RLIGHTNING_AIO_DEBUG`` is 1.
+Rule: all or nothing. A batch is looked through as a whole first, with few vector operations
+where it comes as columns, and only then does the first byte leave.
 """
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from functools import cache
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
 from rlightning_aio.batch.data import columns_of_responses
 from rlightning_aio.errors import BadAction
 from rlightning_aio.hosts.messages import NO_ACTION
-from rlightning_aio.protocol.columns import Leaf, Tree, as_array, index
+from rlightning_aio.protocol.columns import Leaf, Tree, as_array, index, out_of_range
 
 if TYPE_CHECKING:
+    from gymnasium import spaces
     from numpy.typing import NDArray
 
     from rlightning_aio.batch import BatchedData
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from rlightning_aio.group.slab_layout import SlabLayout
     from rlightning_aio.protocol.slab import Slab
 
-__all__ = ["DEBUG", "OutOfBandSteps", "write_actions"]
+__all__ = ["OutOfBandSteps", "write_actions"]
 
-DEBUG: Final = os.environ.get("RLIGHTNING_AIO_DEBUG") == "1"
-"""Whether actions are searched for NaN, which no action space holds."""
+_FEW: Final = 8192
+"""So many numbers BLAS multiplies in one thread."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +48,8 @@ def write_actions(
     Returns what has to be sent out of band, or None if the rows hold all.
 
     Raises:
-        BadAction: an action's shape, dtype or count doesn't fit its env; rows of idle envs
-            may have been written, nothing else has happened.
+        BadAction: an action's shape, dtype or count doesn't fit its env, or a number its
+            space; rows of idle envs may have been written, nothing else has happened.
     """
     out_of_band = None
     if envs.any_out_of_band:
@@ -71,8 +71,7 @@ def _write_column(action: Any, slab: Slab, slots: NDArray[np.intp], envs: EnvTab
         source = _as_array(_at(action, leaf))
         if source.shape != (len(slots), *leaf.shape) or not _castable(source, leaf):
             raise BadAction(_misfit(f"the batch's action{leaf.name}", source, leaf, len(slots)))
-        if DEBUG:
-            _refuse_nan(source, leaf, slots, envs)
+        _refuse_unfit(source, leaf, slab, slots, envs)
         target[rows] = source
 
 
@@ -99,18 +98,56 @@ def _write_one_by_one(
                 if source.shape != leaf.shape or not _castable(source, leaf):
                     who = envs.describe(int(slots[k]))
                     raise BadAction(_misfit(f"action{leaf.name} for {who}", source, leaf))
-            if DEBUG:
-                _refuse_nan(np.array(sources), leaf, slots[positions], envs)
-            target[rows] = sources
+            stacked = np.array(sources)
+            _refuse_unfit(stacked, leaf, slab, slots[positions], envs)
+            target[rows] = stacked
 
 
-def _refuse_nan(source: NDArray[Any], leaf: Leaf, slots: NDArray[np.intp], envs: EnvTable) -> None:
-    if source.dtype.kind not in "fc":
-        return
-    bad = np.isnan(source).reshape(len(slots), -1).any(axis=1)
-    if bad.any():
-        who = envs.describe(int(slots[bad.argmax()]))
-        raise BadAction(f"action{leaf.name} for {who} holds NaN; nothing was sent")
+def _refuse_unfit(
+    source: NDArray[Any], leaf: Leaf, slab: Slab, slots: NDArray[np.intp], envs: EnvTable
+) -> None:
+    """Raises `BadAction` if any number of the actions of `slots` has no meaning in its space."""
+    unfit = _unfit(source, leaf, slab)
+    if unfit is not None:
+        row = int(unfit.reshape(len(slots), -1).any(axis=1).argmax())
+        number = source[row][unfit[row]].flat[0]
+        raise BadAction(
+            f"action{leaf.name} for {envs.describe(int(slots[row]))} holds {number}, which doesn't "
+            f"fit the action space, of dtype {leaf.dtype}; nothing was sent"
+        )
+
+
+def _unfit(source: NDArray[Any], leaf: Leaf, slab: Slab) -> NDArray[np.bool_] | None:
+    """Where numbers have no meaning in their space; None if nowhere.
+
+    NaN, what the dtype can't hold, and infinity in a place where the space is bounded. Finite
+    numbers outside of the bounds are the env's affair.
+    """
+    if leaf.dtype.kind != "f" or source.dtype.kind != "f":
+        return out_of_range(source, leaf.dtype)
+    most, most_squared = _largest(source.dtype, leaf.dtype)
+    if source.size <= _FEW:
+        # One multiplication tells of any NaN, any infinity, and any number that may be too large.
+        if float(np.vdot(source, source)) <= most_squared:
+            return None
+    elif source.max() <= most and source.min() >= -most:
+        return None
+    space = slab.layout.action_space
+    for key in leaf.path:
+        space = cast("Any", space)[key]
+    box = cast("spaces.Box", space)
+    infinite = np.isinf(source)
+    unfit = (source > most) & (box.bounded_above | ~infinite)
+    unfit |= (source < -most) & (box.bounded_below | ~infinite)
+    unfit |= np.isnan(source)
+    return unfit if unfit.any() else None
+
+
+@cache
+def _largest(one: np.dtype[Any], other: np.dtype[Any]) -> tuple[float, float]:
+    """The largest number that both dtypes hold, and its square as far as it is finite."""
+    most = min(float(np.finfo(one).max), float(np.finfo(other).max))
+    return most, most * most if most < 1e100 else most
 
 
 def actions_of(batch: BatchedData) -> list[Any]:
@@ -134,13 +171,22 @@ def _chosen_out_of_band(
 ) -> OutOfBandSteps | None:
     """What the channel must carry: actions without a row, and extras that somebody reads."""
     columns = columns_of_responses(batch)
-    all_extras = columns is None or len(columns) > 1
+    any_extras = columns is None or len(columns) > 1
     chosen = envs.out_of_band_actions[slots]
-    if all_extras:
+    if any_extras:
         chosen = chosen | envs.reads_extras[slots]
     positions = np.flatnonzero(chosen)
     if not len(positions):
         return None
+    if columns is not None and len(layout.slabs) == 1:
+        action = columns.get("action")
+        if _column_fits(action, layout.slabs[0], len(slots)):
+            if not any_extras:
+                return None
+            _write_column(action, layout.slabs[0], slots, envs)
+            readers = np.flatnonzero(envs.reads_extras[slots])
+            contents = [(NO_ACTION, _extras(batch, k)) for k in readers.tolist()]
+            return OutOfBandSteps(readers, contents) if contents else None
     actions = actions_of(batch)
     contents: list[tuple[Any, dict[str, Any]]] = []
     kept: list[int] = []
@@ -161,6 +207,19 @@ def _chosen_out_of_band(
     return OutOfBandSteps(np.array(kept, np.intp), contents) if kept else None
 
 
+def _column_fits(action: Any, slab: Slab, count: int) -> bool:
+    """Whether the rows can hold the actions of a whole batch."""
+    try:
+        return slab.action is not None and all(
+            (array := _as_array(_at(action, leaf))).shape == (count, *leaf.shape)
+            and _castable(array, leaf)
+            and _unfit(array, leaf, slab) is None
+            for leaf, _ in slab.action_columns
+        )
+    except (BadAction, ValueError):
+        return False
+
+
 def _extras(batch: BatchedData, position: int) -> dict[str, Any]:
     columns = columns_of_responses(batch)
     if columns is not None:
@@ -171,7 +230,9 @@ def _extras(batch: BatchedData, position: int) -> dict[str, Any]:
 def _fits(action: Any, slab: Slab) -> bool:
     try:
         return all(
-            (array := _as_array(_at(action, leaf))).shape == leaf.shape and _castable(array, leaf)
+            (array := _as_array(_at(action, leaf))).shape == leaf.shape
+            and _castable(array, leaf)
+            and _unfit(array, leaf, slab) is None
             for leaf, _ in slab.action_columns
         )
     except (BadAction, ValueError):
@@ -191,7 +252,7 @@ def _plain(action: Any) -> Any:
 def _as_array(value: Any) -> NDArray[Any]:
     try:
         return as_array(value)
-    except ValueError as error:
+    except (ValueError, TypeError, RuntimeError) as error:  # Of tensors: what NumPy has not.
         raise BadAction(f"an action is no array: {error}; nothing was sent") from None
 
 

@@ -9,11 +9,13 @@ Absent on purpose: rules. Every one of them is in the core.
 from __future__ import annotations
 
 import asyncio
+import os
 import time
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
+from rlightning_aio.errors import RLightningError
 from rlightning_aio.group.build import PreprocessFn, plan_group
-from rlightning_aio.group.facade import Facade, ServerView, only_result, steps_of
+from rlightning_aio.group.facade import Facade, ServerView, check_process, only_result, steps_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Mapping, Sequence
@@ -34,7 +36,10 @@ def _nothing() -> None: ...
 
 
 class AioDriver:
-    """Watches sources with `loop.add_reader` and waits for procedures to end."""
+    """Watches sources with `loop.add_reader` and waits for procedures to end.
+
+    It belongs to the loop in which `settle` was called; nobody waits in another.
+    """
 
     def __init__(self) -> None:
         # Takes in what sources have told; set by the group.
@@ -42,64 +47,166 @@ class AioDriver:
         # Invariant: the future of those who wait now; None while nobody does. A call that starts
         # to wait gets one that is not done: what was told before is in the core already.
         self._told: asyncio.Future[None] | None = None
-        self._loops: dict[Source, asyncio.AbstractEventLoop] = {}
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._pid = os.getpid()
         self._descriptors: dict[Source, int] = {}
         self._writing: set[Source] = set()
-        self._broken: BaseException | None = None
+        # What a source's callback has raised, until somebody is told.
+        self._raised: BaseException | None = None
+
+    # -- whose it is --------------------------------------------------------------
+
+    def settle(self) -> None:
+        """Belong to the running loop from now on.
+
+        Raises:
+            RLightningError: it belongs to another, or to another process.
+        """
+        check_process(self._pid)
+        if self._loop is None:
+            self._loop = asyncio.get_running_loop()
+        self.check_caller()
+
+    def check_caller(self) -> None:
+        """See `facade.Driver.check_caller`. While the loop is not running, plain code may ask."""
+        check_process(self._pid)
+        ours = self._loop
+        if ours is None:
+            return  # Not initialised, as the core will say.
+        try:
+            running = asyncio.get_running_loop()
+        except RuntimeError:
+            running = None
+        if running is not ours and (running or ours.is_running() or ours.is_closed()):
+            raise self._elsewhere(ours)
+
+    def move(self) -> None:
+        """Belong to the running loop, if the one that it belongs to does not run.
+
+        Raises:
+            RLightningError: it runs, in another thread; or it is another process's.
+        """
+        check_process(self._pid)
+        ours, loop = self._loop, asyncio.get_running_loop()
+        if ours is None or ours is loop:
+            return
+        if ours.is_running():
+            raise self._elsewhere(ours)
+        self.wake()
+        self._loop = loop
+        for source, descriptor in self._descriptors.items():
+            self._forget(ours, descriptor)
+            loop.add_reader(descriptor, self._readable, source)
+            if source in self._writing:
+                loop.add_writer(descriptor, self._writable, source)
+
+    def _elsewhere(self, ours: asyncio.AbstractEventLoop) -> RLightningError:
+        if ours.is_closed():
+            state = "is closed"
+            do = "build, use and close a group within one asyncio.run(), or use rlightning_aio.sync"
+        elif ours.is_running():
+            state = "runs in another thread"
+            do = "hand it what is to be done there, with asyncio.run_coroutine_threadsafe()"
+        else:
+            state = "is not running"
+            do = "use it there, or close it and build another here"
+        return RLightningError(
+            f"this group belongs to the event loop that initialised it ({ours!r}), which {state}; "
+            f"{do}; nothing was sent"
+        )
+
+    # -- sources ------------------------------------------------------------------
 
     def watch(self, source: Source) -> None:
         """See `base.Watcher.watch`."""
-        loop = self._loops[source] = asyncio.get_running_loop()
-        self._descriptors[source] = source.fileno()
-        loop.add_reader(source.fileno(), self._readable, source)
+        # Not the running loop: a replacement may be started by code that no loop runs.
+        assert self._loop is not None
+        descriptor = source.fileno()
+        self._loop.add_reader(descriptor, self._readable, source)
+        self._descriptors[source] = descriptor
 
     def unwatch(self, source: Source) -> None:
         """See `base.Watcher.unwatch`. A call that waits for `source` wakes."""
-        loop = self._loops.pop(source, None)
-        if loop is None:
+        descriptor = self._descriptors.pop(source, None)
+        if descriptor is None or self._loop is None:
             return
-        descriptor = self._descriptors.pop(source)
-        if not loop.is_closed():
-            loop.remove_reader(descriptor)
-            if source in self._writing:
-                loop.remove_writer(descriptor)
+        self._forget(self._loop, descriptor)
         self._writing.discard(source)
         self.wake()
 
+    @staticmethod
+    def _forget(loop: asyncio.AbstractEventLoop, descriptor: int) -> None:
+        if not loop.is_closed():
+            loop.remove_reader(descriptor)
+            loop.remove_writer(descriptor)
+
     def watch_writable(self, source: Source, wanted: bool) -> None:
         """See `base.Watcher.watch_writable`."""
-        # Not the running loop: `step_async` may be called from anywhere.
-        loop = self._loops[source]
+        descriptor = self._descriptors.get(source)
+        if descriptor is None or self._loop is None:
+            return
         if wanted:
             self._writing.add(source)
-            loop.add_writer(source.fileno(), source.on_writable)
+            self._loop.add_writer(descriptor, self._writable, source)
         elif source in self._writing:
             self._writing.discard(source)
-            loop.remove_writer(source.fileno())
+            self._loop.remove_writer(descriptor)
 
     def wake(self) -> None:
         """See `base.Watcher.wake`."""
         told, self._told = self._told, None
-        if told is not None and not told.done():
+        if told is not None and not told.done() and not told.get_loop().is_closed():
             told.set_result(None)
 
+    def forget(self) -> None:
+        """See `facade.Driver.forget`."""
+        self._descriptors.clear()
+        self._writing.clear()
+
     def _readable(self, source: Source) -> None:
+        if source not in self._descriptors:
+            return  # This process was forked while the loop ran, and it runs on.
         try:
             source.on_readable()
             self.drain()
-        except BaseException as error:  # An event loop would log it and let the waiter hang.
-            self._broken = error
+        except BaseException as error:
+            self._keep(error)
         self.wake()
 
+    def _writable(self, source: Source) -> None:
+        if source not in self._writing:
+            return  # As above.
+        try:
+            source.on_writable()
+        except BaseException as error:
+            self._keep(error)
+            self.wake()
+
+    def _keep(self, error: BaseException) -> None:
+        """Have the next who waits raise `error`: a loop would log it and let them hang."""
+        self._raised = self._raised or error
+
+    def _raise_kept(self) -> None:
+        """Raise, once, what a callback has raised."""
+        error, self._raised = self._raised, None
+        if error is not None:
+            raise error
+
+    # -- waiting ------------------------------------------------------------------
+
     async def run(self, procedure: Procedure[T]) -> T:
-        """Wait until `procedure` ends; its result. It gets to clean up if it is cancelled."""
+        """Wait until `procedure` ends; its result. It gets to clean up if it is cancelled.
+
+        Raises:
+            RLightningError: the group belongs to another loop, or to another process.
+        """
+        self.check_caller()
         try:
             wait = procedure.send(None)  # pyright: ignore[reportArgumentType]
             while True:
                 try:
                     await self._block(wait.until)
-                    if self._broken is not None:
-                        raise self._broken
+                    self._raise_kept()
                     self.drain()
                 except BaseException as error:
                     # Thrown, not closed: closing down takes waiting, too.
@@ -109,16 +216,25 @@ class AioDriver:
         except StopIteration as stop:
             return stop.value
 
+    async def run_last(self, procedure: Procedure[None]) -> None:
+        """Wait until the group is closed, in whichever loop.
+
+        What a callback has raised before doesn't keep it from closing, and is raised after.
+        """
+        self.move()
+        kept, self._raised = self._raised, None
+        await self.run(procedure)
+        if kept is not None:
+            raise kept
+
     async def _block(self, until: float | None) -> None:
         timeout = None if until is None else until - time.monotonic()
-        if timeout is not None and timeout <= 0:
+        if (timeout is None and not self._descriptors) or (timeout is not None and timeout <= 0):
             await asyncio.sleep(0)
-        elif self._loops:
-            if self._told is None:
-                self._told = asyncio.get_running_loop().create_future()
-            await asyncio.wait((self._told,), timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
-        else:
-            await asyncio.sleep(timeout or 0)
+            return
+        if self._told is None:
+            self._told = asyncio.get_running_loop().create_future()
+        await asyncio.wait((self._told,), timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
 
 
 class EnvGroup(Facade):
@@ -130,7 +246,8 @@ class EnvGroup(Facade):
         async with build_env_group(load_config("configs/halfcheetah.yaml")) as group:
             batch, _ = await group.reset(seed=0)
 
-    Not thread-safe: use it from the loop that initialised it.
+    It belongs to the loop that initialised it: use from another, or from another thread, raises
+    RLightningError. `close` works in any loop, unless its own is running elsewhere.
     """
 
     _driver: AioDriver
@@ -149,7 +266,9 @@ class EnvGroup(Facade):
             StartFailed: an env could not be built, or took longer than ``start_timeout``.
             ConfigError: the envs' action spaces have different shapes (a `ValueError`).
             GroupClosed: the group was closed before.
+            RLightningError: another event loop has initialised the group.
         """
+        self._driver.settle()
         try:
             return await self._driver.run(self._core.start(time.monotonic()))
         except BaseException:
@@ -166,7 +285,8 @@ class EnvGroup(Facade):
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        await self.close()
+        if not self._disowned:
+            await self.close()
 
     async def reset(
         self,
@@ -211,7 +331,9 @@ class EnvGroup(Facade):
         result. Cancelled, it leaves the results to `collect_async`.
 
         Raises:
-            BadAction: an action's shape, dtype or count doesn't fit; nothing was sent.
+            BadAction: an action's shape, dtype or count doesn't fit; it holds NaN, a number that
+                its dtype can't hold, or infinity where its space is bounded; or this is no batch.
+                Nothing was sent.
             EnvBusy: an env has a reply outstanding, or comes twice; nothing was sent.
             UnknownEnv: no env of this group has that id.
             NotImplementedError: the env is a client's, which answers when it can.
@@ -264,6 +386,26 @@ class EnvGroup(Facade):
         )
         return await self._driver.run(procedure)
 
+    async def collect_calls(self, deadline: float | None = None) -> list[Any]:
+        """Wait for the values of all calls that `call_async` has sent.
+
+        Args:
+            deadline: seconds in all, from now.
+
+        Returns them in the order in which they were sent: from a worker copies, from an inline
+        env the objects themselves. Cancelled, it loses none.
+
+        Raises:
+            NothingPending: no call is outstanding.
+            TimeoutError: `deadline` has passed; the next `collect_calls` gets the values.
+            EnvRaised: a method raised, or its value can't be pickled; what else went wrong is
+                in ``others``, and the values of the others are gone.
+            WorkerDied, EnvHung: a worker ended meanwhile; a replacement does not repeat the call.
+            GroupClosed: the group was not initialised, or is closed.
+            RLightningError: another task is waiting in it.
+        """
+        return await self._driver.run(self._collect_calls(deadline))
+
     def __getitem__(self, env_id: str) -> EnvHandle:
         """A handle on one env (an `EnvHandle`), or on one env_server (a `ServerHandle`).
 
@@ -273,7 +415,8 @@ class EnvGroup(Facade):
         server = self._core.supervisor.env_server(env_id)
         if server is not None:
             return ServerHandle(self, self._core, self._driver, server)
-        return EnvHandle(self, self._core, self._driver, self._core.envs.find_one(env_id))
+        self._core.envs.find_one(env_id)
+        return EnvHandle(self, self._core, self._driver, env_id)
 
     async def offload(self) -> None:
         """Have every local env free its device memory until `reload`; done when it returns.
@@ -302,9 +445,14 @@ class EnvGroup(Facade):
         Idempotent. A task that waits on the group gets `GroupClosed`; results that were not
         collected are gone. Cancelled, it ends what is left by force. An env that raises in its
         own `close` is named in a warning.
+
+        Raises:
+            RLightningError: the loop that the group belongs to runs in another thread.
         """
-        await self._driver.run(self._core.close(time.monotonic()))
-        self._closed()
+        try:
+            await self._driver.run_last(self._core.close(time.monotonic()))
+        finally:
+            self._closed()
 
 
 class EnvHandle:
@@ -314,16 +462,16 @@ class EnvHandle:
     of it is outstanding.
     """
 
-    def __init__(self, group: EnvGroup, core: Core, driver: AioDriver, slot: int) -> None:
+    def __init__(self, group: EnvGroup, core: Core, driver: AioDriver, env_id: str) -> None:
         self._group = group
         self._core = core
         self._driver = driver
-        self._slot = slot
+        self._env_id = env_id
 
     @property
     def env_id(self) -> str:
         """Its id, as in `EnvGroup.env_ids`."""
-        return self._core.envs.env_ids[self._slot]
+        return self._env_id
 
     async def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -352,7 +500,8 @@ class EnvHandle:
         return only_result(await self._group.step(steps_of(self.env_id, response)))
 
     async def call(self, name: str, *args: Any, **kwargs: Any) -> Any:
-        """Call method `name` of the env (or, if it has none, of its simulator).
+        """Call method `name` of the env, or of the first that has one of its simulator's wrappers,
+        from the outermost in, and the simulator.
 
         Returns its value: from a worker a copy, from an inline env the object itself.
         Cancelled, it leaves the method to end by itself, and its value is dropped.
@@ -362,9 +511,11 @@ class EnvHandle:
             EnvBusy: the env has a reply outstanding; nothing was sent.
             TypeError: the arguments can't be sent to a worker; nothing was sent.
             WorkerDied, EnvHung: the worker ended meanwhile; a replacement does not repeat it.
+            UnknownEnv: a client that has gone, and another has its place.
             GroupClosed: the group was not initialised, or is closed.
         """
-        procedure = self._core.call(time.monotonic(), self._slot, name, args, kwargs)
+        slot = self._core.envs.find_one(self._env_id)
+        procedure = self._core.call(time.monotonic(), slot, name, args, kwargs)
         return await self._driver.run(procedure)
 
     async def get_attr(self, name: str, target: str = "unwrapped") -> Any:
@@ -408,7 +559,7 @@ class ServerHandle(ServerView, EnvHandle):
         driver: AioDriver,
         server: tuple[Host, Membership],
     ) -> None:
-        super().__init__(group, core, driver, -1)
+        super().__init__(group, core, driver, server[1].server_id)
         self._server = server
         self._membership = server[1]
 
@@ -447,7 +598,7 @@ class ServerHandle(ServerView, EnvHandle):
 
 
 def build_env_group(
-    cfgs: Any,
+    env_cfgs: Any,
     preprocess_fn: PreprocessFn | Sequence[PreprocessFn | None] | None = None,
     mixed_actions: bool = False,
     zero_copy: bool = False,
@@ -455,7 +606,7 @@ def build_env_group(
     """A group of the configured envs; nothing is started yet.
 
     Args:
-        cfgs: an `EnvConfig`, a list of them, plain dicts, or OmegaConf nodes.
+        env_cfgs: an `EnvConfig`, a list of them, plain dicts, or OmegaConf nodes.
         preprocess_fn: turns a `PolicyResponse` into what the simulator steps with; one for
             all, a list with one for each entry, or one for each env. Anything that
             cloudpickle takes.
@@ -466,7 +617,7 @@ def build_env_group(
     Raises:
         ConfigError: something is wrong with the configuration or a preprocess function.
     """
-    plan = plan_group(cfgs, preprocess_fn, mixed_actions=mixed_actions, zero_copy=zero_copy)
+    plan = plan_group(env_cfgs, preprocess_fn, mixed_actions=mixed_actions, zero_copy=zero_copy)
     return EnvGroup(plan)
 
 

@@ -10,7 +10,7 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
@@ -28,11 +28,13 @@ from rlightning_aio.hosts.base import Wiring
 from rlightning_aio.hosts.messages import StartOrder
 from rlightning_aio.hosts.pickling import dumped_with_code
 from rlightning_aio.protocol.bell import TrainerBell, bell_size
-from rlightning_aio.registry import BACKENDS, ENVS, PLACEMENTS, load
-from rlightning_aio.types import PolicyResponse
+from rlightning_aio.registry import ENVS, load, placement_of
+from rlightning_aio.types import PolicyResponse, default_env_preprocess_fn
 
 if TYPE_CHECKING:
     from rlightning_aio.hosts.base import HostFactory, Watcher
+    from rlightning_aio.hosts.messages import Completions
+    from rlightning_aio.registry import Placement
 
 ENV_SERVER: Final = "env_server"
 MAX_CLIENTS: Final = 1024
@@ -54,7 +56,7 @@ class Plan:
 
 
 def plan_group(
-    cfgs: Any,
+    env_cfgs: Any,
     preprocess_fn: PreprocessFn | Sequence[PreprocessFn | None] | None,
     *,
     mixed_actions: bool,
@@ -65,14 +67,20 @@ def plan_group(
     Raises:
         ConfigError: a config or a preprocess function can't be used.
     """
-    configs = parse_configs(cfgs)
+    configs = parse_configs(env_cfgs)
     check_installed(configs)
-    for config in configs:
+    fns = _preprocess_fns(configs, preprocess_fn)
+    for config, own in zip(configs, fns, strict=True):
         host_class(config)
         if config.backend == ENV_SERVER:
-            _check_server(config, ignored=preprocess_fn is not None)
-    fns = _preprocess_fns(configs, preprocess_fn)
+            _check_server(config, ignored=own[0] not in (None, default_env_preprocess_fn))
+        for make in _distinct(config.make_env):
+            _check_sendable(config, "make_env", make)
     return Plan(configs, fns, mixed_actions, zero_copy)
+
+
+def _place(config: EnvConfig) -> Placement:
+    return placement_of(config.backend, config.placement)
 
 
 def host_class(config: EnvConfig) -> HostFactory:
@@ -81,9 +89,7 @@ def host_class(config: EnvConfig) -> HostFactory:
     Raises:
         ConfigError: its placement is not available.
     """
-    if config.backend == ENV_SERVER:
-        return load(BACKENDS[ENV_SERVER].target)
-    target = PLACEMENTS[config.placement].target
+    target = _place(config).target
     if target is None:
         raise ConfigError(
             f"entry {config.name!r}: placement {config.placement!r} is not available yet; use "
@@ -97,21 +103,11 @@ def _check_server(config: EnvConfig, *, ignored: bool) -> None:
     from rlightning_aio.hosts.listener import server_settings  # noqa: PLC0415
 
     server_settings(config)
-    if config.num_workers > 1:
-        raise ConfigError(
-            f"entry {config.name!r}, num_workers: an env_server is one; its clients are as many as "
-            "connect (env_kwargs.min_clients)"
-        )
-    if config.on_worker_death == "raise":
-        raise ConfigError(
-            f"entry {config.name!r}, on_worker_death: 'raise' is for workers; what a client owes "
-            "that is gone is answered by a truncated result, and it may come back"
-        )
     if ignored:
         warnings.warn(
             f"entry {config.name!r}: preprocess_fn is ignored for an env_server; it runs at the "
             "client",
-            stacklevel=5,
+            stacklevel=4,
         )
 
 
@@ -133,25 +129,32 @@ def _preprocess_fns(
             "envs; give one, one for each entry, or one for each env"
         )
     for config, fns in zip(configs, chosen, strict=True):
-        # By identity: a callable need not be hashable.
-        for fn in {id(fn): fn for fn in fns if fn is not None}.values():
-            _check_preprocess(config, fn)
+        for fn in _distinct(tuple(fns)):
+            if not callable(fn):
+                raise ConfigError(
+                    f"entry {config.name!r}: preprocess_fn must be callable, not "
+                    f"{type(fn).__name__}"
+                )
+            _check_sendable(config, "preprocess_fn", fn)
     return chosen
 
 
-def _check_preprocess(config: EnvConfig, fn: Any) -> None:
-    if not callable(fn):
-        raise ConfigError(
-            f"entry {config.name!r}: preprocess_fn must be callable, not {type(fn).__name__}"
-        )
-    if not PLACEMENTS[config.placement].spreads:
+def _distinct(fns: Any) -> list[Any]:
+    """One callable, or a tuple of them, without repetitions; callables need not be hashable."""
+    listed = cast("tuple[Any, ...]", fns if isinstance(fns, tuple) else (fns,))
+    return list({id(fn): fn for fn in listed if fn is not None}.values())
+
+
+def _check_sendable(config: EnvConfig, field: str, fn: Any) -> None:
+    """Raises `ConfigError` if a function can't travel to where the entry's envs live."""
+    if not _place(config).spreads:
         return
     try:
         dumped_with_code(fn)
     except Exception as error:
         name = getattr(fn, "__qualname__", repr(fn))
         raise ConfigError(
-            f"entry {config.name!r}: preprocess_fn {name} can't be sent to a worker: "
+            f"entry {config.name!r}: {field} {name} can't be sent to a worker: "
             f"{error}{_culprit(fn)}"
         ) from error
 
@@ -178,7 +181,18 @@ def assemble(plan: Plan, watcher: Watcher, *, shares_thread: bool) -> Core:
         plan: what `plan_group` made.
         watcher: the driver.
         shares_thread: other tasks may use the group while a procedure waits.
+
+    Raises what a host raises that can't be made; nothing is left of the others then.
     """
+    arena = Arena()
+    try:
+        return _assembled(plan, watcher, arena, shares_thread=shares_thread)
+    except BaseException:
+        arena.close()
+        raise
+
+
+def _assembled(plan: Plan, watcher: Watcher, arena: Arena, *, shares_thread: bool) -> Core:
     local = [config for config in plan.configs if config.backend != ENV_SERVER]
     servers = [config for config in plan.configs if config.backend == ENV_SERVER]
     envs = EnvTable(
@@ -188,7 +202,6 @@ def assemble(plan: Plan, watcher: Watcher, *, shares_thread: bool) -> Core:
     )
     cores = sorted(os.sched_getaffinity(0))
     orders = _orders(plan, servers, cores)
-    arena = Arena()
     bell_offset = arena.append(bell_size(len(orders)))
     bell_memory = map_shared(arena.descriptor, bell_offset, bell_size(len(orders)))
     bell = TrainerBell(bell_memory, len(orders))
@@ -197,18 +210,20 @@ def assemble(plan: Plan, watcher: Watcher, *, shares_thread: bool) -> Core:
         len(orders),
     )
     layout = SlabLayout(len(envs))
+    completions: Completions = deque()
     supervisor = Supervisor(
         envs,
         requests,
         layout,
         arena,
+        completions.append,
         mixed_actions=plan.mixed_actions,
         num_cores=len(cores),
     )
     supervisor.resources["bell"] = bell
     poller = Poller(requests, bell, len(cores))
     wiring = Wiring(
-        completions=deque(),
+        completions=completions,
         watcher=watcher,
         arena=arena,
         bell=bell,
@@ -225,7 +240,7 @@ def assemble(plan: Plan, watcher: Watcher, *, shares_thread: bool) -> Core:
         supervisor.add(host, order.config)
         poller.add(host)
         first_slot += host.num_envs
-    parts = (envs, requests, layout, supervisor, poller, wiring.completions, watcher)
+    parts = (envs, requests, layout, supervisor, poller, completions, watcher)
     host = supervisor.hosts[0]
     if not shares_thread and len(envs) == 1 and isinstance(host, StepsAtOnce):
         core = SingleEnvCore(*parts, zero_copy=plan.zero_copy)
@@ -236,16 +251,21 @@ def assemble(plan: Plan, watcher: Watcher, *, shares_thread: bool) -> Core:
 
 def _orders(plan: Plan, servers: Sequence[EnvConfig], cores: Sequence[int]) -> list[StartOrder]:
     """What each host is to build: local ones first, then the env_servers."""
-    shares = [
-        (config, share)
+    local = [
+        (config, fns)
         for config, fns in zip(plan.configs, plan.preprocess_fns, strict=True)
         if config.backend != ENV_SERVER
-        for share in _shares(config, fns, len(cores))
     ]
-    num_processes = sum(PLACEMENTS[config.placement].spreads for config, _ in shares)
+    nums_hosts = _nums_hosts([config for config, _ in local], len(cores))
+    shares = [
+        (config, share)
+        for (config, fns), num_hosts in zip(local, nums_hosts, strict=True)
+        for share in _shares(fns, num_hosts)
+    ]
+    num_processes = sum(_place(config).spreads for config, _ in shares)
     orders = [
         StartOrder(
-            config=config,
+            config=_own_makers(config, [index for index, _ in share]),
             env_class=ENVS.registered(config.backend),
             worker_indices=tuple(index for index, _ in share),
             preprocess_fns=tuple(fn for _, fn in share),
@@ -261,18 +281,45 @@ def _orders(plan: Plan, servers: Sequence[EnvConfig], cores: Sequence[int]) -> l
     ]
 
 
+def _own_makers(config: EnvConfig, indices: Sequence[int]) -> EnvConfig:
+    """`config` for a host of some of the entry's envs, with what makes these."""
+    makers: Any = config.make_env
+    if not isinstance(makers, tuple):
+        return config
+    makers = cast("tuple[Any, ...]", makers)
+    return config.model_copy(update={"make_env": tuple(makers[k] for k in indices)})
+
+
+def _nums_hosts(configs: Sequence[EnvConfig], num_cores: int) -> list[int]:
+    """Over how many hosts the envs of each entry are spread.
+
+    Entries of CPU-bound simulators that don't say it share the cores, by their numbers of envs.
+    """
+    nums: list[int] = []
+    sharing: list[int] = []
+    for k, config in enumerate(configs):
+        if not _place(config).spreads:
+            nums.append(1)
+        elif config.envs_per_process != "auto":
+            nums.append(-(-config.num_workers // config.envs_per_process))
+        elif ENVS.is_cpu_bound(config.backend):
+            nums.append(1)
+            sharing.append(k)
+        else:
+            nums.append(config.num_workers)
+    for _ in range(num_cores - len(sharing)):
+        # One more worker where most envs share one.
+        crowded = max(sharing, key=lambda k: configs[k].num_workers / nums[k], default=None)
+        if crowded is None or nums[crowded] == configs[crowded].num_workers:
+            break
+        nums[crowded] += 1
+    return nums
+
+
 def _shares(
-    config: EnvConfig, fns: Sequence[PreprocessFn | None], num_cores: int
+    fns: Sequence[PreprocessFn | None], num_hosts: int
 ) -> list[list[tuple[int, PreprocessFn | None]]]:
     """Which envs of an entry live together: as evenly as can be, neighbours together."""
-    count = config.num_workers
-    if not PLACEMENTS[config.placement].spreads:
-        num_hosts = 1
-    elif config.envs_per_process == "auto":
-        backend = BACKENDS.get(config.backend)
-        cpu_bound = backend is not None and backend.cpu_bound
-        num_hosts = min(num_cores, count) if cpu_bound else count
-    else:
-        num_hosts = -(-count // config.envs_per_process)
+    count = len(fns)
     envs = list(enumerate(fns))
     return [envs[count * k // num_hosts : count * (k + 1) // num_hosts] for k in range(num_hosts)]

@@ -19,10 +19,12 @@ from rlightning_aio.batch.data import (
     Origin,
     batch_of_results,
     columns_of_responses,
+    names_of,
     slots_of,
 )
 from rlightning_aio.batch.sent import columns_of_values
 from rlightning_aio.errors import (
+    BadAction,
     NothingPending,
     RLightningError,
 )
@@ -105,11 +107,15 @@ class Core:
             self._results,
             self._recovery,
             self.auto,
+            self.stats,
         )
         # Takes in what hosts have told; a driver calls it before a procedure goes on.
         self.drain = self._intake.drain
         self._collecting = False
         self._handed_out = 0
+        # Calls of methods that `collect_calls` will answer.
+        self._calls: list[Ticket] = []
+        self._collecting_calls = False
         # How many results each call that waits wants.
         self._wanted: list[int] = []
 
@@ -136,6 +142,11 @@ class Core:
 
     def _slots_of(self, batch: BatchedData) -> NDArray[np.intp]:
         """Slots of a batch's envs; free for a batch that answers one of ours."""
+        if not isinstance(batch, BatchedData):  # pyright: ignore[reportUnnecessaryIsInstance]
+            raise BadAction(
+                f"a step takes a batch of responses, not a {type(batch).__name__}: answer the last "
+                "results with batch.respond(action=...); nothing was sent"
+            )
         slots = slots_of(batch, self)
         return self._dispatch.distinct(batch.env_ids()) if slots is None else slots
 
@@ -145,8 +156,7 @@ class Core:
         self._intake.now = now
         self._intake.drain()
         if self.supervisor.has_members:
-            if self.requests.num_ready:
-                batch, slots = self._without_returned(batch, slots)
+            batch, slots = self._without_gone(batch, slots)
             if not len(slots):
                 return
         self._dispatch.check_sendable(slots, "step")
@@ -171,18 +181,23 @@ class Core:
         if self.supervisor.has_members:
             self._intake.drain()  # What was withdrawn at once.
 
-    def _without_returned(
+    def _without_gone(
         self, batch: BatchedData, slots: NDArray[np.intp]
     ) -> tuple[BatchedData, NDArray[np.intp]]:
-        """`batch` without the clients that have come back since it was decided upon.
+        """`batch` without the clients that have gone since it was handed out, and are back or
+        have left their slots to others.
 
-        What they would be asked was meant for the episode that they have lost; the first
-        result of the new one, which waits to be collected, is their answer.
+        What they would be asked was meant for the episode that they have lost. Of one that is
+        back, the first result of the new episode, which waits to be collected, is the answer.
         """
-        returned = self.requests.joined(slots)
-        if not returned.any():
+        gone = self.requests.joined(slots)
+        names = self.envs.names
+        if names_of(batch) is not names:
+            pairs = zip(batch.env_ids(), names.ids(slots), strict=True)
+            gone |= np.array([then != now for then, now in pairs], np.bool_)
+        if not gone.any():
             return batch, slots
-        kept = np.flatnonzero(~returned).tolist()
+        kept = np.flatnonzero(~gone).tolist()
         env_ids, values = batch.env_ids(), batch.values()
         return BatchedData([env_ids[k] for k in kept], [values[k] for k in kept]), slots[kept]
 
@@ -310,7 +325,29 @@ class Core:
                 raise fault
 
     def _hand_out(self, slots: NDArray[np.intp], *, synchronous: bool) -> tuple[BatchedData, Flags]:
-        self.requests.hand_out(slots)
+        """The results of `slots`, all ready. They stay so until the batch is complete: where
+        memory runs out on the way, the next collect hands them out.
+        """
+        try:
+            batch, limits, parts = self._batch(slots)
+            flags = [False] * len(slots) if limits is None else limits.tolist()
+            self.stats.account(parts, synchronous=synchronous)
+            self._results.let_go(slots)
+            self.requests.hand_out(slots)
+        except BaseException:
+            self.requests.put_back(slots)
+            raise
+        self._handed_out += 1
+        if len(slots) and self._handed_out % 8 == 0:
+            self._note_eighth(parts)
+        if self._intake.held_back:
+            self._intake.admit(slots)
+        return batch, flags
+
+    def _batch(
+        self, slots: NDArray[np.intp]
+    ) -> tuple[BatchedData, NDArray[np.bool_] | None, list[ResultColumns]]:
+        """A batch, where the step limit was reached, and its parts. Doing it twice is harmless."""
         results = self._results
         parts = results.gather(slots)
         flagged = [part for part in parts if np.count_nonzero(part.flags)]
@@ -321,15 +358,8 @@ class Core:
                 if self.auto.mark_truncated:
                     part.flags[part.limit_reached, ..., TRUNCATED] = True
             results.add_episodes(part)
-        self.stats.account(parts, synchronous=synchronous)
-        self._handed_out += 1
-        if len(slots) and self._handed_out % 8 == 0:
-            self._note_eighth(parts)
-        if self._intake.held_back:
-            self._intake.admit(slots)
-        origin = Origin(self, slots, self.envs)
-        batch = batch_of_results(parts, origin, results.sources(slots))
-        return batch, [False] * len(slots) if limits is None else limits.tolist()
+        origin = Origin(self, slots, self.envs.names)
+        return batch_of_results(parts, origin, results.sources(slots)), limits, parts
 
     def _note_eighth(self, parts: Sequence[ResultColumns]) -> None:
         """Learn from one result in a while how long steps take there."""
@@ -382,7 +412,11 @@ class Core:
         fault = ticket.faults[0]
         fault.others = tuple(ticket.faults[1:])
         if len(done):
-            fault.results = self._hand_out(done, synchronous=True)[0]
+            try:
+                fault.results = self._hand_out(done, synchronous=True)[0]
+            except BaseException:
+                self.requests.faults.extend(ticket.faults)
+                raise
             fault.add_note(
                 f"{len(done)} other envs of the same call are done; their results are in "
                 "the error's `results`"
@@ -433,18 +467,37 @@ class Core:
             self._check(now)
         return now
 
+    def reset_async(
+        self,
+        now: float,
+        seed: Seeds,
+        options: dict[str, Any] | None,
+        env_ids: Sequence[str] | None,
+    ) -> None:
+        """Send resets that `collect` will answer."""
+        slots = self._everyone() if env_ids is None else self._dispatch.distinct(env_ids)
+        seeds = self._seeds_for(slots, seed, now)
+        self._dispatch.check_sendable(slots, "reset")
+        packed = self._packed_resets(slots, seeds, options)
+        self._forget_losses(slots)
+        self._submit_resets(slots, seeds, packed, COLLECTOR, now)
+        if self._wanted:
+            self._watcher.wake()
+
+    def _forget_losses(self, slots: NDArray[np.intp]) -> None:
+        """Whoever resets begins a new episode anyway, and needn't be told of the one before."""
+        self._recovery.forget(slots.tolist())
+        if self._recovery.any_telling:
+            self.supervisor.note_recovery(any_telling=True)
+
     def _reset(
         self, now: float, seed: Seeds, options: dict[str, Any] | None, slots: NDArray[np.intp]
     ) -> Procedure[tuple[BatchedData, Flags]]:
-        self._intake.now = now
-        self._intake.drain()
-        if self.supervisor.has_members:
-            self.supervisor.rank_members()
-        seeds = seeds_for(self.envs, seed, slots)
+        seeds = self._seeds_for(slots, seed, now)
         joined = self.requests.joined(slots)
         self._dispatch.check_sendable(slots[~joined], "reset")
-        packed = None if options is None else self._dispatch.packed_resets(slots, seeds, options)
-        self._recovery.forget(slots.tolist())
+        packed = self._packed_resets(slots, seeds, options)
+        self._forget_losses(slots)
         ticket = self.requests.open_ticket(slots)
         asked = slots
         if joined.any():
@@ -452,13 +505,36 @@ class Core:
             self._take_first_results(slots[joined], ticket, enough=enough)
             if enough:
                 asked, seeds = slots[~joined], seeds[~joined]
-        entries = self.requests.submit(asked, Operation.RESET, ticket.owner, now)
-        self._results.note_sent(asked, None)
-        if packed is None:
-            self._layout.write_seeds(asked, seeds)
-        self._dispatch.hand_over(asked, entries, packed)
+        self._submit_resets(asked, seeds, packed, ticket.owner, now)
         yield from self._await(ticket, now)
         return self._settled(ticket, slots)
+
+    def _seeds_for(self, slots: NDArray[np.intp], seed: Seeds, now: float) -> NDArray[np.int64]:
+        """The seeds of resets that are about to be sent to `slots`, as things are now."""
+        self._intake.now = now
+        self._intake.drain()
+        if self.supervisor.has_members:
+            self.supervisor.rank_members()
+        return seeds_for(self.envs, seed, slots)
+
+    def _packed_resets(
+        self, slots: NDArray[np.intp], seeds: NDArray[np.int64], options: dict[str, Any] | None
+    ) -> list[Any] | None:
+        return None if options is None else self._dispatch.packed_resets(slots, seeds, options)
+
+    def _submit_resets(
+        self,
+        slots: NDArray[np.intp],
+        seeds: NDArray[np.int64],
+        packed: list[Any] | None,
+        owner: int,
+        now: float,
+    ) -> None:
+        entries = self.requests.submit(slots, Operation.RESET, owner, now)
+        self._results.note_sent(slots, None)
+        if packed is None:
+            self._layout.write_seeds(slots, seeds)
+        self._dispatch.hand_over(slots, entries, packed)
 
     def _take_first_results(self, slots: NDArray[np.intp], ticket: Ticket, *, enough: bool) -> None:
         """Let a reset have the first results of clients that have only just joined.
@@ -471,11 +547,14 @@ class Core:
             for slot in slots.tolist():
                 self._results.drop(slot)
 
+    # -- methods of envs --------------------------------------------------------------
+
     def call(
         self, now: float, slot: int, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]
     ) -> Procedure[Any]:
         """Call a method of one env; its value."""
-        return (yield from self._call(now, self.requests.alone(slot), name, args, kwargs))
+        slots = self.requests.alone(slot)
+        return (yield from self._call(now, slots, name, args, kwargs))[0]
 
     def call_all(self, now: float, name: str) -> Procedure[None]:
         """Call a method of every env, all at once."""
@@ -488,8 +567,31 @@ class Core:
         name: str,
         args: tuple[Any, ...],
         kwargs: dict[str, Any],
-    ) -> Procedure[Any]:
-        """The value of the last call to return."""
+    ) -> Procedure[list[Any]]:
+        ticket = self._send_calls(now, slots, name, args, kwargs)
+        yield from self._await(ticket, now)
+        return _values([ticket])
+
+    def call_async(
+        self,
+        now: float,
+        env_ids: Sequence[str] | None,
+        name: str,
+        args: tuple[Any, ...],
+        kwargs: dict[str, Any],
+    ) -> None:
+        """Send calls of a method that `collect_calls` will answer."""
+        slots = self.envs.all if env_ids is None else self._dispatch.distinct(env_ids)
+        self._calls.append(self._send_calls(now, slots, name, args, kwargs))
+
+    def _send_calls(
+        self,
+        now: float,
+        slots: NDArray[np.intp],
+        name: str,
+        args: tuple[Any, ...],
+        kwargs: dict[str, Any],
+    ) -> Ticket:
         self._intake.drain()
         self._dispatch.check_local(slots, f"call {name} of")
         self._dispatch.check_sendable(slots, f"call {name} of")
@@ -502,16 +604,55 @@ class Core:
         entries = self.requests.submit(slots, Operation.CALL, ticket.owner, now)
         self.auto.not_completed(slots)
         self._dispatch.hand_over(slots, entries, packed)
-        yield from self._await(ticket, now)
-        if ticket.faults:
-            ticket.faults[0].others = tuple(ticket.faults[1:])
-            raise ticket.faults[0]
-        return ticket.value
+        return ticket
+
+    def collect_calls(self, now: float, deadline: float | None) -> Procedure[list[Any]]:
+        """See `EnvGroup.collect_calls`."""
+        self.supervisor.check_open()
+        if self._collecting_calls:
+            raise RLightningError(
+                "another collect_calls is already waiting on this group; one at a time"
+            )
+        if not self._calls:
+            raise NothingPending("no call is outstanding; send one with call_async")
+        end = None if deadline is None else now + deadline
+        self._collecting_calls = True
+        try:
+            while True:
+                self._poll()
+                remaining = sum(ticket.remaining for ticket in self._calls)
+                if not remaining:
+                    break
+                if end is not None and now >= end:
+                    raise TimeoutError(
+                        f"{remaining} calls have not returned within {deadline} s; nothing is "
+                        "lost, the next collect_calls gets their values"
+                    )
+                now = yield from self._wait(remaining, now, end)
+        finally:
+            self._collecting_calls = False
+            self._stop_waiting()
+        tickets, self._calls = self._calls, []
+        for ticket in tickets:
+            self.requests.settle(ticket)
+        return _values(tickets)
 
     def pending(self) -> int:
         """Requests that `collect_async` has still to answer, ready or not."""
         self._intake.drain()
         return self.requests.pending()[1]
+
+
+def _values(tickets: Sequence[Ticket]) -> list[Any]:
+    """What calls have returned, in the order in which they were sent.
+
+    Raises their faults instead, if there are any: the first, with the others.
+    """
+    faults = [fault for ticket in tickets for fault in ticket.faults]
+    if faults:
+        faults[0].others = tuple(faults[1:])
+        raise faults[0]
+    return [ticket.values[slot] for ticket in tickets for slot in ticket.slots.tolist()]
 
 
 def _owner(ticket: Ticket | None) -> int:

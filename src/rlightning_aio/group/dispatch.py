@@ -107,10 +107,9 @@ class Dispatch:
         arguments: Sequence[Any] | None = None,
     ) -> None:
         """Give submitted requests to their hosts, with one call for each run of one host."""
-        hosts = self._supervisor.hosts
         for host_id, part in self._requests.by_host(slots):
             given = None if arguments is None else arguments[part]
-            hosts[host_id].submit(entries[part], given)
+            self._supervisor.submit(host_id, entries[part], given)
 
     def hand_over_out_of_band(
         self,

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rlightning_aio.batch.names import EnvNames
 from rlightning_aio.errors import UnknownEnv
 
 if TYPE_CHECKING:
@@ -32,16 +33,15 @@ class EnvTable:
         servers: id, config and number of slots of each env_server.
 
     Attributes:
-        env_ids, configs: of each slot; the id of a slot that no client has taken is empty.
+        names: of each slot; replaced when a client takes one.
+        configs: of each slot.
         local_ids, server_ids: of the local envs, and of the env_servers.
-        entries: number of each slot's config entry; entry_names: their names.
         all: slots of the local envs.
         step_limits: of an episode, configured or the simulator's own; 0 for none.
         out_of_band_actions: actions may not fit the row; reads_extras: responses' extras are
             read there; any_out_of_band: either is true of any env.
-        num_sub_envs: of each; seed_offset: how many come before it, in seeds and in
-            `index`; num_seeds: those of all local envs.
-        turns: results come from some of the sub-environments at a time.
+        num_sub_envs: of each; seed_offset: how many seeds come before its own; num_seeds:
+            those of all local envs.
         resets_itself: it needs no reset after an end; any_resets_itself: true of any env.
     """
 
@@ -54,17 +54,22 @@ class EnvTable:
         self.local_ids = list(env_ids)
         self.server_ids = [server_id for server_id, _, _ in servers]
         self.configs = list(configs)
-        # What a batch calls a slot: a client goes by its env_server's id there.
-        self._batch_ids = list(env_ids)
+        shared_ids = list(env_ids)
         for server_id, config, count in servers:
             self.configs += [config] * count
-            self._batch_ids += [server_id] * count
+            shared_ids += [server_id] * count
         size = len(self.configs)
-        self.env_ids = [*env_ids, *[""] * (size - len(env_ids))]
         self._slot_of = {env_id: slot for slot, env_id in enumerate(env_ids)}
-        self.entry_names = list(dict.fromkeys(config.name for config in self.configs))
-        number = {name: k for k, name in enumerate(self.entry_names)}
-        self.entries = np.array([number[config.name] for config in self.configs], np.intp)
+        entry_names = list(dict.fromkeys(config.name for config in self.configs))
+        number = {name: k for k, name in enumerate(entry_names)}
+        self.names = EnvNames(
+            [*env_ids, *[""] * (size - len(env_ids))],
+            shared_ids,
+            np.array([number[config.name] for config in self.configs], np.intp),
+            entry_names,
+            index_offset=np.zeros(size, np.int64),
+            turns=np.zeros(size, np.bool_),
+        )
         self.all = np.arange(len(env_ids))
         self.step_limits = np.array(
             [config.max_episode_steps or 0 for config in self.configs], np.int64
@@ -74,14 +79,17 @@ class EnvTable:
         self.any_out_of_band = False
         self.num_sub_envs = np.ones(size, np.int64)
         self.seed_offset = np.zeros(size, np.int64)
-        self.index_offset = np.zeros(size, np.int64)
         self.num_seeds = 0
-        self.turns = np.zeros(size, np.bool_)
         self.resets_itself = np.zeros(size, np.bool_)
         self.any_resets_itself = False
 
     def __len__(self) -> int:
         return len(self.configs)
+
+    @property
+    def env_ids(self) -> Sequence[str]:
+        """Of each slot; empty for one that no client has taken."""
+        return self.names.env_ids
 
     # -- what envs tell of themselves -------------------------------------------------
 
@@ -94,12 +102,12 @@ class EnvTable:
             self._note_meta(slot, env.meta)
             # Seeds are the sub-environments', of which a result may hold some only.
             in_all = self.configs[slot].num_envs
-            self.turns[slot] = in_all > env.meta.num_envs
+            self.names.turns[slot] = in_all > env.meta.num_envs
             self.num_sub_envs[slot] = max(env.meta.num_envs, in_all)
         local = self.num_sub_envs[self.all]
         self.num_seeds = int(local.sum())
         self.seed_offset[self.all] = np.cumsum(local) - local
-        self.index_offset[:] = self.seed_offset
+        self.names.index_offset[:] = self.seed_offset
         self._note_any()
 
     def note_joined(
@@ -115,7 +123,6 @@ class EnvTable:
             has_row: its actions have a place in its row.
         """
         self._slot_of.pop(self.env_ids[slot], None)
-        self.env_ids[slot] = meta.env_id
         self._slot_of[meta.env_id] = slot
         self.out_of_band_actions[slot] = traits.free_actions or not has_row
         self.reads_extras[slot] = traits.reads_extras
@@ -123,7 +130,7 @@ class EnvTable:
         self.num_sub_envs[slot] = meta.num_envs
         # Clients of one env_server are of one kind.
         behind = (first_slot - len(self.all)) + (slot - first_slot) * meta.num_envs
-        self.index_offset[slot] = self.num_seeds + behind
+        self.names = self.names.renamed(slot, meta.env_id, self.num_seeds + behind)
         self._note_any()
 
     def _note_meta(self, slot: int, meta: EnvMeta) -> None:
@@ -168,31 +175,17 @@ class EnvTable:
         Raises:
             UnknownEnv: there is no such entry.
         """
+        entry_names = self.names.entry_names
         for name in names:
-            if name not in self.entry_names:
-                known = ", ".join(self.entry_names)
+            if name not in entry_names:
+                known = ", ".join(entry_names)
                 raise UnknownEnv(f"no entry of this group is called {name!r}; they are {known}")
-        return np.isin(self.entries, [self.entry_names.index(name) for name in names])
-
-    def ids(self, slots: NDArray[np.intp]) -> list[str]:
-        """Ids of `slots`, in order."""
-        env_ids = self.env_ids
-        return [env_ids[slot] for slot in slots.tolist()]
-
-    def batch_ids(self, slots: NDArray[np.intp]) -> list[str]:
-        """Ids of `slots` as a batch has them: a client goes by its env_server's id."""
-        chosen: list[int] = slots.tolist()
-        return [self._batch_ids[slot] for slot in chosen]
-
-    def names(self, slots: NDArray[np.intp]) -> list[str]:
-        """Config entries of `slots`, in order."""
-        chosen: list[int] = self.entries[slots].tolist()
-        return [self.entry_names[entry] for entry in chosen]
+        return np.isin(self.names.entries, [entry_names.index(name) for name in names])
 
     def describe(self, slot: int) -> str:
         """How an error message names the env."""
         config = self.configs[slot]
-        env_id = self.env_ids[slot] or self._batch_ids[slot]
+        env_id = self.env_ids[slot] or self.names.shared_ids[slot]
         return (
             f"env {env_id!r} (entry {config.name!r}, backend {config.backend}, "
             f"task {config.task!r})"

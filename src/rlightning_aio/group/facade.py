@@ -9,22 +9,22 @@ import weakref
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
 from rlightning_aio.batch import BatchedData
+from rlightning_aio.errors import BadAction, RLightningError
 from rlightning_aio.group.build import Plan, assemble
 from rlightning_aio.hosts.base import Watcher
 from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from types import TracebackType
 
     import gymnasium as gym
 
     from rlightning_aio.group.core import Core
-    from rlightning_aio.group.supervisor import Supervisor
     from rlightning_aio.group.wait import Procedure
     from rlightning_aio.hosts.base import Membership
 
-__all__ = ["AutoResetContext", "Facade", "ServerView", "only_result", "steps_of"]
+__all__ = ["AutoResetContext", "Facade", "ServerView", "check_process", "only_result", "steps_of"]
 
 
 def only_result(results: tuple[BatchedData, Any]) -> EnvRet | MultiAgentEnvRet:
@@ -33,9 +33,14 @@ def only_result(results: tuple[BatchedData, Any]) -> EnvRet | MultiAgentEnvRet:
 
 
 def steps_of(env_id: str, response: PolicyResponse | Any) -> BatchedData:
-    """A batch of one step."""
+    """A batch of one step; `BadAction` for a response to another env."""
     if not isinstance(response, PolicyResponse):
         response = PolicyResponse(env_id, response)
+    elif response.env_id != env_id and not response.env_id.startswith(f"{env_id}/"):  # Its client.
+        raise BadAction(
+            f"the response is for env {response.env_id!r}, and this is the handle of {env_id!r}; "
+            "step that env, or the group; nothing was sent"
+        )
     return BatchedData([env_id], [response])
 
 
@@ -118,6 +123,23 @@ class Driver(Watcher, Protocol):
 
     drain: Callable[[], None]
 
+    def check_caller(self) -> None:
+        """Raises `RLightningError` if the group is in use, or belongs, elsewhere."""
+        ...
+
+    def forget(self) -> None:
+        """Forget all sources, without a word to the kernel: another process watches them."""
+        ...
+
+
+def check_process(pid: int) -> None:
+    """Raises `RLightningError` in a child that process `pid` has forked."""
+    if os.getpid() != pid:
+        raise RLightningError(
+            f"this group belongs to process {pid}, which has forked this one; only it can use and "
+            "close the group; build another one here"
+        )
+
 
 class Facade:
     """The plain methods of an `EnvGroup`."""
@@ -127,7 +149,9 @@ class Facade:
         self._core = assemble(plan, self._driver, shares_thread=self._shares_thread)
         self._driver.drain = self._core.drain
         supervisor = self._core.supervisor
-        self._finalizer = weakref.finalize(self, _abandon, supervisor, os.getpid())
+        self._finalizer = weakref.finalize(self, supervisor.abandon)
+        self._disowned = False
+        _groups.add(self)
 
     _shares_thread = False
     """Whether other tasks may use the group while a call waits."""
@@ -185,13 +209,65 @@ class Facade:
         `BatchedData.sent` gives back, are copies.
 
         Raises (before anything is sent):
-            BadAction: an action's shape, dtype or count doesn't fit.
+            BadAction: an action's shape, dtype or count doesn't fit; it holds NaN, a number that
+                its dtype can't hold, or infinity where its space is bounded; or this is no batch.
             EnvBusy: an env has a reply outstanding, or comes twice.
             UnknownEnv: no env of this group has that id.
             WorkerDied, EnvHung: an env's worker is gone and is not replaced.
             GroupClosed: the group was not initialised, or is closed.
+            RLightningError: the group is another thread's now, or another loop's.
         """
+        self._driver.check_caller()
         self._core.step_async(batch, time.monotonic())
+
+    def reset_async(
+        self,
+        seed: int | Sequence[int] | Mapping[str, int] | None = None,
+        options: dict[str, Any] | None = None,
+        env_ids: Sequence[str] | None = None,
+    ) -> None:
+        """Have all envs begin a new episode, or those of `env_ids`; `collect_async` gets the
+        first observations. Never blocks, and waits for no client of an env_server.
+
+        Args:
+            seed: as of `reset`.
+            options: passed to each env.
+            env_ids: which envs; None: all local ones and the clients that are connected.
+
+        Raises (before anything is sent):
+            EnvBusy: an env has a reply outstanding, or comes twice.
+            UnknownEnv: no env of this group has that id.
+            ValueError: a seed is no int from 0 to 2**62 - 1, or there are not as many as envs.
+            TypeError: the options can't be sent to a worker.
+            WorkerDied, EnvHung: an env's worker is gone and is not replaced.
+            GroupClosed: the group was not initialised, or is closed.
+            RLightningError: the group is another thread's now, or another loop's.
+        """
+        self._driver.check_caller()
+        self._core.reset_async(time.monotonic(), seed, options, env_ids)
+
+    def call_async(
+        self, name: str, *args: Any, env_ids: Sequence[str] | None = None, **kwargs: Any
+    ) -> None:
+        """Have method `name` called of all local envs, or of those of `env_ids`, all at once;
+        `collect_calls` gets the values. Never blocks.
+
+        Raises (before anything is sent):
+            EnvBusy: an env has a reply outstanding, or comes twice.
+            UnknownEnv: no env of this group has that id.
+            TypeError: the arguments can't be sent to a worker.
+            NotImplementedError: an env is a client's, whose methods can't be called.
+            WorkerDied, EnvHung: an env's worker is gone and is not replaced.
+            GroupClosed: the group was not initialised, or is closed.
+            RLightningError: the group is another thread's now, or another loop's.
+        """
+        self._driver.check_caller()
+        self._core.call_async(time.monotonic(), env_ids, name, args, kwargs)
+
+    def _collect_calls(self, deadline: float | None) -> Procedure[list[Any]]:
+        if deadline is not None and not deadline > 0:
+            raise ValueError(f"deadline must be a positive number of seconds, not {deadline!r}")
+        return self._core.collect_calls(time.monotonic(), deadline)
 
     def _collect(
         self,
@@ -255,12 +331,17 @@ class Facade:
     # -- what was measured --------------------------------------------------------
 
     def get_stats(self) -> dict[str, Any]:
-        """Throughput and latencies over the last ten seconds.
+        """Throughput and latencies over the last ten seconds, or the last thousand batches.
 
-        Keys: ``steps_per_second``; ``entries`` (by config entry, ``sync`` and ``async`` steps
-        per second); ``batch_size`` (mean, min, max); ``latency_us`` with ``p50`` and ``p99``
-        of ``step`` (in the env), ``wait`` (from sending until the env begins) and
-        ``transfer`` (from the env's end until the result is handed out).
+        An env step is a step of one sub-environment: a result of an env with ``num_envs: n``
+        stands for n of them, that of a multi-agent env for one, a reset for none.
+
+        Keys: ``steps_per_second`` (env steps); ``entries`` (by config entry, env steps per
+        second of ``step``, as ``sync``, and of ``collect_async``, as ``async``);
+        ``batch_size`` (results in a batch: mean, min, max); ``latency_us`` with ``p50`` and
+        ``p99`` of the steps' ``step`` (in the env), ``wait`` (from sending until the env
+        begins) and ``transfer`` (from the env's end until the result is handed out). Where
+        nothing was measured yet, a dict is empty.
         """
         return self._core.stats.summary()
 
@@ -272,6 +353,8 @@ class Facade:
         An episode ends by itself or at the step limit of `auto_reset`. Where the env judges its
         episodes (``info["success"]`` and ``info["fail"]`` of the results that end them),
         ``success_rate`` and ``fail_rate`` are the shares that were true; None where it doesn't.
+
+        A client whose place in the group another has taken is counted in its entry's sums alone.
 
         Args:
             reset: start the sums anew after this call.
@@ -292,7 +375,15 @@ class Facade:
         for kind, figures in stats["latency_us"].items():
             print(f"{figures['p50']:12.1f} µs {kind} (median), {figures['p99']:.1f} µs (p99)")
 
+    def _disown(self) -> None:
+        """Leave it to the process that has forked this one: let go of all that they share."""
+        self._disowned = True
+        self._driver.forget()
+        self._core.supervisor.disown()
+
     def _closed(self) -> None:
+        if not self._core.supervisor.closed:
+            return  # It was refused.
         self._finalizer.detach()
         close_errors = self._core.supervisor.close_errors
         errors = list(close_errors)
@@ -300,10 +391,16 @@ class Facade:
         _warn_of(errors)
 
 
-def _abandon(supervisor: Supervisor, owner_pid: int) -> None:
-    """End what nobody can close any more, unless this is a child that its owner has forked."""
-    if os.getpid() == owner_pid:
-        supervisor.abandon()
+_groups: weakref.WeakSet[Facade] = weakref.WeakSet()
+
+
+def _disown_all() -> None:
+    """Leave all groups to the process that has forked this one."""
+    for group in list(_groups):
+        group._disown()  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]  # Nobody else's.
+
+
+os.register_at_fork(after_in_child=_disown_all)
 
 
 def _warn_of(errors: Sequence[tuple[str, Any]]) -> None:

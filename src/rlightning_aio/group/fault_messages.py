@@ -26,7 +26,7 @@ def start_fault(envs: EnvTable, record: HostRecord, death: Death) -> StartFailed
         return late_fault(envs, record, death)
     slot = _starting(record, death)
     return StartFailed(
-        f"the worker of {envs.describe(slot)} {death.cause} while it started"
+        f"{envs.describe(slot)} could not be started: its worker {death.cause}"
         + _said(death.stderr_tail),
         env_id=envs.env_ids[slot],
     )
@@ -107,7 +107,7 @@ def death_error(
     kind = WorkerDied if record.hung_slot is None else EnvHung
 
     def error_for(owed: NDArray[np.intp]) -> WorkerDied:
-        names = ", ".join(envs.ids(owed)) or "none"
+        names = ", ".join(envs.names.ids(owed)) or "none"
         error = kind(
             f"{what} (last request: {last}; envs that owed a reply: {names}); {outcome}"
             + _said(death.stderr_tail),
@@ -115,7 +115,7 @@ def death_error(
             exit_code=death.exit_code,
             stderr_tail=death.stderr_tail,
         )
-        error.env_ids = tuple(envs.ids(owed))
+        error.env_ids = tuple(envs.names.ids(owed))
         return error
 
     return error_for

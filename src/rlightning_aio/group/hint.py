@@ -32,8 +32,10 @@ def hint(
         configs: the entries.
         num_workers: workers of each entry, by its name.
         num_cores: cores that this process and its workers may use.
-        latency_us: as in `EnvGroup.get_stats`.
+        latency_us: as in `EnvGroup.get_stats`; empty while nothing was measured.
     """
+    if not latency_us:
+        return None
     step, transfer = (float(latency_us[kind]["p50"]) for kind in ("step", "transfer"))
     measured = f"a step takes {step:.0f} µs and its transfer {transfer:.0f} µs"
     for config in configs:

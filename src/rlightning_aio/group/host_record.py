@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum, auto
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rlightning_aio.hosts.base import Killable
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
+
+    import numpy as np
+    from numpy.typing import NDArray
 
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.errors import WorkerDied
@@ -27,6 +30,8 @@ class Stage(Enum):
     BUILT = auto()
     ATTACHING = auto()
     UP = auto()
+    DOWN = auto()
+    """Dead; it will be started again."""
     FAILED = auto()
     CLOSED = auto()
 
@@ -37,8 +42,12 @@ class HostRecord:
 
     Attributes:
         start_by: when it must be up; late: it wasn't, and is being killed.
+        restart_at: when a dead one is started again.
+        held: what was asked of it since it died, entries and arguments, until a replacement is
+            up; None while none is needed.
         deaths: by slot, of workers that died while they executed that env, since the env
             last completed a step; None where no env is known. culprit: the last one's.
+        dying: it was killed, and that has not been told yet; die_by: when it must have been.
         hung_slot: the env for which it is being killed.
         idle: how far it had got when it was last seen to do nothing (`Supervisor._progress`).
         failure: makes the error for a caller that asks a host that was given up.
@@ -53,8 +62,12 @@ class HostRecord:
     order: AttachOrder | None = None
     start_by: float | None = None
     late: bool = False
+    restart_at: float | None = None
+    held: list[tuple[NDArray[np.int64], Sequence[Any] | None]] | None = None
     deaths: dict[int | None, int] = field(default_factory=dict[int | None, int])
     culprit: int | None = None
+    dying: bool = False
+    die_by: float | None = None
     hung_slot: int | None = None
     idle: tuple[int, ...] = ()
     idle_since: float = 0.0

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from rlightning_aio.errors import EnvAway, EnvRaised
+from rlightning_aio.errors import ActionRefused, BadAction, EnvAway, EnvRaised
 from rlightning_aio.group.requests import COLLECTOR
 from rlightning_aio.group.supervisor import GivenUp, Replaced
 from rlightning_aio.hosts.messages import (
@@ -46,11 +46,14 @@ if TYPE_CHECKING:
     from rlightning_aio.group.requests import Requests
     from rlightning_aio.group.results import Results
     from rlightning_aio.group.slab_layout import SlabLayout
+    from rlightning_aio.group.stats import Stats
     from rlightning_aio.group.supervisor import Supervisor
     from rlightning_aio.hosts.base import Host
     from rlightning_aio.hosts.messages import Completions
 
 __all__ = ["Intake"]
+
+_BAD_ACTION = f"{BadAction.__module__}.{BadAction.__qualname__}"
 
 
 class Intake:
@@ -73,6 +76,7 @@ class Intake:
         results: Results,
         recovery: Recovery,
         auto: AutoReset,
+        stats: Stats,
     ) -> None:
         self.now = 0.0
         self._completions = completions
@@ -84,6 +88,7 @@ class Intake:
         self._results = results
         self._recovery = recovery
         self._auto = auto
+        self._stats = stats
         self.held_back: dict[int, Joined] = {}
         self._handlers: dict[type, Callable[[Any], None]] = {
             Reported: self._on_reported,
@@ -135,10 +140,11 @@ class Intake:
 
     def raised(self, slot: int, error: ErrorText) -> EnvRaised:
         """What the caller is told of `error`, in which the current request of `slot` ended."""
-        cause = self._recovery.told(slot)
+        cause = self._recovery.failed(slot)
         after = f" (its worker {cause}, and was replaced)" if cause else ""
         doing = Operation(self._requests.op(slot)).name.lower()
-        return EnvRaised(
+        kind = ActionRefused if error.type_name == _BAD_ACTION else EnvRaised
+        return kind(
             f"{self._envs.describe(slot)} raised in {doing}: {error.type_name}: {error.text}"
             f"{after}; the remote traceback is above; reset the env to go on",
             env_id=self._envs.env_ids[slot],
@@ -180,6 +186,8 @@ class Intake:
             self.held_back[slot] = told
             return
         has_row = self._layout.of(slot)[0].action is not None
+        if self._envs.env_ids[slot] not in ("", told.meta.env_id):
+            self._stats.begin_anew(slot)
         self._envs.note_joined(slot, host.first_slot, told.meta, told.traits, has_row=has_row)
         self._auto.note_joined(slot)
         self._requests.join(slot, self.now)
@@ -211,6 +219,9 @@ class Intake:
             # Decoded now: what can read it is about to change.
             self._results.detach_info(slot)
         self._results.begin_schemas(slots)
+        if not verdict.resets:
+            self._fail(owed, verdict.error_for)
+            return
         self._recovery.lose(slots, verdict.cause)
         # A replacement answers for steps and resets, but not for calls.
         calls = self._awaits_value(owed)

@@ -135,7 +135,7 @@ class Ticket:
 
     Attributes:
         remaining: of them that have not ended.
-        calls: they are calls of methods; value: of the last to return.
+        calls: they are calls of methods; values: what these have returned, by slot.
     """
 
     owner: int
@@ -143,7 +143,7 @@ class Ticket:
     remaining: int
     calls: bool
     faults: list[EnvFault] = field(default_factory=list["EnvFault"])
-    value: Any = None
+    values: dict[int, Any] = field(default_factory=dict[int, Any])
 
 
 class Requests:
@@ -289,6 +289,10 @@ class Requests:
         self._renumbered(self.alone(slot), _STEP)
         self.sent_ns[slot] = int(now * 1e9)
 
+    def answer_at_once(self, slot: int) -> None:
+        """Take note that the result of such a step lies in its row, to be handed out."""
+        self.state[slot] = _READY_CODE
+
     def restart(self, slots: NDArray[np.intp]) -> NDArray[np.int64]:
         """Ask owed steps and resets anew, as resets; their entries."""
         return self._renumbered(slots, _RESET)
@@ -378,13 +382,15 @@ class Requests:
             self._forget(self.alone(slot))
         else:
             ticket = self._tickets[owner]
-            ticket.value = value
+            ticket.values[slot] = value
             ticket.remaining -= 1
             self.state[slot] = _SPENT_CODE
 
     def owners(self, slots: NDArray[np.intp]) -> dict[int, NDArray[np.intp]]:
         """The slots of each owner among `slots`."""
-        found: list[int] = np.unique(self.owner[slots]).tolist()
+        # Not `np.unique`, which imports a module when it is first called: after a death there
+        # may be no descriptor left to read one.
+        found: list[int] = sorted({*self.owner[slots].tolist()})
         return {owner: slots[self.owner[slots] == owner] for owner in found}
 
     def fail(self, slots: NDArray[np.intp], owner: int, fault: EnvFault) -> None:
@@ -439,6 +445,13 @@ class Requests:
     def hand_out(self, slots: NDArray[np.intp]) -> None:
         """Take note that results are handed out: their rows may be written again."""
         self.state[slots] = _IDLE_CODE
+
+    def put_back(self, slots: NDArray[np.intp]) -> None:
+        """Those of `slots` whose results were not handed out wait for the collector again."""
+        kept = self.ready(slots)
+        if len(kept):
+            self._ready.appendleft(kept)
+            self.num_ready += len(kept)
 
     def joined(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Which of `slots` have a first result that nobody has collected."""

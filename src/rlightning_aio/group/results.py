@@ -43,7 +43,7 @@ class Results:
         self._out_of_band: dict[int, Any] = {}
         # Of each slot's host; a host's slots share one dict.
         self._schemas: list[dict[int, InfoSchema]] = [{} for _ in range(len(envs))]
-        # Bytes of a row's info that any schema uses.
+        # Bytes of a row's info that any schema uses; 0 if there is none.
         self._info_width = 0
         self._restarted = np.zeros(len(envs), np.bool_)
         self._any_restarted = False
@@ -88,7 +88,7 @@ class Results:
     def note_schema(self, first_slot: int, number: int, schema: InfoSchema) -> None:
         """A host holds infos in one more way."""
         self._schemas[first_slot][number] = schema
-        self._info_width = max(self._info_width, schema.size)
+        self._info_width = max(self._info_width, schema.size, 1)
 
     def mark_restarted(self, slot: int, cause: str) -> None:
         """Mark a result as the first of a replaced worker."""
@@ -120,12 +120,15 @@ class Results:
     # -- what goes out ----------------------------------------------------------------
 
     def gather(self, slots: NDArray[np.intp]) -> list[ResultColumns]:
-        """Copy the results of `slots` out of their rows: one part for each layout."""
+        """Copy the results of `slots` out of their rows: one part for each layout.
+
+        Takes nothing away: should memory run out, they can be gathered again.
+        """
         layout = self._layout
         if len(layout.slabs) == 1:
             return [self._part(layout.slabs[0], slots, None)]
         slabs = layout.slab[slots]
-        present: list[int] = np.unique(slabs).tolist()
+        present: list[int] = np.flatnonzero(np.bincount(slabs)).tolist()
         return [
             self._part(layout.slabs[slab], slots[places], places)
             for slab in present
@@ -137,6 +140,15 @@ class Results:
         slab, rows = self._slab_of(part), self._rows(part.slots)
         part.episode_return = _copy(slab.episode_return, rows)
         part.episode_length = _copy(slab.episode_length, rows)
+
+    def let_go(self, slots: NDArray[np.intp]) -> None:
+        """The results of `slots` are handed out: what is kept for them beside their rows goes."""
+        if self._any_restarted:
+            self._restarted[slots] = False
+            self._any_restarted = bool(self._restarted.any())
+        if self._out_of_band:
+            for slot in slots.tolist():
+                self._out_of_band.pop(slot, None)
 
     def sources(self, slots: NDArray[np.intp]) -> Sources:
         """What was sent for the results of `slots`."""
@@ -158,17 +170,18 @@ class Results:
     ) -> ResultColumns:
         rows = self._rows(slots) if positions is None else self._layout.row[slots]
         flags = gather(slab.flags, rows)
-        restarted = self._take_restarted(slots) if self._any_restarted else None
+        restarted = self._restarted[slots] if self._any_restarted else None
         if restarted is not None:
             # Here and not in the row, where envs write their flags only when they change.
             flags[restarted, ..., TRUNCATED] = True
-        out_of_band, whole = self._take_out_of_band(slots) if self._out_of_band else ({}, False)
+        out_of_band, whole = self._out_of_band_of(slots) if self._out_of_band else ({}, False)
         width = self._info_width
+        observation, out_of_band = self._observations(slab, rows, out_of_band)
         return ResultColumns(
             slots=slots,
-            names=self._envs,
+            names=self._envs.names,
             positions=positions,
-            observation=self._observations(slab, rows, out_of_band),
+            observation=observation,
             reward=_copy(slab.reward, rows),
             flags=flags,
             info_marks=_copy(slab.info_mark, rows) if width else None,
@@ -177,49 +190,51 @@ class Results:
             out_of_band=out_of_band,
             restarted=restarted,
             times=gather(slab.times, rows),
+            sent_ns=None if slab.sent_ns is None else gather(slab.sent_ns, rows),
             agents=slab.layout.agents,
             observation_space=slab.layout.observation_space,
             whole_results=whole,
         )
 
-    def _take_restarted(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
-        restarted = self._restarted[slots]
-        self._restarted[slots] = False
-        self._any_restarted = bool(self._restarted.any())
-        return restarted
-
-    def _take_out_of_band(self, slots: NDArray[np.intp]) -> tuple[dict[int, Any], bool]:
+    def _out_of_band_of(self, slots: NDArray[np.intp]) -> tuple[dict[int, Any], bool]:
         """What belongs to `slots`, by row of the batch; whether some is a whole result."""
         found: dict[int, Any] = {}
         whole = False
         for row, slot in enumerate(slots.tolist()):
-            kept = self._out_of_band.pop(slot, None)
+            kept = self._out_of_band.get(slot)
             if kept is not None:
                 found[row] = kept
                 whole = whole or (type(kept) is dict and "ret" in kept)
         return found, whole
 
-    def _observations(self, slab: Slab, rows: Rows, out_of_band: dict[int, Any]) -> Any:
-        """Fresh columns; read-only views where the group hands those out and the rows allow it.
+    def _observations(
+        self, slab: Slab, rows: Rows, out_of_band: dict[int, Any]
+    ) -> tuple[Any, dict[int, Any]]:
+        """Fresh columns, and what is out of band beside them.
 
-        What envs have handed over as it is leaves `out_of_band`; that of one alone isn't
-        copied.
+        Read-only views where the group hands those out and the rows allow it. What envs have
+        handed over as it is becomes columns; that of one alone isn't copied.
         """
         if slab.observation is None:
             handed_over = slab.layout.observations_out_of_band and len(out_of_band) > 0
             if not handed_over or not all("observation" in kept for kept in out_of_band.values()):
-                return None
-            return stacked([kept.pop("observation") for kept in out_of_band.values()])
+                return None, out_of_band
+            columns = stacked([kept["observation"] for kept in out_of_band.values()])
+            beside = {
+                row: {name: value for name, value in kept.items() if name != "observation"}
+                for row, kept in out_of_band.items()
+            }
+            return columns, beside
         contiguous = _contiguous(rows) if self._zero_copy else None
         if contiguous is None:
-            return gather(slab.observation, rows)
+            return gather(slab.observation, rows), out_of_band
 
         def view(array: NDArray[Any]) -> NDArray[Any]:
             part = array[contiguous]
             part.flags.writeable = False
             return part
 
-        return mapped(view, slab.observation)
+        return mapped(view, slab.observation), out_of_band
 
 
 def _copy(column: NDArray[Any], rows: Rows) -> NDArray[Any]:

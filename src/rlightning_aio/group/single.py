@@ -59,6 +59,7 @@ class SingleEnvCore(Core):
                 raise
             raise self._intake.raised(0, ErrorText.of(error)) from None
         self._results.keep(0, out_of_band or {})
+        self.requests.answer_at_once(0)
         self.drain()  # An info may have come in a new form.
         results, flags = self._hand_out(slots, synchronous=True)
         return results, flags if self.auto.active else None

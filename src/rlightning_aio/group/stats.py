@@ -7,7 +7,8 @@ from them is computed when somebody asks.
 from __future__ import annotations
 
 import time
-from collections import deque
+from collections import Counter, deque
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Stats"]
 
-_WINDOW_BATCHES: Final = 1024
+_WINDOW_SAMPLES: Final = 1024
 _WINDOW_SECONDS: Final = 10.0
 _VERDICTS: Final = ("success", "fail")
 """Booleans in an info by which an env judges its episodes."""
@@ -32,13 +33,28 @@ _VERDICTS: Final = ("success", "fail")
 
 @dataclass(slots=True)
 class _Sample:
-    """One batch that was handed out. Times in ns of the monotonic clock."""
+    """Results of one layout in a batch that was handed out. Times in ns of the monotonic clock.
 
+    Attributes:
+        batch: number of the batch.
+        num_steps: env steps that each result stands for; None where none is a reset, so that
+            each stands for ``num_envs`` of them.
+    """
+
+    batch: int
     at_ns: int
     slots: NDArray[np.intp]
     sent_ns: NDArray[np.int64]
     times: NDArray[np.int64]
+    num_envs: int
+    num_steps: NDArray[np.int64] | None
     synchronous: bool
+
+    def steps(self) -> NDArray[np.int64]:
+        """Env steps that each result stands for: ``[n]``."""
+        if self.num_steps is None:
+            return np.full(len(self.slots), self.num_envs)
+        return self.num_steps
 
 
 @dataclass(slots=True)
@@ -63,21 +79,61 @@ class Stats:
     def __init__(self, envs: EnvTable, requests: Requests) -> None:
         self._envs = envs
         self._requests = requests
-        self._samples: deque[_Sample] = deque(maxlen=_WINDOW_BATCHES)
-        # By slot: episodes, the sum of their returns, that of their lengths.
-        self._sums = np.zeros((len(envs), 3))
+        self._samples: deque[_Sample] = deque(maxlen=_WINDOW_SAMPLES)
+        self._batches = 0
+        # Sums have one more place for each config entry, for clients whose slots others have
+        # taken. By slot: episodes, the sum of their returns, that of their lengths.
+        size = len(envs) + len(envs.names.entry_names)
+        self._sums = np.zeros((size, 3))
         # Return and length of the last episode.
         self._last = np.zeros((len(envs), 2))
-        self._requests_before = np.zeros(len(envs), np.int64)
-        self._verdicts = {name: _Verdicts.of(len(envs)) for name in _VERDICTS}
+        self._requests_before = np.zeros(size, np.int64)
+        self._verdicts = {name: _Verdicts.of(size) for name in _VERDICTS}
+
+    def begin_anew(self, slot: int) -> None:
+        """Another client is about to take `slot`: what was summed up of the one that had it
+        stays with its entry.
+        """
+        former = self._former(self._envs.names.entries.item(slot))
+        for sums in self._all_sums():
+            sums[former] += sums[slot]
+            sums[slot] = 0
+        self._last[slot] = 0
+        number = self._requests.number(slot)
+        self._requests_before[former] += self._requests_before[slot] - number
+        self._requests_before[slot] = number
+
+    def _former(self, entry: int) -> int:
+        """The place of those that were clients of an entry."""
+        return len(self._envs) + entry
+
+    def _all_sums(self) -> list[NDArray[Any]]:
+        verdicts = self._verdicts.values()
+        return [self._sums, *(v.count for v in verdicts), *(v.true for v in verdicts)]
 
     def account(self, parts: Sequence[ResultColumns], *, synchronous: bool) -> None:
         """Take note of results that are handed out."""
         now = time.monotonic_ns()
         sent_ns = self._requests.sent_ns
+        self._batches += 1
         for part in parts:
-            slots = part.slots
-            self._samples.append(_Sample(now, slots, sent_ns[slots], part.times, synchronous))
+            slots, resets = part.slots, part.is_reset
+            num_envs = resets.shape[1] if resets.ndim > 1 else 1
+            num_steps = None
+            if np.count_nonzero(resets):
+                num_steps = num_envs - np.count_nonzero(resets.reshape(len(part), -1), axis=1)
+            self._samples.append(
+                _Sample(
+                    self._batches,
+                    now,
+                    slots,
+                    sent_ns[slots],
+                    part.times,
+                    num_envs,
+                    num_steps,
+                    synchronous,
+                )
+            )
             if part.episode_return is not None and part.episode_length is not None:
                 self._note_episodes(part, part.episode_return, part.episode_length)
 
@@ -104,7 +160,8 @@ class Stats:
         if part.info_marks is not None or part.out_of_band:
             for slot, row in zip(slots.tolist(), rows.tolist(), strict=True):
                 if part.may_hold(row, _VERDICTS):
-                    self._note_verdicts(slot, part.info_of(row), ended[row])
+                    with suppress(Exception):  # It may hold anything; its reader learns.
+                        self._note_verdicts(slot, part.info_of(row), ended[row])
 
     def _note_verdicts(self, slot: int, info: dict[str, Any], ended: NDArray[np.bool_]) -> None:
         """Count what the env says of the episodes that have `ended`."""
@@ -122,16 +179,18 @@ class Stats:
         if not samples:
             return {"steps_per_second": 0.0, "entries": {}, "batch_size": {}, "latency_us": {}}
         seconds = max((samples[-1].at_ns - samples[0].at_ns) / 1e9, 1e-9)
-        sizes = np.array([len(sample.slots) for sample in samples])
+        sizes = Counter[int]()
+        for sample in samples:
+            sizes[sample.batch] += len(sample.slots)
         # The first batch opens the window: what it holds was made before.
-        counted = samples[1:]
+        counted = [sample for sample in samples if sample.batch != samples[0].batch]
         return {
-            "steps_per_second": sum(len(s.slots) for s in counted) / seconds,
+            "steps_per_second": sum(int(s.steps().sum()) for s in counted) / seconds,
             "entries": self._rates_by_entry(counted, seconds),
             "batch_size": {
-                "mean": float(sizes.mean()),
-                "min": int(sizes.min()),
-                "max": int(sizes.max()),
+                "mean": sizes.total() / len(sizes),
+                "min": min(sizes.values()),
+                "max": max(sizes.values()),
             },
             "latency_us": self._latencies(samples),
         }
@@ -148,9 +207,10 @@ class Stats:
         rates: dict[str, dict[str, float]] = {}
         for sample in samples:
             kind = "sync" if sample.synchronous else "async"
-            for name in self._envs.names(sample.slots):
+            names = self._envs.names.names(sample.slots)
+            for name, steps in zip(names, sample.steps().tolist(), strict=True):
                 entry = rates.setdefault(name, {"sync": 0.0, "async": 0.0})
-                entry[kind] += 1.0 / seconds
+                entry[kind] += steps / seconds
         return rates
 
     @staticmethod
@@ -158,11 +218,14 @@ class Stats:
         done, busy = np.concatenate([s.times for s in samples]).T
         sent = np.concatenate([s.sent_ns for s in samples])
         taken = np.concatenate([np.full(len(s.slots), s.at_ns) for s in samples])
+        stepped = np.concatenate([s.steps() for s in samples]) > 0
+        if not stepped.any():
+            return {}
         kinds = {"step": busy, "wait": done - busy - sent, "transfer": taken - done}
         return {
             kind: {
-                "p50": float(np.percentile(values, 50)) / 1e3,
-                "p99": float(np.percentile(values, 99)) / 1e3,
+                "p50": float(np.percentile(values[stepped], 50)) / 1e3,
+                "p99": float(np.percentile(values[stepped], 99)) / 1e3,
             }
             for kind, values in kinds.items()
         }
@@ -175,15 +238,18 @@ class Stats:
 
     def by_entry(self) -> dict[str, dict[str, Any]]:
         """The same for each config entry, over all of its envs."""
-        found: dict[str, list[int]] = {name: [] for name in self._envs.entry_names}
-        for slot, name in enumerate(self._envs.names(np.arange(len(self._envs)))):
-            found[name].append(slot)
-        return {name: self._summed(slots) for name, slots in found.items()}
+        names = self._envs.names
+        found: dict[str, dict[str, Any]] = {}
+        for entry, name in enumerate(names.entry_names):
+            slots: list[int] = np.flatnonzero(names.entries == entry).tolist()
+            found[name] = self._summed([*slots, self._former(entry)])
+        return found
 
     def _summed(self, slots: list[int]) -> dict[str, Any]:
+        numbers = self._requests.numbers([slot for slot in slots if slot < len(self._envs)])
         episodes, total_return, total_length = self._sums[slots].sum(axis=0).tolist()
         found = {
-            "requests": int((self._requests.numbers(slots) - self._requests_before[slots]).sum()),
+            "requests": int(numbers.sum() - self._requests_before[slots].sum()),
             "episodes": int(episodes),
             "mean_return": total_return / episodes if episodes else None,
             "mean_length": total_length / episodes if episodes else None,
@@ -196,11 +262,6 @@ class Stats:
 
     def reset_envs(self) -> None:
         """Start the sums over episodes anew."""
-        for sums in (
-            self._sums,
-            self._last,
-            *(v.count for v in self._verdicts.values()),
-            *(v.true for v in self._verdicts.values()),
-        ):
+        for sums in (*self._all_sums(), self._last, self._requests_before):
             sums[:] = 0
-        self._requests_before[:] = self._requests.numbers()
+        self._requests_before[: len(self._envs)] = self._requests.numbers()

@@ -3,12 +3,14 @@
 It starts them, has their envs placed in slabs, notices that one is dead or hung, replaces
 it, and closes them all. What a death means for requests is the core's affair: it is told
 what to do about them (`GivenUp`, `Replaced`).
-Rule: no wait but by yielding one; the time is passed in.
+Rule: no wait but by yielding one; the time is passed in, but for that of a death, which
+comes to light at no certain time.
 """
 
 from __future__ import annotations
 
 import logging
+import time
 import warnings
 from collections import Counter
 from collections.abc import Callable
@@ -41,6 +43,7 @@ from rlightning_aio.hosts.messages import (
     NotBuilt,
 )
 from rlightning_aio.protocol.entries import Operation, slot_of
+from rlightning_aio.registry import ENVS
 from rlightning_aio.types import EnvMeta
 
 if TYPE_CHECKING:
@@ -66,8 +69,17 @@ _END_SECONDS: Final = 1.5
 """How long a fork server that is let go may take to end its workers and pass on their words."""
 _LOOK_SECONDS: Final = 0.02
 """How often a trainer that never has to wait looks for what has hung."""
+_OBEY_SECONDS: Final = 5.0
+"""How long the death of a worker that was killed may take to come; what should have killed it has
+hung then, too. Nobody but a machine that is out of breath needs a tenth of that.
+"""
 _DUMP_SECONDS: Final = 1.0
 """How long a worker that is late may take to write its stacks and die."""
+
+_FIRST_PAUSE_SECONDS: Final = 0.1
+"""How long the second restart in a row is put off. The first is not; each further one is, for
+twice as long as the one before."""
+_LONGEST_PAUSE_SECONDS: Final = 5.0
 
 _log = logging.getLogger("rlightning_aio")
 
@@ -88,12 +100,18 @@ class GivenUp:
 
 @dataclass(frozen=True)
 class Replaced:
-    """A dead host is being replaced: what it owed is to be asked anew, calls end in errors."""
+    """A dead host is being replaced: what it owed is to be asked anew, calls end in errors.
+
+    Nobody but the user sets hardware in motion: unless it `resets`, all that it owed ends in
+    errors. What is asked of it from now on is held until the replacement is up, however many
+    attempts that takes.
+    """
 
     host: Host
     owed: NDArray[np.intp]
     error_for: ErrorFor
     cause: str
+    resets: bool
 
 
 class Supervisor:
@@ -102,7 +120,9 @@ class Supervisor:
     Args:
         envs: names them in messages; requests: what they owe; layout: where they write.
         arena: of the group.
+        tell: takes the death of a replacement that could not be started; `bury` has the rest.
         num_cores: cores that this process and its workers may use.
+        clock: monotonic seconds; asked only when a host has died.
 
     Attributes:
         metas: one for each local env, and for each env_server; empty before the start.
@@ -119,9 +139,11 @@ class Supervisor:
         requests: Requests,
         layout: SlabLayout,
         arena: Arena,
+        tell: Callable[[Died], object],
         *,
         mixed_actions: bool,
         num_cores: int,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.hosts: list[Host] = []
         self.open = False
@@ -134,6 +156,8 @@ class Supervisor:
         self._requests = requests
         self._layout = layout
         self._arena = arena
+        self._tell = tell
+        self._clock = clock
         self._mixed_actions = mixed_actions
         self._num_cores = num_cores
         self._records: list[HostRecord] = []
@@ -142,6 +166,7 @@ class Supervisor:
         self._now = 0.0
         self.timed = False
         self._looked_at = 0.0
+        self._any_dying = False
         self._any_given_up = False
 
     def add(self, host: Host, config: EnvConfig) -> None:
@@ -163,7 +188,7 @@ class Supervisor:
         try:
             self._now = now
             for record in self._records:
-                self._launch(record, now)
+                self._launch_first(record, now)
             yield from self._until(Stage.BUILT)
             self._place()
             for record in self._records:
@@ -184,18 +209,19 @@ class Supervisor:
         ]
         return self.metas
 
+    def _launch_first(self, record: HostRecord, now: float) -> None:
+        try:
+            self._launch(record, now)
+        except OSError as error:
+            raise StartFailed(
+                _refusal(record, error), env_id=self._envs.env_ids[record.host.first_slot]
+            ) from error
+
     def _launch(self, record: HostRecord, now: float) -> None:
         record.stage = Stage.BUILDING
         record.start_by = now + record.config.start_timeout
         record.late = False
-        try:
-            record.host.start()
-        except OSError as error:
-            raise StartFailed(
-                f"can't start a worker for entry {record.config.name!r}: {error}; check its "
-                "`interpreter` and this machine's process and memory limits",
-                env_id=self._envs.env_ids[record.host.first_slot],
-            ) from error
+        record.host.start()
 
     def _until(self, stage: Stage) -> Procedure[None]:
         # What hosts of this very process have told waits to be taken in.
@@ -218,7 +244,7 @@ class Supervisor:
             record.start_by = None if record.late else self._now + _DUMP_SECONDS
             if not record.late:
                 record.late = True
-                record.kill(dump=True)
+                self._kill(record, dump=True)
             elif not self.open:
                 self._fail_start(late_fault(self._envs, record, Death("")))
 
@@ -245,8 +271,8 @@ class Supervisor:
         elif isinstance(told, NotBuilt):
             self._on_not_built(record, record.host.first_slot + told.env_index, told.error)
         elif isinstance(told, Attached):
-            record.stage = Stage.UP
-            record.start_by = None
+            if record.rebuild_error is None:
+                self._on_attached(record)
         else:
             was_built = record.stage is not Stage.BUILDING
             record.stage = Stage.CLOSED
@@ -264,10 +290,19 @@ class Supervisor:
             error = ErrorText("ValueError", "its spaces changed with the restart", "")
             self._on_not_built(record, record.host.first_slot, error)
 
+    def _on_attached(self, record: HostRecord) -> None:
+        record.stage = Stage.UP
+        record.start_by = None
+        # Until now it had nothing to do.
+        record.idle = ()
+        held, record.held = record.held, None
+        for entries, arguments in held or ():
+            record.host.submit(entries, arguments)
+
     def _on_not_built(self, record: HostRecord, slot: int, error: ErrorText) -> None:
         if self.open:
             record.rebuild_error, record.culprit = record.rebuild_error or error, slot
-            record.kill(dump=False)
+            self._kill(record, dump=False)
             return
         # ConfigError keeps its type: what is wrong with the config is wrong everywhere.
         if error.type_name == "rlightning_aio.errors.ConfigError":
@@ -301,6 +336,16 @@ class Supervisor:
             failure = record.failure
             if failure is not None and np.isin(slots, record.slots).any():
                 raise failure()
+
+    def submit(
+        self, host_id: int, entries: NDArray[np.int64], arguments: Sequence[Any] | None
+    ) -> None:
+        """Give requests to a host; a replacement that is not up yet gets them when it is."""
+        held = self._records[host_id].held
+        if held is None:
+            self.hosts[host_id].submit(entries, arguments)
+        else:
+            held.append((entries, arguments))
 
     @property
     def has_members(self) -> bool:
@@ -358,9 +403,13 @@ class Supervisor:
 
     def next_check(self) -> float | None:
         """When `check` must be called at the latest."""
-        times: list[float | None] = [r.start_by for r in self._records] if self.recovering else []
+        times: list[float | None] = []
+        if self.recovering:
+            times += [due for r in self._records for due in (r.start_by, r.restart_at)]
         if self.timed:
             times += [self._expiry(r) for r in self._records if r.timed and self._in_flight(r)]
+        if self._any_dying:
+            times += [r.die_by or self._now for r in self._records if r.dying]
         times += [server.deadline() for _, server in self._env_servers]
         return earliest(*times)
 
@@ -397,6 +446,9 @@ class Supervisor:
         self._looked_at = now
         if self.recovering:
             self._check_start_times()
+            for record in self._records:
+                if record.restart_at is not None and record.restart_at <= now:
+                    self._restart(record, now)
         for _, server in self._env_servers:
             due = server.deadline()
             if due is not None and due <= now:
@@ -405,6 +457,7 @@ class Supervisor:
             for record in self._records:
                 if record.timed and self._in_flight(record):
                     self._check_hung(record)
+        self._check_dying()
 
     def is_overdue(self, now: float) -> bool:
         """Whether nobody has looked after hosts for a while, having had no need to wait."""
@@ -421,7 +474,27 @@ class Supervisor:
         if expiry is None or self._now < expiry:
             return
         record.hung_slot = slot_of(entry) if entry else self._first_owed(record)
-        record.kill(dump=True)
+        self._kill(record, dump=True)
+
+    def _kill(self, record: HostRecord, *, dump: bool) -> None:
+        record.kill(dump=dump)
+        if record.killable is not None:
+            record.dying = self._any_dying = True
+
+    def _check_dying(self) -> None:
+        """End, with what they stand on, those that a kill has not ended."""
+        if not self._any_dying:
+            return
+        for record in self._records:
+            if not record.dying:
+                continue
+            if record.die_by is None:
+                # Counted from here: the time may have been an old one when it was killed.
+                record.die_by = self._now + _OBEY_SECONDS
+            elif self._now >= record.die_by and record.killable is not None:
+                record.die_by = None
+                record.killable.destroy()
+        self._any_dying = any(record.dying for record in self._records)
 
     def _first_owed(self, record: HostRecord) -> int:
         return int(self._requests.owed(np.array(record.slots, np.intp))[0])
@@ -429,29 +502,51 @@ class Supervisor:
     def bury(self, told: Died) -> GivenUp | Replaced | None:
         """Decide what becomes of a host whose worker is gone.
 
-        Returns what follows for its requests; None while the group starts or closes.
+        Returns what follows for its requests; None while the group starts or closes, and after
+        a replacement that never came up: what is asked of the host waits for the next one.
         """
         record, death = self._records[told.host_id], told.death
+        record.dying, record.die_by = False, None
         if (record.stage.value < Stage.UP.value and record.order is None) or not self.open:
             record.stage = Stage.CLOSED
             self._fail_start(start_fault(self._envs, record, death))
             return None
         owed = self._requests.owed(np.array(record.slots, np.intp))
+        was_up = record.stage is Stage.UP
+        error_for, cause, is_last = self._judge(record, death, owed)
+        if is_last:
+            self._requests.lose_host(told.host_id)
+            self._give_up(record, partial(error_for, owed))
+            return GivenUp(record.host, owed, error_for)
+        _log.warning("%s", str(error_for(owed)))
+        self._put_off_restart(record)
+        if not was_up:
+            return None
         self._requests.lose_host(told.host_id)
-        while True:
-            error_for, cause, is_last = self._judge(record, death, owed)
-            if is_last:
-                self._give_up(record, partial(error_for, owed))
-                return GivenUp(record.host, owed, error_for)
-            _log.warning("%s", str(error_for(owed)))
-            try:
-                self._launch(record, self._now)
-            except StartFailed as fault:
-                death = Death(f"could not be replaced: {fault}")
-                continue
-            assert record.order is not None
-            record.host.attach(record.order)
-            return Replaced(record.host, owed, error_for, cause)
+        resets = not ENVS.is_hardware(record.config.backend)
+        return Replaced(record.host, owed, error_for, cause, resets)
+
+    def _put_off_restart(self, record: HostRecord) -> None:
+        """Start a replacement: the first of a row at once, others after a while."""
+        now = self._clock()
+        record.stage = Stage.DOWN
+        record.start_by = None
+        record.restart_at = now + _pause(record.deaths[record.culprit])
+        if record.held is None:
+            record.held = []
+        if record.restart_at <= now:
+            self._restart(record, now)
+
+    def _restart(self, record: HostRecord, now: float) -> None:
+        record.restart_at = None
+        try:
+            self._launch(record, now)
+        except OSError as error:
+            cause = f"could not be replaced: {_refusal(record, error)}"
+            self._tell(Died(record.host.host_id, Death(cause)))
+            return
+        assert record.order is not None
+        record.host.attach(record.order)
 
     def _judge(
         self, record: HostRecord, death: Death, owed: NDArray[np.intp]
@@ -470,7 +565,11 @@ class Supervisor:
         elif is_last:
             outcome = f"it is not replaced after {deaths - 1} restarts in a row (max_restarts)"
         else:
+            pause = _pause(deaths)
             outcome = f"restart {deaths} of {config.max_restarts} in a row"
+            outcome += f", in {pause:g} s" if pause else ""
+            if ENVS.is_hardware(config.backend):
+                outcome += "; it moves nothing until you reset it"
         told = replace(death, cause=cause)
         error_for = death_error(self._envs, record, told, entries.copy(), outcome)
         record.hung_slot = record.rebuild_error = None
@@ -478,7 +577,7 @@ class Supervisor:
 
     def _give_up(self, record: HostRecord, failure: Callable[[], WorkerDied]) -> None:
         record.stage = Stage.FAILED
-        record.start_by = None
+        record.start_by = record.held = None
         record.failure = failure
         self._any_given_up = True
 
@@ -509,7 +608,8 @@ class Supervisor:
         self.open = False
         alive = [r for r in self._records if r.stage not in (Stage.NEW, Stage.CLOSED)]
         for record in alive:
-            if record.stage is Stage.FAILED:
+            record.held = record.restart_at = None
+            if record.stage in (Stage.FAILED, Stage.DOWN):
                 record.stage = Stage.CLOSED
             else:
                 record.host.close()
@@ -540,6 +640,16 @@ class Supervisor:
         self._layout.release()
         self._arena.close()
 
+    def disown(self) -> None:
+        """Leave everything to the process that has forked this one; nobody hears of it there."""
+        self.closed = True
+        self.open = False
+        for record in self._records:
+            if record.killable is not None:
+                record.host.release()
+        for shared in self.resources.values():
+            shared.disown()
+
     def abandon(self) -> None:
         """Let go of everything at once: the group was dropped without being closed."""
         if self.closed:
@@ -553,3 +663,16 @@ class Supervisor:
             warnings.warn(
                 "an EnvGroup was not closed; its envs were killed", ResourceWarning, stacklevel=1
             )
+
+
+def _pause(deaths: int) -> float:
+    """Seconds before the restart that follows so many deaths in a row."""
+    doublings = min(deaths - 2, 10)
+    return min(_FIRST_PAUSE_SECONDS * 2.0**doublings, _LONGEST_PAUSE_SECONDS) if deaths > 1 else 0.0
+
+
+def _refusal(record: HostRecord, error: OSError) -> str:
+    return (
+        f"can't start a worker for entry {record.config.name!r}: {error}; check its `interpreter` "
+        "and this machine's process and memory limits"
+    )

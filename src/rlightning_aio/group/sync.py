@@ -6,12 +6,15 @@ thread: it works in a script, in a thread, and in a notebook cell whose loop is 
 
 from __future__ import annotations
 
+import os
 import select
+import threading
 import time
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
+from rlightning_aio.errors import RLightningError
 from rlightning_aio.group.build import PreprocessFn, plan_group
-from rlightning_aio.group.facade import Facade, ServerView, only_result, steps_of
+from rlightning_aio.group.facade import Facade, ServerView, check_process, only_result, steps_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -40,15 +43,30 @@ class SyncDriver:
         self._epoll: select.epoll | None = None
         self._sources: dict[int, Source] = {}
         self._descriptors: dict[Source, int] = {}
+        self._pid = os.getpid()
+        # That is in a call now; 0 if none is.
+        self._thread = 0
+
+    def check_caller(self) -> None:
+        """See `facade.Driver.check_caller`. A signal handler of the thread that waits may ask."""
+        check_process(self._pid)
+        if self._thread and self._thread != threading.get_ident():
+            raise self._in_use()
+
+    def _in_use(self) -> RLightningError:
+        return RLightningError(
+            f"thread {self._thread} is using this group, and only one may at a time; nothing was "
+            "sent; guard the group by a lock, or give each thread a group of its own"
+        )
 
     def watch(self, source: Source) -> None:
         """See `base.Watcher.watch`."""
-        if self._epoll is None:
-            self._epoll = select.epoll()
+        epoll = self._epoll or select.epoll()
         descriptor = source.fileno()
+        epoll.register(descriptor, select.EPOLLIN)
+        self._epoll = epoll
         self._sources[descriptor] = source
         self._descriptors[source] = descriptor
-        self._epoll.register(descriptor, select.EPOLLIN)
 
     def unwatch(self, source: Source) -> None:
         """See `base.Watcher.unwatch`."""
@@ -71,8 +89,28 @@ class SyncDriver:
     def wake(self) -> None:
         """See `base.Watcher.wake`. One procedure runs at a time: nobody else waits."""
 
+    def forget(self) -> None:
+        """See `facade.Driver.forget`."""
+        if self._epoll is not None:
+            self._epoll.close()
+            self._epoll = None
+        self._sources.clear()
+        self._descriptors.clear()
+
     def run(self, procedure: Procedure[T]) -> T:
-        """Wait until `procedure` ends; its result. It gets to clean up if it is interrupted."""
+        """Wait until `procedure` ends; its result. It gets to clean up if it is interrupted.
+
+        Raises:
+            RLightningError: another thread is using the group, or it is another process's.
+        """
+        check_process(self._pid)
+        me = threading.get_ident()
+        # Nothing is called from here to the note, so that no other thread gets in between.
+        outermost = not self._thread
+        if outermost:
+            self._thread = me
+        elif self._thread != me:
+            raise self._in_use()
         try:
             wait = procedure.send(None)  # pyright: ignore[reportArgumentType]
             while True:
@@ -86,6 +124,9 @@ class SyncDriver:
                     wait = procedure.send(time.monotonic())
         except StopIteration as stop:
             return stop.value
+        finally:
+            if outermost:
+                self._thread = 0
 
     def _block(self, until: float | None) -> None:
         if self._epoll is None:
@@ -93,7 +134,14 @@ class SyncDriver:
                 time.sleep(max(0.0, until - time.monotonic()))
             return
         timeout = -1.0 if until is None else max(0.0, until - time.monotonic())
-        for descriptor, events in self._epoll.poll(timeout):
+        epoll = self._epoll
+        try:
+            found = epoll.poll(timeout)
+        except OSError:
+            if not epoll.closed:
+                raise
+            return  # A signal handler has closed the group meanwhile.
+        for descriptor, events in found:
             source = self._sources.get(descriptor)
             if source is not None and events & select.EPOLLOUT:
                 source.on_writable()
@@ -113,7 +161,8 @@ class EnvGroup(Facade):
     Each method returns when it is done; the calling thread waits meanwhile. A wait that Ctrl-C
     interrupts raises KeyboardInterrupt and leaves its results to `collect_async`; one that
     comes while a request is being sent leaves only `close` (docs/faults.md).
-    Not thread-safe: use it from one thread at a time.
+    Any thread may use it, one at a time: a call while another thread is in one raises
+    RLightningError.
     """
 
     _driver: SyncDriver
@@ -148,7 +197,8 @@ class EnvGroup(Facade):
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self.close()
+        if not self._disowned:
+            self.close()
 
     def reset(
         self,
@@ -193,7 +243,9 @@ class EnvGroup(Facade):
         result. Interrupted, it leaves the results to `collect_async`.
 
         Raises:
-            BadAction: an action's shape, dtype or count doesn't fit; nothing was sent.
+            BadAction: an action's shape, dtype or count doesn't fit; it holds NaN, a number that
+                its dtype can't hold, or infinity where its space is bounded; or this is no batch.
+                Nothing was sent.
             EnvBusy: an env has a reply outstanding, or comes twice; nothing was sent.
             UnknownEnv: no env of this group has that id.
             NotImplementedError: the env is a client's, which answers when it can.
@@ -248,6 +300,26 @@ class EnvGroup(Facade):
         )
         return self._driver.run(procedure)
 
+    def collect_calls(self, deadline: float | None = None) -> list[Any]:
+        """Wait for the values of all calls that `call_async` has sent.
+
+        Args:
+            deadline: seconds in all, from now.
+
+        Returns them in the order in which they were sent: from a worker copies, from an inline
+        env the objects themselves. Interrupted, it loses none.
+
+        Raises:
+            NothingPending: no call is outstanding.
+            TimeoutError: `deadline` has passed; the next `collect_calls` gets the values.
+            EnvRaised: a method raised, or its value can't be pickled; what else went wrong is
+                in ``others``, and the values of the others are gone.
+            WorkerDied, EnvHung: a worker ended meanwhile; a replacement does not repeat the call.
+            GroupClosed: the group was not initialised, or is closed.
+            RLightningError: it was called within itself, as from a signal handler.
+        """
+        return self._driver.run(self._collect_calls(deadline))
+
     def __getitem__(self, env_id: str) -> EnvHandle:
         """A handle on one env (an `EnvHandle`), or on one env_server (a `ServerHandle`).
 
@@ -257,7 +329,8 @@ class EnvGroup(Facade):
         server = self._core.supervisor.env_server(env_id)
         if server is not None:
             return ServerHandle(self, self._core, self._driver, server)
-        return EnvHandle(self, self._core, self._driver, self._core.envs.find_one(env_id))
+        self._core.envs.find_one(env_id)
+        return EnvHandle(self, self._core, self._driver, env_id)
 
     def offload(self) -> None:
         """Have every local env free its device memory until `reload`; return when all have.
@@ -284,8 +357,9 @@ class EnvGroup(Facade):
         """Close all envs and end their workers, by force after a second and a half.
 
         Idempotent. Returns when nothing is left running; interrupted, it ends what is left by
-        force. Results that were not collected are gone. An env that raises in its own `close`
-        is named in a warning.
+        force. From a signal handler it closes the group as well; the call that it interrupts
+        raises `GroupClosed` if it was waiting. Results that were not collected are gone. An env
+        that raises in its own `close` is named in a warning.
         """
         self._driver.run(self._core.close(time.monotonic()))
         self._closed()
@@ -298,16 +372,16 @@ class EnvHandle:
     of it is outstanding.
     """
 
-    def __init__(self, group: EnvGroup, core: Core, driver: SyncDriver, slot: int) -> None:
+    def __init__(self, group: EnvGroup, core: Core, driver: SyncDriver, env_id: str) -> None:
         self._group = group
         self._core = core
         self._driver = driver
-        self._slot = slot
+        self._env_id = env_id
 
     @property
     def env_id(self) -> str:
         """Its id, as in `EnvGroup.env_ids`."""
-        return self._core.envs.env_ids[self._slot]
+        return self._env_id
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -336,7 +410,8 @@ class EnvHandle:
         return only_result(self._group.step(steps_of(self.env_id, response)))
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> Any:
-        """Call method `name` of the env (or, if it has none, of its simulator).
+        """Call method `name` of the env, or of the first that has one of its simulator's wrappers,
+        from the outermost in, and the simulator.
 
         Returns its value: from a worker a copy, from an inline env the object itself.
         Interrupted, it leaves the method to end by itself, and its value is dropped.
@@ -346,9 +421,11 @@ class EnvHandle:
             EnvBusy: the env has a reply outstanding; nothing was sent.
             TypeError: the arguments can't be sent to a worker; nothing was sent.
             WorkerDied, EnvHung: the worker ended meanwhile; a replacement does not repeat it.
+            UnknownEnv: a client that has gone, and another has its place.
             GroupClosed: the group was not initialised, or is closed.
         """
-        procedure = self._core.call(time.monotonic(), self._slot, name, args, kwargs)
+        slot = self._core.envs.find_one(self._env_id)
+        procedure = self._core.call(time.monotonic(), slot, name, args, kwargs)
         return self._driver.run(procedure)
 
     def get_attr(self, name: str, target: str = "unwrapped") -> Any:
@@ -392,7 +469,7 @@ class ServerHandle(ServerView, EnvHandle):
         driver: SyncDriver,
         server: tuple[Host, Membership],
     ) -> None:
-        super().__init__(group, core, driver, -1)
+        super().__init__(group, core, driver, server[1].server_id)
         self._server = server
         self._membership = server[1]
 
@@ -431,7 +508,7 @@ class ServerHandle(ServerView, EnvHandle):
 
 
 def build_env_group(
-    cfgs: Any,
+    env_cfgs: Any,
     preprocess_fn: PreprocessFn | Sequence[PreprocessFn | None] | None = None,
     mixed_actions: bool = False,
     zero_copy: bool = False,
@@ -439,7 +516,7 @@ def build_env_group(
     """A synchronous group of the configured envs; nothing is started yet.
 
     Args:
-        cfgs: an `EnvConfig`, a list of them, plain dicts, or OmegaConf nodes.
+        env_cfgs: an `EnvConfig`, a list of them, plain dicts, or OmegaConf nodes.
         preprocess_fn: turns a `PolicyResponse` into what the simulator steps with; one for
             all, a list with one for each entry, or one for each env. Anything that
             cloudpickle takes.
@@ -450,5 +527,5 @@ def build_env_group(
     Raises:
         ConfigError: something is wrong with the configuration or a preprocess function.
     """
-    plan = plan_group(cfgs, preprocess_fn, mixed_actions=mixed_actions, zero_copy=zero_copy)
+    plan = plan_group(env_cfgs, preprocess_fn, mixed_actions=mixed_actions, zero_copy=zero_copy)
     return EnvGroup(plan)

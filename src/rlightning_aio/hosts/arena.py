@@ -7,10 +7,16 @@ up: the memory goes with the last process that maps it.
 
 from __future__ import annotations
 
+import ctypes
 import mmap
 import os
+from typing import Final
 
-__all__ = ["Arena", "map_shared"]
+from rlightning_aio.hosts.standard_streams import occupy_standard_streams
+
+__all__ = ["Arena", "make_private", "map_shared"]
+
+_MAP_FIXED: Final = 0x10
 
 
 def map_shared(descriptor: int, offset: int, size: int) -> memoryview:
@@ -18,10 +24,35 @@ def map_shared(descriptor: int, offset: int, size: int) -> memoryview:
     return memoryview(mmap.mmap(descriptor, size, offset=offset))
 
 
+def make_private(memory: memoryview) -> None:
+    """Have nobody else see what this process writes into a part of an arena from now on.
+
+    It stays where it is, and holds what it held.
+    """
+    held = bytes(memory)
+    address = ctypes.addressof(ctypes.c_char.from_buffer(memory))
+    libc = ctypes.CDLL(None, use_errno=True)
+    libc.mmap.argtypes = (
+        ctypes.c_void_p,
+        ctypes.c_size_t,
+        ctypes.c_int,
+        ctypes.c_int,
+        ctypes.c_int,
+        ctypes.c_long,
+    )
+    libc.mmap.restype = ctypes.c_void_p
+    flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | _MAP_FIXED
+    found = libc.mmap(address, len(held), mmap.PROT_READ | mmap.PROT_WRITE, flags, -1, 0)
+    if found != address:
+        raise OSError(ctypes.get_errno(), "shared memory can't be made private")
+    memory[:] = held
+
+
 class Arena:
     """The trainer's end: owns the descriptor and appends parts."""
 
     def __init__(self) -> None:
+        occupy_standard_streams()  # It is a group's first descriptor.
         self.descriptor = os.memfd_create("rlightning_aio", os.MFD_CLOEXEC)
         self._size = 0
 

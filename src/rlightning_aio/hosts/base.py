@@ -149,6 +149,12 @@ class Killable(Protocol):
         """End it; `Died` follows. With `dump`, have it write its stacks first."""
         ...
 
+    def destroy(self) -> None:
+        """End it together with what it stands on, when `kill` has not ended it; `Died` follows,
+        also of other hosts that stand on the same.
+        """
+        ...
+
 
 @runtime_checkable
 class Polled(Protocol):
@@ -272,6 +278,10 @@ class Shared(Protocol):
 
     def release(self, seconds: float) -> None:
         """Let go of it; what it still does may take `seconds`, and is then ended by force."""
+        ...
+
+    def disown(self) -> None:
+        """Let go of this process's share: it was forked, and the other one goes on using it."""
         ...
 
 

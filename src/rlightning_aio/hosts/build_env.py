@@ -33,5 +33,13 @@ def build_env(
 
 def built_envs(order: StartOrder, *, inline: bool = False) -> Iterator[EnvRunner]:
     """Build the envs of a host, one after the other."""
-    for index, fn in zip(order.worker_indices, order.preprocess_fns, strict=True):
-        yield EnvRunner(build_env(order.config, order.env_class, index, fn), inline=inline)
+    for place, (index, fn) in enumerate(
+        zip(order.worker_indices, order.preprocess_fns, strict=True)
+    ):
+        config = order.config
+        makers: Any = config.make_env
+        if isinstance(makers, tuple):
+            config = config.model_copy(update={"make_env": makers[place]})
+        env = build_env(config, order.env_class, index, fn)
+        env.trainer_pid = None if inline else order.trainer_pid
+        yield EnvRunner(env, inline=inline)

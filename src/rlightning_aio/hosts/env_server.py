@@ -11,7 +11,7 @@ from __future__ import annotations
 import mmap
 import time
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -30,6 +30,7 @@ from rlightning_aio.hosts.messages import (
 from rlightning_aio.hosts.row_writer import RowWriter, infos_out_of_band
 from rlightning_aio.protocol.columns import row_reader
 from rlightning_aio.protocol.entries import Operation, number_of, op_of, slot_of
+from rlightning_aio.protocol.net.wire import MAX_BYTES_IN_ALL
 from rlightning_aio.protocol.slab import RowLayout, Slab
 
 if TYPE_CHECKING:
@@ -44,9 +45,6 @@ if TYPE_CHECKING:
     from rlightning_aio.types import EnvMeta
 
 __all__ = ["EnvServerHost"]
-
-_SLAB_BYTES: Final = 1 << 32
-"""So large may a slab be; of what no client uses, the system takes nothing."""
 
 
 class _Place:
@@ -66,6 +64,7 @@ class _Place:
             self.read_action = row_reader(slab.layout.action_space, slab.action, row)
         self._slab = slab
         self._row = row
+        self._sent_ns = cast("NDArray[np.int64]", slab.sent_ns)
 
     def take(self, name: str, meta: EnvMeta) -> None:
         """Have the place hold a session of `name`, whose episodes begin anew."""
@@ -80,6 +79,11 @@ class _Place:
 
     def write(self, result: RemoteResult) -> OutOfBand | None:
         """Put a result into the row; what of it is out of band."""
+        # The trainer may have its own arithmetic raise; a client's numbers must not.
+        with np.errstate(all="ignore"):
+            return self._write(result)
+
+    def _write(self, result: RemoteResult) -> OutOfBand | None:
         writer = self._writer
         ends = writer.checked_ends(result.reward, result.terminated, result.truncated)
         if result.is_reset or result.is_loss:
@@ -90,6 +94,8 @@ class _Place:
         else:
             writer.write_ends(*ends, result.info)
         writer.write_times(time.monotonic_ns(), result.busy_ns)
+        # Statistics go by this machine's clock, and what the result says by its client's.
+        self._sent_ns[self._row] = result.sent_ns or time.time_ns()
         return writer.write_data(result.observation, result.info, result.extra)
 
 
@@ -259,7 +265,7 @@ class EnvServerHost:
 
     def poll(self) -> None:
         """See `base.Polled.poll`."""
-        if self._listener.is_readable():
+        if self._open and self._listener.is_readable():
             self.tick(time.monotonic())
 
     def deadline(self) -> float | None:
@@ -313,6 +319,9 @@ def _slab_for(meta: EnvMeta, most: int) -> Slab:
         (*agents, *sub_envs),
         meta.agents,
     )
-    rows = max(1, min(most, _SLAB_BYTES // layout.size(1)))
+    # Of what no client uses, the system takes nothing.
+    rows = max(1, min(most, MAX_BYTES_IN_ALL // layout.size(1)))
     memory = mmap.mmap(-1, layout.size(rows), mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-    return Slab(layout, memoryview(memory), rows)
+    slab = Slab(layout, memoryview(memory), rows)
+    slab.sent_ns = np.zeros(rows, np.int64)
+    return slab

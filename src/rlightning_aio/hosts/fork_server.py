@@ -15,7 +15,6 @@ import faulthandler
 import gc
 import importlib
 import os
-import pickle
 import select
 import signal
 import socket
@@ -24,33 +23,52 @@ import threading
 import time
 import traceback
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
+
+from rlightning_aio.hosts.fork_messages import (
+    Exited,
+    Fork,
+    Forked,
+    Hello,
+    Kill,
+    MessageSocket,
+    Ready,
+)
+from rlightning_aio.hosts.standard_streams import occupy_standard_streams
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from types import FrameType
 
-    from rlightning_aio.hosts.messages import WorkerPlace
+    from rlightning_aio.hosts.fork_messages import Message
 
-__all__ = ["BOOTSTRAP", "DUMP_SIGNAL", "Exited", "Fork", "Forked", "Hello", "Kill", "Ready", "main"]
+__all__ = ["BOOTSTRAP", "DUMP_SIGNAL", "main"]
 
 BOOTSTRAP: Final = """
-import sys, importlib.util as u
+import os, sys
+def fail(text):
+    os.write(int(sys.argv[2]), b"!" + text[-60000:].encode("utf-8", "replace"))
+    os._exit(1)
+if sys.path[0] == "":
+    del sys.path[0]
+if sys.version_info < (3, 11):
+    fail("its interpreter %s is Python %s, and workers need Python 3.11 or later"
+         % (sys.executable, ".".join(map(str, sys.version_info[:3]))))
 try:
+    import importlib.util as u
     s = u.spec_from_file_location(
         "rlightning_aio", sys.argv[1] + "/__init__.py", submodule_search_locations=[sys.argv[1]])
     m = sys.modules["rlightning_aio"] = u.module_from_spec(s)
     s.loader.exec_module(m)
     from rlightning_aio.hosts.fork_server import main
 except BaseException:
-    import os, traceback
-    os.write(int(sys.argv[2]), b"!" + traceback.format_exc()[-60000:].encode())
-    os._exit(1)
+    import traceback
+    fail(traceback.format_exc())
 main(int(sys.argv[2]), int(sys.argv[3]))
 """
-"""Runs `main` from this very package, whatever the interpreter has installed.
+"""Runs `main` from this very package, whatever the interpreter has installed, and of any version.
 
-If that fails, the only message is ``!`` and a traceback.
+If that fails, the only packet is `FAILED` and why.
 """
 
 DUMP_SIGNAL: Final = signal.SIGRTMIN + 7
@@ -58,64 +76,17 @@ _TAIL_BYTES: Final = 8192
 _GRACE_SECONDS: Final = 1.2
 """How long workers may take to notice that the trainer is gone and stop a robot."""
 _DUMP_SECONDS: Final = 0.3
-_MESSAGE_BYTES: Final = 1 << 16
+_ERROR_CHARACTERS: Final = 60_000
 _OUTLET_BYTES: Final = 1 << 20
 _READ_SECONDS: Final = 0.2
 """A trainer that hasn't read anything for so long reads nothing."""
 _STDERR: Final = 2
 
 
-@dataclass(frozen=True)
-class Hello:
-    """First message of the trainer: what to import before anything is forked."""
-
-    path: list[str] | None
-    preload: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Ready:
-    """First message of the fork server; `error` says why it can't serve."""
-
-    error: str | None
-
-
-@dataclass(frozen=True)
-class Fork:
-    """Fork the worker of `place`; the channel's and the arena's descriptors ride along."""
-
-    place: WorkerPlace
-
-
-@dataclass(frozen=True)
-class Forked:
-    """Worker `host_id` runs as process `pid`."""
-
-    host_id: int
-    pid: int
-
-
-@dataclass(frozen=True)
-class Kill:
-    """Kill worker `host_id`; with `dump`, have it write its stacks to stderr first."""
-
-    host_id: int
-    dump: bool
-
-
-@dataclass(frozen=True)
-class Exited:
-    """Worker `host_id` has ended: exit code (negative for a signal), last words."""
-
-    host_id: int
-    exit_code: int
-    stderr_tail: str
-
-
 @dataclass
 class _Child:
-    """A worker. Its end of the channel is kept open until it is buried: so the trainer hears
-    why it died before it hears that its channel has closed, and it can be told to stop.
+    """A worker. Its end of the channel is kept open until it is buried, so it can be told to stop
+    when the trainer is gone.
     """
 
     host_id: int
@@ -185,12 +156,11 @@ def _on_child(signal_number: int, frame: FrameType | None) -> None:
 class _ForkServer:
     """Args: the socket to the trainer, and a descriptor of its process (-1 if unknown)."""
 
-    def __init__(self, trainer: socket.socket, trainer_process: int) -> None:
+    def __init__(self, trainer: MessageSocket, trainer_process: int) -> None:
         self._trainer = trainer
         self._trainer_process = trainer_process
         self._children: dict[int, _Child] = {}
         self._poll = select.poll()
-        self._poll.register(trainer, select.POLLIN)
         if trainer_process >= 0:
             self._poll.register(trainer_process, select.POLLIN)
         self._outlet = _Outlet(self._poll)
@@ -215,10 +185,13 @@ class _ForkServer:
 
     def _step(self, until: float | None) -> bool:
         timeout = None if until is None else max(0.0, until - time.monotonic()) * 1000
+        events = select.POLLIN | select.POLLOUT if self._trainer.waiting else select.POLLIN
+        self._poll.register(self._trainer, events)
         for descriptor, _ in self._poll.poll(timeout):
             if descriptor == self._trainer_process:
                 return False
             if descriptor == self._trainer.fileno():
+                self._trainer.flush()
                 if not self._obey():
                     return False
             else:
@@ -239,16 +212,15 @@ class _ForkServer:
 
     def _obey(self) -> bool:
         try:
-            data, descriptors, _, _ = socket.recv_fds(self._trainer, _MESSAGE_BYTES, 2)
-        except ConnectionResetError:
+            received = self._trainer.receive()
+        except EOFError:
             return False
-        if not data:
-            return False
-        message = pickle.loads(data)
-        if isinstance(message, Fork):
-            self._fork(message, descriptors)
-        elif isinstance(message, Kill):
-            self._kill(message)
+        if received is None:
+            return True
+        if isinstance(received.message, Fork):
+            self._fork(received.message, received.descriptors)
+        elif isinstance(received.message, Kill):
+            self._kill(received.message)
         return True
 
     def _fork(self, order: Fork, descriptors: list[int]) -> None:
@@ -262,7 +234,8 @@ class _ForkServer:
         except OSError as error:
             for descriptor in (*pipe, *descriptors):
                 os.close(descriptor)
-            self._tell(Exited(order.place.host_id, 1, f"no worker could be forked: {error}"))
+            why = f"no worker could be forked: {error}"
+            self._trainer.send(Exited(order.place.host_id, 1, why))
             return
         reader, writer = pipe
         channel, arena = descriptors
@@ -273,7 +246,7 @@ class _ForkServer:
         os.set_blocking(reader, False)
         self._children[pid] = _Child(order.place.host_id, pid, reader, channel)
         self._choose_heard()
-        self._tell(Forked(order.place.host_id, pid))
+        self._trainer.send(Forked(order.place.host_id, pid))
 
     def _become_worker(self) -> None:
         """Leave behind, in the child, what belongs to the fork server."""
@@ -347,13 +320,8 @@ class _ForkServer:
                 self._poll.unregister(child.stderr)
             os.close(child.stderr)
             tail = bytes(child.tail).decode(errors="replace")
-            self._tell(Exited(child.host_id, os.waitstatus_to_exitcode(status), tail))
+            self._trainer.send(Exited(child.host_id, os.waitstatus_to_exitcode(status), tail))
             os.close(child.channel)
-
-    def _tell(self, message: Any) -> None:
-        # The trainer may be gone, and its socket closed.
-        with contextlib.suppress(OSError):
-            self._trainer.send(pickle.dumps(message))
 
     def _end_all(self) -> None:
         """The trainer is gone: workers see their channel close; kill those that stay."""
@@ -412,7 +380,7 @@ def _run_worker(
         os._exit(code)
 
 
-def _watch_trainer(trainer: socket.socket, process: int, finished: socket.socket) -> None:
+def _watch_trainer(trainer: MessageSocket, process: int, finished: socket.socket) -> None:
     """Exit if the trainer dies while modules are still being imported."""
     poll = select.poll()
     poll.register(trainer, select.POLLRDHUP)
@@ -424,7 +392,7 @@ def _watch_trainer(trainer: socket.socket, process: int, finished: socket.socket
             os._exit(0)
 
 
-def _preload(trainer: socket.socket, process: int, modules: tuple[str, ...]) -> str | None:
+def _preload(trainer: MessageSocket, process: int, modules: tuple[str, ...]) -> str | None:
     """Import what every worker needs; an error that only one env would meet is left to it."""
     finish, finished = socket.socketpair()
     watcher = threading.Thread(
@@ -440,7 +408,7 @@ def _preload(trainer: socket.socket, process: int, modules: tuple[str, ...]) -> 
             with contextlib.suppress(Exception):
                 importlib.import_module(module)
     except Exception:
-        error = traceback.format_exc()
+        error = traceback.format_exc()[-_ERROR_CHARACTERS:]
     finish.close()
     watcher.join()
     finished.close()
@@ -460,23 +428,38 @@ def _process_of(pid: int) -> int:
         return -1
 
 
+def _first_message(trainer: MessageSocket) -> Message:
+    poll = select.poll()
+    poll.register(trainer, select.POLLIN)
+    while True:
+        poll.poll()
+        received = trainer.receive()
+        if received is not None:
+            return received.message
+
+
 def main(descriptor: int, trainer_pid: int) -> None:
     """Serve the trainer, which is at the other end of socket `descriptor`; never returns."""
-    trainer = socket.socket(fileno=descriptor)
+    # What the trainer's thread has blocked is inherited, by workers as well: they would miss the
+    # signals that tell of a death, write stacks, or end them.
+    signal.pthread_sigmask(signal.SIG_SETMASK, ())
+    occupy_standard_streams()
+    trainer = MessageSocket(socket.socket(fileno=descriptor))
     process = _process_of(trainer_pid)
-    data = trainer.recv(_MESSAGE_BYTES)
-    if not data:
+    try:
+        hello = _first_message(trainer)
+    except EOFError:
         os._exit(0)
-    hello: Hello = pickle.loads(data)
+    assert isinstance(hello, Hello)
     if hello.path is not None:
         sys.path[:] = hello.path
+    # Looking for garbage takes a tenth of the imports' time, finds next to none, and would
+    # touch the memory that workers share with this process.
+    gc.disable()
     error = _preload(trainer, process, hello.preload)
-    gc.collect()
     gc.freeze()
-    try:
-        trainer.send(pickle.dumps(Ready(error)))
-    except (BrokenPipeError, ConnectionResetError):
-        os._exit(0)
+    gc.enable()
+    trainer.send(Ready(error))
     if error is None:
         _ForkServer(trainer, process).serve()
     os._exit(0)

@@ -85,8 +85,12 @@ class Link:
             if self._rings.request(entries):
                 self._write(BELL)
             return
-        for entry, packed in zip(entries.tolist(), arguments, strict=True):
-            self.send(FrameKind.REQUEST, entry, packed)
+        frames = [
+            encode(FrameKind.REQUEST, entry, packed)
+            for entry, packed in zip(entries.tolist(), arguments, strict=True)
+        ]
+        self._frames_outgoing += len(frames)
+        self._write(b"".join(frames))
 
     def send(self, kind: FrameKind, number: int = 0, payload: bytes = b"") -> None:
         """Send a frame, as soon as the worker reads."""
@@ -189,7 +193,9 @@ class Link:
         value: Any
         try:
             value = pickle.loads(payload)
-        except Exception as error:
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # What it is made by may raise anything.
             text = ErrorText.of(error)
             starts = kind == FrameKind.STARTED
             tell(NotBuilt(host_id, 0, text) if starts else Raised(host_id, number, text))

@@ -21,9 +21,10 @@ from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
 from zmq.utils import z85
 
 from rlightning_aio.errors import ConfigError, StartFailed
+from rlightning_aio.hosts.door import Door
 from rlightning_aio.protocol.net.server_session import PATIENCE, ServerSessions
-from rlightning_aio.protocol.net.wire import MAX_FRAME_BYTES
-from rlightning_aio.remote.keys import PUBLIC_SUFFIX, read_keys, read_server_keys
+from rlightning_aio.protocol.net.wire import MAX_FRAME_BYTES, MAX_PARTS
+from rlightning_aio.remote.keys import AllowedKeys, read_server_keys
 from rlightning_aio.remote.parts import receive_parts, send_parts
 
 if TYPE_CHECKING:
@@ -39,9 +40,9 @@ __all__ = ["Listener", "ServerSettings", "server_settings"]
 _MESSAGES_A_PUMP: Final = 1000
 """Read in one go at most, so that a flood doesn't keep the driver."""
 _UNSENT_A_CLIENT: Final = 100
+_UNREAD_A_CLIENT: Final = 100
 _LINGER_MS: Final = 200
 _HANDSHAKE_MS: Final = 5000
-_ROUTES_REMEMBERED: Final = 4096
 _SECONDS_BETWEEN_WARNINGS: Final = 10.0
 
 _EVENTS: Final = int(zmq.EVENTS)
@@ -144,10 +145,11 @@ class Listener:
             objection=objection,
         )
         self._gate = None if settings.keys is None else _Gate(settings.keys)
-        self._users: dict[bytes, str | None] = {}
+        self._is_skipping = False
         self._address: str | None = None
         self._context: zmq.Context[zmq.Socket[bytes]] | None = None
         self._router: zmq.Socket[bytes]
+        self._door: Door
         self._epoll: select.epoll
         self._more = -1
         self._has_more = False
@@ -168,6 +170,11 @@ class Listener:
     def malformed(self) -> int:
         """Messages that were dropped because they were none."""
         return self._sessions.malformed
+
+    @property
+    def num_cut(self) -> int:
+        """Connections that were cut off because they were of no use."""
+        return self._door.num_cut
 
     def start(self) -> None:
         """Listen.
@@ -197,6 +204,7 @@ class Listener:
         router.set(zmq.ROUTER_MANDATORY, 1)
         router.set(zmq.MAXMSGSIZE, MAX_FRAME_BYTES)
         router.set(zmq.SNDHWM, _UNSENT_A_CLIENT)
+        router.set(zmq.RCVHWM, _UNREAD_A_CLIENT)
         router.set(zmq.LINGER, _LINGER_MS)
         router.set(zmq.HANDSHAKE_IVL, _HANDSHAKE_MS)
         router.set(zmq.HEARTBEAT_IVL, max(1, int(1000 * settings.heartbeat / PATIENCE)))
@@ -210,9 +218,16 @@ class Listener:
         if ":" in host:
             router.set(zmq.IPV6, 1)
             host = f"[{host}]"
-        router.bind(f"tcp://{host}:{settings.port or '*'}")
-        self._epoll.register(_descriptor(router), select.EPOLLIN)
+        door = self._door = Door(context, router, has_keys=self._gate is not None)
+        try:
+            router.bind(f"tcp://{host}:{settings.port or '*'}")
+        except zmq.ZMQError:
+            door.close()
+            raise
         self._address = router.get_string(zmq.LAST_ENDPOINT).rstrip("\0")
+        door.watch(int(self._address.rpartition(":")[2]))
+        self._epoll.register(_descriptor(router), select.EPOLLIN)
+        self._epoll.register(door.fileno(), select.EPOLLIN)
 
     def fileno(self) -> int:
         """Readable, and staying so, while there is something for `pump` to do."""
@@ -233,6 +248,7 @@ class Listener:
             os.eventfd_read(self._more)
         if self._gate is not None:
             self._gate.answer(now)
+        self._door.look()
         for _ in range(_MESSAGES_A_PUMP):
             # Asking is what makes ZMQ's descriptor unreadable again.
             if not _is_readable(self._router):
@@ -244,23 +260,24 @@ class Listener:
         self._flush(now)
 
     def _receive(self, now: float) -> None:
+        """Read one message, or one part of one that is dropped."""
         frame = self._router.recv(zmq.NOBLOCK, copy=False)
-        route = frame.bytes
-        user = self._user(route, frame)
+        if self._is_skipping:
+            self._is_skipping = frame.more
+            return
+        connection = self._door.connection(frame)
+        if connection is None:
+            self._is_skipping = frame.more
+            return
         parts: list[Part] = []
         if frame.more:
-            parts = receive_parts(self._router, self._router.recv(zmq.NOBLOCK, copy=False))
-        self._sessions.receive(route, user, parts, now)
-
-    def _user(self, route: bytes, frame: zmq.Frame) -> str | None:
-        """Whose key the connection has proved; asked once for each connection."""
-        if self._gate is None:
-            return None
-        if route not in self._users:
-            if len(self._users) >= _ROUTES_REMEMBERED:
-                self._users.clear()
-            self._users[route] = str(frame.get("User-Id"))
-        return self._users[route]
+            first = self._router.recv(zmq.NOBLOCK, copy=False)
+            parts = receive_parts(self._router, first, MAX_PARTS + 1)
+            self._is_skipping = self._router.get(zmq.RCVMORE) != 0
+        was_useful = self._sessions.receive(connection.route, connection.user, parts, now)
+        self._door.judge(connection, was_useful=was_useful)
+        if self._is_skipping:
+            self._door.cut(connection)
 
     def _flush(self, now: float) -> None:
         """Send what is due, and see to it that nothing is left that wakes nobody."""
@@ -338,6 +355,7 @@ class Listener:
         if self._address is not None:
             self._sessions.close("the trainer closed its group")
             self._flush(0.0)
+            self._door.close()
         self._epoll.close()
         os.close(self._more)
         context.destroy(linger=_LINGER_MS)
@@ -366,9 +384,8 @@ class _Gate:
     """
 
     def __init__(self, directory: Path) -> None:
-        self.secret, self._clients = read_server_keys(directory)
-        self._names: dict[bytes, str] = {}
-        self._read_at_ns = 0
+        self.secret, clients = read_server_keys(directory)
+        self._allowed = AllowedKeys(clients)
         self._warned_at: float | None = None
         self._socket: zmq.Socket[bytes] | None = None
 
@@ -383,7 +400,8 @@ class _Gate:
         socket = self._socket
         while socket is not None and _is_readable(socket):
             version, request_id, _, address, _, mechanism, *credentials = socket.recv_multipart()
-            name = self._name(credentials[0]) if mechanism == b"CURVE" else None
+            key = z85.encode(credentials[0]) if mechanism == b"CURVE" else b""
+            name = self._allowed.owner(key)
             if name is None:
                 self._warn(address.decode(errors="replace"), now)
             verdict = (b"400", b"not on the list", b"") if name is None else (
@@ -391,24 +409,9 @@ class _Gate:
             )  # fmt: skip
             socket.send_multipart([version, request_id, *verdict, b""])
 
-    def _name(self, key: bytes) -> str | None:
-        """Whose key it is. The directory is read again whenever it has changed."""
-        changed_at_ns = self._clients.stat().st_mtime_ns if self._clients.is_dir() else -1
-        if changed_at_ns != self._read_at_ns:
-            self._read_at_ns = changed_at_ns
-            self._names = self._listed()
-        return self._names.get(z85.encode(key))
-
-    def _listed(self) -> dict[bytes, str]:
-        names: dict[bytes, str] = {}
-        for path in sorted(self._clients.glob(f"*{PUBLIC_SUFFIX}")):
-            try:
-                names[read_keys(path).public] = path.stem
-            except ConfigError as error:
-                _log.warning("%s; its client stays out", error)
-        return names
-
     def _warn(self, address: str, now: float) -> None:
         if self._warned_at is None or now - self._warned_at >= _SECONDS_BETWEEN_WARNINGS:
             self._warned_at = now
-            _log.warning("a client at %s has a key that is not in %s", address, self._clients)
+            _log.warning(
+                "a client at %s has a key that is not in %s", address, self._allowed.directory
+            )

@@ -9,9 +9,10 @@ Absent on purpose: how these travel (see `link`), and what they mean (see `group
 
 from __future__ import annotations
 
+import os
 import traceback
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 if TYPE_CHECKING:
@@ -75,6 +76,7 @@ class StartOrder:
         preprocess_fns: one for each of them; None for the default.
         spins: whether waiting may burn a core for some microseconds.
         core: the core to stay on; None for any.
+        trainer_pid: the process that gives the order.
     """
 
     config: EnvConfig
@@ -83,6 +85,7 @@ class StartOrder:
     preprocess_fns: tuple[Any, ...]
     spins: bool
     core: int | None
+    trainer_pid: int = field(default_factory=os.getpid)
 
 
 @dataclass(frozen=True)
@@ -139,20 +142,34 @@ class ErrorText:
 
     @classmethod
     def of(cls, error: BaseException) -> ErrorText:
-        """`error` in words; a broken ``__str__`` is no obstacle."""
+        """`error` in words, in plain text; nothing about its class is an obstacle."""
         kind = type(error)
-        name = kind.__qualname__
-        if kind.__module__ != "builtins":
-            name = f"{kind.__module__}.{name}"
+        name = _plain(_NAME.__get__(kind))
+        module = _MODULE.__get__(kind)
+        if isinstance(module, str) and module != "builtins":
+            name = f"{_plain(module)}.{name}"
         try:
-            text = str(error)
+            text = _plain(str(error))
         except BaseException as broken:
-            text = f"<its __str__ raised {type(broken).__name__}>"
+            text = f"<its __str__ raised {_plain(_NAME.__get__(type(broken)))}>"
         try:
-            lines = "".join(traceback.format_exception(error))
+            lines = _plain("".join(traceback.format_exception(error)))
         except BaseException:
-            lines = "".join(traceback.format_tb(error.__traceback__)) + f"{name}: {text}\n"
+            # As it was noted when it was raised, whatever its class says.
+            frames = traceback.format_tb(_TRACEBACK.__get__(error))
+            lines = "".join(frames) + f"{name}: {text}\n"
         return cls(name, text, lines)
+
+
+_NAME: Final[Any] = vars(type)["__qualname__"]
+_MODULE: Final[Any] = vars(type)["__module__"]
+_TRACEBACK: Final[Any] = vars(BaseException)["__traceback__"]
+"""What a class may have redefined, as Python itself defines it."""
+
+
+def _plain(text: str) -> str:
+    """`text` as a `str` and nothing else: a subclass may be unknown elsewhere."""
+    return str.__str__(text)
 
 
 @dataclass(frozen=True)

@@ -7,21 +7,29 @@ Absent on purpose: any decision about what a death means; that is the supervisor
 
 from __future__ import annotations
 
-import contextlib
 import os
 import pickle
 import signal
 import socket
 import subprocess
 import sys
-from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rlightning_aio.hosts.fork_server import BOOTSTRAP, Exited, Fork, Forked, Hello, Kill, Ready
+from rlightning_aio.hosts.fork_messages import (
+    Exited,
+    Fork,
+    Forked,
+    Hello,
+    Kill,
+    MessageSocket,
+    Ready,
+)
+from rlightning_aio.hosts.fork_server import BOOTSTRAP
 from rlightning_aio.hosts.link import Link
 from rlightning_aio.hosts.messages import Closed, Death, Died, ErrorText, WorkerPlace
 from rlightning_aio.hosts.pickling import dumped, dumped_with_code
+from rlightning_aio.hosts.standard_streams import occupy_standard_streams
 from rlightning_aio.protocol.entries import slot_of
 from rlightning_aio.protocol.frames import FrameKind
 from rlightning_aio.protocol.rings import rings_size
@@ -36,6 +44,7 @@ if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.hosts.arena import Arena
     from rlightning_aio.hosts.base import Watcher, Wiring
+    from rlightning_aio.hosts.fork_messages import Message
     from rlightning_aio.hosts.messages import AttachOrder, StartOrder
 
 __all__ = ["ForkServer", "ProcessHost"]
@@ -91,62 +100,57 @@ class ForkServer:
         self._preload = preload
         self._watcher = watcher
         self._hosts: dict[int, ProcessHost] = {}
-        self._socket: socket.socket | None = None
+        self._messages: MessageSocket | None = None
         self._process: subprocess.Popen[bytes] | None = None
-        self._orders: deque[tuple[Fork, socket.socket, int]] = deque()
         self._ready = False
+        # Why it ended, as far as that is known better than by its exit code.
+        self._failure: str | None = None
 
     def fileno(self) -> int:
         """The socket to the fork server."""
-        assert self._socket is not None
-        return self._socket.fileno()
+        assert self._messages is not None
+        return self._messages.fileno()
 
     def fork(self, host: ProcessHost, channel: socket.socket, arena: Arena, order: Fork) -> None:
         """Start a worker for `host`; starts the fork server first if it isn't running.
 
         It takes `channel`, the worker's end.
         """
-        if self._socket is None:
-            self._launch()
+        messages = self._messages or self._launch()
         self._hosts[order.place.host_id] = host
-        self._orders.append((order, channel, arena.descriptor))
-        if len(self._orders) == 1:
-            self.on_writable()
+        messages.send(order, channel, (arena.descriptor,))
+        self._watcher.watch_writable(self, messages.waiting)
 
     def on_writable(self) -> None:
-        """Send the orders that wait; a fork server that is importing reads none for a while."""
-        assert self._socket is not None
-        while self._orders:
-            order, channel, arena = self._orders[0]
-            try:
-                socket.send_fds(
-                    self._socket,
-                    [pickle.dumps(order)],
-                    [channel.fileno(), arena],
-                    socket.MSG_DONTWAIT,
-                )
-            except BlockingIOError:
-                break
-            except (BrokenPipeError, ConnectionResetError):
-                return  # `on_readable` hears of it, too.
-            channel.close()
-            self._orders.popleft()
-        self._watcher.watch_writable(self, bool(self._orders))
+        """Send what waits; a fork server that is importing reads nothing for a while."""
+        if self._messages is not None:
+            self._messages.flush()
+            self._watcher.watch_writable(self, self._messages.waiting)
 
     def kill(self, host: ProcessHost, *, dump: bool) -> None:
         """Kill the worker of `host`, if it is still there."""
         if not self._ready and self._process is not None:
+            self._failure = f"it was killed while it was importing {self._imports}"
             self._process.kill()  # It hangs in an import, and obeys nobody.
-        elif self._socket is not None:
-            with contextlib.suppress(OSError):
-                self._socket.send(pickle.dumps(Kill(host.host_id, dump)))
+        elif self._messages is not None:
+            self._messages.send(Kill(host.host_id, dump))
+            self._watcher.watch_writable(self, self._messages.waiting)
 
-    def _launch(self) -> None:
+    def destroy(self) -> None:
+        """Kill the fork server itself; the kernel then kills its workers."""
+        if self._process is not None:
+            self._failure = "it did nothing that it was told, and was killed"
+            self._process.kill()
+
+    @property
+    def _imports(self) -> str:
+        return ", ".join(self._preload) or "its modules"
+
+    def _launch(self) -> MessageSocket:
         self._ready = False
-        modules = ", ".join(self._preload) or "its modules"
-        self._failure = f"it ended while it was importing {modules}"
+        self._failure = None
         package = str(Path(__file__).parents[1])
-        command = [self._interpreter or sys.executable, "-P", "-c", BOOTSTRAP, package]
+        command = [self._interpreter or sys.executable, "-c", BOOTSTRAP, package]
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
             self._process = subprocess.Popen(
@@ -162,34 +166,28 @@ class ForkServer:
             raise
         finally:
             theirs.close()
+        messages = self._messages = MessageSocket(ours)
+        try:
+            self._watcher.watch(self)
+        except BaseException:
+            self._end(0.0)
+            raise
         path = None if self._interpreter else list(sys.path)
-        ours.send(pickle.dumps(Hello(path, self._preload)))
-        self._socket = ours
-        self._watcher.watch(self)
+        messages.send(Hello(path, self._preload))
+        return messages
 
     def on_readable(self) -> None:
         """Pass on what the fork server tells of its workers."""
-        assert self._socket is not None
-        while True:
-            try:
-                data = self._socket.recv(1 << 16, socket.MSG_DONTWAIT)
-            except BlockingIOError:
-                return
-            except ConnectionResetError:
-                data = b""
-            if not data:
-                self._lost()
-                return
-            self._heard(data)
+        try:
+            while self._messages is not None and (received := self._messages.receive()) is not None:
+                self._heard(received.message)
+        except EOFError:
+            self._lost()
 
-    def _heard(self, data: bytes) -> None:
-        if data.startswith(b"!"):
-            self._failure = data[1:].decode(errors="replace")
-            return
-        message = pickle.loads(data)
+    def _heard(self, message: Message) -> None:
         if isinstance(message, Ready):
-            self._ready = True
-            self._failure = message.error or "it was killed, or it crashed"
+            self._ready = message.error is None
+            self._failure = message.error
         elif isinstance(message, Forked):
             self._hosts[message.host_id].pid = message.pid
         elif isinstance(message, Exited):
@@ -200,26 +198,44 @@ class ForkServer:
         """The fork server is gone, and by the kernel's care so are its workers."""
         hosts = list(self._hosts.values())
         self._hosts.clear()
-        self.release(0.0)
+        exit_code = self._end(0.0)
+        why = self._failure
+        if why is None:
+            why = f"it {_ending(exit_code)}"
+            if not self._ready:
+                why += f" while it was importing {self._imports}"
+            if not self._ready and self._interpreter:
+                why += f"; is {self._interpreter} a Python with what workers need?"
         for host in hosts:
-            host.on_fork_server_lost(self._failure)
+            host.on_fork_server_lost(why.rstrip())
 
     def release(self, seconds: float) -> None:
         """Let the fork server go; it ends what workers it still has, within `seconds`."""
-        if self._socket is None:
-            return
-        self._watcher.unwatch(self)
-        self._socket.close()
-        self._socket = None
-        while self._orders:
-            self._orders.popleft()[1].close()
+        self._end(seconds)
+
+    def disown(self) -> None:
+        """See `base.Shared.disown`."""
+        if self._messages is not None:
+            self._messages.close()
+            self._messages = None
         if self._process is not None:
-            try:
-                self._process.wait(seconds)
-            except subprocess.TimeoutExpired:
-                self._process.kill()  # The kernel then kills its workers.
-                self._process.wait()
+            self._process.returncode = 0  # Another process's child, of which nobody is to warn.
             self._process = None
+
+    def _end(self, seconds: float) -> int:
+        """See `release`; its exit code, 0 if there was none."""
+        if self._messages is not None:
+            self._watcher.unwatch(self)
+            self._messages.close()
+            self._messages = None
+        process, self._process = self._process, None
+        if process is None:
+            return 0
+        try:
+            return process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            process.kill()  # The kernel then kills its workers.
+            return process.wait()
 
 
 def _surroundings(config: EnvConfig) -> tuple[object, ...]:
@@ -256,14 +272,17 @@ class ProcessHost:
         """Fork a worker (a new one, after a death) and tell it what to build."""
         self._closing = False
         self._killed = ""
+        occupy_standard_streams()  # A program may have closed them since.
         ours, theirs = socket.socketpair()
-        ours.setblocking(False)
-        self._link = Link(self._place, self._wiring, ours)
         try:
+            ours.setblocking(False)
+            self._link = Link(self._place, self._wiring, ours)
             self._fork_server.fork(self, theirs, self._wiring.arena, Fork(self._place))
         except BaseException:
+            # Another attempt may follow, when there are descriptors again.
+            self.release()
+            ours.close()
             theirs.close()
-            self._link.hang_up()
             raise
         self._alive = True
         self._link.send(FrameKind.START, payload=self._start_payload)
@@ -277,6 +296,10 @@ class ProcessHost:
         """See `base.Killable.kill`."""
         self._killed = "did not close in time and was killed" if self._closing else ""
         self._fork_server.kill(self, dump=dump)
+
+    def destroy(self) -> None:
+        """See `base.Killable.destroy`."""
+        self._fork_server.destroy()
 
     def close(self) -> None:
         """See `base.Host.close`."""

@@ -127,6 +127,8 @@ class RowWriter:
         """Reward and ends in the shape of the row, from whatever holds them (tensors, dicts by
         agent, an axis of one too many).
 
+        Those that a result leaves out (0.0 and False, no agent at all) hold for all.
+
         Raises:
             ValueError: a shape that doesn't fit.
         """
@@ -138,8 +140,10 @@ class RowWriter:
 
     def _checked(self, what: str, value: Any) -> Any:
         layout = self._slab.layout
-        if type(value) in (float, bool) and not layout.head:
+        if type(value) in (float, bool) and not (value and layout.head):
             return value
+        if layout.agents and isinstance(value, dict) and not value:
+            return False
         if layout.agents:
             value = [as_numpy(value[agent]) for agent in layout.agents]
         array = np.asarray(as_numpy(value))

@@ -7,17 +7,16 @@ whose env is exactly Gymnasium's goes a short way of its own (`_short_steps`).
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any, TypeAlias
+from functools import partial
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
-from rlightning_aio.envs.base import (
-    BareReset,
-    BareResult,
-    BareStep,
-    BareStepAsync,
-    BareStepWait,
-    BaseEnv,
-    default_env_preprocess_fn,
-    result_of,
+from rlightning_aio.envs.results import (
+    has_preprocess_fn,
+    input_of,
+    is_async_first,
+    one_result,
+    reads_extras,
+    step_of,
 )
 from rlightning_aio.envs.tensors import as_numpy, holds_tensor
 from rlightning_aio.hosts.messages import NO_ACTION, EnvStarted, OutOfBand
@@ -26,17 +25,27 @@ from rlightning_aio.protocol.columns import leaves, row_reader
 from rlightning_aio.protocol.entries import Operation
 from rlightning_aio.protocol.info import NO_INFO, PICKLED, InfoSchema
 from rlightning_aio.protocol.slab import RowLayout, Slab
-from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from numpy.typing import NDArray
+
+    from rlightning_aio.envs.base import BareReset, BareResult, BareStep, BaseEnv
+    from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet
 
 __all__ = ["EnvRunner", "Execute"]
 
 Execute: TypeAlias = "Callable[[], OutOfBand | None]"
 """Executes a step or a reset; returns what of its result is out of band."""
+_Take: TypeAlias = "Callable[[], Any]"
+"""Gives what one step is taken with."""
+
+
+class _StepTaking(Protocol):
+    """Steps with what `take` gives; without it, with the action that lies in the row."""
+
+    def __call__(self, take: _Take = ...) -> OutOfBand | None: ...
 
 
 class EnvRunner:
@@ -56,15 +65,18 @@ class EnvRunner:
 
     def __init__(self, env: BaseEnv, *, inline: bool = False) -> None:
         self.env = env
-        self.meta: EnvMeta = env.init()
+        self.meta: EnvMeta = env.initialised()
         self._inline = inline
         self.step: Execute = self._not_attached
+        self._step_taking: _StepTaking
+        self._input = input_of(env)
         self.begin_step: Callable[[], Execute] | None = None
         self.reset_from_row: Execute = self._not_attached
 
     def started(self) -> EnvStarted:
         """What a trainer is told of the env."""
-        return EnvStarted(self.meta, self.layout, self._reads_extras, self._transforms_actions)
+        any_action = self.env.transforms_actions or has_preprocess_fn(self.env)
+        return EnvStarted(self.meta, self.layout, reads_extras(self.env), any_action)
 
     @property
     def layout(self) -> RowLayout:
@@ -91,21 +103,6 @@ class EnvRunner:
         """Whether the results of bare steps may be kept by the one that gets them."""
         return self._inline and self.env.fresh_results and self.env.bare_step() is not None
 
-    @property
-    def _has_preprocess_fn(self) -> bool:
-        return self.env._preprocess_fn is not default_env_preprocess_fn  # pyright: ignore[reportPrivateUsage]
-
-    @property
-    def _reads_extras(self) -> bool:
-        """Whether anything here can read more of a response than a plain action."""
-        built_in = type(self.env).__module__.startswith("rlightning_aio.envs.")
-        return self.env.bare_step() is None and (not built_in or self._has_preprocess_fn)
-
-    @property
-    def _transforms_actions(self) -> bool:
-        """Whether an action may have any shape and type."""
-        return self.env.transforms_actions or self._has_preprocess_fn
-
     def attach(self, slab: Slab, row: int, announce: Callable[[InfoSchema], int]) -> None:
         """Take `row` of `slab` for all further results."""
         layout = self.layout
@@ -128,7 +125,7 @@ class EnvRunner:
         self._before_writing: Callable[[], None] = _nothing
         self._after_writing: Callable[[], None] = _nothing
         self.reset_from_row = self._reset_from_row
-        self.step = self._stepper(layout)
+        self.step = self._step_taking = self._stepper(layout)
 
     def execute(self, op: int, arguments: Any) -> Any:
         """Execute a request whose arguments came out of band.
@@ -142,51 +139,76 @@ class EnvRunner:
         return self._step_with(*arguments)
 
     def _call(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Call a method of the env; ``get_attr`` and ``set_attr`` reach through wrappers."""
+        """Call a method of the env, or of what it wraps, from the outside in."""
         if name == "get_attr":
             return _get_attr(self.env, *args, **kwargs)
         if name == "set_attr":
             return _set_attr(self.env, *args, **kwargs)
-        method = getattr(self.env, name, None)
-        if method is None:
-            method = getattr(self.env.env, name)
-        return method(*args, **kwargs)
+        for owner in _layers(self.env):
+            if hasattr(owner, name):
+                return getattr(owner, name)(*args, **kwargs)
+        raise AttributeError(
+            f"neither env {self.env.env_id!r} nor its simulator, nor a wrapper around that, has "
+            f"{name}()"
+        )
 
     def _not_attached(self) -> OutOfBand | None:
         raise RuntimeError("this env has no row yet")
 
     # -- steps --------------------------------------------------------------------
 
-    def _stepper(self, layout: RowLayout) -> Execute:
-        bare, read_action = self.env.bare_step(), self._read_action
-        if read_action is None:
-            return lambda: self._step_with(None, {})
+    def _stepper(self, layout: RowLayout) -> _StepTaking:
+        bare, take = self.env.bare_step(), self._taker()
         if bare is None:
-            return lambda: self._step_with(read_action(), {})
+            return self._plain_stepper(take)
         halves = self.env.bare_step_async()
         single = not layout.head and self.meta.autoreset == "disabled"
         if single and halves is None and self._writer.write_observation is not None:
-            return self._short_stepper(bare, read_action, self._writer.write_observation)
+            return self._short_stepper(bare, take, self._writer.write_observation)
         store, clock = self._bare_store(layout), time.monotonic_ns
         if halves is not None:
-            self.begin_step = _step_beginner(halves, read_action, store)
+            self.begin_step = _step_beginner(*halves, take, store)
 
-        def step() -> OutOfBand | None:
+        def step(take: _Take = take) -> OutOfBand | None:
             began = clock()
-            return store(bare(read_action()), clock() - began)
+            return store(bare(take()), clock() - began)
+
+        return step
+
+    def _taker(self) -> _Take:
+        """Gives what the env is stepped with where the action lies in the row."""
+        read_action, make = self._read_action, self._input
+        if read_action is None:
+            return lambda: make(None, {})
+        if self.env.bare_step() is not None and not has_preprocess_fn(self.env):
+            return read_action
+        return lambda: make(read_action(), {})
+
+    def _plain_stepper(self, take: _Take) -> _StepTaking:
+        """For an env that gives results of its own making."""
+        env, clock = self.env, time.monotonic_ns
+        step_env, method = step_of(env), "step"
+
+        def store(returned: Any, busy_ns: int) -> OutOfBand | None:
+            return self._store(one_result(env, method, returned), busy_ns, stepped=True)
+
+        if is_async_first(env):
+            method = "collect_async"
+            self.begin_step = _step_beginner(env.step_async, env.collect_async, take, store)
+
+        def step(take: _Take = take) -> OutOfBand | None:
+            began = clock()
+            return store(step_env(take()), clock() - began)
 
         return step
 
     def _short_stepper(
-        self,
-        bare: BareStep,
-        read_action: Callable[[], Any],
-        write_observation: Callable[[Any], None],
-    ) -> Execute:
+        self, bare: BareStep, take: _Take, write_observation: Callable[[Any], None]
+    ) -> _StepTaking:
         bare_reset = self.env.bare_reset()
         self._before_writing = self._writer.look
         step, reset, self._after_writing = _short_steps(
-            bare, bare_reset, read_action, write_observation, self._writer, self._slab, self._row
+            bare, bare_reset, take, write_observation, self._writer, self._slab, self._row
         )
         if bare_reset is not None:
             self.reset_from_row = reset
@@ -212,13 +234,7 @@ class EnvRunner:
         """Step with an action that didn't come through the row, or with extras."""
         if type(action) is str and action == NO_ACTION:
             action = self._action_in_row()
-        began = time.monotonic_ns()
-        bare = self.env.bare_step()
-        if bare is not None:
-            result = result_of(self.env.env_id, bare(action))
-        else:
-            result = self.env.step(PolicyResponse(self.env.env_id, action, **extras))
-        return self._store(result, began, stepped=True)
+        return self._step_taking(partial(self._input, action, extras))
 
     def _action_in_row(self) -> Any:
         """A copy of the action that the row holds."""
@@ -231,22 +247,19 @@ class EnvRunner:
     def _reset(self, seed: int | None, options: dict[str, Any] | None) -> OutOfBand | None:
         """Start a new episode."""
         began = time.monotonic_ns()
-        result = self.env.reset(seed=seed, options=options)
-        return self._store(result, began, stepped=False)
+        returned = self.env.reset(seed=seed, options=options)
+        busy_ns = time.monotonic_ns() - began
+        return self._store(one_result(self.env, "reset", returned), busy_ns, stepped=False)
 
     def _reset_from_row(self) -> OutOfBand | None:
         """Start a new episode with the seed that the row holds."""
         return self._reset(self._slab.take_seed(self._row), None)
 
-    def _store(self, result: Any, began_ns: int, *, stepped: bool) -> OutOfBand | None:
-        done_ns = time.monotonic_ns()
+    def _store(
+        self, result: EnvRet | MultiAgentEnvRet, busy_ns: int, *, stepped: bool
+    ) -> OutOfBand | None:
         writer = self._writer
-        writer.write_times(done_ns, done_ns - began_ns)
-        if not isinstance(result, EnvRet | MultiAgentEnvRet):
-            raise TypeError(
-                f"{'step' if stepped else 'reset'}() of env {self.env.env_id!r} must return an "
-                f"EnvRet or a MultiAgentEnvRet, not {type(result).__name__}"
-            )
+        writer.write_times(time.monotonic_ns(), busy_ns)
         self._before_writing()
         if stepped:
             ends = writer.checked_ends(
@@ -270,12 +283,12 @@ def _nothing() -> None: ...
 def _short_steps(
     bare: BareStep,
     bare_reset: BareReset | None,
-    read_action: Callable[[], Any],
+    take: _Take,
     write_observation: Callable[[Any], None],
     writer: RowWriter,
     slab: Slab,
     row: int,
-) -> tuple[Execute, Execute, Callable[[], None]]:
+) -> tuple[_StepTaking, Execute, Callable[[], None]]:
     """The hot path of plain Gymnasium envs: (step, reset, look at what others wrote to the row).
 
     It writes what `RowWriter` would. Closures over memoryviews: assigning an element of one
@@ -298,10 +311,10 @@ def _short_steps(
         episode_return, episode_length = returns[row], lengths[row]
         fresh, over = resets[row], overs[row]
 
-    def step() -> OutOfBand | None:
+    def step(take: _Take = take) -> OutOfBand | None:
         nonlocal episode_return, episode_length, fresh, over
         began = clock()
-        observation, reward, terminated, truncated, info = bare(read_action())
+        observation, reward, terminated, truncated, info = bare(take())
         done = clock()
         done_times[row] = done
         busy_times[row] = done - began
@@ -341,20 +354,20 @@ def _short_steps(
 
 
 def _step_beginner(
-    halves: tuple[BareStepAsync, BareStepWait],
-    read_action: Callable[[], Any],
-    store: Callable[[BareResult, int], OutOfBand | None],
+    start: Callable[[Any], None],
+    wait: Callable[[], Any],
+    take: _Take,
+    store: Callable[[Any, int], OutOfBand | None],
 ) -> Callable[[], Execute]:
     """A function that starts a step and returns what ends it.
 
     Its time is that of the two halves: in between, the trainer's own goes by.
     """
-    start, wait = halves
     clock = time.monotonic_ns
 
     def begin() -> Callable[[], OutOfBand | None]:
         began = clock()
-        start(read_action())
+        start(take())
         spent = clock() - began
 
         def end() -> OutOfBand | None:
@@ -370,6 +383,17 @@ def _step_beginner(
 def _view(array: NDArray[Any]) -> memoryview[Any]:
     # NumPy's types know that arrays are buffers from Python 3.12 on.
     return memoryview(array)  # pyright: ignore[reportArgumentType]
+
+
+def _layers(env: BaseEnv) -> Iterator[Any]:
+    """The env, its simulator's wrappers from the outermost in, and the simulator itself."""
+    seen: set[int] = set()
+    layer: Any = env
+    while layer is not None and id(layer) not in seen:
+        yield layer
+        seen.add(id(layer))
+        layer = getattr(layer, "env", None)
+    yield _target(env, "unwrapped")
 
 
 def _target(env: BaseEnv, target: str) -> Any:

@@ -12,10 +12,12 @@ import gc
 import os
 import pickle
 import socket
+import sys
 import time
-from typing import TYPE_CHECKING, ClassVar
+import traceback
+from typing import TYPE_CHECKING, ClassVar, NoReturn
 
-from rlightning_aio.hosts.arena import map_shared
+from rlightning_aio.hosts.arena import make_private, map_shared
 from rlightning_aio.hosts.build_env import built_envs
 from rlightning_aio.hosts.messages import ErrorText
 from rlightning_aio.hosts.pickling import dumped, dumped_with_code
@@ -37,7 +39,7 @@ from rlightning_aio.protocol.rings import WorkerRings, rings_size
 from rlightning_aio.protocol.slab import Slab
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from rlightning_aio.hosts.messages import AttachOrder, OutOfBand, StartOrder, WorkerPlace
     from rlightning_aio.hosts.runner import EnvRunner, Execute
@@ -59,10 +61,16 @@ class Worker:
         arena: descriptor of the group's shared memory.
         rings: this worker's.
         first_slot: slot of its first env in the group.
+        shared: the shared memory that it has mapped so far.
     """
 
     def __init__(
-        self, channel: socket.socket, arena: int, rings: WorkerRings, first_slot: int
+        self,
+        channel: socket.socket,
+        arena: int,
+        rings: WorkerRings,
+        first_slot: int,
+        shared: Sequence[memoryview] = (),
     ) -> None:
         self._channel = channel
         self._first_slot = first_slot
@@ -76,6 +84,8 @@ class Worker:
         self._spinner = Spinner(enabled=False)
         self._attached = False
         self._closing = False
+        self._shared = list(shared)
+        self._is_child = False
 
     def serve(self) -> None:
         """Run until told to close; envs are closed on every way out."""
@@ -86,7 +96,8 @@ class Worker:
                 self.run_requests()
                 self._wait()
         except TrainerGone as gone:
-            for runner in self._runners:
+            for index, runner in enumerate(self._runners):
+                self._begin_with(index)
                 with contextlib.suppress(Exception):
                     runner.env.on_disconnect()
             if not isinstance(gone.__cause__, BrokenPipeError | ConnectionResetError | None):
@@ -124,6 +135,8 @@ class Worker:
         except BaseException as error:
             self._send_error(request, error)
             return False
+        if self._is_child:
+            _end_child()
         if out_of_band is None:
             return True
         self._send_result(request, out_of_band)
@@ -161,8 +174,20 @@ class Worker:
         finally:
             self._rings.idle()
 
+    def become_child(self) -> None:
+        """Keep nothing of the trainer's, in a process that an env has forked.
+
+        It goes on in the env's code. If it comes back from there, it ends.
+        """
+        self._is_child = True
+        self._channel.close()
+        for memory in self._shared:
+            make_private(memory)
+
     def _begin(self, request: int) -> None:
         """Say what is being worked on, should that be the last thing it does."""
+        if self._is_child:
+            _end_child()
         self._rings.begin(request, time.monotonic_ns())
 
     def _begin_with(self, index: int) -> None:
@@ -198,10 +223,11 @@ class Worker:
     def _attach(self, frame: Frame) -> None:
         """Map the slabs; the arena's descriptor was inherited for this."""
         order: AttachOrder = pickle.loads(frame.payload)
-        slabs = [
-            Slab(layout, map_shared(self._arena, offset, layout.size(rows)), rows)
-            for layout, rows, offset in order.slabs
-        ]
+        slabs: list[Slab] = []
+        for layout, rows, offset in order.slabs:
+            memory = map_shared(self._arena, offset, layout.size(rows))
+            self._shared.append(memory)
+            slabs.append(Slab(layout, memory, rows))
         os.close(self._arena)
         self.adopt(self._runners, [(slabs[slab_index], row) for slab_index, row in order.rows])
         self._attached = True
@@ -224,8 +250,10 @@ class Worker:
             if answers_with_value(op):
                 payload = dumped(outcome, f"what {arguments[0]}() returned")
                 self._send(FrameKind.VALUE, request, payload)
+            elif outcome is None:
+                self._rings.report(request, self._ring)
             else:
-                self._send_result(request, outcome or {})
+                self._send_result(request, outcome)
         except TrainerGone:
             raise
         except BaseException as error:
@@ -256,6 +284,8 @@ class Worker:
         return errors
 
     def _write(self, data: bytes) -> None:
+        if self._is_child:
+            _end_child()
         try:
             self._channel.sendall(data)
         except BaseException as error:
@@ -281,13 +311,31 @@ class Worker:
         self._send(FrameKind.INFO_SCHEMA, number, pickle.dumps(schema))
 
 
+def _end_child() -> NoReturn:
+    """End a process that an env has forked; what it raised is shown, and nobody is answered."""
+    error = sys.exception()
+    code = 1
+    if isinstance(error, SystemExit) and (error.code is None or isinstance(error.code, int)):
+        code = error.code or 0
+    elif error is not None:
+        traceback.print_exception(error)
+    else:
+        sys.stderr.write(
+            "a process that an env has forked ends where it came back from the env's code; "
+            "it should have ended there, by os._exit\n"
+        )
+    with contextlib.suppress(Exception):
+        sys.stdout.flush()
+        sys.stderr.flush()
+    os._exit(code)
+
+
 def main(channel: socket.socket, arena: int, place: WorkerPlace) -> None:
     """Run a worker in this process; returns when it has closed."""
-    bell = WorkerBell(
-        map_shared(arena, place.bell_offset, bell_size(place.num_hosts)),
-        place.num_hosts,
-        place.host_id,
-    )
+    bell_memory = map_shared(arena, place.bell_offset, bell_size(place.num_hosts))
+    bell = WorkerBell(bell_memory, place.num_hosts, place.host_id)
     rings_memory = map_shared(arena, place.rings_offset, rings_size(place.num_envs))
     rings = WorkerRings(rings_memory, place.num_envs, bell)
-    Worker(channel, arena, rings, place.first_slot).serve()
+    worker = Worker(channel, arena, rings, place.first_slot, (bell_memory, rings_memory))
+    os.register_at_fork(after_in_child=worker.become_child)
+    worker.serve()

@@ -182,6 +182,10 @@ class TrainerBell:
         del seconds
         self._attach(memoryview(bytearray(8 * len(self._words))), len(self._read))
 
+    def disown(self) -> None:
+        """Let go of it in a process that was forked, whose parent goes on using it."""
+        self.release()
+
 
 class WorkerBell:
     """One worker's side: counts its reports, and tells when the bell is due.

@@ -26,6 +26,7 @@ __all__ = [
     "Misfit",
     "Rows",
     "Tree",
+    "array_of_tensor",
     "as_array",
     "assemble",
     "fitted",
@@ -37,6 +38,7 @@ __all__ = [
     "leaf_of",
     "leaves",
     "mapped",
+    "out_of_range",
     "row_reader",
     "row_writer",
     "stacked",
@@ -156,22 +158,43 @@ def as_array(value: Any) -> NDArray[Any]:
     """`value` as NumPy; tensors come from their device to the CPU."""
     if type(value) is np.ndarray:
         return value
-    if hasattr(value, "detach"):
-        value = value.detach().cpu()
-    return np.asarray(value)
+    return array_of_tensor(value) if hasattr(value, "detach") else np.asarray(value)
+
+
+def array_of_tensor(tensor: Any) -> NDArray[Any]:
+    """A torch tensor as an array on the CPU, of float32 if it is of bfloat16, which NumPy lacks."""
+    # A view may be marked as conjugated or negated instead of being so, which NumPy can't show.
+    tensor = tensor.detach().cpu().resolve_conj().resolve_neg()
+    return (tensor.float() if str(tensor.dtype) == "torch.bfloat16" else tensor).numpy()
+
+
+def out_of_range(array: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[np.bool_] | None:
+    """Where numbers of `array` don't fit the integer `dtype`; None if nowhere."""
+    if dtype.kind not in "iu" or not array.size or np.can_cast(array.dtype, dtype):
+        return None
+    limits = np.iinfo(dtype)
+    if array.min() >= limits.min and array.max() <= limits.max:
+        return None
+    return (array < limits.min) | (array > limits.max)
 
 
 def fitted(value: Any, leaf: Leaf, what: str) -> NDArray[Any]:
     """`value` as an array that may be copied into one row of `leaf`.
 
     Raises:
-        Misfit: it has another shape, or another kind of dtype.
+        Misfit: it has another shape, another kind of dtype, or numbers that are out of range.
     """
     array = np.asarray(value)
     if array.shape != leaf.shape or not np.can_cast(array.dtype, leaf.dtype, "same_kind"):
         raise Misfit(
             f"{what}{leaf.name} doesn't fit its space: expected shape {leaf.shape} and dtype "
             f"{leaf.dtype}, found shape {array.shape} and dtype {array.dtype}"
+        )
+    beyond = out_of_range(array, leaf.dtype)
+    if beyond is not None:
+        raise Misfit(
+            f"{what}{leaf.name} doesn't fit its space: it holds {array[beyond][0]}, which is out "
+            f"of the range of {leaf.dtype}"
         )
     return array
 
@@ -224,8 +247,8 @@ def row_writer(
     Floats may be narrowed (float64 into float32), as Gymnasium's vector environments do.
 
     Raises (from the function):
-        Misfit: the value has another shape, structure, or kind of dtype; the row may hold
-            a part of it.
+        Misfit: the value has another shape, structure, or kind of dtype, or numbers that are
+            out of its range; the row may hold a part of it.
     """
     if is_dict(space):
         return _dict_writer(space, tree, row, what, path)

@@ -10,12 +10,15 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from numpy.typing import NDArray
 
 __all__ = ["INFO_BYTES", "NO_INFO", "PICKLED", "InfoSchema", "InfoWriter"]
 
@@ -75,10 +78,25 @@ class InfoSchema:
             return None
         return cls(tuple(info), kinds, tuple(arrays), codes)
 
-    @property
+    @cached_property
     def size(self) -> int:
         """Bytes of a row that it uses."""
         return struct.calcsize(self.format)
+
+    @cached_property
+    def _dtype(self) -> np.dtype[Any]:
+        """The bytes of a row as a structured array knows them."""
+        return np.dtype(
+            [
+                (key, _SCALARS[kind]) if array is None else (key, array[1], array[0])
+                for key, kind, array in zip(self.keys, self.types, self.arrays, strict=True)
+            ]
+        )
+
+    def fields(self, rows: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
+        """What ``rows [n, bytes]`` hold, one column for each key; views of a copy."""
+        values = np.ascontiguousarray(rows[:, : self.size]).view(self._dtype)[:, 0]
+        return {key: values[key] for key in self.keys}
 
     def decode(self, row: bytes | memoryview) -> dict[str, Any]:
         """The info that `row` holds; arrays are fresh and writable."""

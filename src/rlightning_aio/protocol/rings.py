@@ -224,6 +224,16 @@ class WorkerRings:
             ring()
         return True
 
+    def report(self, request: int, ring: Callable[[], object]) -> None:
+        """Report an entry that came in a frame and whose reply is all in its row; see `serve`."""
+        self._reports[self._sent & self._mask] = request
+        self._sent += 1
+        if not STORES_STAY_IN_ORDER:
+            self._fence()
+        self._bell.publish(self._sent)
+        if self._bell.is_due():
+            ring()
+
     def count_frame(self) -> None:
         """Say that one more frame was handed to the channel."""
         self._frames_sent += 1

@@ -124,6 +124,8 @@ class Slab:
         seed: ``[rows]`` int64, of the reset that was sent, plus 1; 0 for none.
         times: ``[rows, 2]`` int64; its halves are done_ns, the monotonic time at which the
             reply was ready, and busy_ns, the time that the env itself took.
+        sent_ns: ``[rows]`` int64, ns since the epoch by the env's own clock, where that is
+            another than the trainer's; beside the block of memory, and None elsewhere.
     """
 
     def __init__(self, layout: RowLayout, buffer: memoryview, rows: int) -> None:
@@ -149,6 +151,7 @@ class Slab:
         self.times = next(arrays)
         self.done_ns, self.busy_ns = self.times[:, 0], self.times[:, 1]
         self.info = next(arrays)
+        self.sent_ns: NDArray[np.int64] | None = None
 
     def take_seed(self, row: int) -> int | None:
         """The seed of the reset that was sent to `row`; it is good for that one alone."""

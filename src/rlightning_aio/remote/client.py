@@ -21,9 +21,14 @@ from typing import TYPE_CHECKING, Any, Final, Self
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
-from rlightning_aio.envs.base import default_env_preprocess_fn
+from rlightning_aio.envs.results import (
+    has_preprocess_fn,
+    input_of,
+    one_result,
+    reads_extras,
+    step_of,
+)
 from rlightning_aio.errors import ClientRefused, ConfigError
-from rlightning_aio.protocol.columns import Misfit
 from rlightning_aio.protocol.net.client_session import (
     ClientSession,
     Ended,
@@ -38,7 +43,6 @@ from rlightning_aio.protocol.net.space_description import UnsupportedSpace
 from rlightning_aio.protocol.net.wire import MAX_FRAME_BYTES, MAX_NAME_LENGTH
 from rlightning_aio.remote.keys import read_client_keys
 from rlightning_aio.remote.parts import receive_parts, send_parts
-from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -111,15 +115,17 @@ class RemoteEnvClient:
         self._heartbeat = heartbeat
         try:
             self._session = ClientSession(
-                env.init(),
+                env.initialised(),
                 self.name,
                 heartbeat=heartbeat,
-                free_actions=env.transforms_actions or _preprocesses(env),
-                reads_extras=_reads_extras(env),
+                free_actions=env.transforms_actions or has_preprocess_fn(env),
+                reads_extras=reads_extras(env),
             )
         except UnsupportedSpace as error:
             raise ConfigError(f"env {env.env_id!r} can't be a remote client: {error}") from None
         self._bare_step = env.bare_step()
+        self._env_step = step_of(env)
+        self._input = input_of(env)
         self._todo: StepRequest | ResetRequest | None = None
         self._trouble = ""
         self._redial_at: float | None = None
@@ -331,26 +337,25 @@ class RemoteEnvClient:
     def _reset(self, request: ResetRequest) -> None:
         began_ns = time.perf_counter_ns()
         ret = self._env.reset(seed=request.seed, options=request.options)
-        self._answer(request.number, ret, time.perf_counter_ns() - began_ns)
+        self._answer(request.number, "reset", ret, time.perf_counter_ns() - began_ns)
 
     def _step(self, request: StepRequest) -> None:
         began_ns = time.perf_counter_ns()
         if self._bare_step is not None:
-            *outcome, info = self._bare_step(request.action)
+            *outcome, info = self._bare_step(self._input(request.action, request.extras))
             busy_ns = time.perf_counter_ns() - began_ns
             self.num_steps += 1
-            self._session.answer(request.number, Outcome(*outcome), info, {}, busy_ns)
+            self._session.answer(
+                request.number, Outcome(*outcome), info, {}, busy_ns, time.time_ns()
+            )
             self._flush()
             return
-        response = PolicyResponse(self._env.env_id, request.action, **request.extras)
-        ret = self._env.step(response)
+        ret = self._env_step(self._input(request.action, request.extras))
         self.num_steps += 1
-        self._answer(request.number, ret, time.perf_counter_ns() - began_ns)
+        self._answer(request.number, "step", ret, time.perf_counter_ns() - began_ns)
 
-    def _answer(self, number: int, ret: Any, busy_ns: int) -> None:
-        if not isinstance(ret, EnvRet | MultiAgentEnvRet):
-            raise Misfit(f"the env returned {type(ret).__name__}, not an EnvRet")
-        self._session.finish(number, ret, busy_ns)
+    def _answer(self, number: int, method: str, returned: Any, busy_ns: int) -> None:
+        self._session.finish(number, one_result(self._env, method, returned), busy_ns)
         self._flush()
 
 
@@ -358,17 +363,6 @@ def _earliest(one: float | None, other: float | None) -> float | None:
     if one is None or other is None:
         return other if one is None else one
     return min(one, other)
-
-
-def _preprocesses(env: BaseEnv) -> bool:
-    function = env._preprocess_fn  # pyright: ignore[reportPrivateUsage]
-    return function is not default_env_preprocess_fn
-
-
-def _reads_extras(env: BaseEnv) -> bool:
-    """Whether anything here can read more of a response than its action."""
-    built_in = type(env).__module__.startswith("rlightning_aio.envs.")
-    return env.bare_step() is None and (not built_in or _preprocesses(env))
 
 
 def _in_words(error: Exception) -> tuple[str, str, str]:

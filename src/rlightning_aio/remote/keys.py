@@ -4,14 +4,16 @@ Rule: key files are ZeroMQ's certificates, so that its tools read them; a key is
 characters of Z85. ``make_keys(directory, names)`` lays out one directory for each machine, so that
 setting up a client is copying one of them: ``server/`` has the server's secret and, in
 ``clients/``, the public key of every client that may come in; ``<name>/`` has one
-client's secret and the server's public key. Deleting a file in ``server/clients/`` shuts
-that client out.
+client's secret and the server's public key. Deleting a file in ``server/clients/``, or
+writing another key into it, shuts that client out.
 """
 
 from __future__ import annotations
 
+import logging
 import os
 import re
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 __all__ = [
+    "AllowedKeys",
     "ClientKeys",
     "KeyPair",
     "ServerKeys",
@@ -32,13 +35,15 @@ __all__ = [
     "read_server_keys",
 ]
 
-PUBLIC_SUFFIX: Final = ".key"
+_PUBLIC_SUFFIX: Final = ".key"
 _SECRET_SUFFIX: Final = ".key_secret"  # noqa: S105  # The name of a file, not a secret.
 _SERVER: Final = "server"
 _CLIENT: Final = "client"
 _ALLOWED: Final = "clients"
 # Z85 spelt out, see https://rfc.zeromq.org/spec/32/
 _KEY: Final = r'"([0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40})"'
+
+_log = logging.getLogger(__name__)
 
 
 class KeyPair(NamedTuple):
@@ -94,8 +99,8 @@ def make_keys(directory: str | os.PathLike[str], names: Sequence[str]) -> list[P
     for name in names:
         (top / name).mkdir()
         keys = _write_pair(top / name, _CLIENT)
-        (top / name / (_SERVER + PUBLIC_SUFFIX)).write_text(_render(KeyPair(server_keys.public)))
-        (allowed / (name + PUBLIC_SUFFIX)).write_text(_render(KeyPair(keys.public)))
+        (top / name / (_SERVER + _PUBLIC_SUFFIX)).write_text(_render(KeyPair(server_keys.public)))
+        (allowed / (name + _PUBLIC_SUFFIX)).write_text(_render(KeyPair(keys.public)))
     return [top / name for name in names]
 
 
@@ -105,7 +110,7 @@ def _write_pair(directory: Path, name: str) -> KeyPair:
     path = directory / (name + _SECRET_SUFFIX)
     with os.fdopen(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "w") as file:
         file.write(_render(keys))
-    (directory / (name + PUBLIC_SUFFIX)).write_text(_render(KeyPair(public)))
+    (directory / (name + _PUBLIC_SUFFIX)).write_text(_render(KeyPair(public)))
     return keys
 
 
@@ -116,7 +121,9 @@ def read_client_keys(directory: str | os.PathLike[str]) -> ClientKeys:
         ConfigError: a file is missing or is no key; the message names it.
     """
     public, secret = _read_secret(Path(directory) / (_CLIENT + _SECRET_SUFFIX))
-    return ClientKeys(public, secret, read_keys(Path(directory) / (_SERVER + PUBLIC_SUFFIX)).public)
+    return ClientKeys(
+        public, secret, read_keys(Path(directory) / (_SERVER + _PUBLIC_SUFFIX)).public
+    )
 
 
 def read_server_keys(directory: str | os.PathLike[str]) -> ServerKeys:
@@ -156,6 +163,101 @@ def read_keys(path: Path) -> KeyPair:
     if public is None:
         raise ConfigError(f"{path} has no line public-key with a key of 40 characters")
     return KeyPair(public[1].encode(), secret[1].encode() if secret else None)
+
+
+class _Stamp(NamedTuple):
+    """What changes when a file does, however it was written."""
+
+    modified_ns: int
+    size: int
+    inode: int
+
+
+_UNSETTLED: Final = _Stamp(-1, -1, -1)
+_TICK_NS: Final = 1_000_000_000
+
+
+class AllowedKeys:
+    """Whose keys lie in a directory, as it is now.
+
+    Each question looks at the stamps of all files (some microseconds for each), and reads
+    those anew that have changed. A file that holds no key is left out with one warning.
+
+    Args:
+        directory: of public keys, ``<name>.key`` each.
+
+    Attributes:
+        directory: as given.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self.directory = directory
+        self._read: dict[str, tuple[_Stamp, bytes | None]] = {}
+        self._owners: dict[bytes, str] = {}
+        self._faulty: set[str] = set()
+        self._is_unreadable = False
+
+    def owner(self, key: bytes) -> str | None:
+        """The name of the client whose public key, as Z85 text, is `key`; None if nobody's."""
+        stamps = self._stamps()
+        if stamps != {name: stamp for name, (stamp, _) in self._read.items()}:
+            self._refresh(stamps)
+        return self._owners.get(key)
+
+    def _stamps(self) -> dict[str, _Stamp]:
+        stamps: dict[str, _Stamp] = {}
+        try:
+            with os.scandir(self.directory) as files:
+                for file in files:
+                    if file.name.endswith(_PUBLIC_SUFFIX) and not file.name.startswith("."):
+                        try:
+                            said = file.stat()
+                        except OSError:
+                            continue  # Deleted since it was listed, or a link to nowhere.
+                        stamps[file.name] = _Stamp(said.st_mtime_ns, said.st_size, said.st_ino)
+        except OSError as error:
+            # A list that can't be read allows nobody.
+            if not self._is_unreadable:
+                self._is_unreadable = True
+                _log.warning("can't read %s: %s; no client gets in", self.directory, error)
+            return {}
+        self._is_unreadable = False
+        return stamps
+
+    def _refresh(self, stamps: dict[str, _Stamp]) -> None:
+        read: dict[str, tuple[_Stamp, bytes | None]] = {}
+        for name, stamp in sorted(stamps.items()):
+            known = self._read.get(name)
+            if known is not None and known[0] == stamp:
+                read[name] = known
+                continue
+            # What is written within the same tick of the file system's clock leaves no trace.
+            is_settled = time.time_ns() - stamp.modified_ns > _TICK_NS
+            read[name] = stamp if is_settled else _UNSETTLED, self._key_in(name)
+        self._read = read
+        self._faulty &= read.keys()
+        self._owners = {
+            key: name.removesuffix(_PUBLIC_SUFFIX)
+            for name, (_, key) in read.items()
+            if key is not None
+        }
+
+    def _key_in(self, name: str) -> bytes | None:
+        """The key in the file `name`; None, with a warning, if there is none."""
+        path = self.directory / name
+        try:
+            if not name.isprintable():
+                raise ConfigError(f"{str(path)!a} has a name that can't be a client's")
+            if not path.is_file():
+                raise ConfigError(f"{path} is no file")
+            key = read_keys(path).public
+        except ConfigError as error:
+            if name not in self._faulty:
+                self._faulty.add(name)
+                _log.warning("%s; its client stays out", error)
+            return None
+        self._faulty.discard(name)
+        return key
 
 
 def _render(keys: KeyPair) -> str:

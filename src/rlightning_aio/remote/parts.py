@@ -5,6 +5,7 @@ Small parts are copied, which takes less than keeping count of who still holds t
 
 from __future__ import annotations
 
+import sys
 from typing import TYPE_CHECKING, Any, Final
 
 import zmq
@@ -34,10 +35,13 @@ def send_parts(socket: zmq.Socket[Any], parts: Sequence[Part]) -> None:
         send(part, _MORE if position < last else _LAST, copy=size < _COPIED_BYTES)
 
 
-def receive_parts(socket: zmq.Socket[Any], frame: zmq.Frame) -> list[Part]:
-    """The parts of a message from `frame`, which is its first or follows it, to the last."""
+def receive_parts(socket: zmq.Socket[Any], frame: zmq.Frame, most: int = sys.maxsize) -> list[Part]:
+    """The parts of a message from `frame`, which is its first or follows it, to the last.
+
+    Of a message with more than `most`, the others are yet to be received.
+    """
     parts = [_content(frame)]
-    while frame.more:
+    while frame.more and len(parts) < most:
         frame = socket.recv(_LAST, copy=False)
         parts.append(_content(frame))
     return parts

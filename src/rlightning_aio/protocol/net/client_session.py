@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 from rlightning_aio.protocol.net.payload import Outcome, Packed, ResultLayout, SpaceLayout
 from rlightning_aio.protocol.net.server_session import PATIENCE, random_token
 from rlightning_aio.protocol.net.space_description import describe
+from rlightning_aio.protocol.net.texts import in_one_line
 from rlightning_aio.protocol.net.wire import (
     STALE_REQUEST,
     VERSION,
@@ -54,6 +55,7 @@ _SECONDS_BETWEEN_HELLOS: Final = (0.5, 8.0)
 """At first, and at most after refusals; doubled from one to the next."""
 
 _MAX_TEXT: Final = 50_000
+_LATEST_NS: Final = 2**63 - 1
 
 _log = logging.getLogger(__name__)
 
@@ -244,11 +246,11 @@ class ClientSession:
     ) -> Event | None:
         if isinstance(message, Gone):
             self._greet_at(now)
-            return self._end(f"the server ended the session: {message.text[:1000]}")
+            return self._end(f"the server ended the session: {in_one_line(message.text)}")
         if isinstance(message, Bye):
             # Not at once: a server that closes would only be asked in vain.
             self._greet_at(now + self._pause)
-            return self._end(f"the server closed: {message.reason[:1000]}")
+            return self._end(f"the server closed: {in_one_line(message.reason)}")
         # A server that has forgotten this session, and whose word of it got lost, is silent.
         self.phase, self._ask_at = Phase.SERVING, now + self._heartbeat
         if isinstance(message, Step | Reset):
@@ -313,11 +315,11 @@ class ClientSession:
     def _on_refusal(self, refusal: Refusal, now: float) -> Event | None:
         if self.phase is not Phase.GREETING or refusal.nonce != self._hello.nonce:
             return None
-        self.refusal = refusal.text
+        self.refusal = text = in_one_line(refusal.text)
         if not refusal.retry:
             self._ask_at = None
-            return Refused(refusal.code, refusal.text)
-        _log.info("%s: refused for now: %s", self._name, refusal.text)
+            return Refused(in_one_line(refusal.code), text)
+        _log.info("%s: refused for now: %s", self._name, text)
         self._pause = min(2 * self._pause, _SECONDS_BETWEEN_HELLOS[1])
         self._ask_at = now + self._pause
         return None
@@ -336,7 +338,10 @@ class ClientSession:
         self.malformed += 1
         if self._warned_at is None or now - self._warned_at >= _SECONDS_BETWEEN_WARNINGS:
             self._warned_at = now
-            _log.warning("%s dropped a message (%d so far): %s", self._name, self.malformed, text)
+            _log.warning(
+                "%s dropped a message (%d so far): %s",
+                self._name, self.malformed, in_one_line(text),
+            )  # fmt: skip
 
     # What the env did
 
@@ -345,7 +350,8 @@ class ClientSession:
         outcome = Outcome(ret.observation, ret.last_reward, ret.last_terminated, ret.last_truncated)
         # The contract gives this field its name.
         extra = ret._extra  # pyright: ignore[reportPrivateUsage]
-        self.answer(number, outcome, ret.info, extra, busy_ns)
+        sent_ns = min(max(0, ret.ts_env_sent_ns), _LATEST_NS)
+        self.answer(number, outcome, ret.info, extra, busy_ns, sent_ns)
 
     def answer(
         self,
@@ -354,8 +360,9 @@ class ClientSession:
         info: dict[str, Any],
         extra: dict[str, Any],
         busy_ns: int,
+        sent_ns: int,
     ) -> None:
-        """Answer request `number` with what the env took `busy_ns` to make.
+        """Answer request `number` with what the env took `busy_ns` to make, until `sent_ns`.
 
         What of `info` and `extra` can't travel is left out; one warning names each such key.
 
@@ -365,8 +372,9 @@ class ClientSession:
         if self._session is None:
             return
         result = Result(
-            session=self._session, number=number, busy_ns=busy_ns, info=info, extra=extra
-        )
+            session=self._session, number=number, busy_ns=busy_ns, sent_ns=sent_ns,
+            info=info, extra=extra,
+        )  # fmt: skip
         packed = Packed([], result.texts)
         header = self._results.pack(outcome, packed)
         result.reward, result.terminated, result.truncated = header[1:]

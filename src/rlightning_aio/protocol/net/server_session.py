@@ -16,12 +16,16 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 
 import gymnasium as gym
+import numpy as np
 
 from rlightning_aio.errors import BadAction, EnvBusy, EnvRaised, UnknownEnv
 from rlightning_aio.protocol.columns import Misfit
 from rlightning_aio.protocol.net.payload import Packed, ResultLayout, SpaceLayout
 from rlightning_aio.protocol.net.space_description import describe, space_from
+from rlightning_aio.protocol.net.texts import in_lines, in_one_line
 from rlightning_aio.protocol.net.wire import (
+    MAX_BYTES_IN_ALL,
+    MAX_HELLO_BYTES,
     STALE_REQUEST,
     VERSION,
     Bye,
@@ -80,6 +84,8 @@ class RemoteResult:
             by agent.
         info, extra: as the env gave them; ``info["client_lost"]`` says why a client is gone.
         busy_ns: how long the env took, by the client's clock.
+        sent_ns: when the env produced it, in ns since the epoch by the client's clock; 0 if
+            nobody said.
         error: set instead of all that, if the env raised.
         is_reset: it is the first of an episode.
         is_loss: no result of the env's, but the mark that the client was lost.
@@ -94,9 +100,14 @@ class RemoteResult:
     info: dict[str, Any] = field(default_factory=dict[str, Any])
     extra: dict[str, Any] = field(default_factory=dict[str, Any])
     busy_ns: int = 0
+    sent_ns: int = 0
     error: EnvRaised | None = None
     is_reset: bool = False
     is_loss: bool = False
+
+
+class _NoRoom(Exception):
+    """A client would take more than is left for all of them; it may try again later."""
 
 
 class Outgoing(NamedTuple):
@@ -164,9 +175,11 @@ class _Seat:
         unreported: why an earlier session ended, until the next request is told.
         early: the first result of the current session, held back for as long.
         last: what the trainer saw of it last; None until it has joined once.
+        num_bytes: reserved for its actions and results, as long as the seat is there.
     """
 
     name: str
+    num_bytes: int = 0
     session: _Session | None = None
     request: _Request | None = None
     unreported: str | None = None
@@ -216,6 +229,7 @@ class ServerSessions:
         self._writer = Writer()
         self._sessions: dict[int, _Session] = {}
         self._seats: dict[str, _Seat] = {}
+        self._reserved = 0
         self._kind: _Kind | None = None
         self._results: list[RemoteResult] = []
         self._next_tick: float | None = None
@@ -233,7 +247,7 @@ class ServerSessions:
 
     # What arrives
 
-    def receive(self, route: bytes, user: str | None, parts: Sequence[Part], now: float) -> None:
+    def receive(self, route: bytes, user: str | None, parts: Sequence[Part], now: float) -> bool:
         """Take in one message; never raises for what it holds.
 
         Args:
@@ -241,17 +255,26 @@ class ServerSessions:
             user: who the connection belongs to, if that was proved.
             parts: header and frames.
             now: monotonic seconds.
+
+        Returns:
+            Whether it was said in a session, or has opened one.
         """
         try:
-            message, frames = self._reader.read(parts)
-            if isinstance(message, Hello):
-                self._on_hello(message, route, user, now)
-                return
-            session = self._session_of(message, route, user, now)
-            if session is not None:
-                self._handlers[type(message)](session, message, frames, now)
+            # The trainer may have its own arithmetic raise; a client's numbers must not.
+            with np.errstate(all="ignore"):
+                return self._receive(route, user, parts, now)
         except WireError as error:
             self._complain(str(error), now)
+            return False
+
+    def _receive(self, route: bytes, user: str | None, parts: Sequence[Part], now: float) -> bool:
+        message, frames = self._reader.read(parts)
+        if isinstance(message, Hello):
+            return self._on_hello(message, len(parts[0]), route, user, now)
+        session = self._session_of(message, route, user, now)
+        if session is not None:
+            self._handlers[type(message)](session, message, frames, now)
+        return session is not None
 
     def _session_of(
         self,
@@ -281,34 +304,45 @@ class ServerSessions:
         last = self._warned_at.get(kind)
         if last is None or now - last >= _SECONDS_BETWEEN_WARNINGS:
             self._warned_at[kind] = now
-            _log.warning("%s %s", self._server_id, text)
+            _log.warning("%s %s", self._server_id, in_one_line(text))
 
     # Coming and going
 
-    def _on_hello(self, hello: Hello, route: bytes, user: str | None, now: float) -> None:
+    def _on_hello(
+        self, hello: Hello, size: int, route: bytes, user: str | None, now: float
+    ) -> bool:
         seat = self._seats.get(hello.name)
         current = seat.session if seat else None
         if current and current.nonce == hello.nonce and current.user == user:
             current.route, current.heard_at = route, now
             self._welcome(current)
-            return
-        refusal = self._objection(hello, user, now)
+            return True
+        refusal = self._objection(hello, size, user, now)
         if refusal is None:
             try:
                 self._welcome(self._open(hello, route, user, now))
+            except _NoRoom as error:
+                refusal = ("full", str(error), True)
             except WireError as error:
                 refusal = ("spaces", str(error), False)
+            # Gymnasium, NumPy and pydantic have errors of their own for what nobody expected.
+            except Exception as error:  # noqa: BLE001  # A stranger's fault is not the trainer's.
+                refusal = ("spaces", f"{type(error).__name__}: {error}", False)
         if refusal is not None:
             code, text, retry = refusal
+            text = in_one_line(text)
             self._warn(code, f"refused the client {hello.name!r}: {text}", now)
             self._send(route, Refusal(nonce=hello.nonce, code=code, text=text, retry=retry))
+        return refusal is None
 
     def _objection(
-        self, hello: Hello, user: str | None, now: float
+        self, hello: Hello, size: int, user: str | None, now: float
     ) -> tuple[str, str, bool] | None:
         """Why `hello` may not come in: code, text, and whether to try again later."""
         if hello.version != VERSION:
             return "version", f"this server speaks version {VERSION}, not {hello.version}", False
+        if size > MAX_HELLO_BYTES:
+            return "spaces", f"a hello has {size} bytes; {MAX_HELLO_BYTES} are allowed", False
         if not hello.name.isprintable() or "/" in hello.name:
             return "name", "a client's name must be printable and without '/'", False
         self._give_way(hello, user)
@@ -316,7 +350,7 @@ class ServerSessions:
         if seat and seat.session:
             self._ping(seat.session, now)
             return "taken", f"a client named {hello.name!r} is here already", True
-        if len(self._sessions) >= _MAX_SESSIONS or (not seat and not self._room_for_a_seat()):
+        if len(self._sessions) >= _MAX_SESSIONS:
             return "full", f"{len(self._sessions)} clients are here already", True
         return None
 
@@ -331,14 +365,38 @@ class ServerSessions:
         elif session.unreachable_since is not None:
             self._lose(session, "its connection broke and it came back as another")
 
-    def _room_for_a_seat(self) -> bool:
-        if len(self._seats) < _MAX_SEATS:
-            return True
-        for name, seat in self._seats.items():
-            if seat.session is None:
-                del self._seats[name]
-                return True
-        return False
+    def _seat_for(self, name: str, num_bytes: int) -> _Seat:
+        """The seat of a client that comes in, with what it needs reserved.
+
+        Raises:
+            _NoRoom: all seats, or all bytes, are taken by clients that are here.
+        """
+        seat = self._seats.get(name) or _Seat(name)
+        more = num_bytes - seat.num_bytes
+        away = [other for other in self._seats.values() if other.session is None]
+        # Those that are away the longest were made first, more or less.
+        for other in away:
+            if self._has_room(name, more):
+                break
+            if other is not seat:
+                self._forget(other)
+        if not self._has_room(name, more):
+            raise _NoRoom(
+                f"a result and an action take {num_bytes} bytes, and the {len(self._sessions)} "
+                f"clients that are here have reserved {self._reserved} of {MAX_BYTES_IN_ALL}"
+            )
+        self._seats[name] = seat
+        self._reserved += more
+        seat.num_bytes = num_bytes
+        return seat
+
+    def _has_room(self, name: str, more: int) -> bool:
+        num_seats = len(self._seats) + (name not in self._seats)
+        return num_seats <= _MAX_SEATS and self._reserved + more <= MAX_BYTES_IN_ALL
+
+    def _forget(self, seat: _Seat) -> None:
+        del self._seats[seat.name]
+        self._reserved -= seat.num_bytes
 
     def _open(self, hello: Hello, route: bytes, user: str | None, now: float) -> _Session:
         observation_space = space_from(hello.observation_space)
@@ -360,34 +418,36 @@ class ServerSessions:
                 or [*cast("gym.spaces.Dict[Any]", space).spaces] != hello.agents
             ):
                 raise WireError("the spaces of a multi-agent env must be Dicts by agent")
-        seat = self._seats.get(hello.name) or _Seat(hello.name)
-        session = _Session(
+        meta = EnvMeta(
+            env_id=f"{self._server_id}/{hello.name}",
+            observation_space=observation_space,
+            action_space=action_space,
+            num_envs=hello.num_envs,
+            agents=kind.agents,
+            max_episode_steps=hello.max_episode_steps,
+            autoreset=hello.autoreset,
+        )
+        if (objection := self._objection_to(meta)) is not None:
+            raise WireError(objection)
+        results = ResultLayout(observation_space, hello.num_envs, hello.agents)
+        actions = SpaceLayout(action_space, "action")
+        seat = self._seat_for(hello.name, results.num_bytes + actions.num_bytes)
+        session = seat.session = _Session(
             token=self._new_token(),
             nonce=hello.nonce,
             seat=seat,
             route=route,
             user=user,
             kind=kind,
-            meta=EnvMeta(
-                env_id=f"{self._server_id}/{hello.name}",
-                observation_space=observation_space,
-                action_space=action_space,
-                num_envs=hello.num_envs,
-                agents=kind.agents,
-                max_episode_steps=hello.max_episode_steps,
-                autoreset=hello.autoreset,
-            ),
-            results=ResultLayout(observation_space, hello.num_envs, hello.agents),
-            actions=SpaceLayout(action_space, "action"),
+            meta=meta,
+            results=results,
+            actions=actions,
             free_actions=hello.free_actions,
             reads_extras=hello.reads_extras,
             heard_at=now,
             asked_at=now,
         )
-        if (objection := self._objection_to(session.meta)) is not None:
-            raise WireError(objection)
-        self._seats[hello.name] = seat
-        seat.session = self._sessions[session.token] = session
+        self._sessions[session.token] = session
         if self._next_tick is None:
             self._next_tick = now + self._tick_every
         return session
@@ -405,7 +465,7 @@ class ServerSessions:
 
     def _on_bye(self, session: _Session, message: Bye, frames: Sequence[Part], now: float) -> None:
         del frames, now
-        self._lose(session, f"it left: {message.reason[:1000] or 'no reason given'}")
+        self._lose(session, f"it left: {in_one_line(message.reason) or 'no reason given'}")
 
     def unreachable(self, route: bytes, now: float) -> None:
         """A message to `route` could not be sent: its connection is no more."""
@@ -426,7 +486,7 @@ class ServerSessions:
         self.clients.pop(seat.name, None)
         if seat.last is None:
             # It never joined, so nobody has heard of it.
-            del self._seats[seat.name]
+            self._forget(seat)
         elif seat.request is not None:
             self._report_loss(seat, seat.last, seat.request.number, cause)
         elif seat.early is not None:
@@ -600,11 +660,14 @@ class ServerSessions:
             self._complain(str(error), now)
             session.bad_results += 1
             if session.bad_results >= _MAX_BAD_RESULTS:
-                self._dismiss(session, f"its results don't fit what it announced: {error}")
+                self._dismiss(
+                    session, f"its results don't fit what it announced: {in_one_line(str(error))}"
+                )
             return
         request = session.seat.request
         result = RemoteResult(
             session.seat.name, number, *outcome, message.info, message.extra, message.busy_ns,
+            message.sent_ns,
             is_reset=number is None or (request is not None and request.doing == "reset"),
         )  # fmt: skip
         if number is None:
@@ -646,8 +709,9 @@ class ServerSessions:
     ) -> None:
         del frames, now
         number = self._number_answered(session, message.number)
+        kind, text = in_one_line(message.exception_type), in_one_line(message.text)
         if number is None:
-            self._lose(session, f"its first reset raised {message.exception_type}: {message.text}")
+            self._lose(session, f"its first reset raised {kind}: {text}")
             return
         seat, request = session.seat, session.seat.request
         if number == _LATE or request is None:
@@ -655,16 +719,16 @@ class ServerSessions:
             return
         if message.exception_type == STALE_REQUEST:
             # Not so: nothing newer was ever asked. The two no longer mean the same by a number.
-            self._dismiss(session, f"it lost count: {message.text}")
+            self._dismiss(session, f"it lost count: {text}")
             return
         seat.request = None
         error = EnvRaised(
-            f"{session.meta.env_id} raised {message.exception_type} in {request.doing}: "
-            f"{message.text}; it can be reset and used again",
+            f"{session.meta.env_id} raised {kind} in {request.doing}: "
+            f"{text}; it can be reset and used again",
             env_id=session.meta.env_id,
-            exception_type=message.exception_type,
-            exception_text=message.text,
-            traceback_text=message.traceback,
+            exception_type=kind,
+            exception_text=text,
+            traceback_text=in_lines(message.traceback),
         )
         self._results.append(RemoteResult(seat.name, request.number, error=error))
 
@@ -747,6 +811,7 @@ class ServerSessions:
             self._send(session.route, Bye(session=session.token, reason=reason))
         self._sessions.clear()
         self._seats.clear()
+        self._reserved = 0
         self.clients.clear()
         self._results.clear()
         self._next_tick = None

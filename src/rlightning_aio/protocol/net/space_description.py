@@ -10,6 +10,7 @@ form on the wire.
 from __future__ import annotations
 
 import math
+import warnings
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import gymnasium as gym
@@ -119,6 +120,8 @@ def _bounds(array: NDArray[Any]) -> Any:
     """`array` as nested lists, without the leading axes along which it is constant."""
     if not array.size:
         return 0
+    # An axis along which it is a view of one value costs nothing to look at.
+    array = array[tuple(slice(0, 1 if stride == 0 else None) for stride in array.strides)]
     if (array == array.flat[0]).all():
         return _number_said(array.flat[0].item())
     while array.ndim > 1 and (array == array[:1]).all():
@@ -144,7 +147,12 @@ def space_from(description: Any) -> gym.Space[Any]:
         WireError: it describes none, or one whose values exceed `MAX_FRAME_BYTES`.
     """
     try:
-        with np.errstate(over="raise", invalid="raise"):
+        # What Gymnasium warns of, and what the trainer does about warnings, is not at issue.
+        with (
+            np.errstate(over="raise", invalid="raise", under="ignore", divide="ignore"),
+            warnings.catch_warnings(),
+        ):
+            warnings.simplefilter("ignore")
             return _Builder().build(description, _MAX_DEPTH)
     except WireError:
         raise
@@ -191,12 +199,15 @@ class _Builder:
         dtype = _dtype(fields)
         shape = self._shape(fields["shape"], dtype)
         low, high = (_bound_array(fields[bound], shape, dtype) for bound in ("low", "high"))
-        return spaces.Box(low, high, dtype=dtype.type)
+        return _SaidBox(low, high, shape, dtype)
 
     def _discrete(self, fields: Description, depth: int) -> gym.Space[Any]:
         del depth
         n, start = _int(fields["n"]), _int(fields.get("start", 0))
-        return spaces.Discrete(n, start=start, dtype=_dtype(fields, "int64").type)
+        dtype = _dtype(fields, "int64")
+        if dtype.kind not in "iu" or start + n > np.iinfo(dtype).max:
+            raise WireError(f"a discrete space of {n} from {start} exceeds {dtype}")
+        return spaces.Discrete(n, start=start, dtype=dtype.type)
 
     def _multi_binary(self, fields: Description, depth: int) -> gym.Space[Any]:
         del depth
@@ -210,9 +221,13 @@ class _Builder:
         nvec = np.array(_numbers(fields["nvec"], _MAX_AXES), dtype.type)
         self._shape(list(nvec.shape), dtype)
         start = np.array(_numbers(fields.get("start", 0), _MAX_AXES), dtype.type)
-        return spaces.MultiDiscrete(
+        space = spaces.MultiDiscrete(
             nvec, dtype=dtype.type, start=np.broadcast_to(start, nvec.shape).copy()
         )
+        # All of it is above 0 by now, so this does not overflow itself.
+        if (start > np.iinfo(dtype).max - nvec).any():
+            raise WireError(f"a multi_discrete space exceeds {dtype}")
+        return space
 
     def _dict(self, fields: Description, depth: int) -> gym.Space[Any]:
         members: dict[str, gym.Space[Any]] = {}
@@ -261,8 +276,37 @@ def _int(value: Any) -> int:
     return value
 
 
+class _SaidBox(spaces.Box[Any]):
+    """A Box whose bounds take no more memory than the numbers that were said of them.
+
+    What a peer announces in a few bytes would otherwise cost as many times its size as its
+    bounds have axes of one value: they are read-only views.
+
+    Args:
+        low, high: arrays that broadcast to `shape`.
+    """
+
+    def __init__(
+        self,
+        low: NDArray[Any],
+        high: NDArray[Any],
+        shape: tuple[int, ...],
+        dtype: np.dtype[Any],
+    ) -> None:
+        low, high = (np.array(bound) for bound in np.broadcast_arrays(low, high))
+        super().__init__(low, high, dtype=dtype.type)
+        for name in ("low", "high", "bounded_below", "bounded_above"):
+            setattr(self, name, np.broadcast_to(getattr(self, name), shape))
+        self._shape = shape
+
+    def __reduce__(self) -> Any:
+        return spaces.Box, (self.low.copy(), self.high.copy(), self.shape, self.dtype)
+
+
 def _bound_array(value: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
-    return np.broadcast_to(np.array(_numbers(value, len(shape)), dtype.type), shape).copy()
+    bound = np.array(_numbers(value, len(shape)), dtype.type)
+    np.broadcast_to(bound, shape)  # Raises if it can't be.
+    return bound
 
 
 def _numbers(value: Any, axes: int) -> Any:

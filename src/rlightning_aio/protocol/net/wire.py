@@ -26,8 +26,10 @@ if TYPE_CHECKING:
 
 __all__ = [
     "DTYPES",
+    "MAX_BYTES_IN_ALL",
     "MAX_FRAME_BYTES",
     "MAX_HEADER_BYTES",
+    "MAX_HELLO_BYTES",
     "MAX_NAME_LENGTH",
     "MAX_PARTS",
     "STALE_REQUEST",
@@ -56,7 +58,11 @@ __all__ = [
 
 VERSION: Final = 1
 MAX_HEADER_BYTES: Final = 4 << 20
+MAX_HELLO_BYTES: Final = 256 << 10
+"""The header of a hello: to understand it costs some 50 ms at most."""
 MAX_FRAME_BYTES: Final = 64 << 20
+MAX_BYTES_IN_ALL: Final = 1 << 30
+"""What all clients of a server may need for one result and one action each."""
 MAX_PARTS: Final = 1024
 """Header and frames of one message."""
 MAX_NAME_LENGTH: Final = 128
@@ -153,6 +159,8 @@ class Result(Struct, tag="result", tag_field="type", kw_only=True, omit_defaults
     number: Count
     busy_ns: Count = 0
     """How long the env took."""
+    sent_ns: Count = 0
+    """When the env produced it, in ns since the epoch by the client's clock; 0: unknown."""
     reward: float | None = None
     terminated: bool | None = None
     truncated: bool | None = None

@@ -1,0 +1,125 @@
+"""What an env is stepped with, and what it returns, for all who run one.
+
+Rule: a worker, an inline host, a client of an env_server and the contract step an env with
+`step_of`, or its `bare_step`, give it what `input_of` makes, and read what it returned with
+`one_result`. So a preprocess function, an env that answers in two halves, and one that answers
+with a list mean the same everywhere.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from rlightning_aio.envs.base import BaseEnv
+from rlightning_aio.envs.tensors import as_numpy
+from rlightning_aio.protocol.columns import stacked
+from rlightning_aio.types import (
+    EnvRet,
+    MultiAgentEnvRet,
+    PolicyResponse,
+    default_env_preprocess_fn,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+__all__ = [
+    "has_preprocess_fn",
+    "input_of",
+    "is_async_first",
+    "one_result",
+    "reads_extras",
+    "step_of",
+]
+
+
+def has_preprocess_fn(env: BaseEnv) -> bool:
+    """Whether actions of `env` go through a function of the user's."""
+    return env._preprocess_fn is not default_env_preprocess_fn  # pyright: ignore[reportPrivateUsage]
+
+
+def reads_extras(env: BaseEnv) -> bool:
+    """Whether anything can read more of a response to `env` than its action."""
+    built_in = type(env).__module__.startswith("rlightning_aio.envs.")
+    return has_preprocess_fn(env) or not (built_in or env.bare_step() is not None)
+
+
+def input_of(env: BaseEnv) -> Callable[[Any, dict[str, Any]], Any]:
+    """What makes the input of one step, of an action and what the policy attached to it.
+
+    For `bare_step`, where there is one, that is an action, which the preprocess function has
+    made; for `step_of` a `PolicyResponse`.
+    """
+    env_id = env.env_id
+    if env.bare_step() is None:
+        return lambda action, extras: PolicyResponse(env_id, action, **extras)
+    if not has_preprocess_fn(env):
+        return lambda action, _extras: action
+    preprocess = env._preprocess_fn  # pyright: ignore[reportPrivateUsage]
+    return lambda action, extras: as_numpy(preprocess(PolicyResponse(env_id, action, **extras)))
+
+
+def is_async_first(env: BaseEnv) -> bool:
+    """Whether `env` is stepped by `BaseEnv.step_async` and `BaseEnv.collect_async`."""
+    kind = type(env)
+    return (
+        kind.step_async is not BaseEnv.step_async
+        and kind.collect_async is not BaseEnv.collect_async
+    )
+
+
+def step_of(env: BaseEnv) -> Callable[[PolicyResponse], Any]:
+    """What steps `env` and returns what it answers."""
+    if not is_async_first(env):
+        return env.step
+
+    def step(policy_resp: PolicyResponse) -> Any:
+        env.step_async(policy_resp)
+        return env.collect_async()
+
+    return step
+
+
+def one_result(env: BaseEnv, method: str, returned: Any) -> EnvRet | MultiAgentEnvRet:
+    """What `method` of `env` returned, as one result.
+
+    A list holds one result for each sub-environment, in order; their arrays are stacked
+    (as NumPy arrays) and their infos become Gymnasium's vector form.
+
+    Raises:
+        TypeError: it is no result, and no list of as many as there are sub-environments.
+    """
+    if isinstance(returned, EnvRet | MultiAgentEnvRet):
+        return returned
+    if not isinstance(returned, list):
+        raise TypeError(
+            f"{method}() of env {env.env_id!r} must return an EnvRet or a MultiAgentEnvRet, not "
+            f"{type(returned).__name__}"
+        )
+    results = cast("list[Any]", returned)
+    if len(results) == env.num_envs == 1:
+        return one_result(env, method, results[0])
+    if len(results) != env.num_envs or not all(isinstance(one, EnvRet) for one in results):
+        kinds = sorted({type(one).__name__ for one in results})
+        raise TypeError(
+            f"{method}() of env {env.env_id!r} returned a list of {len(results)} "
+            f"({', '.join(kinds) or 'nothing'}); it must hold one EnvRet for each of its "
+            f"{env.num_envs} sub-environments"
+        )
+    return _together(env, cast("list[EnvRet]", results))
+
+
+def _together(env: BaseEnv, results: list[EnvRet]) -> EnvRet:
+    # Not at the top: a worker seldom needs it.
+    from rlightning_aio.batch.infos import vector_infos
+
+    return EnvRet(
+        env_id=env.env_id,
+        observation=stacked([as_numpy(one.observation) for one in results]),
+        last_reward=np.array([as_numpy(one.last_reward) for one in results], np.float64),
+        last_terminated=np.array([as_numpy(one.last_terminated) for one in results], np.bool_),
+        last_truncated=np.array([as_numpy(one.last_truncated) for one in results], np.bool_),
+        info=vector_infos([one.info for one in results]),
+    )

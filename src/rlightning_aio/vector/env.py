@@ -1,0 +1,460 @@
+"""`VectorEnv`: a group of envs behind Gymnasium's vector interface; see the package."""
+
+from __future__ import annotations
+
+import copy as copying
+import multiprocessing
+import warnings
+from typing import TYPE_CHECKING, Any, Final, cast
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
+from gymnasium.spaces.utils import is_space_dtype_shape_equiv
+from gymnasium.vector import AutoresetMode, utils
+
+from rlightning_aio.batch import BatchedData
+from rlightning_aio.batch.data import reported_infos
+from rlightning_aio.envs.same_step import SameStepOf
+from rlightning_aio.errors import EnvFault, NothingPending
+from rlightning_aio.group.auto_reset import as_int
+from rlightning_aio.protocol.columns import leaves
+from rlightning_aio.sync import EnvGroup, build_env_group
+from rlightning_aio.types import PolicyResponse
+from rlightning_aio.vector.batching import batched, merged, spread
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    from rlightning_aio.types import EnvMeta
+
+__all__ = ["VectorEnv"]
+
+_NO_LIMIT: Final = 1 << 61
+"""Step limits are the envs' own business here."""
+_NOT_TO_BE_CALLED: Final = ("reset", "step", "close")
+
+
+class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
+    """Envs in worker processes behind Gymnasium's vector interface.
+
+    Args:
+        env_fns: one callable for each env. They run in the workers, and only there; lambdas
+            and functions of ``__main__`` will do.
+        shared_memory, context, daemon: accepted, and without meaning here.
+        copy: observations are the caller's own. False spares a copy: who writes to them writes
+            to what a later masked reset shows of envs that it doesn't reset.
+        worker: must be None; there is no worker function to replace.
+        observation_mode: ``same``, ``different`` (equal shapes and dtypes), or a pair of the
+            batched and the single observation space.
+        autoreset_mode: what an env does after its episode's end.
+        max_concurrency: workers at most, each of which executes one env at a time; None for
+            as many as this process may use cores.
+        entry: further fields of `EnvConfig` (``step_timeout``, ``on_worker_death``, …).
+
+    Attributes:
+        group: the `EnvGroup` that does the work; its envs are called ``env-0``, ``env-1``, …
+
+    Raises:
+        ConfigError: a callable can't be sent to a worker, or `entry` is wrong.
+        StartFailed: a callable raised, or returned no env.
+        RuntimeError: the envs' spaces don't go together.
+    """
+
+    def __init__(
+        self,
+        env_fns: Sequence[Callable[[], gym.Env[Any, Any]]],
+        shared_memory: bool = True,
+        copy: bool = True,
+        context: str | None = None,
+        daemon: bool = True,
+        worker: None = None,
+        observation_mode: str | tuple[gym.Space[Any], gym.Space[Any]] = "same",
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        max_concurrency: int | None = None,
+        **entry: Any,
+    ) -> None:
+        # Annotated here: Gymnasium leaves open what its spaces hold.
+        self.observation_space: gym.Space[Any]
+        self.action_space: gym.Space[Any]
+        self.single_observation_space: gym.Space[Any]
+        self.single_action_space: gym.Space[Any]
+        del shared_memory, context, daemon
+        if worker is not None:
+            raise ValueError(
+                "worker: the workers of rlightning_aio can't be replaced; see EnvGroup"
+            )
+        self.env_fns = env_fns
+        self.num_envs = len(env_fns)
+        self.copy = copy
+        self.observation_mode = observation_mode
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.closed = True  # Until it has started.
+        self._pending: str | None = None
+        self._arguments: Any = None
+        self._late = False
+        if max_concurrency is not None:
+            entry = {"envs_per_process": _per_worker(max_concurrency, self.num_envs), **entry}
+        makers = list(env_fns)
+        if self.autoreset_mode == AutoresetMode.SAME_STEP:
+            makers = [SameStepOf(make) for make in makers]
+        self.group: EnvGroup = build_env_group(
+            {"name": "env", "num_workers": self.num_envs, "make_env": makers, **entry},
+            mixed_actions=True,
+            zero_copy=copy,
+        )
+        metas = self.group.init()
+        self.closed = False
+        try:
+            self._adopt(metas)
+        except BaseException:
+            self.close()
+            raise
+
+    def _adopt(self, metas: list[EnvMeta]) -> None:
+        """Take the spaces and the metadata of the envs for the whole."""
+        self._adopt_spaces([(m.observation_space, m.action_space) for m in metas])
+        for name in ("metadata", "render_mode"):
+            self.group.call_async("call_wrapped", name, env_ids=self.group.env_ids[:1])
+            (value,) = self.group.collect_calls()
+            setattr(self, name, value)
+        self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
+        self._fits_rows = leaves(self.single_action_space) is not None
+        self._observations: Any = None
+        # Results of all envs, in order, which actions can answer.
+        self._answerable = BatchedData(self.group.env_ids, [None] * self.num_envs)
+        if self.autoreset_mode == AutoresetMode.NEXT_STEP:
+            self.group.auto_reset(max_episode_steps=_NO_LIMIT).__enter__()
+
+    def _adopt_spaces(self, spaces: list[tuple[Any, Any]]) -> None:
+        single: Any
+        batched_space: Any
+        (observations, actions), mode = zip(*spaces, strict=True), self.observation_mode
+        if isinstance(mode, tuple):
+            batched_space, single = mode
+        elif mode == "same":
+            single = observations[0]
+            batched_space = utils.batch_space(single, self.num_envs)
+        elif mode == "different":
+            single = observations[0]
+            # Its stubs know it in part.
+            batched_space = cast("Any", utils).batch_differing_spaces(list(observations))
+        else:
+            raise ValueError(
+                "Invalid `observation_mode`, expected: 'same' or 'different' or tuple of single "
+                f"and batch observation space, actual got {mode}"
+            )
+        self.observation_space, self.single_observation_space = batched_space, single
+        alike = _equal if mode == "same" else is_space_dtype_shape_equiv
+        for k, own in enumerate(observations):
+            if not alike(single, own):
+                hint = "If this is intentional, use `observation_mode='different'` instead."
+                raise RuntimeError(
+                    f"the sub-environments observation spaces are not equivalent. That of env {k} "
+                    f"is {own}, not {single}. {hint * (mode == 'same')}"
+                )
+        self.single_action_space = actions[0]
+        self.action_space = utils.batch_space(actions[0], self.num_envs)
+        for k, own in enumerate(actions):
+            if own != actions[0]:
+                raise RuntimeError(
+                    f"the action space of env {k}, {own}, isn't that of env 0, {actions[0]}; "
+                    "actions are batched, so they must be equal"
+                )
+
+    # -- resets -----------------------------------------------------------------------
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Any, dict[str, Any]]:
+        """Reset all envs, or those of a mask, and wait for them.
+
+        Args:
+            seed: env k gets ``seed + k``; or one for each, None for none.
+            options: passed to each env, without ``reset_mask``: a bool array ``[num_envs]``
+                that tells which envs are reset. The others show the observation they had.
+
+        Returns observations and infos, batched.
+
+        Raises:
+            EnvRaised, WorkerDied, EnvHung: an env failed; nothing is left to be collected.
+            AlreadyPendingCallError, ClosedEnvironmentError: it is no time for it.
+        """
+        self.reset_async(seed, options)
+        return self.reset_wait()
+
+    def reset_async(
+        self,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> None:
+        """Send resets, which `reset_wait` waits for; see `reset`."""
+        self._begin("reset_async")
+        seeds = self._seeds(seed)
+        mask = None
+        if options is not None and "reset_mask" in options:
+            options = dict(options)
+            mask = self._checked_mask(options.pop("reset_mask"))
+        which = range(self.num_envs) if mask is None else np.flatnonzero(mask).tolist()
+        env_ids = self.group.env_ids
+        self.group.reset_async(
+            {env_ids[k]: seeds[k] for k in which if seeds[k] is not None},
+            options,
+            [env_ids[k] for k in which],
+        )
+        self._pending, self._arguments = "reset", mask
+
+    def _seeds(self, seed: int | Sequence[int | None] | None) -> list[Any]:
+        if seed is None or isinstance(seed, int | np.integer):
+            return [None if seed is None else seed + k for k in range(self.num_envs)]
+        if len(seed) != self.num_envs:
+            raise ValueError(f"{len(seed)} seeds for num_envs={self.num_envs}; give one for each")
+        return list(seed)
+
+    def _checked_mask(self, mask: Any) -> NDArray[np.bool_]:
+        # The words are Gymnasium's, which its own tests look for.
+        what = "`options['reset_mask']` must"
+        if not isinstance(mask, np.ndarray):
+            raise TypeError(f"{what} be a numpy array, got {type(mask)}")
+        array = cast("NDArray[Any]", mask)
+        if array.shape != (self.num_envs,):
+            raise ValueError(f"{what} have shape `({self.num_envs},)`, got {array.shape}")
+        if array.dtype != np.bool_:
+            raise TypeError(f"{what} have `dtype=np.bool_`, got {array.dtype}")
+        if not array.any():
+            raise ValueError(
+                f"{what} contain a boolean array with at least one True value, got "
+                f"reset_mask={array}"
+            )
+        return array
+
+    def reset_wait(self, timeout: float | None = None) -> tuple[Any, dict[str, Any]]:
+        """Wait for `reset_async`, `timeout` seconds at most.
+
+        Raises:
+            TimeoutError: the envs reset all the same; what comes late is dropped.
+            NoAsyncCallError: nothing was sent.
+        """
+        batch = self._wait("reset", timeout)
+        mask = self._arguments
+        if mask is None or mask.all():
+            return self._observed(batch.observation), reported_infos(batch)
+        chosen = np.flatnonzero(mask)
+        observations = merged(self._observations, batch.observation, chosen, self.num_envs)
+        return self._observed(observations), spread(reported_infos(batch), chosen, self.num_envs)
+
+    # -- steps ------------------------------------------------------------------------
+
+    def step(self, actions: Any) -> tuple[Any, NDArray[Any], NDArray[Any], NDArray[Any], Any]:
+        """Step all envs and wait for them.
+
+        Args:
+            actions: ``[num_envs, ...]``, an element of `action_space`; cast to its dtype.
+
+        Returns observations, rewards (float64), terminations, truncations (bool) and infos,
+        batched.
+
+        Raises:
+            ValueError, TypeError: the actions are not as many as envs, or don't fit.
+            EnvRaised, WorkerDied, EnvHung: an env failed; nothing is left to be collected.
+            AlreadyPendingCallError, ClosedEnvironmentError: it is no time for it.
+        """
+        self._begin("step_async")
+        self._answerable, _ = self.group.step(self._batch(actions))
+        return self._stepped(self._answerable)
+
+    def step_async(self, actions: Any) -> None:
+        """Send steps, which `step_wait` waits for; see `step`."""
+        self._begin("step_async")
+        self.group.step_async(self._batch(actions))
+        self._pending = "step"
+
+    def step_wait(
+        self, timeout: float | None = None
+    ) -> tuple[Any, NDArray[Any], NDArray[Any], NDArray[Any], Any]:
+        """Wait for `step_async`, `timeout` seconds at most.
+
+        Raises:
+            TimeoutError: the envs step all the same; what comes late is dropped.
+            NoAsyncCallError: nothing was sent.
+        """
+        return self._stepped(self._wait("step", timeout))
+
+    def _batch(self, actions: Any) -> BatchedData:
+        if self._fits_rows and not isinstance(actions, dict | tuple):
+            actions = np.asarray(actions)
+            if not actions.ndim:
+                raise TypeError(f"actions must be as many as envs, {self.num_envs}, not a scalar")
+        if self._fits_rows:
+            return self._answerable.respond(action=actions)
+        env_ids = self.group.env_ids
+        each = list(utils.iterate(self.action_space, actions))
+        pairs = zip(env_ids, each, strict=True)
+        return BatchedData(env_ids, [PolicyResponse(id_, action) for id_, action in pairs])
+
+    def _stepped(self, batch: BatchedData) -> tuple[Any, Any, Any, Any, Any]:
+        observations = self._observed(batch.observation)
+        return (
+            observations, batch.reward, batch.terminated, batch.truncated, reported_infos(batch)
+        )  # fmt: skip
+
+    # -- both -------------------------------------------------------------------------
+
+    def _begin(self, what: str) -> None:
+        """Make sure that something may be sent."""
+        self._check_running()
+        if self._pending is not None:
+            raise AlreadyPendingCallError(
+                f"Calling `{what}` while waiting for a pending call to `{self._pending}` to "
+                f"complete; call `{self._pending}_wait` first.",
+                self._pending,
+            )
+        if self._late:
+            self._drop_late_ones()
+
+    def _check_running(self) -> None:
+        if self.closed:
+            raise ClosedEnvironmentError(f"this {type(self).__name__} is closed")
+
+    def _check_sent(self, what: str) -> None:
+        self._check_running()
+        if self._pending != what:
+            raise NoAsyncCallError(
+                f"Calling `{what}_wait` without any prior call to `{what}_async`.", what
+            )
+        self._pending = None
+
+    def _wait(self, what: str, timeout: float | None) -> BatchedData:
+        self._check_sent(what)
+        self._late = True  # Unless all goes well.
+        try:
+            batch, _ = self.group.collect_async(
+                wait_all=True, ordered=True, deadline=_seconds(timeout)
+            )
+        except TimeoutError as error:
+            raise multiprocessing.TimeoutError(
+                f"the envs have not answered {what}_async within {timeout} s; what comes late is "
+                "dropped"
+            ) from error
+        self._late = False
+        return batch
+
+    def _drop_late_ones(self) -> None:
+        """Let the envs end what a call that failed or timed out has left."""
+        for collect in (self.group.collect_async, self.group.collect_calls):
+            while True:
+                try:
+                    collect()
+                except NothingPending:
+                    break
+                except EnvFault:
+                    continue
+        self._late = False
+
+    def _observed(self, observations: Any) -> Any:
+        """Observations as Gymnasium batches them; the last ones are kept, for masks.
+
+        With `copy` they are views of the rows still, of which the caller gets the one copy.
+        """
+        self._observations = batched(self.single_observation_space, observations)
+        return copying.deepcopy(self._observations) if self.copy else self._observations
+
+    # -- methods and attributes -------------------------------------------------------
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Call method `name` of every env, found through its wrappers, or get an attribute."""
+        self.call_async(name, *args, **kwargs)
+        return self.call_wait()
+
+    def call_async(self, name: str, /, *args: Any, **kwargs: Any) -> None:
+        """Send calls, which `call_wait` waits for; see `call`."""
+        self._begin("call_async")
+        if name in _NOT_TO_BE_CALLED:
+            raise ValueError(f"call {name}() of the vector env itself, not of its envs")
+        self.group.call_async("call_wrapped", name, *args, **kwargs)
+        self._pending = "call"
+
+    def call_wait(self, timeout: float | None = None) -> tuple[Any, ...]:
+        """Wait for `call_async`, `timeout` seconds at most; one value for each env.
+
+        Raises:
+            TimeoutError: the methods run all the same; what comes late is dropped.
+            NoAsyncCallError: nothing was sent.
+        """
+        self._check_sent("call")
+        self._late = True
+        try:
+            values = self.group.collect_calls(deadline=_seconds(timeout))
+        except TimeoutError as error:
+            raise multiprocessing.TimeoutError(f"the calls took longer than {timeout} s") from error
+        self._late = False
+        return tuple(values)
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """Attribute `name` of every env, found through its wrappers."""
+        return self.call(name)
+
+    def set_attr(self, name: str, values: Any) -> None:
+        """Set attribute `name` of every env: one value for each (a list or a tuple), or one."""
+        self._check_running()
+        single = not isinstance(values, list | tuple)
+        each = [values] * self.num_envs if single else list(cast("list[Any]", values))
+        if len(each) != self.num_envs:
+            raise ValueError(
+                f"{len(each)} values for num_envs={self.num_envs}; give one for each, or a single "
+                "one that is no list or tuple"
+            )
+        self._begin("set_attr")
+        for env_id, value in zip(self.group.env_ids, each, strict=True):
+            self.group.call_async("call_wrapped", "set_wrapper_attr", name, value, env_ids=[env_id])
+        self._pending = "call"
+        self.call_wait()
+
+    def render(self) -> tuple[Any, ...]:
+        """One frame of each env, as it renders it."""
+        return self.call("render")
+
+    @property
+    def np_random(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]  # As theirs.
+        """Random generators of the envs: a tuple of copies."""
+        return self.get_attr("np_random")
+
+    @property
+    def np_random_seed(self) -> Any:
+        """Seeds of these generators: a tuple."""
+        return self.get_attr("np_random_seed")
+
+    # -- the end ----------------------------------------------------------------------
+
+    def close_extras(self, timeout: float | None = None, terminate: bool = False) -> None:
+        """Close the envs and end their workers.
+
+        Args:
+            timeout: accepted; workers that don't end are ended by force after 1.5 s.
+            terminate: likewise.
+        """
+        del timeout, terminate
+        if self._pending is not None:
+            warnings.warn(f"closed before {self._pending}_wait was called", stacklevel=3)
+        self.group.close()
+
+
+def _equal(one: Any, other: Any) -> bool:
+    return one == other
+
+
+def _per_worker(max_concurrency: Any, num_envs: int) -> int:
+    count = as_int(max_concurrency)
+    if count is None or count < 1:
+        raise ValueError(f"max_concurrency must be an int above 0 or None, not {max_concurrency!r}")
+    return -(-num_envs // count)
+
+
+def _seconds(timeout: float | None) -> float | None:
+    """A deadline; 0 asks only for what is there."""
+    return timeout if timeout is None else max(timeout, 1e-9)

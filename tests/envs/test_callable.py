@@ -1,0 +1,185 @@
+"""Envs that come from callables: whatever these return, wrapped as its author likes."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import wrappers
+
+from rlightning_aio import BaseEnv, ConfigError, EnvConfig, EnvRet, StartFailed, load_config
+from rlightning_aio.sync import build_env_group
+
+
+def wrapped_pendulum(gravity: float = 10.0) -> gym.Env[Any, Any]:
+    """State in every wrapper: frames, statistics, a running mean, a clock."""
+    env: Any = gym.make("Pendulum-v1", g=gravity, max_episode_steps=5)
+    env = wrappers.RecordEpisodeStatistics(env)
+    env = wrappers.ClipAction(env)
+    env = wrappers.NormalizeObservation(env)
+    return wrappers.FrameStackObservation(env, 2)
+
+
+def inline(**fields: Any) -> Any:
+    return build_env_group({"name": "e", "placement": "inline", **fields})
+
+
+class Counter(BaseEnv):
+    """An env of the runtime's own kind, made without knowing its entry."""
+
+    def __init__(self) -> None:
+        super().__init__(EnvConfig(name="made", backend="made", task="made"))
+        self.env = gym.make("CartPole-v1")
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> EnvRet:
+        return EnvRet(env_id=self.env_id, observation=np.zeros(4, np.float32))
+
+    def step(self, policy_resp: Any) -> EnvRet:
+        action = self._preprocess_fn(policy_resp)
+        return EnvRet(env_id=self.env_id, observation=np.zeros(4, np.float32), last_reward=action)
+
+
+def test_wrapped_envs_behave_as_in_a_plain_loop() -> None:
+    """One callable for each env; each env is its own, in workers, over the ends of episodes."""
+    gravities = [1.0, 5.0, 10.0]
+    # A lambda, which knows its number: it can't be imported anywhere.
+    makers = [lambda g=g: wrapped_pendulum(g) for g in gravities]
+    loop = [wrapped_pendulum(g) for g in gravities]
+    actions = np.random.default_rng(0).uniform(-3, 3, (12, 3, 1)).astype(np.float32)
+    with build_env_group(makers) as group, group.auto_reset():
+        assert group.env_ids == ["env-0", "env-1", "env-2"]
+        batch, _ = group.reset(seed=7)
+        expected = [env.reset(seed=7 + k)[0] for k, env in enumerate(loop)]
+        np.testing.assert_array_equal(batch.observation, np.stack(expected))
+        for turn, action in enumerate(actions):
+            batch, _ = group.step(batch.respond(action=action))
+            for k, env in enumerate(loop):
+                if turn in (5, 11):
+                    observation, reward, info = env.reset()[0], 0.0, {}
+                else:
+                    observation, reward, _, _, info = env.step(action[k])
+                np.testing.assert_array_equal(batch.observation[k], observation)
+                assert batch.reward[k] == reward
+                if "episode" in info:
+                    assert batch.info("episode")["r"][k] == info["episode"]["r"]
+
+
+def test_one_callable_makes_every_env_of_an_entry() -> None:
+    """With the entry's ``env_kwargs``; its step limit is put around what it returns."""
+    fields = {"make_env": wrapped_pendulum, "env_kwargs": {"gravity": 0.0}, "num_workers": 2}
+    with inline(**fields, max_episode_steps=3) as group:
+        batch, _ = group.reset(seed=0)
+        assert [meta.max_episode_steps for meta in group.init()] == [3, 3]
+        for _ in range(3):
+            batch, _ = group.step(batch.respond(action=np.zeros((2, 1), np.float32)))
+        assert batch.truncated.tolist() == [True, True]
+        assert [g.unwrapped.g for g in (group[i].get_attr("unwrapped") for i in group.env_ids)] == [
+            0.0,
+            0.0,
+        ]
+
+
+def test_yaml_names_a_function(tmp_path: Any) -> None:
+    """Without a backend, a task that reads ``module:function`` is one."""
+    path = tmp_path / "envs.yaml"
+    path.write_text("envs: [{name: p, task: 'gymnasium:make', env_kwargs: {id: Pendulum-v1}}]")
+    (config,) = load_config(path)
+    assert config.backend == "callable"
+    with build_env_group(config.model_copy(update={"placement": "inline"})) as group:
+        assert group.reset(seed=1)[0].observation.shape == (1, 3)
+
+
+def test_a_vector_env_brings_its_own_number() -> None:
+    """Its sub-environments, what they do at an end, and its axis, one or several."""
+    for count in (1, 3):
+        with inline(make_env=lambda n=count: gym.make_vec("CartPole-v1", n)) as group:
+            (meta,) = group.init()
+            assert (meta.num_envs, meta.autoreset) == (count, "next_step")
+            batch, _ = group.reset(seed=3)
+            batch, _ = group.step(batch.respond(action=np.zeros((1, count), np.int64)))
+            assert batch.observation.shape == (1, count, 4)
+            assert batch.reward.reshape(-1).tolist() == [1.0] * count
+
+
+def test_an_env_of_the_runtimes_own_becomes_one_of_the_entry() -> None:
+    """It goes by the entry's name, and steps with the group's preprocess function."""
+    config = EnvConfig(name="own", make_env=Counter, num_workers=2, placement="inline")
+    with build_env_group(config, preprocess_fn=lambda response: response.action + 1) as group:
+        batch, _ = group.reset()
+        assert batch.ids() == ["own-0", "own-1"]
+        batch, _ = group.step(batch.respond(action=[1, 2]))
+        assert batch.reward.tolist() == [2, 3]
+
+
+@pytest.mark.parametrize(("task", "entry_point"), [("CartPole-v1", True), ("Pendulum-v1", False)])
+def test_many_of_a_gymnasium_task_in_one_env(task: str, entry_point: bool) -> None:
+    """By the task's own vector environment, or by a loop; both as `make_vec` makes them."""
+    vector: Any = gym.make_vec(task, 3)
+    assert isinstance(vector, gym.vector.SyncVectorEnv) != entry_point
+    with inline(backend="gymnasium", task=task, num_envs=3) as group:
+        batch, _ = group.reset(seed=5)
+        observation, _ = vector.reset(seed=5)
+        np.testing.assert_array_equal(batch.observation[0], observation)
+        vector.action_space.seed(0)
+        for _ in range(210):
+            action = vector.action_space.sample()
+            batch, _ = group.step(batch.respond(action=action[None]))
+            observation, reward, terminated, truncated, _ = vector.step(action)
+            np.testing.assert_array_equal(batch.observation[0], observation)
+            np.testing.assert_array_equal(batch.reward[0], reward)
+            np.testing.assert_array_equal(batch.terminated[0], terminated)
+            np.testing.assert_array_equal(batch.truncated[0], truncated)
+    vector.close()
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"name": "e", "make_env": wrapped_pendulum, "backend": "mujoco"}, "takes the place of"),
+        ({"name": "e", "make_env": [Counter], "num_workers": 2}, "1 callables for num_workers: 2"),
+        ({"name": "e", "make_env": Counter, "task": "a:b"}, "leave out 'a:b'"),
+        ({"name": "e", "task": "Counter", "backend": "callable"}, "module:function"),
+        ({"name": "e", "make_env": "Counter"}, "make_env"),
+    ],
+)
+def test_what_can_be_no_env_is_refused_before_anything_starts(given: Any, said: str) -> None:
+    """By its field, with what to do."""
+    with pytest.raises(ConfigError, match=said):
+        build_env_group(given)
+
+
+def test_a_callable_that_can_t_travel_is_named_before_anything_starts() -> None:
+    """With what it captures; inline it need not travel."""
+    lock = threading.Lock()
+
+    def locked() -> Any:
+        return lock and gym.make("CartPole-v1")
+
+    with pytest.raises(ConfigError, match=r"make_env .*locked can't be sent.*captures 'lock'"):
+        build_env_group([locked])
+    with inline(make_env=locked) as group:
+        assert len(group) == 1
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"make_env": dict}, "must return a gymnasium.Env.*not dict"),
+        ({"make_env": wrapped_pendulum, "num_envs": 2}, "returned a single env; leave num_envs"),
+        (
+            {"make_env": lambda: gym.make_vec("CartPole-v1", 3), "num_envs": 2},
+            "returned 3 of them; leave num_envs",
+        ),
+        (
+            {"make_env": lambda: gym.make_vec("CartPole-v1", 3), "max_episode_steps": 9},
+            "a vector env keeps its own limits",
+        ),
+    ],
+)
+def test_what_is_no_env_of_the_entry_fails_the_start(fields: Any, said: str) -> None:
+    """The message says what it was and what is needed."""
+    with pytest.raises((StartFailed, ConfigError), match=said):
+        inline(**fields).init()

@@ -1,0 +1,176 @@
+"""What passes to an arm and how it is stopped, frame by frame, without a bus or a clock."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rlightning_aio.envs.piper_guard import ArmGuard, Frame
+
+ANY_COMMAND = Frame(0x155, struct.pack(">ii", 1000, 2000))
+EMERGENCY_STOP = Frame(0x150, bytes([1, 0, 0, 0, 0, 0, 0, 0]))
+MOTORS_OFF = Frame(0x471, bytes([7, 1, 0, 0, 0, 0, 0, 0]))
+AT_REST = (1000, 30_000, -30_000, 4000, -5000, 6000)
+"""Joints, in 0.001 degrees."""
+
+
+def guard(stop: Any = "hold", *, gripper: bool = False) -> ArmGuard:
+    made = ArmGuard(stop, 0.5, 40, 1500 if gripper else None)
+    made.arm(0.0)
+    return made
+
+
+def report(made: ArmGuard, now: float, joints: Any = AT_REST, gripper: int = 0) -> None:
+    for k in range(3):
+        made.heard(Frame(0x2A5 + k, struct.pack(">ii", *joints[2 * k : 2 * k + 2])), now)
+    made.heard(Frame(0x2A8, struct.pack(">ihBB", gripper, 0, 0x40, 0)), now)
+
+
+def grip(made: ArmGuard, opening: int, now: float) -> None:
+    made.passes(Frame(0x159, struct.pack(">iHBB", opening, 1500, 1, 0)), now)
+
+
+def grips(frames: list[Frame]) -> list[tuple[int, ...]]:
+    return [struct.unpack(">iHBB", f.data) for f in frames if f.can_id == 0x159]
+
+
+def targets(frames: list[Frame]) -> list[int]:
+    halves = [f.data for f in frames if f.can_id in (0x155, 0x156, 0x157)]
+    return [n for data in halves for n in struct.unpack(">ii", data)]
+
+
+def stopped(made: ArmGuard, now: float, **reported: Any) -> list[Frame]:
+    """All that goes out once the stop has begun, the arm reporting on."""
+    made.stop("a test", now)
+    frames: list[Frame] = []
+    for turn in range(100):
+        if reported:
+            report(made, now + turn * 0.01, **reported)
+        frames += made.act(now + turn * 0.01)
+        if not made.stopping:
+            break
+    return frames
+
+
+@given(st.lists(st.sampled_from(["arm", "stop", "beat", "silence"]), max_size=20))
+def test_nothing_passes_but_between_arming_and_the_next_stop(acts: list[str]) -> None:
+    """Whatever comes in whatever order, a stopped arm is told nothing more of the program's."""
+    made, now, armed = ArmGuard("emergency_stop", 0.5, 40, None), 0.0, False
+    for act in acts:
+        now += 0.6 if act == "silence" else 0.1
+        if act == "arm":
+            made.arm(now)
+            armed = True
+        elif act == "stop":
+            made.stop("", now)
+            armed = False
+        elif act == "beat":
+            made.beat(now)
+        else:
+            armed = False
+        made.act(now)
+        if act != "beat":  # A sign of life that comes too late is too late.
+            assert made.passes(ANY_COMMAND, now) == armed
+        armed = made.armed
+
+
+def test_signs_of_life_that_end_stop_the_arm() -> None:
+    """At the timeout and no earlier; the cause says so."""
+    made = guard("emergency_stop")
+    made.beat(10.0)
+    assert made.act(10.5) == []
+    assert made.wait(10.4) == pytest.approx(0.1)
+    assert made.act(10.51) == [EMERGENCY_STOP]
+    assert made.cause == "it gave no sign of life for 0.5 s"
+
+
+def test_a_stop_is_said_three_times() -> None:
+    """A bus may lose a frame; what it did not take counts as unsaid."""
+    assert stopped(guard("emergency_stop"), 1.0) == [EMERGENCY_STOP] * 3
+    assert stopped(guard("disable"), 1.0) == [MOTORS_OFF] * 3
+    made = guard("emergency_stop")
+    made.stop("a test", 1.0)
+    for turn in range(10):
+        assert made.act(1.0 + turn) == [EMERGENCY_STOP]
+        made.not_sent()
+    assert made.stopping
+
+
+def test_a_hold_is_said_at_once_and_again_where_the_arm_is_by_then() -> None:
+    """The first hold takes the latest feedback, the others what has come since the stop."""
+    made = guard()
+    report(made, 1.0)
+    made.stop("a test", 1.01)
+    first = made.act(1.01)
+    assert targets(first) == list(AT_REST)
+    assert Frame(0x151, bytes([1, 1, 40, 0, 0, 0, 0, 0])) in first
+    later = (1100, *AT_REST[1:])
+    report(made, 1.02, later)
+    assert made.act(1.02) == []
+    assert targets(made.act(1.035)) == list(later)
+    assert made.stopping
+
+
+def test_a_hold_stays_within_the_limits() -> None:
+    """A joint that lies beyond its limits would take no target there and go on to its last."""
+    low = targets(stopped(guard(), 1.0, joints=(0, -300, 200, 0, 0, 0)))
+    assert set(low) == {0}
+    far = targets(stopped(guard(), 1.0, joints=(151_000, 0, 0, 0, 0, -121_000)))
+    assert (far[0], far[5]) == (149_994, -119_999)
+
+
+def test_without_feedback_a_hold_is_an_emergency_stop() -> None:
+    """Nobody knows then where to hold, and old feedback isn't believed."""
+    made = guard()
+    report(made, 0.5)
+    frames = stopped(made, 1.0)
+    assert frames == [EMERGENCY_STOP] * 3
+
+
+def test_a_moving_gripper_is_held_where_it_is() -> None:
+    """One that was told to go on stops at the opening that it reports."""
+    made = guard(gripper=True)
+    report(made, 0.9, gripper=2000)
+    grip(made, 69_000, 0.95)
+    report(made, 1.0, gripper=4000)
+    held = grips(stopped(made, 1.0, gripper=4100))
+    assert held[-1] == (4100, 1500, 1, 0)
+    assert {opening for opening, *_ in held} <= {4000, 4100}
+
+
+def test_a_gripper_that_has_just_been_told_to_close_is_held_open() -> None:
+    """It has not moved yet, so it is no sign of a grip that it stands still."""
+    made = guard(gripper=True)
+    grip(made, 40_000, 0.0)
+    for now in (0.0, 0.5, 0.99):
+        report(made, now, gripper=40_000)
+    grip(made, 0, 0.99)
+    assert grips(stopped(made, 1.0, gripper=40_000))[-1] == (40_000, 1500, 1, 0)
+
+
+def test_what_is_gripped_stays_gripped() -> None:
+    """To hold at the present opening would let go: so a gripper that presses is left alone."""
+    made = guard(gripper=True)
+    for now, opening in ((0.0, 40_000), (0.2, 30_000), (0.4, 30_000), (0.8, 30_050)):
+        grip(made, round(1000 * now), now)  # A policy's targets are never quite the same.
+        report(made, now, gripper=opening)
+    frames = stopped(made, 1.0, gripper=30_000)
+    assert targets(frames)
+    assert grips(frames) == []
+
+
+def test_a_hard_stop_takes_the_gripper_along() -> None:
+    """It is switched off with the motors, and stopped where it is by an emergency stop."""
+    made = guard("disable", gripper=True)
+    report(made, 1.0, gripper=5000)
+    assert grips(stopped(made, 1.0)) == [(5000, 0, 0, 0)] * 3
+    made = guard("emergency_stop", gripper=True)
+    report(made, 1.0, gripper=5000)
+    grip(made, 69_000, 1.0)
+    frames = stopped(made, 1.0)
+    assert grips(frames)[-1] == (5000, 1500, 1, 0)
+    assert EMERGENCY_STOP in frames

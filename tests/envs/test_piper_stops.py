@@ -1,0 +1,51 @@
+"""An arm stops when what drives it ends, by any signal, in any place; its watchdog, too."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("piper_sdk")
+pytest.importorskip("serial")
+
+pytestmark = pytest.mark.simulators
+
+
+def load_harness() -> Any:
+    path = Path(__file__).parents[2] / "benchmarks" / "arm_stops.py"
+    spec = importlib.util.spec_from_file_location("arm_stops", path)
+    assert spec
+    assert spec.loader
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["arm_stops"] = module  # Its dataclasses look for it there.
+    spec.loader.exec_module(module)
+    return module
+
+
+arm_stops = load_harness()
+
+
+@pytest.mark.parametrize("place", arm_stops.PLACES)
+@pytest.mark.parametrize("name", arm_stops.SIGNALS)
+def test_arms_stop_as_configured_when_what_drives_them_ends(name: str, place: str) -> None:
+    """Three arms under way, one for each kind of stop, come nowhere near their target.
+
+    What was only stopped and goes on moves nothing: a late command doesn't reach the arm.
+    """
+    found = arm_stops.measure(place, name)
+    assert [one.stop for one in found] == list(arm_stops.STOPS)
+    for one in found:
+        assert one.degrees < 100  # On their way were more than 170.
+        assert one.moved_again < 1
+
+
+def test_the_table_has_a_row_for_each_place_and_signal() -> None:
+    """As the page on faults shows it."""
+    found = [arm_stops.Stopped("HUP", "client", stop, 0.25, 4.0, 0.0) for stop in arm_stops.STOPS]
+    assert arm_stops.table(found).splitlines()[2:] == [
+        "| SIGHUP | client | 4.0° in 0.25 s | 4.0° in 0.25 s | 4.0° in 0.25 s |"
+    ]

@@ -1,0 +1,184 @@
+"""Actions as they are checked and written: what has no meaning in its space is refused."""
+
+from __future__ import annotations
+
+import warnings
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from rlightning_aio import BatchedData, EnvConfig, PolicyResponse
+from rlightning_aio.batch.data import Origin, batch_of_results
+from rlightning_aio.errors import BadAction
+from rlightning_aio.group.actions import write_actions
+from rlightning_aio.group.env_table import EnvTable
+from rlightning_aio.protocol.slab import RowLayout, Slab
+
+IDS = ["e-0", "e-1", "e-2"]
+
+
+class Rows:
+    """Rows for the actions of three envs, who take any action if they are `free`."""
+
+    def __init__(self, space: Any, *, free: bool = False) -> None:
+        config = EnvConfig(name="e", backend="gymnasium", task="x", num_workers=3)
+        self.envs: Any = EnvTable([config] * 3, IDS)
+        self.envs.out_of_band_actions[:] = self.envs.any_out_of_band = free
+        layout = RowLayout(spaces.Discrete(2), space, (), ())
+        self.slab = Slab(layout, memoryview(bytearray(layout.size(3))), 3)
+        self.layout: Any = SimpleNamespace(
+            slabs=[self.slab], slab=np.zeros(3, np.intp), row=np.arange(3)
+        )
+
+    def write(self, actions: Any, form: str = "columns") -> Any:
+        """What is to be sent out of band."""
+        slots = np.array([2, 0, 1], np.intp)
+        batch = batch_of_results((), Origin(self, slots, self.envs.names)).respond(actions)
+        if form == "values":
+            ids = batch.env_ids()
+            pairs = zip(ids, actions, strict=True)
+            batch = BatchedData(ids, [PolicyResponse(id_, one) for id_, one in pairs])
+        return write_actions(batch, slots, self.envs, self.layout)
+
+    @property
+    def written(self) -> Any:
+        """In the order in which they were given."""
+        return self.slab.action[[2, 0, 1]]
+
+
+INF, NAN = np.inf, np.nan
+HALF_BOUNDED = spaces.Box(np.array([0, -INF], "f"), np.array([INF, 1], "f"), dtype=np.float32)
+SMALL = spaces.Box(-128, 127, (2,), np.int8)
+
+
+@pytest.mark.parametrize("form", ["columns", "values"])
+@pytest.mark.parametrize(
+    ("space", "bad", "held"),
+    [
+        (SMALL, np.array([1, 300]), "300"),
+        (SMALL, np.array([200, 1], np.uint8), "200"),
+        (spaces.MultiBinary(2), np.array([1, 2**40]), str(2**40)),
+        (spaces.Box(-9, 9, (2,), np.int64), np.array([1, 2**63], np.uint64), str(2**63)),
+        (spaces.Box(-9, 9, (2,), np.float32), np.array([1, 1e300]), "1e+300"),
+        (spaces.Box(-9, 9, (2,), np.float64), np.array([NAN, 1]), "nan"),
+        (spaces.Box(-INF, INF, (2,), np.float32), np.array([1, NAN], np.float16), "nan"),
+        (HALF_BOUNDED, np.array([-INF, 0], np.float32), "-inf"),
+        (HALF_BOUNDED, np.array([0, INF], np.float16), "inf"),
+    ],
+    ids=str,
+)
+def test_numbers_without_a_meaning_are_named(space: Any, bad: Any, held: str, form: str) -> None:
+    """With the env and the place; whether they come as columns or one by one."""
+    actions = np.ones((3, 2), bad.dtype)
+    actions[1] = bad
+    with pytest.raises(BadAction) as caught:
+        Rows(space).write(actions, form)
+    said = str(caught.value)
+    assert said.startswith(
+        f"action for env 'e-0' (entry 'e', backend gymnasium, task 'x') holds {held},"
+    )
+    assert said.endswith("nothing was sent")
+    rows = Rows(spaces.Dict(part=space))
+    with pytest.raises(BadAction, match=r"action\['part'\] for env 'e-0' .* holds"):
+        rows.write(
+            {"part": actions} if form == "columns" else [{"part": one} for one in actions], form
+        )
+
+
+@pytest.mark.parametrize("form", ["columns", "values"])
+def test_what_a_cast_keeps_is_written(form: str) -> None:
+    """A policy's int64 for a small dtype, its float64 for a float32, infinity without a bound."""
+    for space, actions in (
+        (SMALL, np.array([[-128, 127], [0, 1], [2, 3]])),
+        (spaces.MultiBinary(2), np.array([[0, 1]] * 3)),
+        (spaces.Discrete(5), np.array([4, 3, 2], np.uint8)),
+        (HALF_BOUNDED, np.array([[INF, -INF], [7, 9], [-3, 0.5]])),
+        (spaces.Box(-1, 1, (2,), np.float64), np.full((3, 2), -1e300)),
+    ):
+        rows = Rows(space)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert rows.write(actions, form) is None
+        assert rows.written.tolist() == actions.tolist()
+    rows = Rows(spaces.Box(-1, 1, (2,), np.float32))
+    rows.write(np.full((3, 2), 0.1), form)
+    assert (rows.written == np.float32(0.1)).all()
+
+
+@given(
+    actions=arrays.arrays(
+        st.sampled_from([np.float32, np.float64]),
+        st.sampled_from([(3, 2), (3, 4000)]),
+        elements=st.floats(width=32),
+        fill=st.just(1.0),
+    )
+)
+def test_nan_and_what_is_beyond_a_bound_is_found_however_many_numbers_there_are(
+    actions: Any,
+) -> None:
+    """And nothing else is: numbers whose squares overflow are numbers."""
+    box = spaces.Box(-INF, 1, actions.shape[1:], np.float32)
+    rows = Rows(box)
+    if np.isnan(actions).any() or np.isposinf(actions).any():
+        with pytest.raises(BadAction, match=r"holds (nan|inf)"):
+            rows.write(actions)
+    else:
+        rows.write(actions)
+        assert (rows.written == actions).all()
+
+
+def test_free_actions_may_be_anything() -> None:
+    """What its row can't hold as it is goes to the env out of band."""
+    for space, actions in (
+        (SMALL, np.array([[1, 2], [1, 300], [3, 4]])),
+        (HALF_BOUNDED, np.array([[0, 0], [NAN, INF], [0, 0]], np.float32)),
+    ):
+        rows = Rows(space, free=True)
+        sent = rows.write(actions)
+        assert sent.positions.tolist() == [1]
+        assert np.array_equal(sent.contents[0][0], actions[1], equal_nan=True)
+        assert rows.written[[0, 2]].tolist() == actions[[0, 2]].tolist()
+
+
+class Tensor:
+    """What can't be shown as an array, as a sparse tensor."""
+
+    def __len__(self) -> int:
+        return 3
+
+    def detach(self) -> Any:
+        raise RuntimeError("no dense layout")
+
+
+@pytest.mark.parametrize("form", ["columns", "values"])
+def test_tensors_that_numpy_has_no_form_of_are_bad_actions(form: str) -> None:
+    """Not whatever error torch has for them."""
+    actions = Tensor()
+    with pytest.raises(BadAction, match="no array: no dense layout"):
+        Rows(SMALL).write(actions if form == "columns" else [Tensor()] * 3, form)
+
+
+@pytest.mark.simulators
+def test_tensors_that_numpy_lacks_are_converted() -> None:
+    """bfloat16, views that are marked as negated; others are bad actions."""
+    torch = pytest.importorskip("torch")
+    box = spaces.Box(-9, 9, (2,), np.float32)
+    numbers = [[1.5, -2.0], [0.0, 3.0], [4.0, 5.0]]
+    negated = torch.complex(torch.zeros(3, 2), -torch.tensor(numbers)).conj().imag
+    assert negated.is_neg()
+    for actions in (torch.tensor(numbers, dtype=torch.bfloat16, requires_grad=True), negated):
+        for form in ("columns", "values"):
+            rows = Rows(box)
+            rows.write(actions, form)
+            assert rows.written.tolist() == numbers
+    for odd in (torch.eye(3, 2).to_sparse(), torch.zeros(3, 2, device="meta")):
+        with pytest.raises(BadAction, match="no array"):
+            Rows(box).write(odd)
+    with pytest.raises(BadAction, match="no array"):
+        Rows(box).write(torch.zeros(3, 2).to(torch.float8_e5m2))

@@ -1,0 +1,247 @@
+"""A group belongs to one event loop and one process; each use from elsewhere is refused by name."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import threading
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+import uvloop
+from patience import HANG
+
+import rlightning_aio
+from rlightning_aio import sync
+from rlightning_aio.errors import GroupClosed, RLightningError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine
+
+PROBE = {
+    "name": "probe",
+    "backend": "probe",
+    "task": "x",
+    "num_workers": 3,
+    "envs_per_process": 3,
+}
+INLINE = {
+    "name": "probe",
+    "backend": "probe",
+    "task": "x",
+    "num_workers": 3,
+    "placement": "inline",
+}
+# The first loop opens a pipe that libuv keeps for good; no test is to be blamed for it.
+uvloop.new_event_loop().close()
+LOOPS = pytest.mark.parametrize("new_loop", [asyncio.new_event_loop, uvloop.new_event_loop])
+
+
+def run_in(loop: Callable[[], asyncio.AbstractEventLoop], main: Coroutine[Any, Any, Any]) -> Any:
+    """In a loop of its own, as `asyncio.run`; what takes too long is a hang."""
+    with asyncio.Runner(loop_factory=loop) as runner:
+        return runner.run(asyncio.wait_for(main, HANG))
+
+
+async def use(group: rlightning_aio.EnvGroup) -> list[float]:
+    batch, _ = await group.reset()
+    batch, _ = await group.step(batch.respond(action=np.array([[0, 4.0]] * 3)))
+    return batch.reward.tolist()
+
+
+async def begun(group: rlightning_aio.EnvGroup) -> None:
+    """Initialised, and with steps under way."""
+    await group.init()
+    batch, _ = await group.reset()
+    group.step_async(batch.respond(action=np.array([[0, 4.0]] * 3)))
+
+
+@LOOPS
+def test_use_from_another_loop_is_refused_and_closing_is_not(
+    new_loop: Callable[[], asyncio.AbstractEventLoop],
+) -> None:
+    """It says which loop, and what to do; nothing that it holds is left. (See conftest.)"""
+    group = rlightning_aio.build_env_group(PROBE)
+    run_in(new_loop, begun(group))
+    expected = r"belongs to the event loop .*[Ll]oop running=False closed=True.*asyncio\.run\(\)"
+    for use_again in (group.init, group.reset, group.collect_async, group["probe-0"].reset):
+        with pytest.raises(RLightningError, match=expected):
+            run_in(new_loop, use_again())
+    with pytest.raises(RLightningError, match=expected):
+        group.step_async(rlightning_aio.BatchedData([], []))
+    run_in(new_loop, group.close())
+    run_in(new_loop, group.close())
+    with pytest.raises(GroupClosed):
+        group.get_action_spaces()
+
+
+@LOOPS
+def test_a_loop_that_is_not_closed_may_be_used_again(
+    new_loop: Callable[[], asyncio.AbstractEventLoop],
+) -> None:
+    """Between its runs plain code may send; another loop may close what its tasks wait for."""
+    group = rlightning_aio.build_env_group(PROBE)
+    with asyncio.Runner(loop_factory=new_loop) as own:
+        own.run(group.init())
+        batch, _ = own.run(group.reset())
+        with pytest.raises(RLightningError, match="is not running; use it there"):
+            run_in(new_loop, group.reset())
+        group.step_async(batch.respond(action=np.array([[0, 4.0]] * 3)))
+        batch, _ = own.run(group.collect_async(wait_all=True))
+        assert batch.reward.tolist() == [4.0] * 3
+        worker = group._core.supervisor.hosts[0]
+        os.kill(worker.pid, signal.SIGSTOP)
+        group.step_async(batch.respond(action=np.array([[0, 4.0]] * 3)))
+
+        async def begin() -> asyncio.Task[Any]:
+            waiting = asyncio.ensure_future(group.collect_async())
+            await asyncio.sleep(0)
+            return waiting
+
+        waiting = own.run(begin())
+        os.kill(worker.pid, signal.SIGCONT)
+        run_in(new_loop, group.close())
+        with pytest.raises(GroupClosed):
+            own.run(asyncio.wait_for(waiting, HANG))
+
+
+@pytest.mark.parametrize("kind", ["another loop", "no loop"])
+def test_use_from_another_thread_is_refused_while_the_loop_runs(kind: str) -> None:
+    """Closing is, too; the tasks of its own loop go on."""
+    refused: list[BaseException] = []
+
+    def elsewhere(group: rlightning_aio.EnvGroup) -> None:
+        uses: list[Callable[[], Any]] = [
+            lambda: group.step_async(rlightning_aio.BatchedData([], [])),
+            group.reset_async,
+        ]
+        if kind == "another loop":
+            uses = [lambda: asyncio.run(group.reset()), lambda: asyncio.run(group.close())]
+        for use_there in uses:
+            with pytest.raises(RLightningError) as caught:
+                use_there()
+            refused.append(caught.value)
+
+    async def main() -> None:
+        async with rlightning_aio.build_env_group(INLINE) as group:
+            await asyncio.to_thread(elsewhere, group)
+            assert await use(group) == [4.0] * 3
+
+    asyncio.run(main())
+    assert len(refused) == 2
+    assert all("runs in another thread; hand it" in str(error) for error in refused)
+
+
+def test_a_synchronous_group_is_one_thread_s_at_a_time() -> None:
+    """While a thread waits in it, another is refused, whatever it asks; the first goes on."""
+    with sync.build_env_group(PROBE) as group:
+        batch, _ = group.reset()
+        worker = group._core.supervisor.hosts[0].pid
+        os.kill(worker, signal.SIGSTOP)
+        group.step_async(batch.respond(action=np.array([[0, 4.0]] * 3)))
+        found: list[Any] = []
+        waiter = threading.Thread(target=lambda: found.append(group.collect_async(wait_all=True)))
+        waiter.start()
+        try:
+            while not group._driver._thread:
+                os.sched_yield()
+            for ask in (group.reset, group.close, lambda: group.step_async(batch)):
+                with pytest.raises(RLightningError, match=f"{waiter.ident} is using this group"):
+                    ask()
+        finally:
+            os.kill(worker, signal.SIGCONT)
+        waiter.join()
+        assert found[0][0].reward.tolist() == [4.0] * 3
+
+
+@pytest.mark.parametrize("kind", ["sync", "asyncio"])
+def test_a_forked_child_is_refused(kind: str) -> None:
+    """It can neither use nor close its parent's group, which goes on."""
+    own = asyncio.Runner()
+    group: Any = (sync if kind == "sync" else rlightning_aio).build_env_group(PROBE)
+
+    def wait(result: Any) -> Any:
+        return own.run(result) if asyncio.iscoroutine(result) else result
+
+    wait(group.init())
+    batch, _ = wait(group.reset())
+    child = os.fork()
+    if child == 0:
+        refused = 0
+        for ask in (group.reset, group.close, lambda: group.step_async(batch)):
+            try:
+                wait(ask())
+            except RLightningError as error:
+                refused += "belongs to process" in str(error)
+        os._exit(refused)
+    _, status = os.waitpid(child, 0)
+    assert os.waitstatus_to_exitcode(status) == 3
+    batch, _ = wait(group.step(batch.respond(action=np.array([[0, 4.0]] * 3))))
+    assert batch.reward.tolist() == [4.0] * 3
+    wait(group.close())
+    own.close()
+
+
+# -- what a callback raises
+
+
+class Broken:
+    """Stands in for `on_readable` of a source: raises so many times, then does what that does."""
+
+    def __init__(self, source: Any, times: int) -> None:
+        self.times = times
+        self.struck = asyncio.Event()
+        self._read = source.on_readable
+        source.on_readable = self
+
+    def __call__(self) -> None:
+        self.struck.set()
+        if self.times:
+            self.times -= 1
+            raise MemoryError("none left")
+        self._read()
+
+
+def link_of(group: rlightning_aio.EnvGroup) -> Any:
+    return group._core.supervisor.hosts[0]._link
+
+
+@LOOPS
+def test_an_error_in_a_callback_is_raised_once_to_who_waits(
+    new_loop: Callable[[], asyncio.AbstractEventLoop],
+) -> None:
+    """The group goes on; the results are there for the next call."""
+
+    async def main() -> None:
+        async with rlightning_aio.build_env_group(PROBE) as group:
+            link = link_of(group)
+            Broken(link, 1)
+            with pytest.raises(MemoryError):
+                await group["probe-0"].call("get_attr", "label")
+            assert await use(group) == [4.0] * 3
+            del link.on_readable
+
+    run_in(new_loop, main())
+
+
+@pytest.mark.parametrize("times", [1, 10**9])
+def test_an_error_that_nobody_has_heard_of_does_not_keep_a_group_open(times: int) -> None:
+    """`close` closes first and raises then; a source that never reads is let go by force."""
+
+    async def main() -> None:
+        group = rlightning_aio.build_env_group(PROBE)
+        await group.init()
+        link = link_of(group)
+        broken = Broken(link, times)
+        call = asyncio.ensure_future(group["probe-0"].call("get_attr", "label"))
+        await asyncio.sleep(0)
+        call.cancel()
+        await broken.struck.wait()
+        with pytest.raises(MemoryError):
+            await group.close()
+        await group.close()
+        del link.on_readable
+
+    asyncio.run(asyncio.wait_for(main(), HANG))

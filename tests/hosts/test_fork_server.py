@@ -1,0 +1,89 @@
+"""The trainer's handle on a fork server: whatever kind of program that turns out to be."""
+
+from __future__ import annotations
+
+import os
+import socket
+import sys
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from rlightning_aio.hosts.arena import Arena
+from rlightning_aio.hosts.fork_messages import Fork
+from rlightning_aio.hosts.messages import WorkerPlace
+from rlightning_aio.hosts.process import ForkServer
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+class Asker:
+    """A host that is told why its fork server is gone; and a watcher."""
+
+    host_id = 0
+    why = ""
+
+    def on_fork_server_lost(self, why: str) -> None:
+        self.why = why
+
+    def watch(self, source: Any) -> None: ...
+
+    def unwatch(self, source: Any) -> None: ...
+
+    def watch_writable(self, source: Any, wanted: bool) -> None: ...
+
+
+def lost(interpreter: str) -> str:
+    """Why a fork server is gone, as it is told to a trainer that comes late."""
+    asker: Any = Asker()
+    server = ForkServer(interpreter, {}, ("gymnasium",), asker)
+    channel, worker = socket.socketpair()
+    arena = Arena()
+    server.fork(asker, worker, arena, Fork(WorkerPlace(0, 1, 0, 1, 0, 0)))
+    assert server._process is not None
+    os.waitid(os.P_PID, server._process.pid, os.WEXITED | os.WNOWAIT)
+    server.on_readable()
+    channel.close()
+    arena.close()
+    return asker.why
+
+
+def script(path: Path, text: str) -> str:
+    path.write_text(text)
+    path.chmod(0o755)
+    return str(path)
+
+
+def test_what_an_interpreter_lacks_is_told_to_a_trainer_that_comes_late(tmp_path: Path) -> None:
+    """It has ended by then, with orders unread: its reason is heard before its end."""
+    bare = script(tmp_path / "bare", f'#!/bin/sh\nexec {sys.executable} -I -S "$@"\n')
+    why = lost(bare)
+    assert why.startswith("Traceback")
+    assert "ModuleNotFoundError: No module named" in why.splitlines()[-1]
+
+
+def test_an_interpreter_that_is_too_old_is_told_with_its_version(tmp_path: Path) -> None:
+    """It knows no option of a later one, and none of our code."""
+    old = script(
+        tmp_path / "old",
+        f"#!{sys.executable}\n"
+        "import sys\n"
+        "assert sys.argv[1] == '-c', 'unknown option'\n"
+        "code = sys.argv[2]\n"
+        "sys.argv[:3] = ['-c']\n"
+        "sys.version_info = (3, 9, 2, 'final', 0)\n"
+        "exec(code)\n",
+    )
+    assert lost(old) == (
+        f"its interpreter {sys.executable} is Python 3.9.2, and workers need Python 3.11 or later"
+    )
+
+
+@pytest.mark.parametrize(("program", "code"), [("true", 0), ("false", 1)])
+def test_a_program_that_is_no_interpreter_ends_with_its_exit_code(program: str, code: int) -> None:
+    """It leaves no zombie behind, either."""
+    assert lost(f"/bin/{program}") == (
+        f"it exited with code {code} while it was importing gymnasium; is /bin/{program} a Python "
+        "with what workers need?"
+    )

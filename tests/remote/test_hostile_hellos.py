@@ -1,0 +1,245 @@
+"""Whatever a hello says, it is let in or refused, and costs next to nothing."""
+
+from __future__ import annotations
+
+import logging
+import tracemalloc
+import warnings
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from patience import HANG
+from remote.counting import ClientThread, CountingEnv
+from remote.random_spaces import any_space
+
+from rlightning_aio import sync
+from rlightning_aio.errors import EnvRaised
+from rlightning_aio.protocol.net.server_session import ServerSessions
+from rlightning_aio.protocol.net.space_description import describe, space_from
+from rlightning_aio.protocol.net.wire import MAX_BYTES_IN_ALL, Bye, Failure, Hello, Result, Writer
+
+if TYPE_CHECKING:
+    from rlightning_aio.types import EnvRet, PolicyResponse
+
+TOP = 2**63 - 1
+SMALL = {"type": "discrete", "n": 2}
+BOX = {"type": "box", "shape": [64 << 20], "dtype": "uint8", "low": 0, "high": 255}
+ESCAPES = "\x1b[2J\r\nfake: \u202e line\x07"
+
+
+def hello(name: str = "x", nonce: int = 1, **fields: Any) -> list[bytes]:
+    said = {"observation_space": SMALL, "action_space": SMALL, **fields}
+    return Writer().write(Hello(version=1, name=name, nonce=nonce, **said))
+
+
+def answers(server: ServerSessions) -> list[dict[str, Any]]:
+    """What the server has said since it was asked last."""
+    said = [msgspec.msgpack.decode(outgoing.parts[0]) for outgoing in server.outbox]
+    server.outbox.clear()
+    return said
+
+
+HOSTILE: list[Any] = [
+    {"type": "discrete", "n": TOP, "start": TOP},
+    {"type": "discrete", "n": TOP, "start": 1},
+    {"type": "discrete", "n": 2**64 - 1},
+    {"type": "discrete", "n": 1, "start": -(2**63)},
+    {"type": "discrete", "n": 300, "dtype": "uint8"},
+    {"type": "discrete", "n": 2, "dtype": "float64"},
+    {"type": "discrete", "n": 2, "dtype": "bool"},
+    {"type": "discrete", "n": 0},
+    {"type": "multi_discrete", "nvec": [TOP, TOP], "start": [TOP, 0]},
+    {"type": "multi_discrete", "nvec": [[1], [1, 2]]},
+    {"type": "multi_discrete", "nvec": []},
+    {"type": "multi_binary", "n": 1 << 62},
+    {"type": "multi_binary", "n": [1 << 40, 0]},
+    {"type": "box", "shape": [2], "dtype": "float16", "low": -1e300, "high": 1e300},
+    {"type": "box", "shape": [2], "dtype": "float32", "low": 5e-324, "high": 1.1},
+    {"type": "box", "shape": [2], "dtype": "uint8", "low": "-inf", "high": "inf"},
+    {"type": "box", "shape": [2], "dtype": "int64", "low": -(2**63), "high": TOP},
+    {"type": "box", "shape": [2], "dtype": "int64", "low": -(2**63), "high": 2**64 - 1},
+    {"type": "box", "shape": [0, 1 << 62], "dtype": "int8", "low": 0, "high": 1},
+    {"type": "box", "shape": [1 << 40, 1 << 40], "dtype": "int8", "low": 0, "high": 1},
+    {"type": "box", "shape": [2], "dtype": "float64", "low": [[0.0]], "high": [1, 2, 3]},
+    {"type": "text", "max_length": 5, "min_length": 9, "charset": "\x1b"},
+    {"type": "dict", "spaces": [[ESCAPES, SMALL]]},
+    {"type": "tuple", "spaces": []},
+    {"type": ESCAPES},
+    {"type": "x" * 100_000},
+    {},
+]
+
+
+@pytest.mark.parametrize("place", ["observation_space", "action_space"])
+def test_every_hello_is_answered(place: str) -> None:
+    """Although the trainer has arithmetic and warnings raise."""
+    server = ServerSessions("srv", heartbeat=5.0)
+    with np.errstate(all="raise"), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for nonce, description in enumerate(HOSTILE):
+            server.receive(b"r", None, hello(f"c{nonce}", nonce, **{place: description}), 0.0)
+            (answer,) = answers(server)
+            assert answer["type"] in ("welcome", "refusal")
+            assert answer["nonce"] == nonce
+            assert answer.get("text", "").isprintable()
+            assert len(answer.get("text", "")) < 1100
+    assert server.malformed == 0
+
+
+_BIG = st.sampled_from([0, 1, 2, 127, 255, 2**31, 2**62, TOP, 2**64 - 1, -1, -(2**63)])
+_ANYTHING = st.one_of(_BIG, st.floats(), st.text(max_size=3), st.none(), st.lists(_BIG, max_size=3))
+
+
+@given(space=any_space, data=st.data())
+def test_a_description_with_any_field_changed_is_answered(space: Any, data: st.DataObject) -> None:
+    """At any depth."""
+    fields = description = describe(space, "space")
+    while fields["type"] in ("dict", "tuple") and fields["spaces"] and data.draw(st.booleans()):
+        inner = data.draw(st.sampled_from(fields["spaces"]))
+        fields = inner[1] if isinstance(inner, list) else inner
+    fields[data.draw(st.sampled_from(sorted(fields)))] = data.draw(_ANYTHING)
+    server = ServerSessions("srv", heartbeat=5.0)
+    with np.errstate(all="raise"), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        server.receive(b"r", None, hello(observation_space=description), 0.0)
+    assert len(server.outbox) + server.malformed == 1
+
+
+def test_a_large_space_costs_what_was_said_of_it() -> None:
+    """Twenty clients that announce 64 MiB take no memory before they send a result."""
+    server = ServerSessions("srv", heartbeat=5.0)
+    server.receive(b"r", None, hello("first"), 0.0)
+    tracemalloc.start()
+    try:
+        for k in range(20):
+            server.receive(b"r", None, hello(f"c{k}", observation_space=BOX), 0.0)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()
+
+
+def test_all_clients_together_have_a_limit(caplog: pytest.LogCaptureFixture) -> None:
+    """The one too many is told why, and to try later; the log has one line."""
+    server = ServerSessions("srv", heartbeat=5.0)
+    each = (64 << 20) + 8 + 8 + 2  # Observation, action, reward and two flags.
+    most = MAX_BYTES_IN_ALL // each
+    for k in range(most + 3):
+        server.receive(b"r", None, hello(f"c{k}", observation_space=BOX), 0.0)
+    said = answers(server)
+    assert [answer["type"] for answer in said] == ["welcome"] * most + ["refusal"] * 3
+    assert said[-1]["code"] == "full"
+    assert said[-1]["retry"]
+    assert f"have reserved {most * each} of {MAX_BYTES_IN_ALL}" in said[-1]["text"]
+    assert len(caplog.records) == 1
+    server.receive(b"r", None, Writer().write(Bye(session=said[0]["session"])), 0.0)
+    server.receive(b"r", None, hello("another", observation_space=BOX), 0.0)
+    assert answers(server)[-1]["type"] == "welcome"
+
+
+def test_those_who_are_away_make_room() -> None:
+    """Whoever joins and leaves under ever new names takes no more than the limit."""
+    server = ServerSessions("srv", heartbeat=5.0)
+    half = {**BOX, "shape": [32 << 20], "low": 0}
+    frame = bytes(32 << 20)
+    for k in range(40):
+        server.receive(b"r", None, hello(f"c{k}", observation_space=half), 0.0)
+        (said,) = answers(server)
+        first = Result(session=said["session"], number=0, reward=0.0, terminated=False,
+                       truncated=False)  # fmt: skip
+        server.receive(b"r", None, Writer().write(first, [frame]), 0.0)
+        server.receive(b"r", None, Writer().write(Bye(session=said["session"])), 0.0)
+        server.take()
+    assert len(server._seats) == MAX_BYTES_IN_ALL // ((32 << 20) + 18)
+    assert server._reserved <= MAX_BYTES_IN_ALL
+
+
+def test_a_hello_of_any_length_costs_little() -> None:
+    """It is refused before anything is made of it."""
+    server = ServerSessions("srv", heartbeat=5.0)
+    long = {"type": "multi_discrete", "nvec": [1] * 300_000}
+    server.receive(b"r", None, hello(observation_space=long), 0.0)
+    (answer,) = answers(server)
+    assert (answer["code"], answer["retry"]) == ("spaces", False)
+    assert "262144 are allowed" in answer["text"]
+
+
+def test_texts_of_clients_are_shown_without_control_characters(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Reasons, errors and what is wrong with a message, in logs, infos and errors."""
+    server = ServerSessions("srv", heartbeat=5.0)
+    long = ESCAPES * 10_000
+    with caplog.at_level(logging.INFO, "rlightning_aio"):
+        server.receive(b"r", None, hello("raises"), 0.0)
+        (said,) = answers(server)
+        failure = Failure(session=said["session"], number=0, exception_type=long, text=long,
+                          traceback=long)  # fmt: skip
+        server.receive(b"r", None, Writer().write(failure), 0.0)
+        server.receive(b"r", None, hello("leaves"), 0.0)
+        (said,) = answers(server)
+        first = Result(session=said["session"], number=0, reward=0.0, terminated=False,
+                       truncated=False)  # fmt: skip
+        server.receive(b"r", None, Writer().write(first, [bytes(8)]), 0.0)
+        server.submit("leaves", 1, 0, {}, 0.0)
+        server.receive(b"r", None, Writer().write(Bye(session=said["session"], reason=long)), 0.0)
+        server.receive(b"r", None, hello(ESCAPES), 0.0)
+        server.receive(b"r", None, hello(observation_space={"type": ESCAPES}), 0.0)
+        server.receive(b"r", None, [msgspec.msgpack.encode({"type": ESCAPES})], 0.0)
+    messages = [record.getMessage() for record in caplog.records]
+    assert len(messages) == 5
+    assert all(message.isprintable() and len(message) < 2500 for message in messages)
+    (_, lost) = server.take()
+    assert lost.info["client_lost"].isprintable()
+    assert "fake: " in lost.info["client_lost"]
+
+
+class _Hostile(CountingEnv):
+    """Its rewards overflow what is summed up, and its words are a terminal's."""
+
+    def step(self, policy_resp: PolicyResponse) -> EnvRet:
+        super().step(policy_resp)
+        if self.steps == 5:
+            raise RuntimeError(ESCAPES)
+        ret = self.ret()
+        ret.last_reward = 1e308
+        ret.observation = np.array([5e-324, np.nan, np.inf])
+        return ret
+
+
+def test_numbers_of_clients_raise_nothing_in_a_trainer_that_has_them_raise() -> None:
+    """And an error of the env's is shown in plain words."""
+    with (
+        np.errstate(all="raise"),
+        sync.build_env_group(
+            {"name": "robots", "backend": "env_server", "env_kwargs": {"connect_timeout": HANG}}
+        ) as group,
+    ):
+        friend = ClientThread(group["robots-0"].address, "arm", _Hostile())
+        batch, _ = group.reset()
+        for _ in range(4):
+            group.step_async(batch.respond(action=np.zeros((1, 2), np.float32)))
+            batch, _ = group.collect_async(deadline=HANG)
+        group.step_async(batch.respond(action=np.zeros((1, 2), np.float32)))
+        with pytest.raises(EnvRaised) as caught:
+            group.collect_async(deadline=HANG)
+        group.close()
+        friend.join()
+    error = caught.value
+    assert str(error).isprintable()
+    assert "\\x1b[2J\\r\\nfake: \\u202e line\\x07" in str(error)
+    assert error.exception_text.isprintable()
+    assert "\x1b" not in error.traceback_text
+    assert len(error.traceback_text.splitlines()) > 3
+
+
+def test_a_space_made_of_a_description_is_a_box_like_any_other() -> None:
+    """It can be compared, sampled and written to a file."""
+    said = {"type": "box", "shape": [3, 2], "dtype": "float32", "low": [0, 1], "high": "inf"}
+    space = space_from(said)
+    assert space.sample().shape == (3, 2)
+    assert np.asarray(space.low).tolist() == [[0, 1]] * 3
+    assert not space.low.flags.writeable

@@ -1,0 +1,104 @@
+"""Which keys count: those that lie in the directory now."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from typing import TYPE_CHECKING
+
+from rlightning_aio.remote import make_keys
+from rlightning_aio.remote.keys import AllowedKeys, read_client_keys, read_keys
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import pytest
+
+
+def laid_out(tmp_path: Path) -> tuple[AllowedKeys, Path, bytes, bytes]:
+    """The allowed keys, their directory, and the public keys of arm and leg."""
+    arm, leg = make_keys(tmp_path, ["arm", "leg"])
+    allowed = tmp_path / "server" / "clients"
+    # As if they had been made long ago.
+    for path in allowed.iterdir():
+        os.utime(path, ns=(0, 0))
+    return (
+        AllowedKeys(allowed),
+        allowed,
+        read_client_keys(arm).public,
+        read_client_keys(leg).public,
+    )
+
+
+def test_each_change_of_a_file_counts_at_once(tmp_path: Path) -> None:
+    """Deleted, added, replaced, and written over in place."""
+    keys, directory, arm, leg = laid_out(tmp_path)
+    assert (keys.owner(arm), keys.owner(leg), keys.owner(b"")) == ("arm", "leg", None)
+    (directory / "arm.key").unlink()
+    assert keys.owner(arm) is None
+    shutil.copy(tmp_path / "arm" / "client.key", directory / "hand.key")
+    assert keys.owner(arm) == "hand"
+    (directory / "hand.key").write_text((directory / "leg.key").read_text())
+    assert keys.owner(arm) is None
+    (directory / "leg.key").replace(directory / "hand.key")
+    assert (keys.owner(arm), keys.owner(leg)) == (None, "hand")
+
+
+def test_a_file_that_is_written_over_within_one_tick_of_the_clock_counts(tmp_path: Path) -> None:
+    """Its stamps are then what they were, size and all."""
+    keys, directory, arm, leg = laid_out(tmp_path)
+    path = directory / "arm.key"
+    os.utime(path)
+    stamp = path.stat()
+    assert keys.owner(arm) == "arm"
+    (directory / "leg.key").unlink()
+    path.write_text(path.read_text().replace(arm.decode(), leg.decode()))
+    os.utime(path, ns=(stamp.st_mtime_ns, stamp.st_mtime_ns))
+    assert (keys.owner(arm), keys.owner(leg)) == (None, "arm")
+
+
+def test_files_that_have_not_changed_are_not_read_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A question costs a look at their stamps."""
+    keys, _, arm, _ = laid_out(tmp_path)
+    assert keys.owner(arm) == "arm"
+    monkeypatch.setattr("rlightning_aio.remote.keys.read_keys", None)
+    assert keys.owner(arm) == "arm"
+
+
+def test_what_holds_no_key_is_left_out_with_one_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A bad name, a bad content, a directory, a pipe, a link to nowhere."""
+    keys, directory, arm, _ = laid_out(tmp_path)
+    (directory / os.fsdecode(b"\xff.key")).write_text("x")
+    (directory / "red\x1b[31m\n.key").write_text("x")
+    (directory / "empty.key").write_text("")
+    (directory / "bytes.key").write_bytes(b"\xff")
+    (directory / "folder.key").mkdir()
+    os.mkfifo(directory / "pipe.key")
+    (directory / "nowhere.key").symlink_to(directory / "nothing")
+    for _ in range(3):
+        assert keys.owner(arm) == "arm"
+        (directory / "other").touch()
+        (directory / "other").unlink()
+    messages = [record.getMessage() for record in caplog.records]
+    assert all(message.isprintable() for message in messages)
+    for name in ("\\udcff", "red\\x1b", "empty", "bytes", "folder", "pipe"):
+        assert len([message for message in messages if name in message]) == 1
+    assert len(messages) == 6
+
+
+def test_a_directory_that_cannot_be_read_lets_nobody_in(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It is said once, and a directory that comes back counts again."""
+    keys, directory, arm, _ = laid_out(tmp_path)
+    away = directory.rename(tmp_path / "away")
+    assert [keys.owner(arm), keys.owner(arm)] == [None, None]
+    assert len(caplog.records) == 1
+    assert "no client gets in" in caplog.text
+    away.rename(directory)
+    assert keys.owner(arm) == "arm"
+    assert read_keys(directory / "arm.key").public == arm

@@ -1,0 +1,212 @@
+"""What Gymnasium's users rely on beside the results: waiting, refusing, closing, wrappers."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import vector as wrappers
+from vector.toys import Toy, assert_alike, toy
+
+from rlightning_aio.errors import EnvRaised
+from rlightning_aio.vector import VectorEnv, make_vec, vector_entry_point
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+class Plain(Toy):
+    """Its observations stack."""
+
+    observation_space = spaces.Box(-10, 10, (2,), np.float64)
+
+    def _observed(self) -> Any:
+        return self.place.copy()
+
+
+class Held(Plain):
+    """Each step and call waits until the file is there."""
+
+    def __init__(self, gate: Path) -> None:
+        self.gate = gate
+
+    def worker(self) -> int:
+        return os.getpid()
+
+    def wait(self) -> int:
+        while not self.gate.exists():
+            pass
+        return self.count
+
+    def step(self, action: Any) -> Any:
+        self.wait()
+        if action == 2:
+            raise RuntimeError("no such action")
+        observation, reward, _, _, info = super().step(action)
+        return observation, reward, False, False, info
+
+
+def test_halves_of_a_call_belong_together(tmp_path: Path) -> None:
+    """Each `wait` needs its own `async`; a timeout raises, and what comes late is dropped."""
+    gate = tmp_path / "open"
+    env = VectorEnv([lambda: Held(gate)] * 2, max_concurrency=1)
+    assert len(set(env.call("worker"))) == 1
+    for wait in (env.reset_wait, env.step_wait, env.call_wait):
+        with pytest.raises(NoAsyncCallError):
+            wait()
+    env.reset_async(seed=1)
+    with pytest.raises(AlreadyPendingCallError, match="reset_wait"):
+        env.step_async(np.zeros(2, np.int64))
+    with pytest.raises(AlreadyPendingCallError):
+        env.call("double", 1)
+    env.reset_wait()
+    env.step_async(np.zeros(2, np.int64))
+    with pytest.raises(multiprocessing.TimeoutError, match="step_async"):
+        env.step_wait(timeout=0.01)
+    gate.touch()
+    env.call_async("wait")
+    assert env.call_wait(timeout=60) == (1, 1)
+    gate.unlink()
+    env.call_async("wait")
+    with pytest.raises(multiprocessing.TimeoutError):
+        env.call_wait(timeout=0.01)
+    gate.touch()
+    assert env.step(np.zeros(2, np.int64))[4]["count"].tolist() == [2, 2]
+    with pytest.raises(EnvRaised, match="no such action"):
+        env.step(np.array([0, 2]))
+    assert env.step(np.zeros(2, np.int64))[4]["count"].tolist() == [4, 3]
+    env.step_async(np.zeros(2, np.int64))
+    with pytest.warns(UserWarning, match="before step_wait"):
+        env.close()
+    env.close()
+    with pytest.raises(ClosedEnvironmentError):
+        env.reset()
+
+
+def test_bad_arguments_are_refused_as_gymnasium_refuses_them() -> None:
+    """By the same classes, and nothing is sent."""
+    env = VectorEnv([toy] * 2, placement="inline")
+    env.reset()
+    for actions, kind in ((np.zeros(3, np.int64), ValueError), (np.int64(1), TypeError)):
+        with pytest.raises(kind):
+            env.step(actions)
+    with pytest.raises(ValueError, match="itself"):
+        env.call("step", 1)
+    with pytest.raises(ValueError, match="3 values for num_envs=2"):
+        env.set_attr("speed", [1, 2, 3])
+    env.step(np.zeros(2, np.int64))
+    env.close()
+    for wrong in (0, 1.5, "2"):
+        with pytest.raises(ValueError, match="max_concurrency"):
+            VectorEnv([toy], max_concurrency=wrong)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="worker"):
+        VectorEnv([toy], worker=print)  # type: ignore[arg-type]
+
+
+class Sized(Plain):
+    def __init__(self, high: float, actions: int) -> None:
+        self.observation_space = spaces.Box(-high, high, (2,), np.float64)
+        self.action_space = spaces.Discrete(actions)
+
+
+def test_spaces_go_together_or_are_refused() -> None:
+    """As the observation mode says; actions are always of one space."""
+    both = [lambda: Sized(1, 3), lambda: Sized(2, 3)]
+    with pytest.raises(RuntimeError, match=r"env 1 is Box.*observation_mode='different'"):
+        VectorEnv(both, placement="inline")
+    env = VectorEnv(both, placement="inline", observation_mode="different")
+    theirs = SyncVectorEnv(both, observation_mode="different")
+    assert env.observation_space == theirs.observation_space
+    for one in (env, theirs):
+        one.close()
+    with pytest.raises(RuntimeError, match="action space of env 1"):
+        VectorEnv([lambda: Sized(1, 3), lambda: Sized(1, 4)], placement="inline")
+
+
+def test_what_the_whole_tells_of_itself() -> None:
+    """Spaces, metadata with the mode, render mode, seeds; without building an env here."""
+    env = VectorEnv([toy] * 2, autoreset_mode="Disabled", placement="inline")
+    assert (env.num_envs, env.render_mode) == (2, "rgb_array")
+    assert env.metadata["autoreset_mode"] is env.autoreset_mode is AutoresetMode.DISABLED
+    assert "autoreset_mode" not in Toy.metadata
+    assert env.single_observation_space == Toy.observation_space
+    env.reset(seed=[5, 9])
+    assert env.np_random_seed == (5, 9)
+    assert [frame.shape for frame in env.render()] == [(2, 2, 3)] * 2
+    env.close()
+
+
+def test_make_vec_takes_what_gymnasiums_takes() -> None:
+    """Wrappers, arguments of the task and of the vector env; the spec tells of the task."""
+    kwargs = {"max_episode_steps": 9, "wrappers": [gym.wrappers.RecordEpisodeStatistics]}
+    ours = make_vec("Pendulum-v1", 2, vector_kwargs={"placement": "inline"}, g=3.0, **kwargs)
+    theirs = gym.make_vec("Pendulum-v1", 2, vectorization_mode="sync", g=3.0, **kwargs)
+    assert ours.spec is not None
+    assert ours.spec.id == "Pendulum-v1"
+    assert ours.get_attr("g") == (3.0, 3.0)
+    assert_alike(ours.reset(seed=4), theirs.reset(seed=4))
+    for _ in range(9):
+        actions = ours.action_space.sample()
+        found, expected = ours.step(actions), theirs.step(actions)
+    for one in (found, expected):
+        del one[4]["episode"]["t"], one[4]["episode"]["_t"]
+    assert_alike(found, expected)
+    for one in (ours, theirs):
+        one.close()
+
+
+def test_gymnasium_makes_it_by_a_vector_entry_point() -> None:
+    """As RLlib does, say."""
+    gym.register(
+        "served/Pendulum-v1",
+        entry_point="gymnasium.envs.classic_control:PendulumEnv",
+        vector_entry_point=vector_entry_point("Pendulum-v1", placement="inline"),
+    )
+    try:
+        env = gym.make_vec("served/Pendulum-v1", 2, vectorization_mode="vector_entry_point")
+        assert isinstance(env.unwrapped, VectorEnv)
+        assert env.reset(seed=1)[0].shape == (2, 3)
+        env.close()
+    finally:
+        del gym.registry["served/Pendulum-v1"]
+
+
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        wrappers.RecordEpisodeStatistics,
+        wrappers.NormalizeObservation,
+        wrappers.NormalizeReward,
+        wrappers.DictInfoToList,
+        lambda env: wrappers.RescaleObservation(env, -1.0, 1.0),
+        lambda env: wrappers.ClipReward(env, 0.2, 0.8),
+        wrappers.FlattenObservation,
+    ],
+)
+def test_vector_wrappers_do_what_they_do_to_gymnasiums(wrap: Any) -> None:
+    """Over the ends of episodes."""
+
+    def make() -> Any:
+        return Sized(10, 3)
+
+    ours, theirs = (
+        wrap(VectorEnv([make] * 2, placement="inline")), wrap(SyncVectorEnv([make] * 2))
+    )  # fmt: skip
+    found, expected = [ours.reset(seed=2)], [theirs.reset(seed=2)]
+    for _ in range(20):
+        actions = theirs.action_space.sample()
+        found.append(ours.step(actions))
+        expected.append(theirs.step(actions))
+    for told in (*found, *expected):
+        if isinstance(told[-1], dict) and "episode" in told[-1]:
+            told[-1]["episode"].pop("t")
+    assert_alike(found, expected)
+    ours.close()
+    theirs.close()

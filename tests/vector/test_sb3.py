@@ -1,0 +1,80 @@
+"""Stable-Baselines3's interface beside its own: the same results, and what trains on it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from vector.toys import assert_alike
+
+pytestmark = pytest.mark.simulators
+
+
+@pytest.fixture(autouse=True)
+def stable_baselines3() -> Any:
+    return pytest.importorskip("stable_baselines3")
+
+
+def pendulum() -> gym.Env[Any, Any]:
+    return gym.make("Pendulum-v1", max_episode_steps=30)
+
+
+def test_it_does_what_its_own_does() -> None:
+    """Over the ends of episodes: observations, rewards, ends, infos, and those of resets."""
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    from rlightning_aio.sb3 import VecEnv
+
+    ours, theirs = VecEnv([pendulum] * 3), DummyVecEnv([pendulum] * 3)
+    for env in (ours, theirs):
+        env.seed(5)
+    assert_alike(ours.reset(), theirs.reset())
+    for _ in range(100):
+        actions = np.random.default_rng(0).uniform(-2, 2, (3, 1)).astype(np.float32)
+        found, expected = ours.step(actions), theirs.step(actions)
+        assert_alike(found[0], expected[0])
+        np.testing.assert_allclose(found[1], expected[1], rtol=1e-6)  # Theirs are float32.
+        assert_alike(found[2], expected[2])
+        assert_alike(found[3], expected[3])
+        assert_alike(ours.reset_infos, theirs.reset_infos)
+    assert ours.get_attr("g") == theirs.get_attr("g")
+    ours.set_attr("note", 7, indices=[0, -1])
+    assert ours.get_attr("note", indices=-1) == [7]
+    assert not ours.has_attr("nothing")
+    assert ours.env_is_wrapped(gym.wrappers.TimeLimit) == [True] * 3
+    assert ours.env_method("get_wrapper_attr", "g", indices=[1]) == [10.0]
+    ours.close()
+    ours.close()
+
+
+def test_sac_learns_the_very_same_on_it() -> None:
+    """Weights and all, for the same seed; through `VecNormalize`."""
+    from stable_baselines3 import SAC
+    from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+    from rlightning_aio.sb3 import VecEnv
+
+    weights: list[Any] = []
+    for kind in (VecEnv, DummyVecEnv):
+        env = VecNormalize(kind([pendulum] * 2), norm_reward=False)  # Theirs are float32.
+        model = SAC("MlpPolicy", env, learning_starts=40, seed=1, device="cpu").learn(120)
+        weights.append(model.policy.state_dict())
+        env.close()
+    assert all((weights[0][key] == weights[1][key]).all() for key in weights[0])
+
+
+def test_ppo_is_evaluated_on_it() -> None:
+    """With monitors and stacked frames around it."""
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.evaluation import evaluate_policy
+    from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor
+
+    from rlightning_aio.sb3 import VecEnv
+
+    env = VecMonitor(VecFrameStack(VecEnv([pendulum] * 2), 2))
+    model = PPO("MlpPolicy", env, n_steps=16, batch_size=16, seed=0, device="cpu").learn(64)
+    mean, _ = evaluate_policy(model, env, n_eval_episodes=2)
+    assert -1000 < mean < 0
+    env.close()
