@@ -6,6 +6,7 @@ bit. docs/stable_baselines3.md tells what differs.
 
 from __future__ import annotations
 
+import contextlib
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -15,12 +16,13 @@ import numpy as np
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.batch.data import reported_info_list
 from rlightning_aio.envs.same_step import SameStepOf
-from rlightning_aio.errors import ConfigError, EnvFault, EnvRaised, NothingPending
+from rlightning_aio.errors import ConfigError, EnvRaised
 from rlightning_aio.sync import EnvGroup, build_env_group
 from rlightning_aio.types import PolicyResponse
+from rlightning_aio.vector.leftovers import drop_outstanding
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Generator, Iterable, Sequence
 
     from numpy.typing import NDArray
 
@@ -85,13 +87,17 @@ class VecEnv(_Base):
 
         Returns observations ``[num_envs, ...]``, or dicts or tuples of such; `reset_infos` has
         the infos.
+
+        Raises:
+            EnvRaised, WorkerDied, EnvHung: an env failed; the others' results are dropped.
         """
-        for env_id, seed, options in zip(
-            self.group.env_ids, self._seeds, self._options, strict=True
-        ):
-            seeds = {} if seed is None else {env_id: int(seed)}
-            self.group.reset_async(seeds, options or None, [env_id])
-        batch, _ = self.group.collect_async(wait_all=True, ordered=True)
+        with self._dropping_the_rest():
+            for env_id, seed, options in zip(
+                self.group.env_ids, self._seeds, self._options, strict=True
+            ):
+                seeds = {} if seed is None else {env_id: int(seed)}
+                self.group.reset_async(seeds, options or None, [env_id])
+            batch, _ = self.group.collect_async(wait_all=True, ordered=True)
         self.reset_infos = reported_info_list(batch)
         self._reset_seeds()
         self._reset_options()
@@ -116,11 +122,8 @@ class VecEnv(_Base):
         Raises:
             EnvRaised, WorkerDied, EnvHung: an env failed; the others' results are dropped.
         """
-        try:
+        with self._dropping_the_rest():
             batch, _ = self.group.collect_async(wait_all=True, ordered=True)
-        except EnvFault:
-            self._drop()
-            raise
         self._answerable = batch
         infos = reported_info_list(batch)
         truncated = (batch.truncated & ~batch.terminated).tolist()
@@ -131,15 +134,14 @@ class VecEnv(_Base):
             info["TimeLimit.truncated"] = cut
         return batch.observation, batch.reward, done, infos
 
-    def _drop(self) -> None:
-        """Let the others end the step in which an env has failed."""
-        while True:
-            try:
-                self.group.collect_async(wait_all=True)
-            except NothingPending:
-                return
-            except EnvFault:
-                continue
+    @contextlib.contextmanager
+    def _dropping_the_rest(self) -> Generator[None]:
+        """Where an env fails, let the others end what they do, so that all can be reset."""
+        try:
+            yield
+        except Exception:
+            drop_outstanding(self.group)
+            raise
 
     def close(self) -> None:
         """Close the envs and end their workers; idempotent."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import threading
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -88,6 +89,16 @@ def test_halves_of_a_call_belong_together(tmp_path: Path) -> None:
     env.close()
     with pytest.raises(ClosedEnvironmentError):
         env.reset()
+
+
+def test_a_value_that_cannot_be_sent_leaves_nothing_behind() -> None:
+    """Of the values for several envs, one that can't be pickled."""
+    env = VectorEnv([Plain] * 2, max_concurrency=1)
+    with pytest.raises(TypeError, match="pickle"):
+        env.set_attr("note", [1, threading.Lock()])
+    env.set_attr("note", 2)
+    assert env.get_attr("note") == (2, 2)
+    env.close()
 
 
 def test_bad_arguments_are_refused_as_gymnasium_refuses_them() -> None:

@@ -49,6 +49,54 @@ def test_it_does_what_its_own_does() -> None:
     ours.close()
 
 
+class Choosy(gym.Env[Any, Any]):
+    """Raises when it is told to."""
+
+    observation_space = gym.spaces.Discrete(2)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        if options:
+            raise RuntimeError("no options, please")
+        return 0, {}
+
+    def step(self, action: Any) -> Any:
+        if action:
+            raise RuntimeError("no such action")
+        return 0, 0.0, False, False, {}
+
+
+class Stuck:
+    """Can be copied, and not be sent."""
+
+    def __deepcopy__(self, memo: Any) -> Stuck:
+        return self
+
+    def __reduce__(self) -> Any:
+        raise TypeError("no pickle of this")
+
+
+def test_after_an_env_has_raised_all_are_reset() -> None:
+    """In a reset or a step, or where something can't be sent: nothing of it comes up later."""
+    from rlightning_aio.errors import EnvRaised
+    from rlightning_aio.sb3 import VecEnv
+
+    env = VecEnv([Choosy] * 3, envs_per_process=3)
+    env.set_options([{}, {"any": 1}, {}])
+    with pytest.raises(EnvRaised, match="no options"):
+        env.reset()
+    env.set_options([{}, {"any": Stuck()}, {}])
+    with pytest.raises(TypeError, match="pickle"):
+        env.reset()
+    env.set_options()
+    env.reset()
+    with pytest.raises(EnvRaised, match="no such action"):
+        env.step(np.array([1, 0, 1]))
+    assert env.reset().tolist() == [0, 0, 0]
+    env.step(np.zeros(3, np.int64))
+    env.close()
+
+
 def test_sac_learns_the_very_same_on_it() -> None:
     """Weights and all, for the same seed; through `VecNormalize`."""
     from stable_baselines3 import SAC

@@ -338,10 +338,7 @@ class BatchedData:
         numbers), ``infos["_" + key]`` tells which rows have the key; nested dicts likewise.
         """
         if self._infos is None:
-            whole = len(self._parts) == 1 and self._parts[0].positions is None
-            self._infos = (
-                infos_of_rows(self._parts[0], episodes=True) if whole else vector_infos(self.info())
-            )
+            self._infos = _infos_of(self, episodes=True)
         return self._infos
 
     @overload
@@ -500,11 +497,7 @@ def _infos_of(batch: BatchedData, *, episodes: bool) -> dict[str, Any]:
     parts = batch._parts
     if len(parts) == 1 and parts[0].positions is None:
         return infos_of_rows(parts[0], episodes=episodes)
-    if episodes or not parts:
-        return vector_infos(batch.info())
-    return vector_infos(
-        [part.reported_info_of(row) for part, row in _by_position(parts, len(batch))]
-    )
+    return vector_infos(batch.info() if episodes or not parts else reported_info_list(batch))
 
 
 def parts_of(batch: BatchedData) -> Sequence[ResultColumns]:

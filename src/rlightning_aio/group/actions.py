@@ -180,10 +180,10 @@ def _chosen_out_of_band(
         return None
     if columns is not None and len(layout.slabs) == 1:
         action = columns.get("action")
-        if _column_fits(action, layout.slabs[0], len(slots)):
+        if _fits(action, layout.slabs[0], len(slots)):
             if not any_extras:
                 return None
-            _write_column(action, layout.slabs[0], slots, envs)
+            _write(action, layout.slabs[0], slots)
             readers = np.flatnonzero(envs.reads_extras[slots])
             contents = [(NO_ACTION, _extras(batch, k)) for k in readers.tolist()]
             return OutOfBandSteps(readers, contents) if contents else None
@@ -195,29 +195,16 @@ def _chosen_out_of_band(
         extras = _extras(batch, k) if envs.reads_extras[slot] else {}
         action = actions[k]
         slab = layout.slabs[int(layout.slab[slot])]
-        if slab.action is not None and _fits(action, slab):
+        if _fits(action, slab):
             if not extras:
                 continue
-            _write_one(action, slab, int(layout.row[slot]))
+            _write(action, slab, int(layout.row[slot]))
             action = NO_ACTION
         elif not envs.out_of_band_actions[slot]:
             continue
         kept.append(k)
         contents.append((_plain(action), extras))
     return OutOfBandSteps(np.array(kept, np.intp), contents) if kept else None
-
-
-def _column_fits(action: Any, slab: Slab, count: int) -> bool:
-    """Whether the rows can hold the actions of a whole batch."""
-    try:
-        return slab.action is not None and all(
-            (array := _as_array(_at(action, leaf))).shape == (count, *leaf.shape)
-            and _castable(array, leaf)
-            and _unfit(array, leaf, slab) is None
-            for leaf, _ in slab.action_columns
-        )
-    except (BadAction, ValueError):
-        return False
 
 
 def _extras(batch: BatchedData, position: int) -> dict[str, Any]:
@@ -227,10 +214,11 @@ def _extras(batch: BatchedData, position: int) -> dict[str, Any]:
     return batch.values()[position].extras
 
 
-def _fits(action: Any, slab: Slab) -> bool:
+def _fits(action: Any, slab: Slab, *count: int) -> bool:
+    """Whether a row can hold an action; or `count` rows those of a whole batch."""
     try:
-        return all(
-            (array := _as_array(_at(action, leaf))).shape == leaf.shape
+        return slab.action is not None and all(
+            (array := _as_array(_at(action, leaf))).shape == (*count, *leaf.shape)
             and _castable(array, leaf)
             and _unfit(array, leaf, slab) is None
             for leaf, _ in slab.action_columns
@@ -239,9 +227,10 @@ def _fits(action: Any, slab: Slab) -> bool:
         return False
 
 
-def _write_one(action: Any, slab: Slab, row: int) -> None:
+def _write(action: Any, slab: Slab, rows: Any) -> None:
+    """Write what fits: one action into its row, or a whole batch."""
     for leaf, target in slab.action_columns:
-        target[row] = _as_array(_at(action, leaf))
+        target[rows] = _as_array(_at(action, leaf))
 
 
 def _plain(action: Any) -> Any:

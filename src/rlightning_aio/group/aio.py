@@ -515,7 +515,7 @@ class EnvHandle:
             GroupClosed: the group was not initialised, or is closed.
         """
         slot = self._core.envs.find_one(self._env_id)
-        procedure = self._core.call(time.monotonic(), slot, name, args, kwargs)
+        procedure = self._core.call(time.monotonic(), slot, (name, args, kwargs))
         return await self._driver.run(procedure)
 
     async def get_attr(self, name: str, target: str = "unwrapped") -> Any:

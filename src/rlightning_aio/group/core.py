@@ -61,6 +61,8 @@ if TYPE_CHECKING:
 __all__ = ["Core", "Flags"]
 
 Flags: TypeAlias = "list[bool]"
+Call: TypeAlias = "tuple[str, tuple[Any, ...], dict[str, Any]]"
+"""Name of a method and its arguments."""
 
 
 class Core:
@@ -549,56 +551,31 @@ class Core:
 
     # -- methods of envs --------------------------------------------------------------
 
-    def call(
-        self, now: float, slot: int, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]
-    ) -> Procedure[Any]:
+    def call(self, now: float, slot: int, call: Call) -> Procedure[Any]:
         """Call a method of one env; its value."""
-        slots = self.requests.alone(slot)
-        return (yield from self._call(now, slots, name, args, kwargs))[0]
+        return (yield from self._call(now, self.requests.alone(slot), call))[0]
 
     def call_all(self, now: float, name: str) -> Procedure[None]:
         """Call a method of every env, all at once."""
-        yield from self._call(now, self.envs.all, name, (), {})
+        yield from self._call(now, self.envs.all, (name, (), {}))
 
-    def _call(
-        self,
-        now: float,
-        slots: NDArray[np.intp],
-        name: str,
-        args: tuple[Any, ...],
-        kwargs: dict[str, Any],
-    ) -> Procedure[list[Any]]:
-        ticket = self._send_calls(now, slots, name, args, kwargs)
+    def _call(self, now: float, slots: NDArray[np.intp], call: Call) -> Procedure[list[Any]]:
+        ticket = self._send_calls(now, slots, call)
         yield from self._await(ticket, now)
         return _values([ticket])
 
-    def call_async(
-        self,
-        now: float,
-        env_ids: Sequence[str] | None,
-        name: str,
-        args: tuple[Any, ...],
-        kwargs: dict[str, Any],
-    ) -> None:
+    def call_async(self, now: float, env_ids: Sequence[str] | None, call: Call) -> None:
         """Send calls of a method that `collect_calls` will answer."""
         slots = self.envs.all if env_ids is None else self._dispatch.distinct(env_ids)
-        self._calls.append(self._send_calls(now, slots, name, args, kwargs))
+        self._calls.append(self._send_calls(now, slots, call))
 
-    def _send_calls(
-        self,
-        now: float,
-        slots: NDArray[np.intp],
-        name: str,
-        args: tuple[Any, ...],
-        kwargs: dict[str, Any],
-    ) -> Ticket:
+    def _send_calls(self, now: float, slots: NDArray[np.intp], call: Call) -> Ticket:
+        name = call[0]
         self._intake.drain()
         self._dispatch.check_local(slots, f"call {name} of")
         self._dispatch.check_sendable(slots, f"call {name} of")
-        arguments = (name, args, kwargs)
         packed = [
-            self._dispatch.packed(k, arguments, f"the arguments of {name}()")
-            for k in slots.tolist()
+            self._dispatch.packed(k, call, f"the arguments of {name}()") for k in slots.tolist()
         ]
         ticket = self.requests.open_ticket(slots, calls=True)
         entries = self.requests.submit(slots, Operation.CALL, ticket.owner, now)

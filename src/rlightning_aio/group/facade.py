@@ -262,11 +262,10 @@ class Facade:
             RLightningError: the group is another thread's now, or another loop's.
         """
         self._driver.check_caller()
-        self._core.call_async(time.monotonic(), env_ids, name, args, kwargs)
+        self._core.call_async(time.monotonic(), env_ids, (name, args, kwargs))
 
     def _collect_calls(self, deadline: float | None) -> Procedure[list[Any]]:
-        if deadline is not None and not deadline > 0:
-            raise ValueError(f"deadline must be a positive number of seconds, not {deadline!r}")
+        _check_seconds("deadline", deadline)
         return self._core.collect_calls(time.monotonic(), deadline)
 
     def _collect(
@@ -279,9 +278,8 @@ class Facade:
         entries: Sequence[str] | None,
         ordered: bool,
     ) -> Procedure[tuple[BatchedData, list[bool]]]:
-        for name, seconds in (("timeout", timeout), ("deadline", deadline)):
-            if seconds is not None and not seconds > 0:
-                raise ValueError(f"{name} must be a positive number of seconds, not {seconds!r}")
+        _check_seconds("timeout", timeout)
+        _check_seconds("deadline", deadline)
         if min_results < 1:
             raise ValueError(f"min_results must be at least 1, not {min_results!r}")
         if max_results is not None and max_results < 1:
@@ -408,3 +406,8 @@ def _warn_of(errors: Sequence[tuple[str, Any]]) -> None:
         warnings.warn(
             f"close() of env {env_id!r} raised {error.type_name}: {error.text}", stacklevel=4
         )
+
+
+def _check_seconds(name: str, seconds: float | None) -> None:
+    if seconds is not None and not seconds > 0:
+        raise ValueError(f"{name} must be a positive number of seconds, not {seconds!r}")

@@ -425,7 +425,7 @@ class EnvHandle:
             GroupClosed: the group was not initialised, or is closed.
         """
         slot = self._core.envs.find_one(self._env_id)
-        procedure = self._core.call(time.monotonic(), slot, name, args, kwargs)
+        procedure = self._core.call(time.monotonic(), slot, (name, args, kwargs))
         return self._driver.run(procedure)
 
     def get_attr(self, name: str, target: str = "unwrapped") -> Any:

@@ -16,12 +16,12 @@ from gymnasium.vector import AutoresetMode, utils
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.batch.data import reported_infos
 from rlightning_aio.envs.same_step import SameStepOf
-from rlightning_aio.errors import EnvFault, NothingPending
 from rlightning_aio.group.auto_reset import as_int
 from rlightning_aio.protocol.columns import leaves
 from rlightning_aio.sync import EnvGroup, build_env_group
 from rlightning_aio.types import PolicyResponse
 from rlightning_aio.vector.batching import batched, merged, spread
+from rlightning_aio.vector.leftovers import drop_outstanding
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -240,7 +240,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
             TimeoutError: the envs reset all the same; what comes late is dropped.
             NoAsyncCallError: nothing was sent.
         """
-        batch = self._wait("reset", timeout)
+        batch = self._finish("reset", timeout, self._collect)
         mask = self._arguments
         if mask is None or mask.all():
             return self._observed(batch.observation), reported_infos(batch)
@@ -283,7 +283,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
             TimeoutError: the envs step all the same; what comes late is dropped.
             NoAsyncCallError: nothing was sent.
         """
-        return self._stepped(self._wait("step", timeout))
+        return self._stepped(self._finish("step", timeout, self._collect))
 
     def _batch(self, actions: Any) -> BatchedData:
         if self._fits_rows and not isinstance(actions, dict | tuple):
@@ -315,7 +315,8 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
                 self._pending,
             )
         if self._late:
-            self._drop_late_ones()
+            drop_outstanding(self.group)
+            self._late = False
 
     def _check_running(self) -> None:
         if self.closed:
@@ -329,32 +330,23 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
             )
         self._pending = None
 
-    def _wait(self, what: str, timeout: float | None) -> BatchedData:
+    def _finish(self, what: str, timeout: float | None, collect: Callable[..., Any]) -> Any:
+        """What `collect` returns of the calls that were sent."""
         self._check_sent(what)
         self._late = True  # Unless all goes well.
         try:
-            batch, _ = self.group.collect_async(
-                wait_all=True, ordered=True, deadline=_seconds(timeout)
-            )
+            found = collect(deadline=_seconds(timeout))
         except TimeoutError as error:
             raise multiprocessing.TimeoutError(
                 f"the envs have not answered {what}_async within {timeout} s; what comes late is "
                 "dropped"
             ) from error
         self._late = False
-        return batch
+        return found
 
-    def _drop_late_ones(self) -> None:
-        """Let the envs end what a call that failed or timed out has left."""
-        for collect in (self.group.collect_async, self.group.collect_calls):
-            while True:
-                try:
-                    collect()
-                except NothingPending:
-                    break
-                except EnvFault:
-                    continue
-        self._late = False
+    def _collect(self, deadline: float | None) -> BatchedData:
+        batch, _ = self.group.collect_async(wait_all=True, ordered=True, deadline=deadline)
+        return batch
 
     def _observed(self, observations: Any) -> Any:
         """Observations as Gymnasium batches them; the last ones are kept, for masks.
@@ -386,14 +378,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
             TimeoutError: the methods run all the same; what comes late is dropped.
             NoAsyncCallError: nothing was sent.
         """
-        self._check_sent("call")
-        self._late = True
-        try:
-            values = self.group.collect_calls(deadline=_seconds(timeout))
-        except TimeoutError as error:
-            raise multiprocessing.TimeoutError(f"the calls took longer than {timeout} s") from error
-        self._late = False
-        return tuple(values)
+        return tuple(self._finish("call", timeout, self.group.collect_calls))
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """Attribute `name` of every env, found through its wrappers."""
@@ -410,6 +395,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
                 "one that is no list or tuple"
             )
         self._begin("set_attr")
+        self._late = True  # A value that can't be sent leaves the calls before it.
         for env_id, value in zip(self.group.env_ids, each, strict=True):
             self.group.call_async("call_wrapped", "set_wrapper_attr", name, value, env_ids=[env_id])
         self._pending = "call"

@@ -1,0 +1,24 @@
+"""What a call that failed or timed out has left in the workers."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rlightning_aio.errors import EnvFault, NothingPending
+
+if TYPE_CHECKING:
+    from rlightning_aio.sync import EnvGroup
+
+__all__ = ["drop_outstanding"]
+
+
+def drop_outstanding(group: EnvGroup) -> None:
+    """Wait until no env has anything to do, and forget what comes of it, faults included."""
+    for collect in (group.collect_async, group.collect_calls):
+        while True:
+            try:
+                collect()
+            except NothingPending:
+                break
+            except EnvFault:
+                continue
