@@ -255,12 +255,17 @@ def started(place: str, channels: list[str]) -> Iterator[list[psutil.Process]]:
             raise RuntimeError(f"the trainer of {place} did not come to move its arms")
         if place == "worker":
             targets = [w for fork_server in targets[0].children() for w in fork_server.children()]
-        # What it goes on to say must not fill a pipe.
-        drained = threading.Thread(target=trainer.stdout.read, daemon=True)
-        drained.start()
+        # What they go on to say must not fill a pipe.
+        drained = [threading.Thread(target=p.stdout.read, daemon=True) for p in processes]
+        for thread in drained:
+            thread.start()
         yield targets
-        trainer.kill()
-        drained.join()
+        for process in processes:
+            process.kill()
+        # Their workers hold the pipes, too. A worker that outlived its port would stop whatever
+        # arm has the path then.
+        for thread in drained:
+            thread.join()
 
 
 def table(found: list[Stopped]) -> str:
