@@ -12,7 +12,7 @@ from cli.command import CARTPOLE, invoke, invoke_json, run, start, write_config
 from patience import HANG
 
 from rlightning_aio import EnvConfig, load_config
-from rlightning_aio.cli import measuring, tune
+from rlightning_aio.cli import bench, measuring, tune
 from rlightning_aio.config import moved
 
 if TYPE_CHECKING:
@@ -46,6 +46,16 @@ def test_bench_compares_places_and_rules(tmp_path: Path) -> None:
     assert [c["min_results"] for c in contenders] == rules * 4
     assert all(len(c["rounds"]) == 2 and min(c["rounds"]) > 0 for c in contenders)
     assert all(c["latency_us"]["p50"] <= c["latency_us"]["p99"] for c in contenders)
+
+
+def test_a_measurement_has_a_step_however_slow_the_machine_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the time is over with the first batch, and that was of resets, it goes on."""
+    monkeypatch.setattr(bench, "Limits", lambda steps, _: measuring.Limits(steps, 0.0))
+    config = write_config(tmp_path, {**STUB, "num_workers": 1, "max_episode_steps": 1})
+    document = invoke_json("bench", config, "--rounds", 3)
+    assert all(min(c["rounds"]) > 0 for c in document["contenders"])
 
 
 def test_bench_prints_a_table(tmp_path: Path) -> None:

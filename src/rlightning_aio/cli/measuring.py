@@ -151,10 +151,14 @@ class Rule:
 
 @dataclass(frozen=True)
 class Limits:
-    """A measurement ends at the first of these."""
+    """A measurement ends at the first of these, but not before the first step."""
 
     steps: int
     seconds: float
+
+    def not_reached(self, steps: int, seconds: float) -> bool:
+        """Whether to go on, after so many steps in so many seconds."""
+        return steps == 0 or (steps < self.steps and seconds < self.seconds)
 
 
 @dataclass(frozen=True)
@@ -244,7 +248,7 @@ class Stand:
         latencies: list[float] = []
         first, began = self.statistics.steps, time.monotonic()
         now = began
-        while now - began < limits.seconds and self.statistics.steps - first < limits.steps:
+        while limits.not_reached(self.statistics.steps - first, now - began):
             responses = _joined(self._respond(self._everyone))
             sent_at = time.monotonic()
             batch, _ = await self._group.step(responses)
@@ -260,7 +264,7 @@ class Stand:
         now = began
         sent_at[:] = now
         respond_to_all(group, self._respond, self._everyone)
-        while now - began < limits.seconds and self.statistics.steps - first < limits.steps:
+        while limits.not_reached(self.statistics.steps - first, now - began):
             batch, _ = await group.collect_async(min_results=min_results)
             now = time.monotonic()
             self.statistics.add(batch)
