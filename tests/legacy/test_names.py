@@ -1,0 +1,219 @@
+"""RLightning's names where RLightning is not installed."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from patience import HANG
+
+from rlightning_aio.legacy import install
+from rlightning_aio.legacy.names import is_rlightning_installed
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+pytestmark = pytest.mark.skipif(is_rlightning_installed(), reason="RLightning itself is here")
+
+
+@pytest.fixture(autouse=True)
+def _installed() -> None:
+    install()
+
+
+def test_importing_the_package_brings_none_of_it() -> None:
+    """Neither legacy nor its names are there before somebody asks for them."""
+    program = "import rlightning_aio, sys; print([m for m in sys.modules if 'legacy' in m])"
+    found = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=HANG, check=True
+    )
+    assert found.stdout.strip() == "[]"
+
+
+def test_every_name_of_the_table_is_there() -> None:
+    """Each path imports, and has all of its names, once and for all."""
+    import importlib
+
+    from rlightning_aio.legacy.finder import ALIASED
+
+    for path, homes in ALIASED.items():
+        module = importlib.import_module(path)
+        for names in homes.values():
+            for name in names:
+                assert getattr(module, name) is getattr(module, name)
+    import rlightning
+
+    assert rlightning.__version__
+    assert rlightning.env.EnvGroup is rlightning.env.env_group.EnvGroup
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "import rlightning.engine",
+        "from rlightning import policy",
+        "from rlightning.buffer import DataBuffer",
+        "from rlightning.utils.builders import build_engine",
+        "from rlightning.utils.builders import build_policy_group",
+        "from rlightning.utils.builders import build_data_buffer",
+        "from rlightning.env.libero_env import LiberoEnv",
+    ],
+)
+def test_what_is_rlightnings_alone_says_so(statement: str) -> None:
+    """An ImportError with the reason and the remedy, not one about a file."""
+    with pytest.raises(ImportError, match="RLightning's own and not installed"):
+        exec(statement)
+
+
+def test_looking_for_a_name_is_no_error() -> None:
+    """As whoever pickles a function does, in every module."""
+    import rlightning.types
+
+    assert not hasattr(rlightning.types, "no_such_thing")
+
+
+def test_results_are_built_by_position_and_converted() -> None:
+    """An `EnvRet` has RLightning's order of fields, methods and hash."""
+    import numpy as np
+    from rlightning.types import EnvRet
+
+    ret = EnvRet("env", np.zeros(2), 1.5, True, _extra={"value": 3})
+    assert (ret.last_reward, ret.last_terminated, ret.last_truncated) == (1.5, True, False)
+    assert set(EnvRet.fields()) | {"value"} == ret.to_dict().keys()
+    assert EnvRet.get_defaults()["last_reward"] == 0.0
+    assert ret.numpy().observation is not None
+    assert hash(ret) == hash("env")
+    assert ret.compute_sent_latency(ret.ts_env_sent_ns + 1_000_000_000) == 1.0
+    ret._extra["info"] = 1
+    with pytest.raises(KeyError, match="info"):
+        ret.to_dict()
+
+
+def test_responses_hold_anything_and_pickle() -> None:
+    """An action is not obligatory; what is attached is data."""
+    import pickle
+
+    from rlightning.types import MultiAgentPolicyResponse, PolicyResponse
+
+    response = PolicyResponse(env_id="env", actions=[1, 2], log_prob=0.5)
+    assert pickle.loads(pickle.dumps(response)) == response
+    assert response.to_dict() == {"actions": [1, 2], "log_prob": 0.5}
+    assert response.mark_policy_sent().compute_sent_latency() >= 0.0
+    assert response.cpu().to_dict().keys() == {"actions", "log_prob"}
+    agents = MultiAgentPolicyResponse.make_example({"a": _space()}, env_id="env")
+    assert agents.action["a"] in _space()
+
+
+def _space() -> Any:
+    import gymnasium as gym
+
+    return gym.spaces.Discrete(3)
+
+
+def test_batches_are_tuples_with_ids() -> None:
+    """`ids` and `data`, by these names; an id that is missing is a ValueError."""
+    from rlightning.types import BatchedData
+
+    batch = BatchedData(ids=["a", "b", "a"], data=[1, 2, 3])
+    assert (batch.ids(), batch.values()) == (("a", "b", "a"), (1, 2, 3))
+    assert (batch["a"], len(batch), batch.is_future) == (1, 3, False)
+    assert list(batch) == list(batch.items()) == [("a", 1), ("b", 2), ("a", 3)]
+    assert BatchedData.from_dict({"c": 4}).ids() == ("c",)
+    with pytest.raises(ValueError, match="not in tuple"):
+        batch["z"]
+    with pytest.raises(ValueError, match="1 ids for 0"):
+        BatchedData(["a"], [])
+
+
+def test_configs_are_mutable_open_and_nested(tmp_path: Path) -> None:
+    """Extra fields become sections, and are read as attributes, items, or with `get`."""
+    from omegaconf import OmegaConf
+    from rlightning.utils.config import EnvConfig, MainConfig
+
+    fields = {"name": "one", "backend": "mujoco", "task": "Hopper-v5", "video": {"fps": {"max": 3}}}
+    config = EnvConfig.from_omegaconf(OmegaConf.create(fields))
+    config.num_workers = 3
+    assert config.video.fps.max == 3
+    assert (config["num_workers"], config.get("seed", 7)) == (3, 7)
+    assert config.to_dict()["video"] == {"fps": {"max": 3}}
+    file = tmp_path / "entry.yaml"
+    file.write_text(config.to_yaml())
+    assert EnvConfig.load_yaml(file) == config
+    with pytest.raises(ValueError, match="field 'task'"):
+        EnvConfig.from_dict({"name": "one", "backend": "mujoco"})
+    with pytest.raises(ValueError, match="Vectorized"):
+        EnvConfig(name="one", backend="mujoco", task="Hopper-v5", num_envs=2)
+    with pytest.warns(UserWarning, match="'mine'"):
+        EnvConfig(name="one", backend="mine", task="Hopper-v5", num_cpus=0.5)
+    whole = MainConfig.from_dict(
+        {
+            "env": fields,
+            "buffer": {"type": "ReplayBuffer", "capacity": 8},
+            "policy": {"type": "Mine"},
+            "train": {"max_epochs": 1},
+        }
+    )
+    assert isinstance(whole.env, list)
+    assert (whole.env[0].name, whole.buffer.sampler.type) == ("one", "uniform")
+
+
+def test_a_registry_takes_a_name_once() -> None:
+    """By its class's name if none is given; what is built in may be replaced."""
+    from rlightning.utils.registry import ENVS, Registry
+
+    registry = Registry("toys")
+
+    @registry.register()
+    class Toy: ...
+
+    assert registry.get("Toy") is registry.module_dict["Toy"] is Toy
+    with pytest.raises(KeyError, match="already registered"):
+        registry.register("Toy")(Toy)
+    with pytest.raises(KeyError, match="no_toy is not in the toys registry"):
+        registry.get("no_toy")
+    assert {"mujoco", "ale", "maniskill", "piper"} <= ENVS.module_dict.keys()
+
+
+def test_counts_begin_below_the_reset() -> None:
+    """-1 before the first reset, 0 after it; past the limit there is no step."""
+    from rlightning.env.env_group import EnvStepCounter
+
+    counter = EnvStepCounter(["a", "b"], [1, 5])
+    assert counter["a"] == counter.get_steps("a") == -1
+    counter.step_all()
+    counter.step("a")
+    assert counter.get_truncations(["b", "a"]) == [False, True]
+    with pytest.raises(ValueError, match="a"):
+        counter.step("a")
+    counter.reset_all()
+    assert counter["b"] == -1
+    with pytest.raises(ValueError, match="one limit"):
+        EnvStepCounter(["a"], [1, 2])
+
+
+def test_flags_are_read_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each time anew."""
+    from rlightning.utils.utils import InternalFlag
+
+    monkeypatch.setenv("RLIGHTNING_REMOTE_ENV", "1")
+    assert InternalFlag.REMOTE_ENV
+    assert not InternalFlag.DEBUG
+    assert InternalFlag.get_env_vars()["RLIGHTNING_REMOTE_ENV"] == "1"
+    with pytest.raises(AttributeError, match="REMOTE_CAFE"):
+        InternalFlag.REMOTE_CAFE  # noqa: B018
+
+
+def test_timers_sum_up_what_methods_take() -> None:
+    """In the object's own `timing_raw`."""
+    from rlightning.utils.profiler import profiler
+
+    class Timed:
+        @profiler.timer_wrap(level="debug")
+        def method(self) -> str:
+            return "done"
+
+    timed: Any = Timed()
+    assert timed.method() == timed.method() == "done"
+    assert timed.timing_raw["method"]["count"] == 2

@@ -1,0 +1,124 @@
+"""RLightning's two ends of a network."""
+
+from __future__ import annotations
+
+import threading
+import warnings
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rlightning_aio.legacy.names import is_rlightning_installed, names_in_use
+
+if is_rlightning_installed():
+    pytest.skip("RLightning itself is here", allow_module_level=True)
+names_in_use()
+
+from rlightning.env import BaseEnv  # noqa: E402
+from rlightning.env.env_server import RemoteEnvServer  # noqa: E402
+from rlightning.env.remote_env import RemoteEnvClient  # noqa: E402
+from rlightning.types import BatchedData, EnvRet, PolicyResponse  # noqa: E402
+from rlightning.utils.builders import build_env_group  # noqa: E402
+from rlightning.utils.config import EnvConfig  # noqa: E402
+
+STEPS = 3
+
+
+class Robot(BaseEnv):
+    """Knows no spaces, and is finished after some steps."""
+
+    resets = steps = 0
+
+    def reset(self) -> EnvRet:
+        self.resets += 1
+        self.steps = 0
+        return EnvRet(self.env_id, {"joints": np.zeros(7), "rgb": np.zeros((4, 4, 3), np.uint8)})
+
+    def step(self, policy_resp: Any) -> EnvRet:
+        self.steps += 1
+        joints = np.asarray(self._preprocess_fn(policy_resp))
+        observation = {"joints": joints, "rgb": np.full((4, 4, 3), self.steps, np.uint8)}
+        return EnvRet(policy_resp.env_id, observation, 1.0, info={"gripper": "open"})
+
+    def get_observation_space(self) -> Any:
+        return None
+
+    def get_action_space(self) -> Any:
+        return None
+
+    def is_finish(self) -> bool:
+        return self.steps >= STEPS
+
+
+def serving(address: tuple[str, int], times: int) -> tuple[threading.Thread, Robot]:
+    """A robot that dials in and serves so many times, in a thread of its own."""
+    config = EnvConfig(name="arm", backend="piper", task="any")
+    robot = Robot(config, preprocess_fn=lambda response: response.action * 2)
+
+    def serve() -> None:
+        client = RemoteEnvClient(robot, *address)
+        for _ in range(times):
+            client.connect()
+            client.run()
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    return thread, robot
+
+
+def answers(batch: BatchedData) -> BatchedData:
+    rets = batch.values()
+    responses = [PolicyResponse(env_id=ret.env_id, action=np.full(7, 0.25)) for ret in rets]
+    return BatchedData(batch.ids(), responses)
+
+
+def test_a_robot_serves_a_group_and_comes_back() -> None:
+    """Its results have its own id, and batches the server's; it may leave and dial in again."""
+    group = build_env_group(
+        EnvConfig(name="robots", backend="env_server", task="real", zmq_port="0")
+    )
+    (server_id,) = group.env_ids
+    assert (len(group), group.size(), group.init()) == (1, 0, [])
+    thread, robot = serving(group.env_servers[0].get_address_port(), times=2)
+    try:
+        batch, flags = group.reset()
+        assert (batch.ids(), flags) == ((server_id,), [False])
+        results = []
+        while len(results) < 2 * STEPS:
+            with pytest.raises(NotImplementedError, match="step_async"):
+                group.step(answers(batch))
+            group.step_async(answers(batch))
+            batch, _ = group.collect_async()
+            results += [ret for ret in batch.values() if ret.last_reward == 1.0]
+    finally:
+        thread.join()
+        group.close()
+    (env_id,) = {ret.env_id for ret in results}
+    assert env_id.startswith(f"{server_id}/")
+    assert results[0].observation["joints"].tolist() == [0.5] * 7
+    assert (results[-1].observation["rgb"].max(), results[-1].info) == (STEPS, {"gripper": "open"})
+    assert robot.steps == STEPS
+
+
+def test_a_server_by_itself_waits_for_clients() -> None:
+    """`collect_async` with a time may come back with nothing."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        config = EnvConfig(name="robots", backend="env_server", task="real")
+    server = RemoteEnvServer(config)
+    with pytest.raises(RuntimeError, match="init"):
+        server.get_address_port()
+    server.init()
+    thread, _ = serving(server.get_address_port(), times=1)
+    rets = server.reset()
+    for _ in range(STEPS):
+        batch = BatchedData([server.env_id] * len(rets), rets)
+        server.step_async(answers(batch).values())
+        rets = server.collect_async()
+        assert [ret.last_reward for ret in rets] == [1.0]
+    thread.join()
+    assert server.collect_async(timeout=0.001) == ()
+    with pytest.raises(NotImplementedError, match="step_async"):
+        server.step(None)
+    server.close()
