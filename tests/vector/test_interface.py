@@ -84,7 +84,7 @@ def test_halves_of_a_call_belong_together(tmp_path: Path) -> None:
         env.step(np.array([0, 2]))
     assert env.step(np.zeros(2, np.int64))[4]["count"].tolist() == [4, 3]
     env.step_async(np.zeros(2, np.int64))
-    with pytest.warns(UserWarning, match="before step_wait"):
+    with pytest.warns(UserWarning, match="pending call to `step`"):
         env.close()
     env.close()
     with pytest.raises(ClosedEnvironmentError):

@@ -426,7 +426,11 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         """
         del timeout, terminate
         if self._pending is not None:
-            warnings.warn(f"closed before {self._pending}_wait was called", stacklevel=3)
+            warnings.warn(
+                f"Calling `close` while waiting for a pending call to `{self._pending}` to "
+                "complete.",
+                stacklevel=3,
+            )
         self.group.close()
 
 
