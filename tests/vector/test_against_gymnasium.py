@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
@@ -78,24 +77,5 @@ def test_whatever_is_done_to_both_they_do_the_same(
             due = due & ~doing[2] if doing[2] is not None else np.zeros(SIZE, np.bool_)
         elif doing[0] == "step" and isinstance(expected, tuple):
             due = np.zeros(SIZE, np.bool_)
-    ours.close()
-    theirs.close()
-
-
-def task(name: str, limit: int) -> Any:
-    return lambda: gym.make(name, max_episode_steps=limit)
-
-
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-def test_trajectories_in_workers_are_gymnasiums(mode: str) -> None:
-    """A thousand steps over many ends, to the bit: observations, rewards, ends and infos."""
-    makers = [task("HalfCheetah-v5", 90 + 7 * k) for k in range(2)]
-    ours = VectorEnv(makers, autoreset_mode=mode)
-    theirs = SyncVectorEnv(makers, autoreset_mode=mode)
-    assert_alike(ours.reset(seed=11), theirs.reset(seed=11))
-    theirs.action_space.seed(0)
-    for turn in range(1000):
-        actions = theirs.action_space.sample()
-        assert_alike(ours.step(actions), theirs.step(actions), str(turn))
     ours.close()
     theirs.close()

@@ -71,6 +71,7 @@ def assert_alike(found: Any, expected: Any, where: str = "") -> None:
         if expected.dtype == object:
             assert_alike(list(found), list(expected), where)
         else:
-            np.testing.assert_array_equal(found, expected, where)
+            same = found.tobytes() == expected.tobytes()
+            assert same, f"{where}: {found}, not {expected}"
     else:
         assert found == expected, where
