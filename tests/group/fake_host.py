@@ -146,9 +146,9 @@ class FakeHost:
         )
 
     def attach(self, order: AttachOrder) -> None:
-        (layout, rows, offset), *_ = order.slabs
-        memory = map_shared(self.shared.arena.descriptor, offset, layout.size(rows))
-        self.slab = Slab(layout, memory, rows)
+        (offset, rows), *_ = order.slabs
+        memory = map_shared(self.shared.arena.descriptor, offset, LAYOUT.size(rows))
+        self.slab = Slab(LAYOUT, memory, rows)
         self.row_of = [row for _, row in order.rows]
         self.tell(Attached(self.host_id))
 

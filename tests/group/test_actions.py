@@ -111,6 +111,21 @@ def test_what_a_cast_keeps_is_written(form: str) -> None:
     assert (rows.written == np.float32(0.1)).all()
 
 
+@pytest.mark.parametrize("free", [False, True])
+def test_a_list_holds_one_action_for_each_env(free: bool) -> None:
+    """Also where a Tuple has as many parts as there are envs: nothing is read crosswise."""
+    threes = spaces.Tuple([spaces.Discrete(9), spaces.Discrete(9), spaces.Discrete(9)])
+    rows = Rows(spaces.Dict(arm=threes, hand=SMALL), free=free)
+    drawn = [{"arm": (k, k + 1, k + 2), "hand": np.array([k, -k])} for k in (0, 3, 6)]
+    assert rows.write(drawn) is None
+    arm, hand = (rows.slab.action[part] for part in ("arm", "hand"))
+    assert [part[[2, 0, 1]].tolist() for part in arm] == [[0, 3, 6], [1, 4, 7], [2, 5, 8]]
+    assert hand[[2, 0, 1]].tolist() == [[0, 0], [3, -3], [6, -6]]
+    rows = Rows(threes, free=free)
+    rows.write([action["arm"] for action in drawn])
+    assert rows.slab.action[1][[2, 0, 1]].tolist() == [1, 4, 7]
+
+
 @given(
     actions=arrays.arrays(
         st.sampled_from([np.float32, np.float64]),

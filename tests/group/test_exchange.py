@@ -16,11 +16,13 @@ from rlightning_aio import (
     BadAction,
     BatchedData,
     ConfigError,
+    EnvMeta,
     EnvRaised,
     MultiAgentEnvRet,
     PolicyResponse,
     build_env_group,
 )
+from rlightning_aio.group.slab_layout import check_actions
 
 # Values are made and read on this side of any loop.
 pytestmark = pytest.mark.one_driver_for_each_place
@@ -194,7 +196,9 @@ async def test_extras_that_nothing_can_read_are_not_sent(start: Any) -> None:
 
 
 async def test_actions_of_every_space_that_travels_in_rows(start: Any) -> None:
-    """Box, Discrete, MultiBinary and MultiDiscrete in Dict and Tuple; the env checks each."""
+    """Box, Discrete, MultiBinary and MultiDiscrete in Dict and Tuple, as columns and as lists;
+    the env checks each.
+    """
     from gymnasium.vector.utils import batch_space
 
     group = await start(gym_entry("Tree-v0"))
@@ -202,6 +206,8 @@ async def test_actions_of_every_space_that_travels_in_rows(start: Any) -> None:
     drawn = batch_space(sample_envs.MOVES, 2)
     for _ in range(3):
         batch, _ = await group.step(batch.respond(action=drawn.sample()))
+        one_by_one = [sample_envs.MOVES.sample() for _ in range(2)]
+        batch, _ = await group.step(batch.respond(action=one_by_one))
     ids = batch.ids()
     single = [PolicyResponse(id_, sample_envs.MOVES.sample()) for id_ in ids]
     batch, _ = await group.step(BatchedData(ids, single))
@@ -348,6 +354,36 @@ async def test_envs_of_different_observations_work_as_one_group(start: Any) -> N
     assert sorted(batch.by_name()) == ["e", "pole"]
     batch, _ = await group.step(batch.respond(action=np.zeros(3, int)))
     assert len(batch.info()) == 3
+
+
+def test_spaces_of_the_users_own_are_alike_by_what_they_say_of_themselves() -> None:
+    """An object's address says nothing."""
+
+    class Words(spaces.Space[str]):
+        pass
+
+    class Sized(Words):
+        def __init__(self, size: int) -> None:
+            super().__init__()
+            self.size = size
+
+        def __repr__(self) -> str:
+            return f"Sized({self.size})"
+
+    def check(*actions: spaces.Space[Any]) -> None:
+        check_actions(
+            [
+                EnvMeta(env_id=f"e-{k}", observation_space=None, action_space=space)
+                for k, space in enumerate(actions)
+            ]
+        )
+
+    check(Words(), Words())
+    check(Sized(2), Sized(2))
+    with pytest.raises(ValueError, match=r"'e-0' and 'e-1'.*Sized\(2\).*Sized\(3\)"):
+        check(Sized(2), Sized(3))
+    with pytest.raises(ValueError, match="Words"):
+        check(Words(), Sized(2))
 
 
 async def test_actions_of_different_shapes_are_refused_unless_meant(place: Any, start: Any) -> None:

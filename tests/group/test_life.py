@@ -234,6 +234,19 @@ class Thought:
 def weigh(response):
     return int(response.action) * getattr(response, "thought", Thought(1)).weight
 
+class Totals(spaces.Space):
+    def contains(self, x):
+        return isinstance(x, int)
+
+class Spoken(Counter):
+    def get_observation_space(self): return spaces.Dict(total=Totals())
+    def reset(self, **given):
+        ret = super().reset(**given)
+        return EnvRet(env_id=self.env_id, observation={"total": ret.observation})
+    def step(self, policy_resp):
+        ret = super().step(policy_resp)
+        return EnvRet(env_id=self.env_id, observation={"total": ret.observation})
+
 if __name__ == "__main__":
     for placement in ("process", "inline"):
         entry = {"name": "c", "backend": "counter", "task": "x", "num_workers": 2,
@@ -244,19 +257,24 @@ if __name__ == "__main__":
             response = PolicyResponse("c-1", 3, thought=Thought(10))
             batch, _ = group.step(BatchedData(["c-1"], [response]))
             print(placement, batch.observation.tolist(), group["c-0"].step(1).observation)
+    ENVS.register("spoken")(Spoken)
+    with sync.build_env_group({"name": "s", "backend": "spoken", "task": "x"}) as group:
+        batch, _ = group.reset(seed=3)
+        batch, _ = group.step(batch.respond(action=np.array([4])))
+        print([int(total) for total in batch.observation["total"]])
 """
 )
 
 
 def test_a_script_may_define_its_own_envs(tmp_path: Path) -> None:
-    """With the classes and functions it uses, in `__main__`, for both placements."""
+    """With the classes and functions it uses, spaces too, in `__main__`, for both placements."""
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
     done = subprocess.run(
         [sys.executable, str(script)], capture_output=True, text=True, timeout=60, check=False
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines() == ["process [38] 7", "inline [38] 7"]
+    assert done.stdout.splitlines() == ["process [38] 7", "inline [38] 7", "[7]"]
     assert done.stderr == ""
 
 

@@ -36,9 +36,9 @@ from rlightning_aio.hosts.messages import (
     Result,
     Value,
 )
+from rlightning_aio.hosts.runner import placed
 from rlightning_aio.protocol.entries import Operation, op_of, slot_of
 from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
-from rlightning_aio.protocol.slab import Slab
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -91,13 +91,9 @@ class ThreadHost:
 
     def attach(self, order: AttachOrder) -> None:
         """See `base.Host.attach`. The slabs lie in the arena, which we share with everybody."""
-        slabs = [
-            Slab(layout, map_shared(self._wiring.arena.descriptor, offset, layout.size(rows)), rows)
-            for layout, rows, offset in order.slabs
-        ]
-        rows = [(slabs[slab_index], row) for slab_index, row in order.rows]
+        map_part = partial(map_shared, self._wiring.arena.descriptor)
         if self._thread is not None:
-            self._thread.tasks.put(partial(self._thread.attach, rows))
+            self._thread.tasks.put(partial(self._thread.attach, order, map_part))
 
     def close(self) -> None:
         """See `base.Host.close`. What was asked before and has not begun is dropped."""
@@ -210,9 +206,11 @@ class EnvThread(threading.Thread):
         else:
             self._tell(Built(self._host_id, started))
 
-    def attach(self, rows: list[tuple[Slab, int]]) -> None:
-        """Give each env the row for its results."""
-        for runner, (slab, row) in zip(self._runners, rows, strict=True):
+    def attach(self, order: AttachOrder, map_part: Callable[[int, int], memoryview]) -> None:
+        """Give each env the row for its results. Once we are closing, the arena may be gone."""
+        if self.closing:
+            return
+        for runner, slab, row in placed(self._runners, order, map_part):
             runner.attach(slab, row, self._schemas.announce)
         self._tell(Attached(self._host_id))
 

@@ -422,7 +422,7 @@ class BatchedData:
 
         Args:
             action: ``[n, *action]`` (a dict or tuple of such arrays for Dict and Tuple
-                spaces, a list where actions don't stack).
+                spaces), or a list with one action for each result.
             extras: further columns of n rows (``log_prob``, ``value``, …).
 
         Raises:

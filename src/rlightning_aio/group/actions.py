@@ -68,7 +68,7 @@ def _write_column(action: Any, slab: Slab, slots: NDArray[np.intp], envs: EnvTab
     """Write the actions of a whole batch with one copy for each array."""
     rows = slice(None) if slots is envs.all else slots
     for leaf, target in slab.action_columns:
-        source = _as_array(_at(action, leaf))
+        source = _as_array(_column_at(action, leaf))
         if source.shape != (len(slots), *leaf.shape) or not _castable(source, leaf):
             raise BadAction(_misfit(f"the batch's action{leaf.name}", source, leaf, len(slots)))
         _refuse_unfit(source, leaf, slab, slots, envs)
@@ -216,9 +216,10 @@ def _extras(batch: BatchedData, position: int) -> dict[str, Any]:
 
 def _fits(action: Any, slab: Slab, *count: int) -> bool:
     """Whether a row can hold an action; or `count` rows those of a whole batch."""
+    at = _column_at if count else _at
     try:
         return slab.action is not None and all(
-            (array := _as_array(_at(action, leaf))).shape == (*count, *leaf.shape)
+            (array := _as_array(at(action, leaf))).shape == (*count, *leaf.shape)
             and _castable(array, leaf)
             and _unfit(array, leaf, slab) is None
             for leaf, _ in slab.action_columns
@@ -229,8 +230,9 @@ def _fits(action: Any, slab: Slab, *count: int) -> bool:
 
 def _write(action: Any, slab: Slab, rows: Any) -> None:
     """Write what fits: one action into its row, or a whole batch."""
+    at = _at if isinstance(rows, int) else _column_at
     for leaf, target in slab.action_columns:
-        target[rows] = _as_array(_at(action, leaf))
+        target[rows] = _as_array(at(action, leaf))
 
 
 def _plain(action: Any) -> Any:
@@ -255,6 +257,13 @@ def _at(tree: Tree, leaf: Leaf) -> Any:
                 f"the action has no part {leaf.name}; the action space is a Dict or Tuple"
             ) from None
     return tree
+
+
+def _column_at(action: Any, leaf: Leaf) -> Any:
+    """The column of a batch's actions that belongs to `leaf`; a list holds them one by one."""
+    if isinstance(action, list) and leaf.path:
+        return [_at(one, leaf) for one in cast("list[Tree]", action)]
+    return _at(action, leaf)
 
 
 def _castable(array: NDArray[Any], leaf: Leaf) -> bool:

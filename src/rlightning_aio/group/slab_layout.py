@@ -46,7 +46,9 @@ def _action_shape(meta: EnvMeta) -> Any:
         return None
     found = leaves(meta.action_space)
     if found is None:
-        return str(meta.action_space)
+        # A space of the user's own that doesn't describe itself would be named by its address.
+        described = type(meta.action_space).__repr__ is not object.__repr__
+        return str(meta.action_space) if described else type(meta.action_space).__qualname__
     skip = 1 if meta.num_envs > 1 else 0
     return [(leaf.path, leaf.shape[skip:]) for leaf in found]
 
@@ -65,7 +67,7 @@ class SlabLayout:
         self.slab = np.zeros(size, np.intp)
         self.row = np.zeros(size, np.intp)
         self.row_is_slot = False
-        self._places: list[tuple[RowLayout, int, int]] = []
+        self._places: list[tuple[int, int]] = []
 
     def place(self, started: Sequence[EnvStarted], arena: Arena) -> None:
         """Give each local env a row in the slab of its layout.
@@ -84,14 +86,11 @@ class SlabLayout:
                 rows_used.append(0)
             self.slab[slot], self.row[slot] = slab, rows_used[slab]
             rows_used[slab] += 1
-        self._places = [
-            (layout, rows, arena.append(layout.size(rows)))
-            for layout, rows in zip(layouts, rows_used, strict=True)
-        ]
-        self.slabs += [
-            Slab(layout, map_shared(arena.descriptor, offset, layout.size(rows)), rows)
-            for layout, rows, offset in self._places
-        ]
+        for layout, rows in zip(layouts, rows_used, strict=True):
+            size = layout.size(rows)
+            offset = arena.append(size)
+            self._places.append((offset, rows))
+            self.slabs.append(Slab(layout, map_shared(arena.descriptor, offset, size), rows))
         self._note_rows()
 
     def order_for(self, first_slot: int, num_envs: int) -> AttachOrder:

@@ -28,9 +28,9 @@ from rlightning_aio.hosts.messages import (
     Result,
     Value,
 )
+from rlightning_aio.hosts.runner import placed
 from rlightning_aio.protocol.entries import Operation, answers_with_value, op_of, slot_of
 from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
-from rlightning_aio.protocol.slab import Slab
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -80,12 +80,9 @@ class InlineHost:
 
     def attach(self, order: AttachOrder) -> None:
         """See `base.Host.attach`."""
-        slabs = [
-            Slab(layout, map_shared(self._arena.descriptor, offset, layout.size(rows)), rows)
-            for layout, rows, offset in order.slabs
-        ]
-        for runner, (slab_index, row) in zip(self._runners, order.rows, strict=True):
-            runner.attach(slabs[slab_index], row, self._schemas.announce)
+        map_part = partial(map_shared, self._arena.descriptor)
+        for runner, slab, row in placed(self._runners, order, map_part):
+            runner.attach(slab, row, self._schemas.announce)
         self._tell(Attached(self.host_id))
 
     def _announce(self, number: int, schema: InfoSchema) -> None:

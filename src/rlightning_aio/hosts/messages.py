@@ -90,14 +90,14 @@ class StartOrder:
 
 @dataclass(frozen=True)
 class AttachOrder:
-    """Where a host's envs write.
+    """Where a host's envs write. What a row consists of, each of them knows by itself.
 
     Attributes:
-        slabs: layout, rows and offset in the arena of each slab.
+        slabs: offset in the arena and number of rows of each slab of the group.
         rows: for each env which slab and which row of it.
     """
 
-    slabs: tuple[tuple[RowLayout, int, int], ...]
+    slabs: tuple[tuple[int, int], ...]
     rows: tuple[tuple[int, int], ...]
 
 

@@ -27,14 +27,15 @@ from rlightning_aio.protocol.info import NO_INFO, PICKLED, InfoSchema
 from rlightning_aio.protocol.slab import RowLayout, Slab
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
     from rlightning_aio.envs.base import BareReset, BareResult, BareStep, BaseEnv
+    from rlightning_aio.hosts.messages import AttachOrder
     from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet
 
-__all__ = ["EnvRunner", "Execute"]
+__all__ = ["EnvRunner", "Execute", "placed"]
 
 Execute: TypeAlias = "Callable[[], OutOfBand | None]"
 """Executes a step or a reset; returns what of its result is out of band."""
@@ -275,6 +276,26 @@ class EnvRunner:
                 return {"ret": result}
             observation = as_numpy(observation)
         return writer.write_data(observation, result.info, result._extra)  # pyright: ignore[reportPrivateUsage]
+
+
+def placed(
+    runners: Sequence[EnvRunner],
+    order: AttachOrder,
+    map_part: Callable[[int, int], memoryview],
+) -> Iterator[tuple[EnvRunner, Slab, int]]:
+    """Each env of a host with the slab and the row that it is given.
+
+    Args:
+        runners: of the host's envs.
+        order: of the group.
+        map_part: maps a part of the arena, given its offset and size.
+    """
+    slabs: dict[int, Slab] = {}
+    for runner, (slab_index, row) in zip(runners, order.rows, strict=True):
+        if slab_index not in slabs:
+            (offset, rows), layout = order.slabs[slab_index], runner.layout
+            slabs[slab_index] = Slab(layout, map_part(offset, layout.size(rows)), rows)
+        yield runner, slabs[slab_index], row
 
 
 def _nothing() -> None: ...

@@ -21,6 +21,7 @@ from rlightning_aio.hosts.arena import make_private, map_shared
 from rlightning_aio.hosts.build_env import built_envs
 from rlightning_aio.hosts.messages import ErrorText
 from rlightning_aio.hosts.pickling import dumped, dumped_with_code
+from rlightning_aio.hosts.runner import placed
 from rlightning_aio.hosts.spinner import Spinner
 from rlightning_aio.protocol.bell import WorkerBell, bell_size
 from rlightning_aio.protocol.entries import (
@@ -36,7 +37,6 @@ from rlightning_aio.protocol.entries import (
 from rlightning_aio.protocol.frames import BELL, CHUNK_BYTES, Frame, FrameKind, FrameReader, encode
 from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
 from rlightning_aio.protocol.rings import WorkerRings, rings_size
-from rlightning_aio.protocol.slab import Slab
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -223,22 +223,17 @@ class Worker:
     def _attach(self, frame: Frame) -> None:
         """Map the slabs; the arena's descriptor was inherited for this."""
         order: AttachOrder = pickle.loads(frame.payload)
-        slabs: list[Slab] = []
-        for layout, rows, offset in order.slabs:
-            memory = map_shared(self._arena, offset, layout.size(rows))
-            self._shared.append(memory)
-            slabs.append(Slab(layout, memory, rows))
+        for runner, slab, row in placed(self._runners, order, self._map_part):
+            runner.attach(slab, row, self._schemas.announce)
+        self._steps = [runner.step for runner in self._runners]
         os.close(self._arena)
-        self.adopt(self._runners, [(slabs[slab_index], row) for slab_index, row in order.rows])
         self._attached = True
         self._send(FrameKind.ATTACHED)
 
-    def adopt(self, runners: list[EnvRunner], rows: list[tuple[Slab, int]]) -> None:
-        """Serve the envs of `runners`, each in the row of a slab that is given for it."""
-        for runner, (slab, row) in zip(runners, rows, strict=True):
-            runner.attach(slab, row, self._schemas.announce)
-        self._runners = runners
-        self._steps = [runner.step for runner in runners]
+    def _map_part(self, offset: int, size: int) -> memoryview:
+        memory = map_shared(self._arena, offset, size)
+        self._shared.append(memory)
+        return memory
 
     def _request(self, frame: Frame) -> None:
         """Execute a request whose arguments came out of band."""
