@@ -85,8 +85,11 @@ class Backend:
             return "unknown"
 
 
-# Python 3.12 alone, and best in an environment of its own; docs/backends.md has the rest.
-ISAAC_LAB = "pip install isaaclab==3.0.0 rlightning-aio"
+# In an environment of its own; docs/backends.md says why it is two steps.
+ISAAC_LAB = (
+    "pip install 'rlightning-aio[isaac]' && "
+    "pip install --ignore-requires-python --no-deps isaaclab==3.0.0"
+)
 
 # One row for one backend.
 # fmt: off

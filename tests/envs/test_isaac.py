@@ -6,6 +6,12 @@ ground come from `isaac_assets`.
 
 from __future__ import annotations
 
+import contextlib
+import os
+import threading
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +25,6 @@ from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
     from rlightning_aio.envs.base import BaseEnv
 
@@ -34,6 +39,7 @@ pytestmark = [
 
 MANAGER_BASED = "Isaac-Cartpole"
 MARL = "Isaac-Pendulum-MARL-Direct"
+DOG = "Isaac-Velocity-{}-UnitreeGo2"
 CARTPOLE_CFG = "isaaclab_tasks.core.cartpole.cartpole_manager_env_cfg::CartpoleEnvCfg"
 
 
@@ -57,11 +63,12 @@ def make() -> Iterator[Any]:
 
         close()
         env_class = IsaacMarlEnv if backend == "isaac_marl" else IsaacManagerBasedEnv
+        worker_index = fields.pop("worker_index", 0)
         env_kwargs = {"device": "cpu", **fields.pop("env_kwargs", {})}
         config = EnvConfig(
             name="isaac", backend=backend, task=task, env_kwargs=env_kwargs, **fields
         )
-        live.append(env_class(config))
+        live.append(env_class(config, worker_index))
         return live[-1]
 
     def close() -> None:
@@ -283,6 +290,84 @@ def test_faults_of_the_config_are_named(make: Any, fields: Any, message: str) ->
     with pytest.raises(ConfigError, match=message):
         make(**fields)
     make(num_envs=1)
+
+
+def walk(env: BaseEnv) -> Any:
+    """Observations of a seeded reset and of ten steps."""
+    start = env.reset(seed=3)
+    steps = [env.step(respond(action)) for action in actions(10, 2 * 12).reshape(10, 2, 12)]
+    return torch.stack([ret.observation["policy"] for ret in (start, *steps)])
+
+
+def test_another_task_walks_on_rough_ground(make: Any) -> None:
+    """A dog sees the ground under it, whose terrain is generated; seeded, it is the same again."""
+    overrides = {
+        "seed": 7,
+        "scene.terrain.terrain_generator": {"num_rows": 1, "num_cols": 2},
+        "commands.base_velocity.debug_vis": False,
+    }
+    walks = []
+    for _ in range(2):
+        env = make(DOG.format("Rough"), num_envs=2, env_kwargs={"overrides": overrides})
+        walks.append(walk(env))
+        assert walks[-1][0].numpy() in env.get_observation_space()["policy"]
+        height_scan = walks[-1][..., 48:]
+        assert height_scan.shape[-1] == 187
+        assert height_scan.std() > 0.01
+    assert torch.equal(*walks)
+
+
+def test_what_is_drawn_once_is_drawn_from_a_seed_of_the_env(make: Any) -> None:
+    """Startup events give the dogs their masses: by the seed, and other ones to other envs."""
+    masses, walks = [], []
+    for worker_index in (0, 0, 1):
+        env = make(
+            DOG.format("Flat"), num_envs=2, worker_index=worker_index,
+            env_kwargs={"overrides": {"seed": 7, "commands.base_velocity.debug_vis": False}},
+        )  # fmt: skip
+        walks.append(walk(env))
+        masses.append(env.env.scene["robot"].data.body_mass.torch.clone())
+    assert torch.equal(masses[0], masses[1])
+    assert torch.equal(walks[0], walks[1])
+    assert not torch.equal(masses[0], masses[2])
+
+
+def test_assets_come_from_a_server(tmp_path: Path) -> None:
+    """A URL does for ISAACSIM_ASSET_ROOT, as it stands in the configurations of all tasks."""
+    with serving(Path(os.environ["ISAACSIM_ASSET_ROOT"])) as (url, paths):
+        entry = {
+            "name": "isaac",
+            "backend": "isaac_manager_based",
+            "task": MANAGER_BASED,
+            "num_envs": 2,
+            "start_timeout": 300.0,
+            # What was fetched is kept among temporary files.
+            "env_vars": {"ISAACSIM_ASSET_ROOT": url, "TMPDIR": str(tmp_path)},
+            "env_kwargs": {"device": "cpu"},
+        }
+        with sync.build_env_group(entry) as group:
+            group.reset(seed=0)
+    assert any(path.endswith("cartpole.usd") for path in paths)
+
+
+@contextlib.contextmanager
+def serving(folder: Path) -> Iterator[tuple[str, list[str]]]:
+    """The URL of an HTTP server for `folder`, and the paths that it was asked for."""
+    paths: list[str] = []
+
+    class Handler(SimpleHTTPRequestHandler):
+        def log_request(self, *args: Any) -> None:
+            paths.append(self.path)
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=str(folder)))
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}", paths
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
 
 
 @pytest.mark.parametrize("placement", ["inline", "process"])

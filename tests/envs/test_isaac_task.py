@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import importlib.util
 import math
+import re
 import sys
 import threading
+import tomllib
 from importlib.machinery import ModuleSpec
+from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -16,6 +19,7 @@ from rlightning_aio.config import EnvConfig
 from rlightning_aio.envs import isaac_task
 from rlightning_aio.errors import ConfigError
 
+ROOT = Path(__file__).parents[2]
 CONFIG = EnvConfig(
     name="isaac", backend="isaac_manager_based", task="stub_package::Cfg", num_envs=3,
     env_kwargs={"device": "cuda:1", "launcher": {"enable_cameras": True}},
@@ -30,6 +34,7 @@ class Cfg:
         self.scene = SimpleNamespace(num_envs=1)
         self.decimation = 2
         self.episode_length_s = 5.0
+        self.seed: int | None = None
 
 
 @pytest.fixture
@@ -101,9 +106,40 @@ def test_the_step_limit_survives_the_simulators_rounding(events: list[Any], step
     assert math.ceil(cfg.episode_length_s / (cfg.decimation * cfg.sim.dt)) == steps
 
 
+@pytest.mark.parametrize(
+    ("given", "worker_index", "taken"), [(7, 0, 7), (7, 2, 13), (None, 2, None), (-1, 2, -1)]
+)
+def test_each_env_of_an_entry_is_built_from_a_seed_of_its_own(
+    events: list[Any], given: int | None, worker_index: int, taken: int | None
+) -> None:
+    """They count on by sub-environments, as those of resets; without one, and with Isaac Lab's
+    own sign for any, nothing is counted.
+    """
+    env_kwargs = {**CONFIG.env_kwargs, "overrides": {"seed": given}}
+    config = CONFIG.model_copy(update={"env_kwargs": env_kwargs})
+    cfg = isaac_task.make_simulator("isaac-0", config, "stub_package::Env", worker_index)
+    assert cfg.seed == taken
+
+
 def test_a_python_without_isaac_lab_is_named() -> None:
-    """The message says which Python was asked, and how an entry gets another one."""
+    """The message says which Python was asked, how an entry gets another one, and by what
+    command that other one is made, which the extra of this package stands in.
+    """
     if importlib.util.find_spec("isaaclab"):
         pytest.skip("Isaac Lab is here")
-    with pytest.raises(ConfigError, match=rf"isaac-0: {sys.executable} has no Isaac Lab"):
+    with pytest.raises(ConfigError, match=rf"isaac-0: {sys.executable} has no Isaac Lab") as raised:
         isaac_task.make_simulator("isaac-0", CONFIG, None)
+    assert str(raised.value).endswith(
+        "interpreter name a Python of an environment made by: pip install 'rlightning-aio[isaac]' "
+        "&& pip install --ignore-requires-python --no-deps isaaclab==3.0.0"
+    )
+
+
+def test_the_extra_brings_what_terrains_and_assets_need() -> None:
+    """Isaac Lab is installed without what it declares, so the extra names it."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extra = project["optional-dependencies"]["isaac"]
+    names = {re.split(r"[\[=>]", line)[0] for line in extra}
+    assert {"omniverseclient", "scipy", "trimesh"} <= names
+    pinned = (ROOT / "tests/simulators/isaac.txt").read_text().splitlines()
+    assert names <= {re.split(r"[\[=]", line)[0] for line in pinned}

@@ -52,7 +52,9 @@ class _IsaacEnv(BaseEnv):
         self._fresh = True
         self._claim_process()
         try:
-            self.env = make_simulator(self.env_id, self.config, self.default_env_class)
+            self.env = make_simulator(
+                self.env_id, self.config, self.default_env_class, worker_index
+            )
         except BaseException:
             _IsaacEnv.live_env_id = None
             raise

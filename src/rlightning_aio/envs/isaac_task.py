@@ -21,11 +21,15 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from rlightning_aio.envs.options import load_named, read_options
 from rlightning_aio.errors import ConfigError
+from rlightning_aio.registry import BACKENDS
 
 if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
 
 __all__ = ["IsaacOptions", "make_simulator"]
+
+ANY_SEED = -1
+"""Isaac Lab draws a seed where it finds this one."""
 
 # Stopping Isaac Sim ends the process it runs in, so what was launched stays until the
 # process goes. Without Isaac Sim the entries hold nothing.
@@ -40,14 +44,17 @@ class IsaacOptions(BaseModel):
     device: str | None = None
     """Simulation device; None takes ``cuda:0`` where there is one, else ``cpu``."""
     overrides: dict[str, Any] = Field(default_factory=dict)
-    """Fields of the task's configuration, dotted or nested: ``sim.dt: 0.01``."""
+    """Fields of the task's configuration, dotted or nested: ``sim.dt: 0.01``. ``seed: 7`` seeds
+    what the task draws once, while it is built; each env of the entry takes its own from there."""
     env_class: str | None = None
     """``module::Class`` of the environment, for a task given by its configuration class."""
     launcher: dict[str, Any] = Field(default_factory=dict)
     """Arguments of ``AppLauncher`` (2.3) or ``launch_simulation`` (3)."""
 
 
-def make_simulator(env_id: str, config: EnvConfig, default_env_class: str | None) -> Any:
+def make_simulator(
+    env_id: str, config: EnvConfig, default_env_class: str | None, worker_index: int = 0
+) -> Any:
     """Launch what the task needs and build its environment, unwrapped.
 
     Args:
@@ -56,6 +63,7 @@ def make_simulator(env_id: str, config: EnvConfig, default_env_class: str | None
             registers it, or ``module::Class`` of a configuration.
         default_env_class: ``module::Class`` built from a configuration class for which
             ``env_kwargs.env_class`` names none.
+        worker_index: of the env within its entry.
 
     Raises:
         ConfigError: there is no Isaac Lab; an option, an override or the task doesn't
@@ -64,21 +72,21 @@ def make_simulator(env_id: str, config: EnvConfig, default_env_class: str | None
     if importlib.util.find_spec("isaaclab") is None:
         raise ConfigError(
             f"{env_id}: {sys.executable} has no Isaac Lab; let the entry's interpreter name a "
-            "Python that has (docs/backends.md tells how to install it)"
+            f"Python of an environment made by: {BACKENDS['isaac_marl'].install_command}"
         )
     options = read_options(IsaacOptions, env_id, config.env_kwargs)
     device = options.device or _default_device()
     app: Any = importlib.import_module("isaaclab.app")
     launcher_args = {"headless": True, **options.launcher, "device": device}
     if hasattr(app, "launch_simulation"):
-        cfg = _make_cfg(env_id, config, options, device)
+        cfg = _make_cfg(env_id, config, options, device, worker_index)
         runtime = app.launch_simulation(cfg, launcher_args)
         runtime.__enter__()
         _launched.append(runtime)
     else:
         if not _launched:
             _launched.append(_launch_isaac_sim(env_id, app, launcher_args))
-        cfg = _make_cfg(env_id, config, options, device)
+        cfg = _make_cfg(env_id, config, options, device, worker_index)
     if "::" not in config.task:
         return gym.make(config.task, cfg=cfg).unwrapped
     env_class = options.env_class or default_env_class
@@ -103,7 +111,9 @@ def _default_device() -> str:
     return "cuda:0" if torch.cuda.is_available() else "cpu"
 
 
-def _make_cfg(env_id: str, config: EnvConfig, options: IsaacOptions, device: str) -> Any:
+def _make_cfg(
+    env_id: str, config: EnvConfig, options: IsaacOptions, device: str, worker_index: int
+) -> Any:
     """The task's configuration, with this entry's settings in it."""
     tasks: Any = importlib.import_module("isaaclab_tasks.utils")
     if "::" in config.task:
@@ -122,6 +132,9 @@ def _make_cfg(env_id: str, config: EnvConfig, options: IsaacOptions, device: str
     if hasattr(cfg, "compute_final_obs"):
         cfg.compute_final_obs = True
     _apply(cfg, options.overrides, f"{env_id}: env_kwargs.overrides")
+    if cfg.seed not in (None, ANY_SEED):
+        # As resets count: envs of one seed would all have the same masses and terrain.
+        cfg.seed += worker_index * config.num_envs
     if config.max_episode_steps is not None:
         # Half a step short: the simulator rounds up, and the product may exceed the whole.
         cfg.episode_length_s = (config.max_episode_steps - 0.5) * cfg.decimation * cfg.sim.dt
