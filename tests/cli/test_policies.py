@@ -11,7 +11,7 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rlightning_aio import BatchedData
+from rlightning_aio import BatchedData, EnvRet, MultiAgentEnvRet
 from rlightning_aio.cli.policies import RandomPolicy
 from rlightning_aio.errors import ConfigError
 
@@ -101,6 +101,61 @@ def test_envs_get_actions_of_their_own_space(kinds: list[gym.Space[Any]], seed: 
         batch = BatchedData(ids, [None] * len(ids))
         for response in batch.respond(action=policy(batch)).values():
             assert by_id[response.env_id].contains(response.action)
+
+
+MASK = np.array([0, 1, 0, 1, 0], np.int8)
+FIVE = spaces.Discrete(5, start=-1)
+
+
+def masked(form: str) -> tuple[gym.Space[Any], Any]:
+    """An action space, and a result whose masks allow 0 and 2 of it."""
+    single = EnvRet(env_id="a-0", observation=0)
+    mask = {"action_mask": MASK}
+    match form:
+        case "observation":
+            return FIVE, single.model_copy(update={"observation": {"board": 0, **mask}})
+        case "info":
+            return FIVE, single.model_copy(update={"info": mask})
+        case "vectorised":
+            info = {"action_mask": np.stack([MASK, MASK])}
+            space = spaces.MultiDiscrete([5, 5], start=[-1, -1])
+            return space, single.model_copy(update={"info": info})
+        case _:
+            agents = spaces.Dict({"x": FIVE, "y": FIVE})
+            return agents, MultiAgentEnvRet(
+                env_id="a-0", observation={"x": mask, "y": 0}, info={"y": mask}
+            )
+
+
+@pytest.mark.parametrize("form", ["observation", "info", "vectorised", "agents"])
+@pytest.mark.parametrize("company", [[], [("b-0", spaces.Discrete(3))]])
+def test_masks_are_respected(form: str, company: list[tuple[str, gym.Space[Any]]]) -> None:
+    """All that they allow is met, and nothing else, whoever else is asked for."""
+    space, result = masked(form)
+    others = dict(company)
+    policy = RandomPolicy({"a-0": space, **others}.__getitem__, 0)
+    met: set[int] = set()
+    for _ in range(40):
+        batch = BatchedData(["a-0", *others], [result, *map(unmasked, others)])
+        response, *rest = batch.respond(action=policy(batch)).values()
+        assert space.contains(response.action)
+        assert all(others[one.env_id].contains(one.action) for one in rest)
+        action = response.action
+        met.update(np.ravel(list(action.values()) if isinstance(action, dict) else action).tolist())
+    assert met == {0, 2}
+
+
+def unmasked(env_id: str) -> EnvRet:
+    return EnvRet(env_id=env_id, observation=0)
+
+
+def test_who_may_do_nothing_does_anything() -> None:
+    """It's another's turn: whatever is done is ignored, and must be an action all the same."""
+    result = EnvRet(env_id="a-0", observation={"action_mask": 0 * MASK})
+    policy = RandomPolicy(lambda env_id: FIVE, 0)
+    batch = BatchedData(["a-0"], [result])
+    met = {int(policy(batch)[0]) for _ in range(100)}
+    assert met == {-1, 0, 1, 2, 3}
 
 
 def test_an_env_without_an_action_space_needs_a_policy() -> None:

@@ -6,9 +6,11 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import pytest
-from envs.group_contract import GroupContract
+from envs.group_contract import NO_LIMIT, GroupContract
 from gymnasium.spaces import Box, Dict, Discrete, Tuple
 
+from rlightning_aio import sync
+from rlightning_aio.cli.policies import RandomPolicy
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.types import PolicyResponse
@@ -22,8 +24,10 @@ if TYPE_CHECKING:
 
 pytest.importorskip("pettingzoo")
 pytest.importorskip("mpe2")
+import pettingzoo
 from mpe2 import simple_spread_v3, simple_tag_v3
 from pettingzoo import ParallelEnv
+from pettingzoo.utils.conversions import turn_based_aec_to_parallel
 
 pytestmark = [
     pytest.mark.simulators,
@@ -79,6 +83,61 @@ class TestAgentsWithDifferentSpaces(GroupContract):
             space = env.get_observation_space()
             assert isinstance(space, Dict)
             assert [space[agent].shape for agent in env.agents] == [(16,)] * 3 + [(14,)]
+
+
+class TestRegistered(GroupContract):
+    config = entry("sisl/pursuit-v5", env_kwargs={"n_pursuers": 3, "max_cycles": 25})
+    num_steps = 60
+
+    def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:
+        env = pettingzoo.make("parallel", "sisl/pursuit-v5", n_pursuers=3, max_cycles=25)
+        return parallel_outcomes(env, self.seed, actions)
+
+    def test_its_own_limit_is_known(self) -> None:
+        """SISL's environments have it one object further in than others."""
+        with self.opened() as env:
+            assert env.get_metadata().max_episode_steps == 25
+
+
+def test_modules_may_register_environments() -> None:
+    """One that is named before the colon is imported first."""
+    assert "arena/tag-v3" not in pettingzoo.parallel_registry
+    env = make("envs.registered_arena:arena/tag-v3")
+    assert env.get_metadata().max_episode_steps == 7
+
+
+@pytest.mark.parametrize(
+    ("task", "message"),
+    [
+        ("sisl/persuit-v5", r"'zoo-0': .*'sisl/persuit-v5' is not reg.*mean 'sisl/pursuit-v5'\?"),
+        ("classic/tictactoe-v3", r"'classic/tictactoe-v3' is turn-based; convert it"),
+        ("atari/pong-v3", r"'zoo-0': .*pip install 'pettingzoo\[atari\]'"),
+    ],
+)
+def test_what_the_registry_cannot_make_is_named(task: str, message: str) -> None:
+    """A name that isn't there, one that is another kind's, and one whose packages are missing."""
+    with pytest.raises(ConfigError, match=message):
+        make(task)
+
+
+def turns() -> ParallelEnv:
+    return turn_based_aec_to_parallel(pettingzoo.make("aec", "classic/tictactoe-v3"))
+
+
+def test_random_policies_play_by_the_rules() -> None:
+    """Tic-tac-toe ends a game in which somebody makes an illegal move, to the loss of one alone."""
+    config = entry(f"{HERE}:turns", num_workers=2, placement="inline")
+    with sync.build_env_group(config) as group:
+        spaces = dict(zip(group.env_ids, group.get_action_spaces(), strict=True))
+        policy = RandomPolicy(spaces.__getitem__, seed=0)
+        batch, _ = group.reset(seed=0)
+        with group.auto_reset(NO_LIMIT):
+            for _ in range(200):
+                batch, _ = group.step(batch.respond(action=policy(batch)))
+                assert (batch.reward["player_1"] == -batch.reward["player_2"]).all()
+        episodes = [stats["episodes"] for stats in group.get_env_stats().values()]
+    # Two agents' each, and nobody has won or lost by less than five moves.
+    assert all(20 <= count <= 2 * 200 / 5 for count in episodes)
 
 
 def comings_and_goings(**_: Any) -> ParallelEnv:

@@ -15,8 +15,9 @@ import gymnasium as gym
 import numpy as np
 
 from rlightning_aio.batch import BatchedData
+from rlightning_aio.cli.masks import allowed_action, has_masks
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.protocol.columns import index
+from rlightning_aio.protocol.columns import index, stacked
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -81,7 +82,9 @@ class RandomPolicy:
     """Samples actions from the envs' spaces.
 
     Bounded numbers are uniform. Where a space has no bounds they are normal, with a small
-    spread. One generator serves all envs in the order in which results arrive.
+    spread. Envs whose first result has an ``action_mask``, in an observation that is a dict or
+    in the info (an agent's in its own), get discrete actions that it allows; who may do nothing
+    gets any. One generator serves all envs in the order in which results arrive.
 
     Args:
         space_of: an env's action space, by id; asked when its first result comes.
@@ -93,16 +96,33 @@ class RandomPolicy:
         self._rng = np.random.default_rng(seed)
         self._kinds: list[tuple[gym.Space[Any], Sampler]] = []
         self._samplers: dict[str, Sampler] = {}
+        self._masked: dict[str, gym.Space[Any]] = {}
+        """The action spaces of envs whose results say what is allowed."""
 
     def __call__(self, batch: BatchedData) -> Any:
         """Actions for a batch: columns if its envs share one action space, else a list."""
-        samplers = [self._samplers.get(id_) or self._meet(id_) for id_ in batch.env_ids()]
+        env_ids = batch.env_ids()
+        samplers = [
+            self._samplers.get(id_) or self._meet(id_, batch.values()[row])
+            for row, id_ in enumerate(env_ids)
+        ]
         first = samplers[0]
-        if samplers.count(first) == len(samplers):
-            return first(len(samplers))
-        return [index(sampler(1), 0) for sampler in samplers]
+        if samplers.count(first) < len(samplers):
+            actions = [index(sampler(1), 0) for sampler in samplers]
+        else:
+            actions = first(len(samplers))
+        return self._allowed(env_ids, actions, batch) if self._masked else actions
 
-    def _meet(self, env_id: str) -> Sampler:
+    def _allowed(self, env_ids: list[str], actions: Any, batch: BatchedData) -> Any:
+        """`actions`, in the same form, with what the results forbid drawn anew."""
+        listed = isinstance(actions, list)
+        chosen = [actions[k] if listed else index(actions, k) for k in range(len(env_ids))]
+        for row, (env_id, result) in enumerate(zip(env_ids, batch.values(), strict=True)):
+            if (space := self._masked.get(env_id)) is not None:
+                chosen[row] = allowed_action(space, chosen[row], result, self._rng)
+        return chosen if listed else stacked(chosen)
+
+    def _meet(self, env_id: str, result: Any) -> Sampler:
         space = self._space_of(env_id)
         if space is None:
             raise ConfigError(f"env {env_id!r} reports no action space; give a --policy")
@@ -111,6 +131,8 @@ class RandomPolicy:
             sampler = _sampler(space, self._rng)
             self._kinds.append((space, sampler))
         self._samplers[env_id] = sampler
+        if has_masks(result):
+            self._masked[env_id] = space
         return sampler
 
 

@@ -7,6 +7,7 @@ Absent on purpose: turn-based (AEC) environments; PettingZoo converts those itse
 
 from __future__ import annotations
 
+import difflib
 import math
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, cast
@@ -28,12 +29,16 @@ __all__ = ["PettingZooEnv"]
 
 DEFAULT_FACTORY = "parallel_env"
 
+# Partly typed, so imported by name.
+pettingzoo: Any = import_module("pettingzoo")
+
 
 class PettingZooEnv(BaseEnv):
     """One parallel environment; ``env_kwargs`` go to the function that makes it.
 
-    ``task`` is ``module`` (``mpe2.simple_spread_v3``), whose ``parallel_env`` is called, or
-    ``module:function`` for a function of another name.
+    ``task`` is a name of PettingZoo's registry (``sisl/pursuit-v5``), if need be with the module
+    that registers it (``my_arenas:arena/duel-v0``); or ``module`` (``mpe2.simple_spread_v3``),
+    whose ``parallel_env`` is called; or ``module:function`` for a function of another name.
 
     ``agents`` are the environment's possible agents, and its spaces are Dicts over them.
     An agent that has left before the episode's end, or hasn't joined yet, keeps an
@@ -51,12 +56,36 @@ class PettingZooEnv(BaseEnv):
         **kwargs: Any,
     ) -> None:
         super().__init__(config, worker_index, preprocess_fn, **kwargs)
-        self.env = self._factory()(**config.env_kwargs)
+        self.env = self._make()
         self.agents = tuple(self.env.possible_agents)
         self._observation_spaces = {a: self.env.observation_space(a) for a in self.agents}
         self._action_spaces = {a: self.env.action_space(a) for a in self.agents}
         if self.max_episode_steps is None:
-            self.max_episode_steps = getattr(self.env.unwrapped, "max_cycles", None)
+            self.max_episode_steps = _own_limit(self.env.unwrapped)
+
+    def _make(self) -> Any:
+        module, _, name = self.config.task.rpartition(":")
+        if all(part.isidentifier() for part in name.split(".")):
+            return self._factory()(**self.config.env_kwargs)
+        if module:
+            import_module(module)
+        self._check_registered(name)
+        try:
+            return pettingzoo.make("parallel", name, **self.config.env_kwargs)
+        except pettingzoo.env_registry.exceptions.FailedToImport as error:
+            raise ConfigError(f"env {self.env_id!r}: {error}") from error
+
+    def _check_registered(self, name: str) -> None:
+        try:
+            pettingzoo.spec("parallel", name)
+        except pettingzoo.env_registry.exceptions.PettingZooRegistryError as error:
+            if name in pettingzoo.aec_registry:
+                reason = "is turn-based; convert it in a function of yours (module:function)"
+            else:
+                known: list[str] = list(pettingzoo.parallel_registry)
+                near = difflib.get_close_matches(name, known, n=1)
+                reason = f"is not registered{f'; did you mean {near[0]!r}?' if near else ''}"
+            raise ConfigError(f"env {self.env_id!r}: PettingZoo's {name!r} {reason}") from error
 
     def _factory(self) -> Any:
         module_name, _, function = self.config.task.partition(":")
@@ -64,8 +93,8 @@ class PettingZooEnv(BaseEnv):
         if factory is None:
             raise ConfigError(
                 f"env {self.env_id!r}: module {module_name} has no function "
-                f"{function or DEFAULT_FACTORY}; task names a module with a parallel_env, or "
-                "module:function"
+                f"{function or DEFAULT_FACTORY}; task names a module with a parallel_env, "
+                "module:function, or an environment of PettingZoo's registry"
             )
         return factory
 
@@ -130,6 +159,15 @@ class PettingZooEnv(BaseEnv):
 
     def close(self) -> None:
         self.env.close()
+
+
+def _own_limit(simulator: Any) -> int | None:
+    """How many steps an episode has at most, where the simulator says so."""
+    # PettingZoo's own ones for SISL keep theirs one object further in.
+    limits = (
+        getattr(one, "max_cycles", None) for one in (simulator, getattr(simulator, "env", None))
+    )
+    return next((limit for limit in limits if limit is not None), None)
 
 
 def _zeros(space: gym.Space[Any]) -> Any:

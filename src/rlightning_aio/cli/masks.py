@@ -1,0 +1,69 @@
+"""Action masks: which discrete actions a result allows.
+
+As PettingZoo and Gymnasium have them: under ``action_mask`` in the info, or in an observation
+that is a dict; an agent's in its own. 1 stands for an action that is allowed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, cast
+
+import gymnasium as gym
+import numpy as np
+
+from rlightning_aio.types import EnvRet, MultiAgentEnvRet
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+__all__ = ["allowed_action", "has_masks"]
+
+
+def has_masks(result: Any) -> bool:
+    """Whether a result has a mask, of any of its agents."""
+    return any(mask is not None for _, mask in _masks(result))
+
+
+def allowed_action(
+    space: gym.Space[Any], action: Any, result: Any, rng: np.random.Generator
+) -> Any:
+    """`action`, one of `space`, with what the masks of `result` forbid drawn anew.
+
+    An agent without a mask, or whose mask allows nothing, keeps its own.
+    """
+    for agent, mask in _masks(result):
+        if agent is None:
+            return _allowed(space, action, mask, rng)
+        inner = cast("Any", space)[agent]
+        action = {**action, agent: _allowed(inner, action[agent], mask, rng)}
+    return action
+
+
+def _masks(result: Any) -> Iterator[tuple[str | None, Any]]:
+    """Each agent's mask, or None; one for the agent None where there are no agents."""
+    if isinstance(result, MultiAgentEnvRet):
+        for agent, observation in result.observation.items():
+            yield agent, _mask(observation, result.info.get(agent))
+    elif isinstance(result, EnvRet):
+        yield None, _mask(result.observation, result.info)
+
+
+def _mask(observation: Any, info: Any) -> Any:
+    for where in (info, observation):
+        if isinstance(where, Mapping) and "action_mask" in where:
+            return cast("Any", where)["action_mask"]
+    return None
+
+
+def _allowed(space: gym.Space[Any], action: Any, mask: Any, rng: np.random.Generator) -> Any:
+    # Gymnasium's spaces are generic over dtypes that nobody states.
+    spaces: Any = gym.spaces
+    known = cast("Any", space)
+    if mask is None or not isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
+        return action
+    # A vectorised env has a row for each sub-environment, and as many actions.
+    weights = np.asarray(mask, np.bool_)
+    drawn = (weights * (1.0 - rng.random(weights.shape))).argmax(axis=-1)
+    any_allowed = weights.any(axis=-1)
+    return (any_allowed * (drawn + known.start) + ~any_allowed * action).astype(known.dtype)
