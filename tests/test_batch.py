@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from gymnasium import spaces
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from rlightning_aio.batch import BatchedData
@@ -29,7 +29,7 @@ from rlightning_aio.batch.sent import columns_of_values, kept_columns
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.errors import BadAction
 from rlightning_aio.group.env_table import EnvTable
-from rlightning_aio.protocol.info import INFO_BYTES, InfoSchema, InfoSchemas, InfoWriter
+from rlightning_aio.protocol.info import INFO_BYTES, PICKLED, InfoSchema, InfoSchemas, InfoWriter
 from rlightning_aio.protocol.slab import IS_RESET, OVER, TERMINATED, TRUNCATED
 from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
 
@@ -763,6 +763,43 @@ def test_infos_in_rows_make_the_columns_that_they_make_one_by_one(
     for key, column in expected.items():
         assert found[key].dtype == column.dtype, key
         np.testing.assert_array_equal(found[key], column)
+
+
+@given(
+    infos=st.lists(st.lists(plain_infos, min_size=3, max_size=3), min_size=1, max_size=3),
+    in_rows=st.booleans(),
+)
+def test_infos_of_sub_environments_have_masks_of_their_own(
+    infos: list[list[dict[str, Any]]], in_rows: bool
+) -> None:
+    """As all of them in one vector environment have, with an axis more."""
+    assume(not any("odd" in info for own in infos for info in own))  # The first gives its type.
+    of_envs = [vector_infos(own) for own in infos]
+    slots = list(range(len(infos)))
+    if in_rows:
+        rows = np.zeros((len(slots), 4 * INFO_BYTES), np.uint8)
+        known: dict[int, InfoSchema] = {}
+        announced = InfoSchemas(known.__setitem__)
+        marks = np.array(
+            [
+                InfoWriter(memoryview(row), announced.announce).write(info)
+                for row, info in zip(rows, of_envs, strict=True)
+            ],
+            np.uint8,
+        )
+        assume(all((marks > 0) & (marks < PICKLED)))
+        names = replace(NAMES, turns=np.zeros(len(slots), np.bool_))
+        part = columns(
+            slots, None, info=rows, info_marks=marks, schemas=[known] * len(slots), names=names
+        )
+    else:
+        part = columns(slots, None, out_of_band={k: {"info": of_envs[k]} for k in slots})
+    found, expected = results(part).infos, vector_infos([info for own in infos for info in own])
+    assert found.keys() == expected.keys()
+    for key in [key for key in expected if not key.startswith("_")]:
+        mask = expected["_" + key].reshape(len(slots), 3)
+        np.testing.assert_array_equal(found["_" + key], mask)
+        np.testing.assert_array_equal(found[key][mask], expected[key][mask.reshape(-1)])
 
 
 def test_infos_are_those_of_gymnasiums_vector_envs() -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Container, Iterable, Sequence
 
     from rlightning_aio.batch.columns import ResultColumns
     from rlightning_aio.protocol.info import InfoSchema
@@ -35,9 +35,32 @@ class _Columns(VectorEnv[Any, Any, Any]):
             columns = self._add_info(columns, info, place)
         return columns
 
+    def _add_info(
+        self, vector_infos: dict[str, Any], env_info: dict[str, Any], env_num: int
+    ) -> dict[str, Any]:
+        masks = {key: value for key, value in env_info.items() if is_mask(key, env_info)}
+        if not masks:
+            return super()._add_info(vector_infos, env_info, env_num)
+        rest = {key: value for key, value in env_info.items() if key not in masks}
+        columns = super()._add_info(vector_infos, rest, env_num)
+        for key, mask in masks.items():
+            if columns[key].ndim == 1:
+                outer = columns[key][:, None]
+                columns[key] = np.broadcast_to(outer, (self.num_envs, *mask.shape)).copy()
+            columns[key][env_num] = mask
+        return columns
+
+
+def is_mask(key: str, info: Container[str]) -> bool:
+    """Whether a vector environment tells by `key` which sub-environments have another one."""
+    return key.startswith("_") and key[1:] in info
+
 
 def vector_infos(infos: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """One dict of columns for `infos`: a typed array for each key, and a mask ``_key``."""
+    """One dict of columns for `infos`: a typed array for each key, and a mask ``_key``.
+
+    Those of vector environments have masks already, which become columns of masks.
+    """
     return _Columns(len(infos)).of(enumerate(infos))
 
 
@@ -88,7 +111,12 @@ def _taken_at_once(part: ResultColumns) -> dict[str, Any] | None:
 def _agree(schemas: Iterable[InfoSchema]) -> bool:
     """Whether each key has one typed column in all of `schemas`."""
     kinds: dict[str, tuple[Any, Any]] = {}
+    masked: dict[str, bool] = {}
     for schema in schemas:
+        for key in schema.keys:
+            # Some have a mask of their own, others not.
+            if masked.setdefault(key, f"_{key}" in schema.keys) != (f"_{key}" in schema.keys):
+                return False
         for key, kind, array in zip(schema.keys, schema.types, schema.arrays, strict=True):
             if kinds.setdefault(key, (kind, array)) != (kind, array) or kind is _AS_OBJECTS:
                 return False
@@ -101,17 +129,22 @@ def _of_all(fields: dict[str, Any]) -> dict[str, Any]:
     columns: dict[str, Any] = {}
     for key, values in fields.items():
         columns[key] = values.copy()
-        columns[f"_{key}"] = np.ones(len(values), np.bool_)
+        if not (is_mask(key, fields) or f"_{key}" in fields):
+            columns[f"_{key}"] = np.ones(len(values), np.bool_)
     return columns
 
 
 def _of_some(info: Any, rows: dict[InfoSchema, list[int]]) -> dict[str, Any]:
     columns: dict[str, Any] = {}
     for schema, chosen in rows.items():
-        for key, values in schema.fields(info[chosen]).items():
+        fields = schema.fields(info[chosen])
+        for key, values in fields.items():
+            own_mask = is_mask(key, fields) or f"_{key}" in fields
             if key not in columns:
                 columns[key] = np.zeros((len(info), *values.shape[1:]), values.dtype)
-                columns[f"_{key}"] = np.zeros(len(info), np.bool_)
+                if not own_mask:
+                    columns[f"_{key}"] = np.zeros(len(info), np.bool_)
             columns[key][chosen] = values
-            columns[f"_{key}"][chosen] = True
+            if not own_mask:
+                columns[f"_{key}"][chosen] = True
     return columns

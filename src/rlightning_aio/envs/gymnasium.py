@@ -58,11 +58,9 @@ class GymnasiumEnv(BaseEnv):
     def _make(self) -> Any:
         """Make the simulator that the config names; subclasses wrap or replace it."""
         config = self.config
-        # The runtime checks observations against the space itself, once, where it
-        # copies them; Gymnasium's checker would stay in the path of every step.
-        make_kwargs: dict[str, Any] = {"disable_env_checker": True, **config.env_kwargs}
         if config.num_envs == 1:
-            return gym.make(config.task, max_episode_steps=config.max_episode_steps, **make_kwargs)
+            return self._make_one()
+        make_kwargs: dict[str, Any] = {"disable_env_checker": True, **config.env_kwargs}
         if config.max_episode_steps is not None:
             make_kwargs["max_episode_steps"] = config.max_episode_steps
         if spec_of(config.task).vector_entry_point is None:
@@ -71,6 +69,13 @@ class GymnasiumEnv(BaseEnv):
         else:
             del make_kwargs["disable_env_checker"]
         return gym.make_vec(config.task, config.num_envs, **make_kwargs)
+
+    def _make_one(self) -> gym.Env[Any, Any]:
+        # The runtime checks observations against the space itself, once, where it
+        # copies them; Gymnasium's checker would stay in the path of every step.
+        make_kwargs: dict[str, Any] = {"disable_env_checker": True, **self.config.env_kwargs}
+        limit = self.config.max_episode_steps
+        return gym.make(self.config.task, max_episode_steps=limit, **make_kwargs)
 
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
@@ -119,11 +124,30 @@ def spec_of(task: str) -> EnvSpec:
 
 
 class MujocoEnv(GymnasiumEnv):
-    """Gymnasium's MuJoCo tasks (HalfCheetah-v5, Ant-v5, …)."""
+    """Gymnasium's MuJoCo tasks (HalfCheetah-v5, Ant-v5, …).
+
+    With ``num_envs`` a task of version 5 is stepped with one call for all; see `mujoco_batch`.
+    """
 
     def _make(self) -> Any:
         with outdated_assets_accepted():
-            return super()._make()
+            if self.config.num_envs == 1:
+                return super()._make()
+            # Not at the top: few workers need it.
+            from rlightning_aio.envs.mujoco_batch import MujocoBatch
+
+            one = self._make_one()
+            try:
+                return MujocoBatch(one, self.config.num_envs)
+            except NotImplementedError as error:
+                one.close()
+                warnings.warn(
+                    f"{self.env_id}: {self.config.num_envs} envs of {self.config.task} are stepped "
+                    f"one after the other: {error}",
+                    RuntimeWarning,
+                    stacklevel=2,
+                )
+                return super()._make()
 
 
 @contextlib.contextmanager

@@ -1,0 +1,481 @@
+# ruff: noqa: SLF001 (Gymnasium keeps its options in private attributes.)
+"""What Gymnasium's MuJoCo tasks, version 5, make of a step: whole arrays for many simulations.
+
+Rule: each formula is Gymnasium's (gymnasium/envs/mujoco/*_v5.py), with its order of operations
+and its dtypes, so that results are the same to the bit; options are read from Gymnasium's env.
+Where NumPy computes arrays otherwise than numbers, so is it said. Actions are
+``[n, *action]``; whatever is gathered from n simulations is ``[n, ...]`` float64.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar, cast
+
+import gymnasium as gym
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from numpy.typing import NDArray
+
+__all__ = ["Task", "task_of"]
+
+Judgement = tuple[Any, Any, dict[str, Any]]
+"""Rewards, terminations, infos."""
+
+
+class Task:
+    """What all tasks share.
+
+    Args:
+        env: Gymnasium's, unwrapped.
+        simulations: n of them, of its model.
+
+    Attributes:
+        needs_forces: `mj_rnePostConstraint` must follow each step.
+        actions: of the step.
+        observations: after it.
+    """
+
+    needs_forces: ClassVar[bool] = False
+
+    def __init__(self, env: Any, simulations: list[Any]) -> None:
+        self.env = env
+        self._simulations = simulations
+        self._num = len(simulations)
+        self._observed = self.gathered(*self.observed())
+        self._before: Any = None
+        self.actions: Any = None
+        self.observations: Any = None
+
+    def gathered(self, *parts: Callable[[Any], Any]) -> Callable[[], NDArray[np.float64]]:
+        """What reads parts of each simulation's arrays, flat and one after the other."""
+        views = [part(s).reshape(-1) for s in self._simulations for part in parts]
+        num = self._num
+        return lambda: np.concatenate(views).reshape(num, -1)
+
+    # -- what a task says of itself -----------------------------------------------------
+
+    def observed(self) -> list[Callable[[Any], Any]]:
+        """The parts of a simulation that make an observation."""
+        raise NotImplementedError
+
+    def finish(self, observations: NDArray[np.float64]) -> None:
+        """Change what was observed, in place."""
+
+    def position(self) -> NDArray[np.float64]:
+        """Where each simulation's body is, for its velocity."""
+        return np.empty(0)
+
+    def judge(self) -> Judgement:
+        """What the step was worth, and where it ends an episode."""
+        raise NotImplementedError
+
+    # -- what is done with it -----------------------------------------------------------
+
+    def begin(self, actions: NDArray[Any]) -> None:
+        """Take note of the actions of a step, and of where all are before it."""
+        self.actions = actions
+        self._before = self.position()
+
+    def observe(self) -> NDArray[np.float64]:
+        """Observations of all, as they are now."""
+        self.observations = self._observed()
+        self.finish(self.observations)
+        return self.observations
+
+    def velocity(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Positions now, and velocities since `begin`."""
+        after = self.position()
+        return after, (after - self._before) / self.env.dt
+
+    def never(self) -> NDArray[np.bool_]:
+        return np.zeros(self._num, np.bool_)
+
+
+def _skipping(env: Any, count: int) -> list[Callable[[Any], Any]]:
+    """Positions, without the first ones if they are excluded, and velocities."""
+    skipped = count if env._exclude_current_positions_from_observation else 0
+    return [lambda s: s.qpos[skipped:], lambda s: s.qvel]
+
+
+def _squares(rows: NDArray[Any]) -> Any:
+    return np.square(rows).sum(axis=1)
+
+
+def _lengths(vectors: NDArray[np.float64]) -> Any:
+    # As `np.linalg.norm`, which takes a dot product.
+    return np.sqrt(np.vecdot(vectors, vectors))
+
+
+class HalfCheetah(Task):
+    def __init__(self, env: Any, simulations: list[Any]) -> None:
+        super().__init__(env, simulations)
+        self.x = self.gathered(lambda s: s.qpos[:1])
+
+    def observed(self) -> list[Callable[[Any], Any]]:
+        return _skipping(self.env, 1)
+
+    def position(self) -> NDArray[np.float64]:
+        return self.x()[:, 0]
+
+    def judge(self) -> Judgement:
+        x, velocity = self.velocity()
+        forward = self.env._forward_reward_weight * velocity
+        control = self.env._ctrl_cost_weight * _squares(self.actions)
+        infos = {
+            "x_position": x,
+            "x_velocity": velocity,
+            "reward_forward": forward,
+            "reward_ctrl": -control,
+        }
+        return forward - control, self.never(), infos
+
+
+class Swimmer(Task):
+    def __init__(self, env: Any, simulations: list[Any]) -> None:
+        super().__init__(env, simulations)
+        self.xy = self.gathered(lambda s: s.qpos[:2])
+
+    def position(self) -> NDArray[np.float64]:
+        return self.xy()
+
+    def observed(self) -> list[Callable[[Any], Any]]:
+        return _skipping(self.env, 2)
+
+    def judge(self) -> Judgement:
+        xy, velocity = self.velocity()
+        forward = self.env._forward_reward_weight * velocity[:, 0]
+        control = self.env._ctrl_cost_weight * _squares(self.actions)
+        infos = {
+            "x_position": xy[:, 0],
+            "y_position": xy[:, 1],
+            "distance_from_origin": _lengths(xy),
+            "x_velocity": velocity[:, 0],
+            "y_velocity": velocity[:, 1],
+            "reward_forward": forward,
+            "reward_ctrl": -control,
+        }
+        return forward - control, self.never(), infos
+
+
+class Hopper(Task):
+    def __init__(self, env: Any, simulations: list[Any]) -> None:
+        super().__init__(env, simulations)
+        self.state = self.gathered(lambda s: s.qpos, lambda s: s.qvel)
+        self.x = self.gathered(lambda s: s.qpos[:1])
+        self.velocities = env.observation_space.shape[0] - env.model.nv
+
+    def observed(self) -> list[Callable[[Any], Any]]:
+        return _skipping(self.env, 1)
+
+    def finish(self, observations: NDArray[np.float64]) -> None:
+        velocities = observations[:, self.velocities :]
+        np.clip(velocities, -10, 10, out=velocities)
+
+    def position(self) -> NDArray[np.float64]:
+        return self.x()[:, 0]
+
+    def healthy(self, state: NDArray[np.float64]) -> NDArray[np.bool_]:
+        least, most = self.env._healthy_state_range
+        rest = state[:, 2:]
+        return self.upright(state) & ((least < rest) & (rest < most)).all(axis=1)
+
+    def upright(self, state: NDArray[np.float64]) -> NDArray[np.bool_]:
+        (low, high), (least, most) = self.env._healthy_z_range, self.env._healthy_angle_range
+        z, angle = state[:, 1], state[:, 2]
+        return (low < z) & (z < high) & (least < angle) & (angle < most)
+
+    def judge(self) -> Judgement:
+        env, state = self.env, self.state()
+        x, velocity = self.velocity()
+        healthy = self.healthy(state)
+        forward = env._forward_reward_weight * velocity
+        survive = healthy * env._healthy_reward
+        control = env._ctrl_cost_weight * _squares(self.actions)
+        infos = {
+            "x_position": x,
+            "z_distance_from_origin": state[:, 1] - env.init_qpos[1],
+            "x_velocity": velocity,
+            "reward_forward": forward,
+            "reward_ctrl": -control,
+            "reward_survive": survive,
+        }
+        return forward + survive - control, ~healthy & bool(env._terminate_when_unhealthy), infos
+
+
+class Walker2d(Hopper):
+    def healthy(self, state: NDArray[np.float64]) -> NDArray[np.bool_]:
+        return self.upright(state)
+
+
+class Ant(Task):
+    needs_forces = True
+
+    def __init__(self, env: Any, simulations: list[Any]) -> None:
+        super().__init__(env, simulations)
+        body = env.model.body(env._main_body).id
+        self.state = self.gathered(lambda s: s.qpos, lambda s: s.qvel)
+        self.forces = self.gathered(lambda s: s.cfrc_ext)
+        self.xy = self.gathered(lambda s: s.xpos[body, :2])
+        self.first_force = env.observation_structure["qpos"] + env.observation_structure["qvel"]
+
+    def position(self) -> NDArray[np.float64]:
+        return self.xy()
+
+    def observed(self) -> list[Callable[[Any], Any]]:
+        parts = _skipping(self.env, 2)
+        if self.env._include_cfrc_ext_in_observation:
+            parts.append(lambda s: s.cfrc_ext[1:])
+        return parts
+
+    def finish(self, observations: NDArray[np.float64]) -> None:
+        forces = observations[:, self.first_force :]
+        np.clip(forces, *self.env._contact_force_range, out=forces)
+
+    def judge(self) -> Judgement:
+        env, state = self.env, self.state()
+        _, velocity = self.velocity()
+        low, high = env._healthy_z_range
+        healthy = np.isfinite(state).all(axis=1) & (low <= state[:, 2]) & (state[:, 2] <= high)
+        forward = velocity[:, 0] * env._forward_reward_weight
+        survive = healthy * env._healthy_reward
+        control = env._ctrl_cost_weight * _squares(self.actions)
+        forces = np.clip(self.forces(), *env._contact_force_range)
+        contact = env._contact_cost_weight * _squares(forces)
+        infos = {
+            "x_position": state[:, 0],
+            "y_position": state[:, 1],
+            "distance_from_origin": _lengths(state[:, :2]),
+            "x_velocity": velocity[:, 0],
+            "y_velocity": velocity[:, 1],
+            "reward_forward": forward,
+            "reward_ctrl": -control,
+            "reward_contact": -contact,
+            "reward_survive": survive,
+        }
+        rewards = forward + survive - (control + contact)
+        return rewards, ~healthy & bool(env._terminate_when_unhealthy), infos
+
+
+class _Humanoid(Task):
+    """What the two humanoids share."""
+
+    needs_forces = True
+
+    def __init__(self, env: Any, simulations: list[Any]) -> None:
+        super().__init__(env, simulations)
+        self.start = self.gathered(lambda s: s.qpos[:3])
+        self.controls = self.gathered(lambda s: s.ctrl)
+        self.forces = self.gathered(lambda s: s.cfrc_ext)
+        self.lengths = self.gathered(lambda s: s.ten_length)
+        self.speeds = self.gathered(lambda s: s.ten_velocity)
+
+    def observed(self) -> list[Callable[[Any], Any]]:
+        env, parts = self.env, _skipping(self.env, 2)
+        if env._include_cinert_in_observation is True:
+            parts.append(lambda s: s.cinert[1:])
+        if env._include_cvel_in_observation is True:
+            parts.append(lambda s: s.cvel[1:])
+        if env._include_qfrc_actuator_in_observation is True:
+            parts.append(lambda s: s.qfrc_actuator[6:])
+        if env._include_cfrc_ext_in_observation is True:
+            parts.append(lambda s: s.cfrc_ext[1:])
+        return parts
+
+    def clipped(self, weight: float, limits: tuple[float, float]) -> NDArray[np.float64]:
+        """What forces from outside cost."""
+        return np.clip(weight * _squares(self.forces()), *limits)
+
+
+class Humanoid(_Humanoid):
+    def __init__(self, env: Any, simulations: list[Any]) -> None:
+        super().__init__(env, simulations)
+        self.masses = env.model.body_mass
+        self.centres = self.gathered(lambda s: s.xipos)
+
+    def position(self) -> NDArray[np.float64]:
+        centres = self.centres().reshape(self._num, -1, 3)
+        return (np.einsum("b,kbj->kj", self.masses, centres) / self.masses.sum())[:, :2]
+
+    def judge(self) -> Judgement:
+        env, start = self.env, self.start()
+        _, velocity = self.velocity()
+        low, high = env._healthy_z_range
+        healthy = (low < start[:, 2]) & (start[:, 2] < high)
+        forward = env._forward_reward_weight * velocity[:, 0]
+        survive = healthy * env._healthy_reward
+        control = env._ctrl_cost_weight * _squares(self.controls())
+        contact = self.clipped(env._contact_cost_weight, env._contact_cost_range)
+        infos = {
+            "x_position": start[:, 0],
+            "y_position": start[:, 1],
+            "tendon_length": self.lengths(),
+            "tendon_velocity": self.speeds(),
+            "distance_from_origin": _lengths(start[:, :2]),
+            "x_velocity": velocity[:, 0],
+            "y_velocity": velocity[:, 1],
+            "reward_survive": survive,
+            "reward_forward": forward,
+            "reward_ctrl": -control,
+            "reward_contact": -contact,
+        }
+        rewards = forward + survive - (control + contact)
+        return rewards, ~healthy & bool(env._terminate_when_unhealthy), infos
+
+
+class HumanoidStandup(_Humanoid):
+    def judge(self) -> Judgement:
+        env, start = self.env, self.start()
+        up = (start[:, 2] - 0) / env.model.opt.timestep
+        control = env._ctrl_cost_weight * _squares(self.controls())
+        impact = self.clipped(env._impact_cost_weight, env._impact_cost_range)
+        infos = {
+            "x_position": start[:, 0],
+            "y_position": start[:, 1],
+            "z_distance_from_origin": start[:, 2] - env.init_qpos[2],
+            "tendon_length": self.lengths(),
+            "tendon_velocity": self.speeds(),
+            "reward_linup": up,
+            "reward_quadctrl": -control,
+            "reward_impact": -impact,
+        }
+        return up - control - impact + 1, self.never(), infos
+
+
+class InvertedPendulum(Task):
+    def observed(self) -> list[Callable[[Any], Any]]:
+        return [lambda s: s.qpos, lambda s: s.qvel]
+
+    def judge(self) -> Judgement:
+        finite = np.isfinite(self.observations).all(axis=1)
+        terminated = ~finite | (np.abs(self.observations[:, 1]) > 0.2)
+        survive = (~terminated).astype(np.int64)
+        return survive.astype(np.float64), terminated, {"reward_survive": survive}
+
+
+class InvertedDoublePendulum(Task):
+    def __init__(self, env: Any, simulations: list[Any]) -> None:
+        super().__init__(env, simulations)
+        self.tip = self.gathered(lambda s: s.site_xpos[0])
+        self.speeds = self.gathered(lambda s: s.qvel[1:3])
+
+    def observed(self) -> list[Callable[[Any], Any]]:
+        angles: Callable[[Any], Any] = lambda s: s.qpos[1:]  # noqa: E731
+        return [
+            lambda s: s.qpos[:1],
+            angles,
+            angles,
+            lambda s: s.qvel,
+            lambda s: s.qfrc_constraint[:1],
+        ]
+
+    def finish(self, observations: NDArray[np.float64]) -> None:
+        count = self.env.model.nq - 1
+        sines, cosines = observations[:, 1 : 1 + count], observations[:, 1 + count : 1 + 2 * count]
+        np.sin(sines, out=sines)
+        np.cos(cosines, out=cosines)
+        rest = observations[:, 1 + 2 * count :]
+        np.clip(rest, -10, 10, out=rest)
+
+    def judge(self) -> Judgement:
+        tips, speeds = self.tip().tolist(), self.speeds().tolist()
+        # Of numbers NumPy takes the power that C does, of arrays the product.
+        distances = np.array([0.01 * x**2 + (y - 2) ** 2 for x, _, y in tips])
+        velocities = np.array([1e-3 * v1**2 + 5e-3 * v2**2 for v1, v2 in speeds])
+        terminated = np.array([y <= 1 for _, _, y in tips])
+        alive = self.env._healthy_reward * ~terminated
+        infos = {
+            "reward_survive": alive,
+            "distance_penalty": -distances,
+            "velocity_penalty": -velocities,
+        }
+        return alive - distances - velocities, terminated, infos
+
+
+class Pusher(Task):
+    def observed(self) -> list[Callable[[Any], Any]]:
+        arm, thing, goal = (self.env.model.body(name).id for name in ("tips_arm", "object", "goal"))
+        return [
+            lambda s: s.qpos[:7],
+            lambda s: s.qvel[:7],
+            lambda s: s.xpos[arm],
+            lambda s: s.xpos[thing],
+            lambda s: s.xpos[goal],
+        ]
+
+    def judge(self) -> Judgement:
+        env = self.env
+        arm, thing, goal = (self.observations[:, k : k + 3] for k in (14, 17, 20))
+        near = -_lengths(thing - arm) * env._reward_near_weight
+        distance = -_lengths(thing - goal) * env._reward_dist_weight
+        control = -_squares(self.actions) * env._reward_control_weight
+        infos = {"reward_dist": distance, "reward_ctrl": control, "reward_near": near}
+        return distance + control + near, self.never(), infos
+
+
+class Reacher(Task):
+    def __init__(self, env: Any, simulations: list[Any]) -> None:
+        super().__init__(env, simulations)
+        tip, target = (env.model.body(name).id for name in ("fingertip", "target"))
+        self.tip = self.gathered(lambda s: s.xpos[tip])
+        self.target = self.gathered(lambda s: s.xpos[target])
+
+    def observed(self) -> list[Callable[[Any], Any]]:
+        angles: Callable[[Any], Any] = lambda s: s.qpos[:2]  # noqa: E731
+        # The last is where the distance to the target goes.
+        return [angles, angles, lambda s: s.qpos[2:], lambda s: s.qvel[:2], lambda s: s.xpos[0, :2]]
+
+    def finish(self, observations: NDArray[np.float64]) -> None:
+        cosines, sines = observations[:, :2], observations[:, 2:4]
+        np.cos(cosines, out=cosines)
+        np.sin(sines, out=sines)
+        observations[:, -2:] = (self.tip() - self.target())[:, :2]
+
+    def judge(self) -> Judgement:
+        env = self.env
+        distance = -_lengths(self.tip() - self.target()) * env._reward_dist_weight
+        control = -_squares(self.actions) * env._reward_control_weight
+        infos = {"reward_dist": distance, "reward_ctrl": control}
+        return distance + control, self.never(), infos
+
+
+_KINDS: dict[str, type[Task]] = {
+    "ant_v5:AntEnv": Ant,
+    "half_cheetah_v5:HalfCheetahEnv": HalfCheetah,
+    "hopper_v5:HopperEnv": Hopper,
+    "humanoid_v5:HumanoidEnv": Humanoid,
+    "humanoidstandup_v5:HumanoidStandupEnv": HumanoidStandup,
+    "inverted_double_pendulum_v5:InvertedDoublePendulumEnv": InvertedDoublePendulum,
+    "inverted_pendulum_v5:InvertedPendulumEnv": InvertedPendulum,
+    "pusher_v5:PusherEnv": Pusher,
+    "reacher_v5:ReacherEnv": Reacher,
+    "swimmer_v5:SwimmerEnv": Swimmer,
+    "walker2d_v5:Walker2dEnv": Walker2d,
+}
+
+
+def task_of(env: gym.Env[Any, Any], simulations: list[Any]) -> Task:
+    """The task of an env that `gymnasium.make` made.
+
+    Raises:
+        NotImplementedError: it is none of Gymnasium's v5 tasks, or wrapped in something that
+            changes what it does.
+    """
+    kind = type(env.unwrapped)
+    found = _KINDS.get(
+        f"{kind.__module__}:{kind.__qualname__}".removeprefix("gymnasium.envs.mujoco.")
+    )
+    if found is None:
+        raise NotImplementedError(f"{kind.__name__} is none of Gymnasium's MuJoCo tasks, version 5")
+    for wrapper in _wrappers(env):
+        if not isinstance(wrapper, gym.wrappers.OrderEnforcing | gym.wrappers.TimeLimit):
+            raise NotImplementedError(f"it is wrapped in {type(wrapper).__name__}")
+    return found(env.unwrapped, simulations)
+
+
+def _wrappers(env: Any) -> Iterator[Any]:
+    while isinstance(env, gym.Wrapper):
+        yield env
+        env = cast("Any", env).env
