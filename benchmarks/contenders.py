@@ -39,6 +39,7 @@ class Work:
         modules: imported wherever the env is made.
         backend: this library's name for the simulator.
         max_episode_steps: limit for tasks that have none of their own.
+        together: how many of them this library steps with one request (its `num_envs`).
     """
 
     task: str
@@ -46,6 +47,12 @@ class Work:
     modules: tuple[str, ...] = ()
     backend: str = "gymnasium"
     max_episode_steps: int | None = None
+    together: int = 1
+
+    @property
+    def num_requests(self) -> int:
+        """How many requests a step of all takes."""
+        return self.num_envs // self.together
 
     def make(self) -> Any:
         """One env, as bare as `gymnasium.make` makes it."""
@@ -113,7 +120,8 @@ def group_config(work: Work, envs_per_process: int | str) -> dict[str, Any]:
         "name": "bench",
         "backend": work.backend,
         "task": work.task,
-        "num_workers": work.num_envs,
+        "num_workers": work.num_requests,
+        "num_envs": work.together,
         "max_episode_steps": work.episode_limit(),
         "envs_per_process": envs_per_process,
         # One worker on each core is best kept there.
@@ -145,7 +153,7 @@ class OursSync(Stepped):
         if self.auto_reset:
             self._envs.auto_reset().__enter__()
         self._batch, _ = self._envs.reset(seed=0)
-        self._actions = sampled(self._envs.get_action_spaces()[0], self.work.num_envs)
+        self._actions = sampled(self._envs.get_action_spaces()[0], self.work.num_requests)
 
     def step(self) -> int:
         response = self._batch.respond(action=next(self._actions))
@@ -190,7 +198,7 @@ class OursAsync(Contender):
         if self.auto_reset:
             self._envs.auto_reset().__enter__()
         self._first, _ = self._runner.run(self._envs.reset(seed=0))
-        self._actions = sampled(self._envs.get_action_spaces()[0], self.work.num_envs)
+        self._actions = sampled(self._envs.get_action_spaces()[0], self.work.num_requests)
         self.begin()
 
     def begin(self) -> None:
@@ -212,7 +220,7 @@ class OursAsync(Contender):
             _ = batch.observation, batch.reward
             self._send(batch)
             count += len(batch)
-        return count
+        return count * self.work.together
 
     async def measure(self, seconds: float) -> float:
         """One round, within the event loop."""
@@ -429,13 +437,17 @@ class Limit(Contender):
         """Run in each process: a round for each number of seconds that comes."""
         for inherited in self._connections:
             inherited.close()
-        envs = InLine(self.work, self.num_envs, self.steps_per_look)
+        envs = self.envs()
         connection.send(0.0)
         try:
             while True:
                 connection.send(throughput(envs.step, connection.recv()))
         except EOFError:
             envs.close()
+
+    def envs(self) -> Any:
+        """What each process steps."""
+        return InLine(self.work, self.num_envs, self.steps_per_look)
 
     def round(self, seconds: float) -> float:
         for connection in self._connections:
@@ -447,3 +459,52 @@ class Limit(Contender):
             connection.close()
         for process in self._processes:
             process.join()
+
+
+class Together:
+    """Simulations that are stepped with one call, as this library's workers step them."""
+
+    def __init__(self, work: Work, num_envs: int) -> None:
+        from rlightning_aio.envs.mujoco_batch import MujocoBatch
+
+        self._num_envs = num_envs
+        self._envs = MujocoBatch(work.make(), num_envs)
+        self._envs.reset(seed=0)
+        self._actions = sampled(self._envs.single_action_space, num_envs)
+
+    def step(self) -> int:
+        self._envs.step(next(self._actions))
+        return self._num_envs
+
+    def close(self) -> None:
+        self._envs.close()
+
+
+@dataclass
+class Ceiling(Limit):
+    """On each core simulations that are stepped together; no trainer.
+
+    Attributes:
+        num_envs: of each process.
+    """
+
+    def envs(self) -> Any:
+        return Together(self.work, self.num_envs)
+
+
+@dataclass
+class VectorEntryPoint(Stepped):
+    """The task's own vector environment, in the trainer's process."""
+
+    def setup(self) -> None:
+        import gymnasium as gym
+
+        self._envs = gym.make_vec(
+            self.work.task, self.work.num_envs, vectorization_mode="vector_entry_point"
+        )
+        self._actions = sampled(self._envs.single_action_space, self.work.num_envs)
+        self._envs.reset(seed=0)
+
+    def step(self) -> int:
+        self._envs.step(next(self._actions))
+        return self.work.num_envs

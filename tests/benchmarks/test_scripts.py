@@ -25,6 +25,7 @@ ONE_STAGE = Path(__file__).with_name("one_stage.py")
 # Of each script the contenders that take part, by parts of their names; all if there are none.
 ASKED = {
     "cheetah": ["rlightning_aio async"],
+    "batches": ["aio, HalfCheetah x 32", "aio, 16 of HalfCheetah", "ceiling"],
     "cartpole": ["rlightning_aio sync", "loop"],
     "humanoid": ["rlightning_aio sync"],
     "round_trip": [],
@@ -40,7 +41,7 @@ ASKED = {
 # Here the work itself gives the length.
 WITHOUT_SECONDS = ("start", "memory")
 TOGETHER = (
-    ("cheetah", "cartpole", "humanoid", "start", "memory"),
+    ("cheetah", "batches", "cartpole", "humanoid", "start", "memory"),
     ("round_trip", "facade", "trainer_cpu", "stragglers", "uneven", "peers", "pong"),
 )
 RARELY_SLOW = "all work 50 µs, 2 of 8 rarely take 100 ms, 4 to a worker"
@@ -95,6 +96,7 @@ def test_a_script_run_by_itself(tmp_path: Path) -> None:
     ("script", "contenders"),
     [
         ("cheetah", 1),
+        ("batches", 3),
         ("cartpole", 2),
         ("humanoid", 1),
         ("round_trip", 4),
