@@ -10,7 +10,15 @@ import numpy as np
 import pytest
 from gymnasium import wrappers
 
-from rlightning_aio import BaseEnv, ConfigError, EnvConfig, EnvRet, StartFailed, load_config
+from rlightning_aio import (
+    BaseEnv,
+    ConfigError,
+    EnvConfig,
+    EnvRaised,
+    EnvRet,
+    StartFailed,
+    load_config,
+)
 from rlightning_aio.sync import build_env_group
 
 
@@ -80,6 +88,17 @@ def test_one_callable_makes_every_env_of_an_entry() -> None:
             0.0,
             0.0,
         ]
+
+
+def test_errors_name_what_has_made_the_env() -> None:
+    """Where there is no task to name."""
+    makers = [wrapped_pendulum, lambda: wrapped_pendulum(5.0)]
+    with inline(make_env=makers, num_workers=2) as group:
+        for k, name in enumerate((r"wrapped_pendulum", r"\S+<lambda>")):
+            (env_id,) = [env_id for env_id in group.env_ids if env_id.endswith(str(k))]
+            said = rf"'{env_id}' \(entry '\w+', backend callable, make_env {name}\) raised"
+            with pytest.raises(EnvRaised, match=said):
+                group[env_id].call("nothing")
 
 
 def test_yaml_names_a_function(tmp_path: Any) -> None:

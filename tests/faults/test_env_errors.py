@@ -122,7 +122,7 @@ def test_whatever_a_call_raises_is_told(start: Start) -> None:
     for name in RAISED:
         with pytest.raises(EnvRaised) as caught:
             group.call("faulty-1", "do", name)
-        check_told(caught.value, name, "call")
+        check_told(caught.value, name, "the call of do()")
         tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 

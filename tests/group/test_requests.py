@@ -91,7 +91,7 @@ class Driven:
 
     def _call(self) -> None:
         slots = [SLOT, COMPANION]
-        self.ticket = self.table.open_ticket(np.array(slots), calls=self.method)
+        self.ticket = self.table.open_ticket(np.array(slots), method="render" * self.method)
         op = Operation.CALL if self.method else Operation.RESET
         self._ask(slots, op, self.ticket.owner)
 
@@ -365,7 +365,8 @@ class RequestsMachine(RuleBasedStateMachine):
         joined = self.joined() if op is Operation.RESET else []
         taken = self.some(data, joined) if joined else []
         everyone = np.array(slots + taken, np.intp)
-        claim = Claim(self.table.open_ticket(everyone, calls=op is Operation.CALL), slots + taken)
+        method = "render" if op is Operation.CALL else ""
+        claim = Claim(self.table.open_ticket(everyone, method=method), slots + taken)
         self.claims.append(claim)
         if taken:
             self.table.take_joined(np.array(taken), claim.ticket)

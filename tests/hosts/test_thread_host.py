@@ -145,7 +145,7 @@ async def test_methods_are_called_in_the_thread(facade: Place) -> None:
     async with facade.build([entry("one"), entry("two", placement="process")]) as group:
         handle = group["one-0"]
         assert await handle.call("double", [4], times=3) == [4, 4, 4]
-        with pytest.raises(EnvRaised, match="raised in call: TypeError"):
+        with pytest.raises(EnvRaised, match=r"raised in the call of double\(\): TypeError"):
             await handle.call("double", None)
         await handle.set_attr("label", "changed")
         assert await handle.get_attr("label") == "changed"

@@ -149,7 +149,7 @@ def _faults_of(entry: EnvConfig) -> Generator[None]:
         words, env_id = ErrorText.of(error), f"{entry.name}-0"
         fault = EnvRaised(
             f"{env_id} (backend {entry.backend!r}, task {entry.task!r}) raised "
-            f"{words.type_name}: {words.text}; the remote traceback is above",
+            f"{words.summary}; the remote traceback is above",
             env_id=env_id,
             exception_type=words.type_name,
             exception_text=words.text,

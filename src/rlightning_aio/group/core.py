@@ -577,7 +577,7 @@ class Core:
         packed = [
             self._dispatch.packed(k, call, f"the arguments of {name}()") for k in slots.tolist()
         ]
-        ticket = self.requests.open_ticket(slots, calls=True)
+        ticket = self.requests.open_ticket(slots, method=name)
         entries = self.requests.submit(slots, Operation.CALL, ticket.owner, now)
         self.auto.not_completed(slots)
         self._dispatch.hand_over(slots, entries, packed)

@@ -6,7 +6,7 @@ env_server as it may have clients. Nothing here changes with a step.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -186,7 +186,14 @@ class EnvTable:
         """How an error message names the env."""
         config = self.configs[slot]
         env_id = self.env_ids[slot] or self.names.shared_ids[slot]
-        return (
-            f"env {env_id!r} (entry {config.name!r}, backend {config.backend}, "
-            f"task {config.task!r})"
-        )
+        makers: Any = config.make_env
+        if isinstance(makers, tuple):
+            first = next(k for k, other in enumerate(self.configs) if other is config)
+            makers = cast("tuple[Any, ...]", makers)[slot - first]
+        made = f"make_env {_name(makers)}" if makers else f"task {config.task!r}"
+        return f"env {env_id!r} (entry {config.name!r}, backend {config.backend}, {made})"
+
+
+def _name(function: Any) -> str:
+    """What a callable is called where it was written."""
+    return getattr(function, "__qualname__", type(function).__name__)

@@ -403,9 +403,7 @@ os.register_at_fork(after_in_child=_disown_all)
 
 def _warn_of(errors: Sequence[tuple[str, Any]]) -> None:
     for env_id, error in errors:
-        warnings.warn(
-            f"close() of env {env_id!r} raised {error.type_name}: {error.text}", stacklevel=4
-        )
+        warnings.warn(f"close() of env {env_id!r} raised {error.summary}", stacklevel=4)
 
 
 def _check_seconds(name: str, seconds: float | None) -> None:

@@ -76,7 +76,7 @@ def cause_of(record: HostRecord, death: Death, entries: NDArray[np.int64]) -> st
         return f"hung in {_doing(entries.item(record.hung_slot))} and was killed"
     if record.rebuild_error is not None:
         error = record.rebuild_error
-        return f"could not be rebuilt: {error.type_name}: {error.text}"
+        return f"could not be rebuilt: {error.summary}"
     if record.late:
         return f"did not start again within {record.config.start_timeout} s and was killed"
     return death.cause

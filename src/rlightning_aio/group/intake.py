@@ -142,11 +142,16 @@ class Intake:
         """What the caller is told of `error`, in which the current request of `slot` ended."""
         cause = self._recovery.failed(slot)
         after = f" (its worker {cause}, and was replaced)" if cause else ""
-        doing = Operation(self._requests.op(slot)).name.lower()
+        op = self._requests.op(slot)
+        doing = Operation(op).name.lower()
+        go_on = "reset the env to go on"
+        if answers_with_value(op):
+            doing = f"the call of {self._requests.method(slot)}()"
+            go_on = "the env can be used on"
         kind = ActionRefused if error.type_name == _BAD_ACTION else EnvRaised
         return kind(
-            f"{self._envs.describe(slot)} raised in {doing}: {error.type_name}: {error.text}"
-            f"{after}; the remote traceback is above; reset the env to go on",
+            f"{self._envs.describe(slot)} raised in {doing}: {error.summary}{after}; the remote "
+            f"traceback is above; {go_on}",
             env_id=self._envs.env_ids[slot],
             exception_type=error.type_name,
             exception_text=error.text,

@@ -135,15 +135,21 @@ class Ticket:
 
     Attributes:
         remaining: of them that have not ended.
-        calls: they are calls of methods; values: what these have returned, by slot.
+        method: whose calls they are; empty where they are none.
+        values: what calls have returned, by slot.
     """
 
     owner: int
     slots: NDArray[np.intp]
     remaining: int
-    calls: bool
+    method: str
     faults: list[EnvFault] = field(default_factory=list["EnvFault"])
     values: dict[int, Any] = field(default_factory=dict[int, Any])
+
+    @property
+    def calls(self) -> bool:
+        """Whether the requests are calls of a method."""
+        return bool(self.method)
 
 
 class Requests:
@@ -470,12 +476,22 @@ class Requests:
 
     # -- calls that wait for their own replies ------------------------------------
 
-    def open_ticket(self, slots: NDArray[np.intp], *, calls: bool = False) -> Ticket:
-        """A call's claim to what becomes of its requests, which are about to be submitted."""
-        ticket = Ticket(self._next_ticket, slots, len(slots), calls)
+    def open_ticket(self, slots: NDArray[np.intp], *, method: str = "") -> Ticket:
+        """A call's claim to what becomes of its requests, which are about to be submitted.
+
+        Args:
+            slots: whose requests.
+            method: of the envs that is called; empty for steps and resets.
+        """
+        ticket = Ticket(self._next_ticket, slots, len(slots), method)
         self._next_ticket += 1
         self._tickets[ticket.owner] = ticket
         return ticket
+
+    def method(self, slot: int) -> str:
+        """The method whose call is the current request of `slot`, if somebody waits for it."""
+        ticket = self._tickets.get(self.owner.item(slot))
+        return "" if ticket is None else ticket.method
 
     def drop(self, ticket: Ticket) -> None:
         """Nothing was submitted for it."""

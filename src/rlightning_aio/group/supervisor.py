@@ -309,8 +309,8 @@ class Supervisor:
             self._fail_start(ConfigError(error.text))
             return
         fault = StartFailed(
-            f"{self._envs.describe(slot)} could not be built: {error.type_name}: "
-            f"{error.text}; the remote traceback is above",
+            f"{self._envs.describe(slot)} could not be built: {error.summary}; the "
+            f"remote traceback is above",
             env_id=self._envs.env_ids[slot],
         )
         fault.__cause__ = RemoteTraceback(error.traceback)

@@ -140,6 +140,11 @@ class ErrorText:
     text: str
     traceback: str
 
+    @property
+    def summary(self) -> str:
+        """The last line of the traceback: its type and, where it has one, its text."""
+        return f"{self.type_name}: {self.text}" if self.text else self.type_name
+
     @classmethod
     def of(cls, error: BaseException) -> ErrorText:
         """`error` in words, in plain text; nothing about its class is an obstacle."""

@@ -1,0 +1,77 @@
+"""Where a worker runs: its Python, its environment variables, its core, its threads."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+
+from rlightning_aio.sync import build_env_group
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import pytest
+
+
+def maker_of_witnesses() -> Any:
+    """What makes an env that tells of its worker; no module is needed for it there."""
+
+    class Witness(gym.Env[Any, Any]):
+        observation_space = action_space = gym.spaces.Discrete(2)
+
+        def variable(self, name: str) -> str | None:
+            return os.environ.get(name)
+
+        def cores(self) -> set[int]:
+            return os.sched_getaffinity(0)
+
+        def seen_by(self, module: str) -> str | None:
+            """What a module found when it was imported."""
+            return sys.modules[module].FOUND
+
+    return Witness
+
+
+def test_each_entry_has_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And workers one thread for mathematics, whatever the trainer has."""
+    program = tmp_path / "python-of-another-environment"
+    program.write_text(f'#!/bin/sh\nSTARTED_BY="$0" exec {sys.executable} "$@"\n')
+    program.chmod(0o755)
+    (tmp_path / "flavoured.py").write_text("import os\nFOUND = os.environ.get('FLAVOUR')\n")
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    monkeypatch.setenv("FLAVOUR", "salt")
+    witness = maker_of_witnesses()
+    entries = [
+        {
+            "name": "plain",
+            "make_env": witness,
+            "num_workers": 2,
+            "envs_per_process": 1,
+            "cpu_affinity": True,
+        },
+        {
+            "name": "other",
+            "make_env": witness,
+            "interpreter": str(program),
+            "env_vars": {"FLAVOUR": "sugar", "PYTHONPATH": str(tmp_path), "MKL_NUM_THREADS": "3"},
+            "imports": ["flavoured"],
+        },
+    ]
+    cores = sorted(os.sched_getaffinity(0))
+    with build_env_group(entries) as group:
+        one, two, other = (group[env_id] for env_id in group.env_ids)
+        for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+            assert one.call("variable", name) == "1"
+        assert one.call("variable", "FLAVOUR") == "salt"
+        assert one.call("variable", "STARTED_BY") is None
+        pinned = [env.call("cores") for env in (one, two)]
+        assert pinned == [{cores[k % len(cores)]} for k in range(2)]
+        assert other.call("variable", "STARTED_BY") == str(program)
+        assert other.call("seen_by", "flavoured") == "sugar"
+        assert other.call("variable", "OMP_NUM_THREADS") == "1"
+        assert other.call("variable", "MKL_NUM_THREADS") == "3", "what is configured holds"
+        assert other.call("cores") == set(cores)
+    assert "flavoured" not in sys.modules
