@@ -8,7 +8,9 @@ nobody out. Then a trainer with one honest client, and strangers in a process of
 send as many messages over ever new connections, to a server with keys and to one without.
 Rounds of 2 s alternate: strangers stopped or not (by signal), the trainer stepping its client
 or only waiting. Measured are the steps of a round, and the processor time of the trainer's
-process, ZMQ's thread included, while it only waits.
+process, ZMQ's thread included, while it only waits. Strangers wait for the other end's part of the
+handshake, so an env_server that makes them wait hears less than they would say: how much they have
+sent, and what became of it, is told beside.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ sys.path[0] = str(Path(__file__).resolve().parents[1] / "tests")
 
 from remote.disturbed import disturbed  # noqa: E402  (they lie beside their short form)
 from remote.fuzz import fuzz, fuzz_keys  # noqa: E402
+from remote.strangers import BATCH  # noqa: E402
 
 GROWTH = 200_000
 """Bytes that the noted messages which are spoilt next may differ by."""
@@ -47,6 +50,9 @@ class Cost:
         rates: steps a second, likewise.
         grown: bytes, since the first quarter.
         cut: connections that were cut off.
+        sent: messages, over connections that were not broken off before.
+        read: messages of which somebody found out what they say.
+        dropped: messages that were taken in and thrown away unread.
     """
 
     shares: tuple[list[float], list[float]] = field(default_factory=lambda: ([], []))
@@ -54,6 +60,9 @@ class Cost:
     seconds: float = 0.0
     grown: int = 0
     cut: int = 0
+    sent: int = 0
+    read: int = 0
+    dropped: int = 0
 
 
 def resident() -> int:
@@ -106,7 +115,11 @@ def cost(messages: int, rate: int, seed: int, *, curve: bool) -> Cost:
                 if not first and found.seconds >= messages / rate / 4:
                     first = resident()
         found.grown = resident() - first
-        found.cut = listener.num_cut
+        door = listener.door
+        found.cut, found.read, found.dropped = door.num_cut, door.num_wasted, door.num_dropped
+        strangers.kill()
+        strangers.wait()
+        found.sent = BATCH * len(strangers.stdout.read())
     return found
 
 
@@ -136,11 +149,11 @@ def main() -> int:
         found = cost(given.messages, given.rate, given.seed, curve=curve)
         quiet, loud = (median(shares) for shares in found.shares)
         rate = median(b / a for a, b in zip(*found.rates, strict=True))
-        each = (loud - quiet) * found.seconds / given.messages
         print(
-            f"{given.messages:,} messages of strangers in {found.seconds:.0f} s, "
-            f"{'keys' if curve else 'no keys'}: {loud - quiet:.1%} of a core more ({loud:.1%} "
-            f"against {quiet:.1%}, {1e6 * each:.0f} us a message); the client steps at "
+            f"{given.messages:,} messages of strangers at {given.rate:,} a second, "
+            f"{'keys' if curve else 'no keys'}: after {found.seconds:.0f} s {found.sent:,} sent, "
+            f"{found.read:,} read, {found.dropped:,} dropped; {loud - quiet:.1%} of a core more "
+            f"({loud:.1%} against {quiet:.1%}); the client steps at "
             f"{rate:.2f} of its rate ({median(found.rates[0]):,.0f} a second); "
             f"{found.cut:,} connections cut off; {found.grown:+,} bytes resident"
         )

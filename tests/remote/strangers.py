@@ -1,8 +1,9 @@
 """``strangers.py ADDRESS MESSAGES RATE SEED [curve]``: messages of those who were never let in.
 
 They speak ZMTP by hand, so that a new connection costs them next to nothing: each sends its
-greeting and fifty spoilt messages at once and hangs up. With ``curve`` they dial a server with
-keys: as if it had none, or with a broken proof of a key.
+greeting and, when the other end is done with its own, fifty spoilt messages at once, and hangs up.
+With ``curve`` they dial a server with keys: as if it had none, or with a broken proof of a key.
+They print a dot for each connection over which they have spoken.
 """
 
 from __future__ import annotations
@@ -79,6 +80,8 @@ def main(address: str, messages: int, rate: int, seed: int, *, curve: bool) -> N
             while heard <= GREETING and (part := one.recv(4096)):
                 heard += len(part)
             one.sendall(messages_said)
+            sys.stdout.write(".")
+        sys.stdout.flush()
         time.sleep(BATCH / rate)
 
 

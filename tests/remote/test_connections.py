@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
+import threading
+import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pytest
 import zmq
 from patience import HANG
-from remote.counting import ClientThread
+from remote.counting import ClientThread, CountingEnv
 
 from rlightning_aio import sync
-from rlightning_aio.hosts import door
-from rlightning_aio.protocol.net.wire import MAX_PARTS
-
-if TYPE_CHECKING:
-    import pytest
+from rlightning_aio.hosts import allowance, door, listener
+from rlightning_aio.protocol.net.wire import MAX_PARTS, Ping, Writer
+from rlightning_aio.remote import RemoteEnvClient, make_keys
 
 ENTRY: dict[str, Any] = {
     "name": "robots",
@@ -80,7 +82,7 @@ def test_a_message_of_too_many_parts_is_dropped_and_its_sender_cut_off() -> None
             stranger.linger = 0
             stranger.connect(group["robots-0"].address)
             stranger.send_multipart([b""] * 20 * MAX_PARTS)
-            while not listener.num_cut:
+            while not listener.door.num_cut:
                 batch = step(group, batch)
             for _ in range(50):
                 batch = step(group, batch)
@@ -90,26 +92,32 @@ def test_a_message_of_too_many_parts_is_dropped_and_its_sender_cut_off() -> None
         friend.join()
 
 
-def test_nonsense_in_the_oldest_protocol_of_zmq_is_dropped() -> None:
-    """Of such messages ZMQ does not tell from which connection they are."""
+@pytest.mark.parametrize(
+    "greeting", [b"\x01\x00", b"\xff" + bytes(7) + b"\x01\x7f\x01\x05\x00\x00"]
+)
+def test_protocols_before_zmtp_3_are_turned_away_at_their_greeting(greeting: bytes) -> None:
+    """One that greets while the socket closes would end the process: an assertion of libzmq's."""
     with sync.build_env_group(ENTRY) as group:
         listener = group["robots-0"]._server[0]._listener
-        friend = ClientThread(group["robots-0"].address, "arm")
-        batch, _ = group.reset()
         (stranger,) = dial(group["robots-0"].address, 1)
         with stranger:
             stranger.settimeout(HANG)
-            # ZMTP 1.0: a nameless peer, then messages of two bytes.
-            stranger.sendall(b"\x01\x00" + 5 * b"\x03\x00no")
-            while listener.malformed < 5:
-                batch = step(group, batch)
-        assert group["robots-0"].clients == ["robots-0/arm"]
-        group.close()
-        friend.join()
+            stranger.sendall(greeting + 5 * b"\x03\x00no")
+            with contextlib.suppress(ConnectionResetError):
+                while stranger.recv(4096):
+                    pass
+        with pytest.raises(TimeoutError):
+            group.collect_async(deadline=0.01)
+        assert listener.door.num_wasted == listener.door.num_dropped == 0
 
 
-def test_whoever_says_nothing_of_use_is_cut_off() -> None:
-    """What it has said beyond that is not even read; a client may be silent or err."""
+def ping() -> bytes:
+    return Writer().write(Ping(session=1))[0]
+
+
+@pytest.mark.parametrize(("said", "most"), [(b"nonsense", 1), (ping(), door._MOST_WASTED + 1)])
+def test_whoever_says_nothing_of_use_is_cut_off(said: bytes, most: int) -> None:
+    """At once if it is nonsense, and what it has said beyond isn't read; a client may be silent."""
     with sync.build_env_group(ENTRY) as group:
         listener = group["robots-0"]._server[0]._listener
         friend = ClientThread(group["robots-0"].address, "arm")
@@ -119,12 +127,95 @@ def test_whoever_says_nothing_of_use_is_cut_off() -> None:
             stranger.set(zmq.RECONNECT_IVL, -1)
             stranger.connect(group["robots-0"].address)
             for _ in range(1000):
-                stranger.send(b"nonsense")
-            while not listener.num_cut:
+                stranger.send(said)
+            while not listener.door.num_cut:
                 batch = step(group, batch)
             for _ in range(50):
                 batch = step(group, batch)
-        assert listener.malformed == door._MOST_WASTED + 1
+        assert listener.door.num_wasted == most
         assert friend.env.disconnects == 0
         group.close()
         friend.join()
+
+
+# What strangers may take
+
+SHORT = {**ENTRY, "env_kwargs": {"heartbeat": 5.0, "connect_timeout": HANG}}
+"""A client that doesn't hear the server's goodbye ends a quarter of that later."""
+
+
+def spend_everything(address: str, group: Any, listener: Any) -> None:
+    """Talk nonsense over ever new connections, until nobody is let in any more."""
+    with zmq.Context() as context, context.socket(zmq.DEALER) as stranger:
+        stranger.linger = 0
+        stranger.set(zmq.RECONNECT_IVL, 1)
+        stranger.connect(address)
+        while not listener._gate.deadline(time.monotonic()):
+            with contextlib.suppress(zmq.Again):
+                stranger.send(b"nonsense", zmq.NOBLOCK)
+            with contextlib.suppress(TimeoutError):
+                group.collect_async(deadline=0.01)
+
+
+def try_to_come_in(address: str, told: list[str]) -> None:
+    host, _, port = address.removeprefix("tcp://").rpartition(":")
+    with RemoteEnvClient(CountingEnv(), host, int(port), name="late") as client:
+        try:
+            client.connect(timeout=1.0)
+        except TimeoutError as error:
+            told.append(str(error))
+
+
+def test_strangers_wait_when_they_have_taken_what_is_theirs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Who became a client has taken nothing of it, and is served on."""
+    monkeypatch.setattr(listener, "SAVED", 2 * allowance.CONNECTION)
+    monkeypatch.setattr(listener, "STRANGERS_SHARE", 1e-9)
+    with sync.build_env_group(SHORT) as group:
+        address = group["robots-0"].address
+        friends = [ClientThread(address, name) for name in ("arm", "leg", "head")]
+        batch, _ = group.reset()
+        while len(group["robots-0"].clients) < 3:
+            batch = step(group, batch)
+        spend_everything(address, group, group["robots-0"]._server[0]._listener)
+        told: list[str] = []
+        late = threading.Thread(target=try_to_come_in, args=(address, told))
+        late.start()
+        while late.is_alive():
+            batch = step(group, batch)
+        assert len(told) == 1
+        group.close()
+        for friend in friends:
+            friend.join()
+
+
+def test_who_has_a_key_takes_nothing_of_what_strangers_may(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """There is enough for one stranger; three clients come in."""
+    monkeypatch.setattr(listener, "SAVED", allowance.CONNECTION)
+    monkeypatch.setattr(listener, "STRANGERS_SHARE", 1e-9)
+    keys = make_keys(tmp_path, ["arm", "leg", "head"])
+    kwargs = {**SHORT["env_kwargs"], "keys": str(tmp_path / "server"), "min_clients": 3}
+    with sync.build_env_group({**SHORT, "env_kwargs": kwargs}) as group:
+        friends = [ClientThread(group["robots-0"].address, key.name, keys=key) for key in keys]
+        group.reset()
+        group.close()
+        for friend in friends:
+            friend.join()
+
+
+@pytest.mark.parametrize("looks", [0.0, 1.0])
+def test_clients_come_in_though_so_many_come_and_go(
+    monkeypatch: pytest.MonkeyPatch, looks: float
+) -> None:
+    """Those who come are looked at together then, without anybody else's waking the trainer."""
+    monkeypatch.setattr(listener, "_LOOKS_IN_A_ROW", looks)
+    with sync.build_env_group(SHORT) as group:
+        friends = [ClientThread(group["robots-0"].address, str(k)) for k in range(3)]
+        while len(group["robots-0"].clients) < 3:
+            group.reset()
+        group.close()
+        for friend in friends:
+            friend.join()

@@ -26,12 +26,12 @@ def test_strangers_cost_nothing_that_stays() -> None:
     with disturbed(curve=False, messages=2_000, rate=10**6) as (group, listener, strangers):
         batch, _ = group.reset()
         steps = 0
-        while strangers.poll() is None or listener._door.num_strangers:
+        while strangers.poll() is None or listener.door.num_strangers:
             group.step_async(batch.respond(action=[0]))
             batch, _ = group.collect_async(deadline=HANG)
             steps += 1
         assert steps
-        assert listener.malformed > 500
+        assert listener.malformed > 10
         assert group["robots-0"].clients == ["robots-0/c0"]
 
 

@@ -20,8 +20,12 @@ from typing import TYPE_CHECKING, Final, cast
 
 import zmq
 
+from rlightning_aio.hosts.allowance import CONNECTION, price
+from rlightning_aio.protocol.net.server_session import Heard
+from rlightning_aio.remote.parts import is_readable
+
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from rlightning_aio.hosts.allowance import Allowance
 
 __all__ = ["Connection", "Door"]
 
@@ -33,6 +37,8 @@ ROOM: Final = _MOST + _UNREAD_EVENTS + 64
 """Descriptors that connections take at most; the last are for those that are being closed."""
 _MOST_WASTED: Final = 32
 """Messages in a row of a connection that lead to nothing."""
+_MOST_OWED: Final = 0.02
+"""Seconds by which the allowance for strangers may be overdrawn before they aren't listened to."""
 _CUT_REMEMBERED: Final = 4096
 
 _ACCEPTED: Final = int(zmq.EVENT_ACCEPTED)
@@ -46,7 +52,7 @@ class Connection:
 
     Attributes:
         route: where messages for it go.
-        descriptor: its socket's; -1 where ZMQ does not tell.
+        descriptor: its socket's.
         user: whose key it has proved; None without keys.
         is_client: it has said something in a session.
         wasted: messages since then that led to nothing.
@@ -58,22 +64,36 @@ class Connection:
     is_client: bool = False
     wasted: int = 0
 
+    @property
+    def is_strange(self) -> bool:
+        """Whether nothing at all speaks for it."""
+        return not self.is_client and self.user is None
+
 
 class Door:
     """Counts connections and cuts off those that are of no use.
 
     Args:
         router: a socket that is bound to nothing yet.
+        allowance: for strangers, in seconds.
         has_keys: connections have users.
 
     Attributes:
         num_cut: connections that were cut off.
+        num_wasted: messages that were read and led to nothing.
+        num_dropped: messages that weren't read, as nobody listened any more.
     """
 
     def __init__(
-        self, context: zmq.Context[zmq.Socket[bytes]], router: zmq.Socket[bytes], *, has_keys: bool
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        router: zmq.Socket[bytes],
+        allowance: Allowance,
+        *,
+        has_keys: bool,
     ) -> None:
-        self.num_cut = 0
+        self.num_cut = self.num_wasted = self.num_dropped = 0
+        self._allowance = allowance
         self._router = router
         self._has_keys = has_keys
         self._port = -1
@@ -100,9 +120,10 @@ class Door:
         """Connections that have said nothing of use yet."""
         return sum(one is None or not one.is_client for one in self._open.values())
 
-    def look(self) -> None:
-        """Take in who has come and gone; cut off those who are too many."""
-        for event, descriptor in self._told():
+    def look(self) -> bool:
+        """Take in who has come and gone, cut off those who are too many; whether any had."""
+        told = self._told()
+        for event, descriptor in told:
             gone = self._open.pop(descriptor, None)
             if gone is not None:
                 self._by_route.pop(gone.route, None)
@@ -114,17 +135,26 @@ class Door:
             useless = [fd for fd, one in self._open.items() if one is None or not one.is_client]
             for descriptor in useless[:excess]:
                 self._close(descriptor)
+        return bool(told)
 
-    def _told(self) -> Iterator[tuple[int, int]]:
+    def _told(self) -> list[tuple[int, int]]:
+        told: list[tuple[int, int]] = []
         # Not more than there can be at once: a flood goes on.
-        for _ in range(2 * _UNREAD_EVENTS):
-            try:
-                event, _ = self._events.recv_multipart(zmq.NOBLOCK)
-            except zmq.Again:
-                return
-            yield _EVENT.unpack(event)
+        while len(told) < 2 * _UNREAD_EVENTS and is_readable(self._events):
+            told.append(_EVENT.unpack(self._events.recv(zmq.NOBLOCK)))
+            self._events.recv(zmq.NOBLOCK)  # An address, of which the descriptor tells more.
+        return told
 
-    def connection(self, frame: zmq.Frame) -> Connection | None:
+    def connection(self, frame: zmq.Frame, now: float) -> Connection | None:
+        """Whose message begins with `frame`; None if it is to be dropped."""
+        found = self._speaker(frame)
+        if found and found.is_strange and self._allowance.left(now) < -_MOST_OWED:
+            self.cut(found)
+            found = None
+        self.num_dropped += found is None
+        return found
+
+    def _speaker(self, frame: zmq.Frame) -> Connection | None:
         """Whose message begins with `frame`; None for one that was cut off."""
         route = frame.bytes
         found = self._by_route.get(route)
@@ -132,18 +162,26 @@ class Door:
             # It may be newer than what was looked at last.
             self.look()
             user = str(frame.get("User-Id")) if self._has_keys else None
-            found = Connection(route, _descriptor_behind(frame), user)
-            if found.descriptor in self._open:
+            found = Connection(route, frame.get(zmq.SRCFD), user)
+            # One that is gone may have had the descriptor that is another's now.
+            if self._open.get(found.descriptor, found) is None:
                 self._by_route[route] = self._open[found.descriptor] = found
         return found
 
-    def judge(self, connection: Connection, *, was_useful: bool) -> None:
-        """Take note of whether a message led to anything."""
-        if was_useful:
+    def judge(self, connection: Connection, heard: Heard, num_bytes: int, now: float) -> None:
+        """Take note of what a message of `num_bytes` led to."""
+        if heard is Heard.IN_SESSION:
+            if connection.is_strange:
+                self._allowance.give_back(CONNECTION)
             connection.is_client, connection.wasted = True, 0
             return
         connection.wasted += 1
-        if connection.wasted > _MOST_WASTED:
+        self.num_wasted += 1
+        if connection.is_strange:
+            self._allowance.spend(price(num_bytes), now)
+        # A client may err, where a stranger is none.
+        is_nonsense = heard is Heard.MALFORMED and connection.is_strange
+        if is_nonsense or connection.wasted > _MOST_WASTED:
             self.cut(connection)
 
     def cut(self, connection: Connection) -> None:
@@ -167,17 +205,9 @@ class Door:
 
     def close(self) -> None:
         """Look no more. ZMQ must not be left waiting for a reader of its events."""
-        for _ in self._told():
-            pass
+        self._told()
         self._router.disable_monitor()
         self._events.close(linger=0)
-
-
-def _descriptor_behind(frame: zmq.Frame) -> int:
-    try:
-        return frame.get(zmq.SRCFD)
-    except zmq.ZMQError:
-        return -1  # It came in ZMTP 1.0, which no client of ours speaks.
 
 
 def _make_room() -> int:

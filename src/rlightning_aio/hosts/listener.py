@@ -18,14 +18,15 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 import zmq
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
-from zmq.utils import z85
 
 from rlightning_aio.errors import ConfigError, StartFailed
+from rlightning_aio.hosts.allowance import DROPPED_FRAME, SAVED, STRANGERS_SHARE, Allowance
 from rlightning_aio.hosts.door import Door
+from rlightning_aio.hosts.gate import Gate
 from rlightning_aio.protocol.net.server_session import PATIENCE, ServerSessions
 from rlightning_aio.protocol.net.wire import MAX_FRAME_BYTES, MAX_PARTS
-from rlightning_aio.remote.keys import AllowedKeys, read_server_keys
-from rlightning_aio.remote.parts import receive_parts, send_parts
+from rlightning_aio.remote.keys import read_server_keys
+from rlightning_aio.remote.parts import is_readable, receive_parts, send_parts
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -42,11 +43,9 @@ _MESSAGES_A_PUMP: Final = 1000
 _UNSENT_A_CLIENT: Final = 100
 _UNREAD_A_CLIENT: Final = 100
 _LINGER_MS: Final = 200
-_HANDSHAKE_MS: Final = 5000
-_SECONDS_BETWEEN_WARNINGS: Final = 10.0
-
-_EVENTS: Final = int(zmq.EVENTS)
-_POLLIN: Final = int(zmq.POLLIN)
+_LOOKS_IN_A_ROW: Final = 50
+_LOOKS_A_SECOND: Final = 50
+"""At those who come and go: where there are more, they wait and are looked at together."""
 
 _log = logging.getLogger(__name__)
 
@@ -122,6 +121,9 @@ class Listener:
             reset counts as lost; None for never.
         objection: why an env may not join, if there is a reason.
 
+    Attributes:
+        door: its connections, once it listens.
+
     Raises:
         ConfigError: the keys can't be read.
     """
@@ -144,12 +146,16 @@ class Listener:
             reset_timeout=reset_timeout,
             objection=objection,
         )
-        self._gate = None if settings.keys is None else _Gate(settings.keys)
+        self._allowance = Allowance(SAVED, STRANGERS_SHARE)
+        self._gate = Gate(settings.keys, self._allowance)
+        self._looks = Allowance(_LOOKS_IN_A_ROW, _LOOKS_A_SECOND)
+        self._look_at: float | None = None
+        self._is_deaf = False
         self._is_skipping = False
         self._address: str | None = None
         self._context: zmq.Context[zmq.Socket[bytes]] | None = None
         self._router: zmq.Socket[bytes]
-        self._door: Door
+        self.door: Door
         self._epoll: select.epoll
         self._more = -1
         self._has_more = False
@@ -170,11 +176,6 @@ class Listener:
     def malformed(self) -> int:
         """Messages that were dropped because they were none."""
         return self._sessions.malformed
-
-    @property
-    def num_cut(self) -> int:
-        """Connections that were cut off because they were of no use."""
-        return self._door.num_cut
 
     def start(self) -> None:
         """Listen.
@@ -206,19 +207,14 @@ class Listener:
         router.set(zmq.SNDHWM, _UNSENT_A_CLIENT)
         router.set(zmq.RCVHWM, _UNREAD_A_CLIENT)
         router.set(zmq.LINGER, _LINGER_MS)
-        router.set(zmq.HANDSHAKE_IVL, _HANDSHAKE_MS)
         router.set(zmq.HEARTBEAT_IVL, max(1, int(1000 * settings.heartbeat / PATIENCE)))
         router.set(zmq.HEARTBEAT_TIMEOUT, max(2, int(2000 * settings.heartbeat / PATIENCE)))
-        if self._gate is not None:
-            self._epoll.register(self._gate.open(context), select.EPOLLIN)
-            router.set(zmq.CURVE_SERVER, 1)
-            router.set(zmq.CURVE_SECRETKEY, self._gate.secret)
-            router.set_string(zmq.ZAP_DOMAIN, "rlightning-aio")
+        self._gate.open(context, router)
         host = "127.0.0.1" if settings.host == "localhost" else settings.host
         if ":" in host:
             router.set(zmq.IPV6, 1)
             host = f"[{host}]"
-        door = self._door = Door(context, router, has_keys=self._gate is not None)
+        door = self.door = Door(context, router, self._allowance, has_keys=self._gate.has_keys)
         try:
             router.bind(f"tcp://{host}:{settings.port or '*'}")
         except zmq.ZMQError:
@@ -228,6 +224,7 @@ class Listener:
         door.watch(int(self._address.rpartition(":")[2]))
         self._epoll.register(_descriptor(router), select.EPOLLIN)
         self._epoll.register(door.fileno(), select.EPOLLIN)
+        self._epoll.register(self._gate.fileno(), select.EPOLLIN)
 
     def fileno(self) -> int:
         """Readable, and staying so, while there is something for `pump` to do."""
@@ -235,23 +232,24 @@ class Listener:
 
     def is_readable(self) -> bool:
         """Whether `pump` would find anything; asking may silence the descriptor."""
-        return self._has_more or _is_readable(self._router)
+        return self._has_more or is_readable(self._router)
 
     def deadline(self) -> float | None:
         """When `pump` is due even if nothing comes (monotonic seconds); None if never."""
-        return self._sessions.deadline()
+        due = self._sessions.deadline()
+        if due is None or self._look_at is None:
+            return self._look_at if due is None else due
+        return min(due, self._look_at)
 
     def pump(self, now: float) -> None:
         """Read all there is, send what is due; never blocks."""
         if self._has_more:
             self._has_more = False
             os.eventfd_read(self._more)
-        if self._gate is not None:
-            self._gate.answer(now)
-        self._door.look()
+        self._look(now)
         for _ in range(_MESSAGES_A_PUMP):
             # Asking is what makes ZMQ's descriptor unreadable again.
-            if not _is_readable(self._router):
+            if not is_readable(self._router):
                 break
             self._receive(now)
         else:
@@ -259,25 +257,45 @@ class Listener:
         self._sessions.tick(now)
         self._flush(now)
 
-    def _receive(self, now: float) -> None:
-        """Read one message, or one part of one that is dropped."""
-        frame = self._router.recv(zmq.NOBLOCK, copy=False)
-        if self._is_skipping:
-            self._is_skipping = frame.more
+    def _look(self, now: float) -> None:
+        """See who comes and goes, unless there was much of that a moment ago."""
+        if self._is_deaf and self._look_at is not None and now < self._look_at:
             return
-        connection = self._door.connection(frame)
+        came_or_went = self.door.look()
+        if self._gate.look(now) or came_or_went:
+            self._looks.spend(1, now)
+        is_busy = self._looks.left(now) < 1
+        self._look_at = self._looks.time_of(1, now) if is_busy else self._gate.deadline(now)
+        if is_busy != self._is_deaf:
+            self._is_deaf = is_busy
+            for source in (self.door, self._gate):
+                self._epoll.modify(source.fileno(), 0 if is_busy else select.EPOLLIN)
+
+    def _receive(self, now: float) -> None:
+        """Read one message, or some parts of one that is dropped."""
+        frame = self._router.recv(zmq.NOBLOCK, copy=False)
+        connection = None if self._is_skipping else self.door.connection(frame, now)
         if connection is None:
-            self._is_skipping = frame.more
+            self._drop(frame, now)
             return
         parts: list[Part] = []
         if frame.more:
             first = self._router.recv(zmq.NOBLOCK, copy=False)
             parts = receive_parts(self._router, first, MAX_PARTS + 1)
             self._is_skipping = self._router.get(zmq.RCVMORE) != 0
-        was_useful = self._sessions.receive(connection.route, connection.user, parts, now)
-        self._door.judge(connection, was_useful=was_useful)
+        heard = self._sessions.receive(connection.route, connection.user, parts, now)
+        self.door.judge(connection, heard, sum([len(part) for part in parts]), now)
         if self._is_skipping:
-            self._door.cut(connection)
+            self.door.cut(connection)
+
+    def _drop(self, frame: zmq.Frame, now: float) -> None:
+        """Throw a message away from `frame` on: all of it, if it is none of very many parts."""
+        dropped = 1
+        while frame.more and dropped <= MAX_PARTS:
+            frame = self._router.recv(zmq.NOBLOCK, copy=False)
+            dropped += 1
+        self._is_skipping = frame.more
+        self._allowance.spend(dropped * DROPPED_FRAME, now)
 
     def _flush(self, now: float) -> None:
         """Send what is due, and see to it that nothing is left that wakes nobody."""
@@ -296,7 +314,7 @@ class Listener:
                     raise
                 self._sessions.unreachable(route, now)
         # Sending takes in what ZMQ has to tell, so its descriptor may have fallen silent.
-        if _is_readable(self._router):
+        if is_readable(self._router):
             self._call_back()
 
     def _call_back(self) -> None:
@@ -355,7 +373,7 @@ class Listener:
         if self._address is not None:
             self._sessions.close("the trainer closed its group")
             self._flush(0.0)
-            self._door.close()
+            self.door.close()
         self._epoll.close()
         os.close(self._more)
         context.destroy(linger=_LINGER_MS)
@@ -363,55 +381,3 @@ class Listener:
 
 def _descriptor(socket: zmq.Socket[bytes]) -> int:
     return cast("int", socket.get(zmq.FD))
-
-
-def _is_readable(socket: zmq.Socket[bytes]) -> bool:
-    # Plain ints: an operation on an enum costs as much as the call itself.
-    return cast("int", socket.get(_EVENTS)) & _POLLIN != 0
-
-
-class _Gate:
-    """Lets in whose CURVE key lies in the env_server's directory of clients (ZAP, RFC 27).
-
-    Args:
-        directory: as `remote.keys.make_keys` lays it out.
-
-    Attributes:
-        secret: the env_server's own key.
-
-    Raises:
-        ConfigError: the env_server's key can't be read.
-    """
-
-    def __init__(self, directory: Path) -> None:
-        self.secret, clients = read_server_keys(directory)
-        self._allowed = AllowedKeys(clients)
-        self._warned_at: float | None = None
-        self._socket: zmq.Socket[bytes] | None = None
-
-    def open(self, context: zmq.Context[zmq.Socket[bytes]]) -> int:
-        """Begin to be asked; the descriptor that tells of a question."""
-        self._socket = context.socket(zmq.REP)
-        self._socket.bind("inproc://zeromq.zap.01")
-        return _descriptor(self._socket)
-
-    def answer(self, now: float) -> None:
-        """Answer all questions; never blocks."""
-        socket = self._socket
-        while socket is not None and _is_readable(socket):
-            version, request_id, _, address, _, mechanism, *credentials = socket.recv_multipart()
-            key = z85.encode(credentials[0]) if mechanism == b"CURVE" else b""
-            name = self._allowed.owner(key)
-            if name is None:
-                self._warn(address.decode(errors="replace"), now)
-            verdict = (b"400", b"not on the list", b"") if name is None else (
-                b"200", b"", name.encode(),
-            )  # fmt: skip
-            socket.send_multipart([version, request_id, *verdict, b""])
-
-    def _warn(self, address: str, now: float) -> None:
-        if self._warned_at is None or now - self._warned_at >= _SECONDS_BETWEEN_WARNINGS:
-            self._warned_at = now
-            _log.warning(
-                "a client at %s has a key that is not in %s", address, self._allowed.directory
-            )

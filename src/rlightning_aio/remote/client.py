@@ -380,5 +380,5 @@ def _in_words(error: Exception) -> tuple[str, str, str]:
 _REFUSED_HANDSHAKES: Final[dict[int, str]] = {
     zmq.EVENT_HANDSHAKE_FAILED_AUTH: "the server does not know this client's key",
     zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: "the server speaks another security: keys on one side?",
-    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: "the server broke the handshake: is this its key?",
+    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: "the server did not end the handshake: is this its key?",
 }

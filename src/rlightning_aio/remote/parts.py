@@ -6,7 +6,7 @@ Small parts are copied, which takes less than keeping count of who still holds t
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import zmq
 
@@ -15,12 +15,19 @@ if TYPE_CHECKING:
 
     from rlightning_aio.protocol.net.wire import Part
 
-__all__ = ["receive_parts", "send_parts"]
+__all__ = ["is_readable", "receive_parts", "send_parts"]
 
 _COPIED_BYTES: Final = 4096
 # Plain ints: an operation on an enum costs as much as the call itself.
 _LAST: Final = int(zmq.NOBLOCK)
 _MORE: Final = int(zmq.NOBLOCK) | int(zmq.SNDMORE)
+_EVENTS: Final = int(zmq.EVENTS)
+_POLLIN: Final = int(zmq.POLLIN)
+
+
+def is_readable(socket: zmq.Socket[Any]) -> bool:
+    """Whether a message can be received; asking silences the socket's descriptor until the next."""
+    return cast("int", socket.get(_EVENTS)) & _POLLIN != 0
 
 
 def send_parts(socket: zmq.Socket[Any], parts: Sequence[Part]) -> None:

@@ -13,6 +13,7 @@ import logging
 import secrets
 from collections import deque
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 
 import gymnasium as gym
@@ -52,7 +53,7 @@ from rlightning_aio.types import ClientTraits, EnvMeta
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-__all__ = ["PATIENCE", "Outgoing", "RemoteResult", "ServerSessions"]
+__all__ = ["PATIENCE", "Heard", "Outgoing", "RemoteResult", "ServerSessions"]
 
 PATIENCE: Final = 8
 """Parts of the heartbeat limit: one between pings, two until a broken connection is given up."""
@@ -69,6 +70,14 @@ _log = logging.getLogger(__name__)
 def random_token() -> int:
     """A number that nobody can guess."""
     return secrets.randbits(63)
+
+
+class Heard(Enum):
+    """What a message has led to."""
+
+    IN_SESSION = "it was said in a session, or has opened one"
+    TURNED_AWAY = "it was understood, and to no avail"
+    MALFORMED = "it was dropped"
 
 
 @dataclass(slots=True)
@@ -247,7 +256,7 @@ class ServerSessions:
 
     # What arrives
 
-    def receive(self, route: bytes, user: str | None, parts: Sequence[Part], now: float) -> bool:
+    def receive(self, route: bytes, user: str | None, parts: Sequence[Part], now: float) -> Heard:
         """Take in one message; never raises for what it holds.
 
         Args:
@@ -257,7 +266,7 @@ class ServerSessions:
             now: monotonic seconds.
 
         Returns:
-            Whether it was said in a session, or has opened one.
+            What it led to.
         """
         try:
             # The trainer may have its own arithmetic raise; a client's numbers must not.
@@ -265,16 +274,16 @@ class ServerSessions:
                 return self._receive(route, user, parts, now)
         except WireError as error:
             self._complain(str(error), now)
-            return False
+            return Heard.MALFORMED
 
-    def _receive(self, route: bytes, user: str | None, parts: Sequence[Part], now: float) -> bool:
+    def _receive(self, route: bytes, user: str | None, parts: Sequence[Part], now: float) -> Heard:
         message, frames = self._reader.read(parts)
         if isinstance(message, Hello):
             return self._on_hello(message, len(parts[0]), route, user, now)
         session = self._session_of(message, route, user, now)
         if session is not None:
             self._handlers[type(message)](session, message, frames, now)
-        return session is not None
+        return Heard.TURNED_AWAY if session is None else Heard.IN_SESSION
 
     def _session_of(
         self,
@@ -310,13 +319,13 @@ class ServerSessions:
 
     def _on_hello(
         self, hello: Hello, size: int, route: bytes, user: str | None, now: float
-    ) -> bool:
+    ) -> Heard:
         seat = self._seats.get(hello.name)
         current = seat.session if seat else None
         if current and current.nonce == hello.nonce and current.user == user:
             current.route, current.heard_at = route, now
             self._welcome(current)
-            return True
+            return Heard.IN_SESSION
         refusal = self._objection(hello, size, user, now)
         if refusal is None:
             try:
@@ -333,7 +342,7 @@ class ServerSessions:
             text = in_one_line(text)
             self._warn(code, f"refused the client {hello.name!r}: {text}", now)
             self._send(route, Refusal(nonce=hello.nonce, code=code, text=text, retry=retry))
-        return refusal is None
+        return Heard.IN_SESSION if refusal is None else Heard.TURNED_AWAY
 
     def _objection(
         self, hello: Hello, size: int, user: str | None, now: float
