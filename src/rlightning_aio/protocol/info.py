@@ -20,9 +20,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["INFO_BYTES", "NO_INFO", "PICKLED", "InfoSchema", "InfoWriter"]
+__all__ = ["INFO_BYTES", "INFO_BYTES_OF_SUB_ENV", "NO_INFO", "PICKLED", "InfoSchema", "InfoWriter"]
 
 INFO_BYTES: Final = 512
+"""Of a row; with sub-environments at least."""
+INFO_BYTES_OF_SUB_ENV: Final = 128
 NO_INFO: Final = 0
 PICKLED: Final = 255
 """Row marks: 0 no info, 1 to 254 the number of a schema, 255 the info is out of band."""
@@ -74,8 +76,6 @@ class InfoSchema:
                 codes += f"{value.nbytes}s"
             else:
                 return None
-        if struct.calcsize(codes) > INFO_BYTES:
-            return None
         return cls(tuple(info), kinds, tuple(arrays), codes)
 
     @cached_property
@@ -165,6 +165,8 @@ class InfoWriter:
         self._keys = [*info]
         self._types = [*map(type, info.values())]
         schema = InfoSchema.of(info)
+        if schema is not None and schema.size > len(self._row):
+            schema = None
         self._number = PICKLED if schema is None else self._announce(schema)
         if schema is not None:
             self._pack = struct.Struct(schema.format).pack_into

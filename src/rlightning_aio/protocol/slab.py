@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from rlightning_aio.protocol.columns import Leaf, Tree, assemble, leaf_of, leaves
-from rlightning_aio.protocol.info import INFO_BYTES
+from rlightning_aio.protocol.info import INFO_BYTES, INFO_BYTES_OF_SUB_ENV
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -85,7 +85,7 @@ class RowLayout:
         yield (), np.dtype(np.uint8)
         yield (), np.dtype(np.int64)
         yield (2,), np.dtype(np.int64)
-        yield (INFO_BYTES,), np.dtype(np.uint8)
+        yield (max(INFO_BYTES, prod(self.head) * INFO_BYTES_OF_SUB_ENV),), np.dtype(np.uint8)
 
     def size(self, rows: int) -> int:
         """Bytes of a slab with `rows` rows."""
@@ -120,7 +120,7 @@ class Slab:
         episode_return: ``[rows, *head]`` float64, episode_length: ``[rows, *head]`` int64;
             of the episode that is under way or ends here, this step included; length 0 where
             the step belongs to none.
-        info_mark: ``[rows]`` uint8, see `info`; info: ``[rows, INFO_BYTES]`` uint8.
+        info_mark: ``[rows]`` uint8, see `info`; info: ``[rows, bytes]`` uint8.
         seed: ``[rows]`` int64, of the reset that was sent, plus 1; 0 for none.
         times: ``[rows, 2]`` int64; its halves are done_ns, the monotonic time at which the
             reply was ready, and busy_ns, the time that the env itself took.
