@@ -31,7 +31,7 @@ test-simulators: export ISAAC_PYTHON := $(CURDIR)/$(ISAAC)/bin/python
 test-simulators: $(SIMULATORS)/installed $(ISAAC)/installed ## the tests of every backend, on the real simulators (5 GB of packages)
 	tests/simulators/install_debian.sh
 	$(ISAAC)/bin/python -m pytest -m simulators -rs tests/envs/test_isaac.py
-	$(SIMULATORS)/bin/python -m pytest -m simulators -rs tests/envs tests/vector
+	$(SIMULATORS)/bin/python -m pytest -m simulators -rs tests/envs tests/vector tests/test_docs.py
 
 check: $(VENV)/installed-check ## the static checks: ruff, pyright, import-linter
 	$(VENV)/bin/ruff check

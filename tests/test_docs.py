@@ -1,18 +1,26 @@
-"""What the pages on collecting and on remote machines say, compared.
+"""What pages say of arguments, settings and other libraries' programs.
 
-The programs of the documents are in test_examples.py.
+The other programs of the documents are in test_examples.py.
 """
 
 from __future__ import annotations
 
 import inspect
+import os
 import re
+import shlex
+import subprocess
+import sys
 from pathlib import Path
+
+import pytest
+from patience import HANG
 
 from rlightning_aio import EnvGroup, build_env_group
 from rlightning_aio.hosts.listener import ServerSettings
 
 DOCS = Path(__file__).parent.parent / "docs"
+PROGRAMS = Path(__file__).with_name("programs.py")
 
 
 def table_rows(page: str) -> set[str]:
@@ -25,3 +33,47 @@ def test_every_argument_and_setting_has_its_row() -> None:
     building = inspect.signature(build_env_group).parameters.keys() - {"env_cfgs"}
     assert table_rows("collecting.md") == collecting | building
     assert table_rows("remote.md") - {"state"} == set(ServerSettings.model_fields)
+
+
+def blocks(language: str, page: str) -> list[str]:
+    text = (DOCS / page).read_text()
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+
+
+def run(*command: str, folder: Path) -> str:
+    # Asyncio's debug mode, which holds for tests, would log what takes longer than a blink.
+    environment = {name: v for name, v in os.environ.items() if name != "PYTHONASYNCIODEBUG"}
+    done = subprocess.run(
+        [sys.executable, *command],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=HANG,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def run_programs(programs: list[str], folder: Path) -> str:
+    files = [folder / f"{number}.py" for number in range(len(programs))]
+    for file, program in zip(files, programs, strict=True):
+        file.write_text(program)
+    return run(str(PROGRAMS), *map(str, files), folder=folder)
+
+
+def test_programs_come_over_from_rlightning(tmp_path: Path) -> None:
+    """The script runs by the page's command, and the others in turn; rows name what is there."""
+    script, *programs = blocks("python", "rlightning.md")
+    (command,) = blocks("sh", "rlightning.md")
+    (tmp_path / "steps.py").write_text(script)
+    assert "env steps per second" in run(*shlex.split(command)[1:], folder=tmp_path)
+    assert "(16, 17)" in run_programs(programs, tmp_path)
+
+
+@pytest.mark.simulators
+def test_programs_come_over_from_envpool(tmp_path: Path) -> None:
+    """Each runs as it stands."""
+    pytest.importorskip("envpool")
+    run_programs(blocks("python", "envpool.md"), tmp_path)

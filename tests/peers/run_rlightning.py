@@ -2,9 +2,9 @@
 
     python tests/peers/run_rlightning.py FOLDER [--with-source] [arguments of pytest …]
 
-FOLDER is a checkout of RLightning with its ``tests``. Without its source these meet the names that
-`rlightning_aio.legacy` has; ``--with-source`` puts the source on Python's path (it needs RLightning's
-own dependencies), and its own builder makes our groups. Ray is left out: what asks for its actors or
+FOLDER is a checkout of RLightning with its ``tests``. Without its source these meet the names of
+`rlightning_aio.legacy`; ``--with-source`` puts the source on the path of Python (it needs what it
+depends on), and its own builder makes our groups. Ray is left out: what asks for its actors or
 references is not run. Needs torch and hydra-core, and ale-py for the Atari games.
 """
 
