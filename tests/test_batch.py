@@ -22,6 +22,7 @@ from rlightning_aio.batch.data import (
     batch_of_results,
     columns_of_responses,
     parts_of,
+    reported_info_list,
     slots_of,
 )
 from rlightning_aio.batch.infos import vector_infos
@@ -758,6 +759,7 @@ def test_infos_in_rows_make_the_columns_that_they_make_one_by_one(
     slots = list(range(len(infos)))
     names = replace(NAMES, turns=np.zeros(len(infos), np.bool_))
     part = columns(slots, None, info=rows, info_marks=marks, schemas=schemas, names=names)
+    assert repr(reported_info_list(results(part))) == repr(infos)
     found, expected = results(part).infos, vector_infos(infos)
     assert found.keys() == expected.keys()
     for key, column in expected.items():

@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -67,8 +68,18 @@ class Scripted(gym.Env[Any, Any]):
 
 
 class Plain(GymnasiumEnv):
+    mode = AutoresetMode.DISABLED
+
     def _make(self) -> Any:
-        return Scripted()
+        env = Scripted()
+        env.metadata = {"autoreset_mode": self.mode}
+        return env
+
+
+class Renewed(Plain):
+    """What it tells of a step that ends an episode is the next one's begin."""
+
+    mode = AutoresetMode.SAME_STEP
 
 
 def new_slab(layout: RowLayout, rows: int = 2) -> Slab:
@@ -107,20 +118,24 @@ class Row:
         )
 
 
-def runner_and_row(*, inline: bool = False) -> tuple[EnvRunner, Scripted, Row]:
+def runner_and_row(
+    kind: type[Plain] = Plain, *, inline: bool = False
+) -> tuple[EnvRunner, Scripted, Row]:
     """A plain env that goes the short way."""
-    runner = EnvRunner(Plain(CONFIG), inline=inline)
+    runner = EnvRunner(kind(CONFIG), inline=inline)
     row = Row(runner.layout)
     runner.attach(row.slab, 1, row.announce)
     return runner, runner.env.env, row
 
 
+@pytest.mark.parametrize("kind", [Plain, Renewed])
 @given(history=histories)
-def test_the_short_way_writes_what_the_long_way_does(history: list[Any]) -> None:
+def test_the_short_way_writes_what_the_long_way_does(kind: type[Plain], history: list[Any]) -> None:
     """Whatever happens: ends, steps after an end, resets at any time, infos of any kind."""
-    runner, env, row = runner_and_row()
+    runner, env, row = runner_and_row(kind)
     long = Row(runner.layout)
-    writer = RowWriter(long.slab, 1, env_id="plain-0", autoreset="disabled", announce=long.announce)
+    mode = runner.meta.autoreset
+    writer = RowWriter(long.slab, 1, env_id="plain-0", autoreset=mode, announce=long.announce)
     for count, (what, then) in enumerate(history, 1):
         observation = np.array([count, -count], float)
         if what == "reset":
@@ -140,13 +155,14 @@ def test_the_short_way_writes_what_the_long_way_does(history: list[Any]) -> None
         assert row.slab.done_ns[1] >= row.slab.busy_ns[1] >= 0
 
 
+@pytest.mark.parametrize("kind", [Plain, Renewed])
 @given(history=histories, apart=st.sets(st.integers(0, 30)))
 def test_requests_out_of_band_count_as_those_in_the_row_do(
-    history: list[Any], apart: set[int]
+    kind: type[Plain], history: list[Any], apart: set[int]
 ) -> None:
     """An env may be asked in either way at any time; its episodes are the same."""
-    runner, env, row = runner_and_row()
-    other, other_env, other_row = runner_and_row()
+    runner, env, row = runner_and_row(kind)
+    other, other_env, other_row = runner_and_row(kind)
     for number, (what, then) in enumerate(history):
         env.next = other_env.next = then
         if what == "reset":

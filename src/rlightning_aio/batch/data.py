@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast, overload
 
 import numpy as np
 
-from rlightning_aio.batch.infos import infos_of_rows, vector_infos
+from rlightning_aio.batch.infos import info_list_of_rows, infos_of_rows, vector_infos
 from rlightning_aio.batch.sent import Sent, taken_sources
 from rlightning_aio.batch.stacking import columns_where_possible, differing, stacked_values
 from rlightning_aio.errors import BadAction
@@ -489,8 +489,10 @@ def reported_infos(batch: BatchedData) -> dict[str, Any]:
 
 def reported_info_list(batch: BatchedData) -> list[dict[str, Any]]:
     """`BatchedData.info` of a batch of results, without the sums of episodes."""
-    places = _by_position(batch._parts, len(batch))
-    return [part.reported_info_of(row) for part, row in places]
+    parts = batch._parts
+    if len(parts) == 1 and parts[0].positions is None:
+        return info_list_of_rows(parts[0])
+    return [part.reported_info_of(row) for part, row in _by_position(parts, len(batch))]
 
 
 def _infos_of(batch: BatchedData, *, episodes: bool) -> dict[str, Any]:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rlightning_aio.batch.columns import ResultColumns
     from rlightning_aio.protocol.info import InfoSchema
 
-__all__ = ["infos_of_rows", "vector_infos"]
+__all__ = ["info_list_of_rows", "infos_of_rows", "vector_infos"]
 
 _AS_OBJECTS = np.bool_
 """A kind of number of which Gymnasium makes no typed array."""
@@ -84,11 +84,33 @@ def infos_of_rows(part: ResultColumns, *, episodes: bool) -> dict[str, Any]:
     return columns
 
 
+def info_list_of_rows(part: ResultColumns) -> list[dict[str, Any]]:
+    """One info for each row of `part`, as the envs told them, in its own order."""
+    if part.out_of_band:
+        return [part.reported_info_of(row) for row in range(len(part))]
+    infos: list[dict[str, Any]] = [{} for _ in range(len(part))]
+    for schema, chosen in _rows_by_schema(part).items():
+        assert part.info is not None, "there are rows that hold some"
+        for row, info in zip(chosen, schema.decode_all(part.info[chosen]), strict=True):
+            infos[row] = info
+    return infos
+
+
 def _taken_at_once(part: ResultColumns) -> dict[str, Any] | None:
     """Columns of infos that all lie in the rows; None where they need to be looked at singly."""
-    if part.info is None or part.info_marks is None:
-        return {}
+    rows = _rows_by_schema(part)
+    if len(rows) == 1 and part.info is not None:
+        ((schema, chosen),) = rows.items()
+        if len(chosen) == len(part) and _agree(rows):
+            return _of_all(schema.fields(part.info))
+    return _of_some(part.info, rows) if _agree(rows) else None
+
+
+def _rows_by_schema(part: ResultColumns) -> dict[InfoSchema, list[int]]:
+    """Which rows hold infos of one shape."""
     rows: dict[InfoSchema, list[int]] = {}
+    if part.info is None or part.info_marks is None:
+        return rows
     # A worker's schema is one object: few need to be compared.
     rows_of: dict[int, list[int]] = {}
     slots: list[int] = part.slots.tolist()
@@ -101,11 +123,7 @@ def _taken_at_once(part: ResultColumns) -> dict[str, Any] | None:
         if chosen is None:
             chosen = rows_of[id(schema)] = rows.setdefault(schema, [])
         chosen.append(row)
-    if len(rows) == 1:
-        ((schema, chosen),) = rows.items()
-        if len(chosen) == len(slots) and _agree(rows):
-            return _of_all(schema.fields(part.info))
-    return _of_some(part.info, rows) if _agree(rows) else None
+    return rows
 
 
 def _agree(schemas: Iterable[InfoSchema]) -> bool:

@@ -163,7 +163,7 @@ class EnvRunner:
         if bare is None:
             return self._plain_stepper(take)
         halves = self.env.bare_step_async()
-        single = not layout.head and self.meta.autoreset == "disabled"
+        single = not layout.head and self.meta.autoreset in ("disabled", "same_step")
         if single and halves is None and self._writer.write_observation is not None:
             return self._short_stepper(bare, take, self._writer.write_observation)
         store, clock = self._bare_store(layout), time.monotonic_ns
@@ -209,7 +209,14 @@ class EnvRunner:
         bare_reset = self.env.bare_reset()
         self._before_writing = self._writer.look
         step, reset, self._after_writing = _short_steps(
-            bare, bare_reset, take, write_observation, self._writer, self._slab, self._row
+            bare,
+            bare_reset,
+            take,
+            write_observation,
+            self._writer,
+            self._slab,
+            self._row,
+            resets_itself=self.meta.autoreset == "same_step",
         )
         if bare_reset is not None:
             self.reset_from_row = reset
@@ -309,6 +316,8 @@ def _short_steps(
     writer: RowWriter,
     slab: Slab,
     row: int,
+    *,
+    resets_itself: bool,
 ) -> tuple[_StepTaking, Execute, Callable[[], None]]:
     """The hot path of plain Gymnasium envs: (step, reset, look at what others wrote to the row).
 
@@ -316,14 +325,14 @@ def _short_steps(
     costs a fifth of assigning an element of an array. Flags are written when they change.
     """
     write_info, kept = writer.write_info, writer.kept
-    rewards, marks = _view(slab.reward), _view(slab.info_mark)
-    terminations, truncations = _view(slab.terminated), _view(slab.truncated)
-    resets, overs = _view(slab.is_reset), _view(slab.over)
+    rewards, marks, resets, overs, terminations, truncations = map(
+        _view,
+        (slab.reward, slab.info_mark, slab.is_reset, slab.over, slab.terminated, slab.truncated),
+    )
     returns, lengths = _view(slab.episode_return), _view(slab.episode_length)
     done_times, busy_times = _view(slab.done_ns), _view(slab.busy_ns)
     clock = time.monotonic_ns
-    episode_return = 0.0
-    episode_length = 0
+    episode_return, episode_length = 0.0, 0
     # Whether the last result was a reset; whether it or one before it was an end.
     fresh = over = False
 
@@ -343,14 +352,17 @@ def _short_steps(
         rewards[row] = reward
         if fresh:
             resets[row] = fresh = False
+        if over and resets_itself:
+            episode_return = episode_length = 0
         returns[row] = episode_return = episode_return + reward
         lengths[row] = episode_length = episode_length + 1
         if over or terminated or truncated:
             terminations[row] = terminated
             truncations[row] = truncated
-            if over:  # What comes after an end belongs to no episode; see `EpisodeSums`.
+            if over and not resets_itself:
+                # What comes after an end belongs to no episode; see `EpisodeSums`.
                 returns[row] = lengths[row] = 0
-            overs[row] = over = True
+            overs[row] = over = terminated or truncated or not resets_itself
         marks[row] = mark = write_info(info) if info else NO_INFO
         return kept({"info": info}) if mark == PICKLED else None
 

@@ -108,6 +108,17 @@ class InfoSchema:
             )
         }
 
+    def decode_all(self, rows: NDArray[np.uint8]) -> list[dict[str, Any]]:
+        """The infos that ``rows [n, bytes]`` hold."""
+        if any(self.arrays):
+            return [self.decode(memoryview(row)) for row in rows]
+        # Elements of an array are NumPy's scalars, those of its list are Python's.
+        columns = [
+            column.tolist() if kind in (float, int, bool) else list(column)
+            for kind, column in zip(self.types, self.fields(rows).values(), strict=True)
+        ]
+        return [dict(zip(self.keys, values, strict=True)) for values in zip(*columns, strict=True)]
+
 
 def _restored(value: Any, value_type: type, array: tuple[tuple[int, ...], str] | None) -> Any:
     if array is None:
