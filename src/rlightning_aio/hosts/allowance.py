@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import Final
 
+from rlightning_aio.protocol.net.wire import MAX_HELLO_BYTES
+
 __all__ = ["CONNECTION", "DROPPED_FRAME", "SAVED", "STRANGERS_SHARE", "Allowance", "price"]
 
 STRANGERS_SHARE: Final = 0.02
@@ -16,15 +18,13 @@ SAVED: Final = 0.1
 """That strangers may take at once, when none came for a while."""
 CONNECTION: Final = 400e-6
 DROPPED_FRAME: Final = 5e-6
-_MESSAGE: Final = 100e-6
-_BYTE: Final = 0.2e-6
-_MOST_BYTES: Final = 256 << 10
-"""More of a message is not looked at."""
+_MESSAGE: Final = 50e-6
+_BYTE: Final = 0.5e-6
 
 
 def price(num_bytes: int) -> float:
-    """Of finding out what a message says."""
-    return _MESSAGE + _BYTE * min(num_bytes, _MOST_BYTES)
+    """Of finding out what a message says; nobody looks into a hello that is too long."""
+    return _MESSAGE + _BYTE * min(num_bytes, MAX_HELLO_BYTES)
 
 
 class Allowance:
