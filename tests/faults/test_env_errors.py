@@ -243,7 +243,7 @@ def _foreign() -> Any:
 def test_value_that_can_not_travel_is_the_error_of_its_call(start: Start) -> None:
     """Neither what can't be pickled there nor what can't be unpickled here breaks anything."""
     group, tokens = start(two_workers()), Tokens()
-    with pytest.raises(EnvRaised, match=r"what returns\(\) returned can't be pickled"):
+    with pytest.raises(EnvRaised, match=r"call of returns\(\).*what it returned can't be pickled"):
         group.call("faulty-1", "returns", threading.Lock)
     with pytest.raises(EnvRaised, match="nobody_else_has_this"):
         group.call("faulty-1", "returns", _foreign)

@@ -37,7 +37,7 @@ from rlightning_aio.hosts.messages import (
     Value,
 )
 from rlightning_aio.hosts.runner import placed
-from rlightning_aio.protocol.entries import Operation, op_of, slot_of
+from rlightning_aio.protocol.entries import Operation, answers_with_value, op_of, slot_of
 from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
 
 if TYPE_CHECKING:
@@ -227,7 +227,7 @@ class EnvThread(threading.Thread):
         except BaseException as error:  # noqa: BLE001  # An env may raise anything.
             self._tell(Raised(self._host_id, entry, ErrorText.of(error)))
             return
-        if op == Operation.CALL:
+        if answers_with_value(op):
             self._tell(Value(self._host_id, entry, outcome))
         elif outcome is None:  # The row holds all of it.
             self._tell(Reported(self._host_id, np.array([entry], np.int64)))

@@ -243,8 +243,7 @@ class Worker:
             arguments = pickle.loads(frame.payload)
             outcome = self._runners[slot_of(request) - self._first_slot].execute(op, arguments)
             if answers_with_value(op):
-                payload = dumped(outcome, f"what {arguments[0]}() returned")
-                self._send(FrameKind.VALUE, request, payload)
+                self._send(FrameKind.VALUE, request, dumped(outcome, "what it returned"))
             elif outcome is None:
                 self._rings.report(request, self._ring)
             else:
