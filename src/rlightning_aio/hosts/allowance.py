@@ -14,7 +14,7 @@ __all__ = ["CONNECTION", "DROPPED_FRAME", "SAVED", "STRANGERS_SHARE", "Allowance
 
 STRANGERS_SHARE: Final = 0.02
 """Of a core, for all strangers together."""
-SAVED: Final = 0.1
+SAVED: Final = 0.05
 """That strangers may take at once, when none came for a while."""
 CONNECTION: Final = 400e-6
 DROPPED_FRAME: Final = 5e-6
