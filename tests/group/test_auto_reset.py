@@ -113,6 +113,34 @@ async def test_an_episode_that_ends_by_itself_is_begun_anew(start: Any, what: in
             assert (steps_of(batch), flags) == ([steps], [flag])
 
 
+@pytest.mark.parametrize("what", [END, TRUNCATE])
+async def test_what_was_due_when_the_context_was_left_is_when_another_is_entered(
+    start: Any, what: int
+) -> None:
+    """As with one for each rollout: no step goes on after an end, wherever that was seen."""
+    group = await start(ENTRY)
+    await group.reset()
+    await group.step(responses("probe-0", what=what))  # Ends before there is any context.
+    with group.auto_reset(max_episode_steps=3):
+        batch, flags = await group.step(responses(*IDS, what=what))
+        assert (steps_of(batch), flags) == ([0, 1, 1], [False] * 3)
+        batch, flags = await group.step(responses(*IDS, what=what))
+        assert (steps_of(batch), flags) == ([1, 0, 0], [False] * 3)
+    with group.auto_reset(max_episode_steps=9, on_done=False):
+        batch, _ = await group.step(responses("probe-0"))
+        assert steps_of(batch) == [2], "an end is the caller's affair here"
+    with group.auto_reset(max_episode_steps=2):
+        batch, flags = await group.step(responses(*IDS))
+        assert (steps_of(batch), flags) == ([0, 1, 1], [False] * 3)
+        batch, flags = await group.step(responses(*IDS))
+        assert (steps_of(batch), flags) == ([1, 2, 2], [False, True, True])
+    batch, _ = await group.step(responses("probe-2"))
+    assert steps_of(batch) == [3], "plain steps are plain"
+    with group.auto_reset(max_episode_steps=4, on_done=False):
+        batch, flags = await group.step(responses(*IDS))
+        assert (steps_of(batch), flags) == ([2, 0, 4], [False, False, True])
+
+
 async def test_limits_are_each_entrys_own(start: Any) -> None:
     """Without one everywhere, entering fails, and names the env that has none."""
     group = await start(

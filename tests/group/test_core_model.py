@@ -82,12 +82,18 @@ class Request:
 
 @dataclass
 class ModelEnv:
-    """One env as the model sees it; `count` and `due` are those of auto-reset."""
+    """One env as the model sees it.
+
+    Attributes:
+        count: of steps since the last reset.
+        cut: its last result reached the limit of auto-reset; ended: it ended by itself.
+    """
 
     env: FakeEnv
     request: Request | None = None
     count: int = 0
-    due: bool = False
+    cut: bool = False
+    ended: bool = False
     over: bool = False
     lost: bool = False
 
@@ -167,7 +173,7 @@ class CoreMachine(RuleBasedStateMachine):
             env = self.envs[slot]
             value = slot if self.attaches else None
             request = Request("step", action, value)
-            if self.limit is not None and env.due:
+            if self.limit is not None and (env.cut or (self.on_done and env.ended)):
                 request = Request("reset", value=value)
             if env.lost:
                 request = Request("reset", value=value, restarts=True)
@@ -482,8 +488,6 @@ class CoreMachine(RuleBasedStateMachine):
     def leave_auto_reset(self) -> None:
         self.core.auto.end()
         self.limit = None
-        for env in self.envs:
-            env.due = False
 
     # -- comparing
 
@@ -584,8 +588,7 @@ class CoreMachine(RuleBasedStateMachine):
             assert batch.values()[position].env_id == f"fake-{slot}"
             model.count = model.count + 1 if stepped else 0
             reached = self.limit is not None and model.count >= self.limit
-            ended = stepped and self.on_done and answer.over
-            model.due = self.limit is not None and (reached or ended)
+            model.cut, model.ended = reached, stepped and answer.over
             expected_flags.append(reached)
             assert batch.index[position] == slot
             assert batch.is_reset[position] == (not stepped)

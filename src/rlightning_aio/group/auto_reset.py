@@ -2,7 +2,8 @@
 
 An env's counter is 0 after a reset and one more after each completed step. Inside the
 context the step that reaches the limit is flagged, and the next step of that env is
-replaced by a reset; so a limit of L gives a period of L + 1 calls.
+replaced by a reset; so a limit of L gives a period of L + 1 calls. What is due when a context
+is left is due in the next one, if nothing has come in between.
 
 Nothing is counted step by step: a counter is the number of the env's request less that of
 its last reset, and limits are looked at only when one can have been reached.
@@ -57,6 +58,9 @@ class AutoReset:
         self._base = np.zeros(len(envs), np.int64)
         self._due = np.zeros(len(envs), np.bool_)
         self._any_due = False
+        # Whose last result has reached the limit of a context; whose episode has ended by itself.
+        self._cut = np.zeros(len(envs), np.bool_)
+        self._over = np.zeros(len(envs), np.bool_)
         # For so many batches no env can reach its limit.
         self._margin = 0
         self._limits: NDArray[np.int64] | None = None
@@ -86,6 +90,7 @@ class AutoReset:
         self._margin = 0
         self._on_done = on_done
         self.mark_truncated = mark_truncated
+        self._set_due(np.flatnonzero(self._cut | self._over if on_done else self._cut))
 
     def _chosen_limits(self, given: int | None) -> NDArray[np.int64]:
         envs = self._envs
@@ -124,7 +129,10 @@ class AutoReset:
         self.mark_truncated = False
 
     def due(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Which of `slots` are to be reset in place of their step."""
+        """Which of `slots` are to be reset in place of the step that is about to be sent."""
+        if self._limits is None:
+            self._cut[slots] = False  # Their episodes go on, whatever limit they had reached.
+            return NO_RESETS
         return self._due[slots] if self._any_due else NO_RESETS
 
     def not_completed(self, slots: NDArray[np.intp]) -> None:
@@ -148,7 +156,10 @@ class AutoReset:
         if self._margin <= 0:
             self._margin = int((self._limits - self._counts(...)).min())
             reached = self._counts(slots) >= self._limits[slots]
-            self._set_due(slots[reached])
+            cut = slots[reached]
+            if len(cut):
+                self._cut[cut] = True
+                self._set_due(cut)
         if self._on_done:
             for ended in over:
                 self._set_due(ended)
@@ -162,12 +173,14 @@ class AutoReset:
         begun = part.slots[resets]
         if len(begun):
             self._base[begun] = self._requests.numbers(begun)
-            self._due[begun] = False
+            self._due[begun] = self._cut[begun] = self._over[begun] = False
             self._any_due = np.count_nonzero(self._due) > 0
         over = part.over
         if self._envs.any_resets_itself:
             over &= ~self._envs.resets_itself[part.slots]
-        return part.slots[over]
+        ended = part.slots[over]
+        self._over[ended] = True
+        return ended
 
     def _set_due(self, slots: NDArray[np.intp]) -> None:
         if len(slots):
