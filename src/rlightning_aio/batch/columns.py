@@ -219,11 +219,11 @@ class ResultColumns:
         fields = {
             "env_id": self.names.ids(self.slots[row : row + 1])[0],
             "observation": self.observation_of(row),
-            "last_reward": self._head(self.reward, row),
-            "last_terminated": self._head(self.terminated, row),
-            "last_truncated": self._head(self.truncated, row),
+            "last_reward": self.head_of(self.reward, row),
+            "last_terminated": self.head_of(self.terminated, row),
+            "last_truncated": self.head_of(self.truncated, row),
             "info": self.info_of(row),
-            "ts_env_sent_ns": self._sent_ns_of(row),
+            "ts_env_sent_ns": self.sent_ns_of(row),
         }
         return (MultiAgentEnvRet if self.agents else EnvRet)(_extra=kept.get("extra"), **fields)
 
@@ -232,20 +232,22 @@ class ResultColumns:
         for name in ("reward", "terminated", "truncated"):
             field = f"last_{name}"
             if _stands_for_all(getattr(ret, field)) and self.reward.ndim > 1:
-                changed[field] = self._head(getattr(self, name), row)
+                changed[field] = self.head_of(getattr(self, name), row)
         if self.episode(row):
             changed["info"] = self.info_of(row)
         if self.limit_reached is not None and self.limit_reached[row]:
             # `auto_reset` may have marked the cut.
-            changed["last_truncated"] = _like(ret.last_truncated, self._head(self.truncated, row))
+            changed["last_truncated"] = _like(ret.last_truncated, self.head_of(self.truncated, row))
         return ret.model_copy(update=changed) if changed else ret
 
-    def _sent_ns_of(self, row: int) -> int:
+    def sent_ns_of(self, row: int) -> int:
+        """When one env sent its result, in ns since the epoch."""
         if self.sent_ns is None:
             return int(self.times[row, 0]) + _EPOCH_NS
         return int(self.sent_ns[row])
 
-    def _head(self, column: NDArray[Any], row: int) -> Any:
+    def head_of(self, column: NDArray[Any], row: int) -> Any:
+        """One env's entry of a column of rewards or ends: a number, an array, a dict by agent."""
         value = column[row]
         if self.agents:
             return {

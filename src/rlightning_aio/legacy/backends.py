@@ -47,13 +47,17 @@ class _SimulatedEnv(BaseEnv):
     ) -> None:
         del kwargs  # Accepted so that subclasses may pass on what they were given.
         super().__init__(config, worker_index, preprocess_fn)
+        arguments = self._arguments()
+        # `init_params` are all of ManiSkill's own arguments, these two among them.
+        task = arguments.pop("id", config.task)
+        num_envs = arguments.pop("num_envs", config.num_envs)
         native = EnvConfig(
             name=config.name,
             backend=self.backend,
-            task=config.task,
-            num_envs=config.num_envs,
+            task=task,
+            num_envs=num_envs,
             max_episode_steps=config.max_episode_steps,
-            env_kwargs=self._arguments(),
+            env_kwargs=arguments,
         )
         self.native = BACKENDS.resolve(self.backend)(native, worker_index or 0)
         self.env = self.native.env

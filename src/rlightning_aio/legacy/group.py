@@ -11,10 +11,12 @@ import contextlib
 import logging
 import time
 import warnings
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, cast
+
+import numpy as np
 
 from rlightning_aio.batch import BatchedData
-from rlightning_aio.batch.data import reported_info_list
+from rlightning_aio.batch.data import parts_of
 from rlightning_aio.envs.tensors import as_numpy
 from rlightning_aio.errors import EnvFault
 from rlightning_aio.legacy.counter import EnvStepCounter, ThroughputTracker
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Sequence
 
     import gymnasium as gym
+    from numpy.typing import NDArray
 
 __all__ = ["EnvGroup", "build_env_group", "define_env_instance_cfgs"]
 
@@ -183,7 +186,11 @@ class EnvGroup:
 
     def _reset_server(self, server: ServerHandle, seed: Any, options: Any) -> list[_Row]:
         rets: Any = self._core[self._core_id_of[server.env_id]].reset(seed, options)
-        rows = [self._row(server.env_id, ret, ret.info, is_loss=False) for ret in rets]
+        rows: list[_Row] = []
+        for ret in rets:
+            env_id = f"{server.env_id}/{ret.env_id.partition('/')[2]}"
+            own = self._names.EnvRet(env_id, ret.observation, info=ret.info)
+            rows.append(_Row(server.env_id, env_id, own))
         self._pending -= {row.env_id for row in rows}
         return rows
 
@@ -254,27 +261,24 @@ class EnvGroup:
         """Have the envs of `batch` step, or reset where the counter says so."""
         counter = self.step_counter
         due: list[str] = []
-        steps: list[tuple[str, PolicyResponse]] = []
+        steps: list[tuple[str, str, Any]] = []
         for env_id, response in batch.items():
             core_id = self._core_id_of[env_id]
-            is_local = env_id in self._local_ids
-            if is_local and counter is not None and counter.is_reached_max_steps(env_id):
+            if env_id not in self._local_ids:
+                steps.append((response.env_id, core_id, self._for_client(core_id, response)))
+            elif counter is not None and counter.is_reached_max_steps(env_id):
                 counter.reset(env_id)
-                due.append(core_id)
-            elif is_local:
-                form = self._forms[env_id].of(response, self._names)
-                steps.append((core_id, PolicyResponse(core_id, form)))
+                due.append(env_id)
             else:
-                steps.append((core_id, self._for_client(core_id, response)))
+                form = self._forms[env_id].of(response, self._names)
+                steps.append((env_id, core_id, form))
         if due:
-            self._core.reset_async(env_ids=due)
+            self._core.reset_async(env_ids=[self._core_id_of[env_id] for env_id in due])
+            self._pending.update(due)
         if steps:
-            ids, responses = zip(*steps, strict=True)
-            self._core.step_async(BatchedData(ids, responses))
-        local = self._local_ids
-        self._pending.update(
-            env_id if env_id in local else resp.env_id for env_id, resp in batch.items()
-        )
+            env_ids, core_ids, forms = zip(*steps, strict=True)
+            self._core.step_async(_batch_of(core_ids, forms))
+            self._pending.update(env_ids)
 
     @staticmethod
     def _for_client(core_id: str, response: Any) -> PolicyResponse:
@@ -302,19 +306,16 @@ class EnvGroup:
         return rows
 
     def _rows_of(self, batch: BatchedData) -> list[_Row]:
-        infos = reported_info_list(batch)
-        losses = batch.restarted.tolist()
-        return [
-            self._row(self._id_of[core_id], ret, info, is_loss=is_loss)
-            for (core_id, ret), info, is_loss in zip(batch, infos, losses, strict=True)
-        ]
-
-    def _row(self, batch_id: str, ret: Any, info: dict[str, Any], *, is_loss: bool) -> _Row:
-        env_id = batch_id
-        if batch_id not in self._local_ids:
-            env_id = f"{batch_id}/{ret.env_id.partition('/')[2]}"
-        own = restored(self._names, ret, info, env_id, is_loss=is_loss)
-        return _Row(batch_id, env_id, own)
+        rows: list[Any] = [None] * len(batch)
+        batch_ids, env_ids = batch.ids(), batch.env_ids()
+        for part in parts_of(batch):
+            positions = range(len(part)) if part.positions is None else part.positions.tolist()
+            for row, k in enumerate(positions):
+                own_id = self._id_of[batch_ids[k]]
+                client = env_ids[k].removeprefix(batch_ids[k])
+                env_id = own_id + client
+                rows[k] = _Row(own_id, env_id, restored(self._names, part, row, env_id))
+        return rows
 
     def _handed_out(self, rows: list[_Row]) -> tuple[Any, list[bool]]:
         """A batch of `rows`, counted, and who of them has come to the limit."""
@@ -425,6 +426,18 @@ class EnvGroup:
         """Print the group's figures, and have each env log its own."""
         self._core.print_timing_summary()
         self._call_all("of_env", "print_timing_summary", (reset,), {})
+
+
+def _batch_of(core_ids: Sequence[str], forms: Sequence[Any]) -> BatchedData:
+    """A batch of steps for the group below: one column, where actions are arrays of one kind."""
+    arrays = [cast("NDArray[Any]", form) for form in forms if isinstance(form, np.ndarray)]
+    if len(arrays) == len(forms) and len({(a.shape, a.dtype) for a in arrays}) == 1:
+        return BatchedData(core_ids, core_ids).respond(action=np.stack(arrays))
+    responses = [
+        form if isinstance(form, PolicyResponse) else PolicyResponse(core_id, form)
+        for core_id, form in zip(core_ids, forms, strict=True)
+    ]
+    return BatchedData(core_ids, responses)
 
 
 def _action_shape(meta: Any) -> tuple[int, ...] | None:

@@ -28,6 +28,7 @@ from rlightning_aio.types import EnvRet, PolicyResponse
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from rlightning_aio.batch.columns import ResultColumns
     from rlightning_aio.legacy.names import Names
     from rlightning_aio.protocol.columns import Leaf
 
@@ -272,32 +273,29 @@ def _arrays(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any,
         yield path, value
 
 
-def restored(
-    names: Any, result: EnvRet, info: dict[str, Any], env_id: str, *, is_loss: bool
-) -> Any:
+def restored(names: Names, part: ResultColumns, row: int, env_id: str) -> Any:
     """RLightning's result, of one of ours that a worker or client has sent.
 
     Args:
         names: whose `EnvRet` it is to be.
-        result: ours.
-        info: as the env told it.
+        part: columns of ours.
+        row: the one that becomes a value.
         env_id: RLightning's.
-        is_loss: it marks that the episode before was lost with its worker.
     """
-    extra = result._extra  # pyright: ignore[reportPrivateUsage]
+    extra: dict[str, Any] = part.out_of_band_of(row).get("extra") or {}
     ret = extra.get(WHOLE)
     if ret is None:
         return names.EnvRet(
             env_id,
-            result.observation,
-            result.last_reward,
-            result.last_terminated,
-            result.last_truncated,
-            info,
+            part.observation_of(row),
+            part.head_of(part.reward, row),
+            part.head_of(part.terminated, row),
+            part.head_of(part.truncated, row),
+            part.reported_info_of(row),
             extra,
-            result.ts_env_sent_ns,
+            part.sent_ns_of(row),
         )
-    if is_loss and dataclasses.is_dataclass(ret):
-        told = {**cast("Any", ret).info, **info}
+    if part.restarted is not None and part.restarted[row] and dataclasses.is_dataclass(ret):
+        told = {**cast("Any", ret).info, **part.reported_info_of(row)}
         return dataclasses.replace(cast("Any", ret), last_truncated=True, info=told)
     return ret
