@@ -54,7 +54,9 @@ for (task, count), (pool, half_of_pool, ceiling, limit) in FIGURES.items():
         against(ours, EnvPool(f"EnvPool, {name}", plain), pool)
     if half_of_pool:
         half = count // 2
-        at_once = OursAsync(f"rlightning_aio, {half} of {name}", work, min_results=CORES // 2)
+        # Two for each worker: while the trainer has one, it steps the other.
+        halves = replace(plain, together=count // (2 * CORES))
+        at_once = OursAsync(f"rlightning_aio, {half} of {name}", halves, min_results=CORES)
         against(at_once, EnvPool(f"EnvPool, {half} of {name}", plain, half), half_of_pool)
     if ceiling:
         loops = Ceiling(f"the ceiling, {name}", plain, num_envs=count // CORES)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import os
+import signal
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -27,6 +28,12 @@ os.environ["PYTHONASYNCIODEBUG"] = "1"
 # A thousand interpreters start for the tests; none of them shall compile everything anew.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
+
+# What tests start is to heed signals that whoever started the tests ignores, as nohup does: a
+# handler, unlike that, is not passed on.
+for _number in (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT):
+    if signal.getsignal(_number) is signal.SIG_IGN:
+        signal.signal(_number, lambda *_: None)
 
 # How fast examples come says something of the machine, and nothing of the code.
 settings.register_profile(
