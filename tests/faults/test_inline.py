@@ -28,7 +28,7 @@ def test_whatever_an_inline_env_raises_is_told_and_it_goes_on(start: Start) -> N
         check_told(caught.value, name, "step")
         with pytest.raises(EnvRaised) as caught:
             group.call("faulty-1", "do", name)
-        check_told(caught.value, name, "call")
+        check_told(caught.value, name, "the call of do()")
         group.reset(env_ids=["faulty-1"])
         tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
