@@ -9,6 +9,8 @@ PY := $(VENV)/bin/python
 # Isaac Lab pins what it shares with the other simulators: it has an environment of its own.
 SIMULATORS := .venv-simulators
 ISAAC := .venv-isaac
+# RLlib pins Gymnasium to a version of its own.
+RLLIB := .venv-rllib
 PIP_INSTALL = $(@D)/bin/python -m pip install --quiet --disable-pip-version-check
 
 .DEFAULT_GOAL := help
@@ -28,7 +30,7 @@ test: $(VENV)/installed-test ## the tests
 # Kernels that Isaac Lab compiled once are found again, by workers and tests alike.
 test-simulators: export WARP_CACHE_PATH := $(CURDIR)/$(ISAAC)/warp-cache
 test-simulators: export ISAAC_PYTHON := $(CURDIR)/$(ISAAC)/bin/python
-test-simulators: $(SIMULATORS)/installed $(ISAAC)/installed ## the tests of every backend, on the real simulators (5 GB of packages)
+test-simulators: $(SIMULATORS)/installed $(ISAAC)/installed $(RLLIB)/installed ## the tests of every backend, on the real simulators (7 GB of packages)
 	tests/simulators/install_debian.sh
 	$(ISAAC)/bin/python -m pytest -m simulators -rs tests/envs/test_isaac.py
 	$(SIMULATORS)/bin/python -m pytest -m simulators -rs tests/envs tests/vector tests/test_docs.py
@@ -47,7 +49,7 @@ bench: $(VENV)/installed-bench ## every benchmark, peers included (their package
 	$(PY) benchmarks/run_all.py
 
 clean: ## remove the virtual environments and every cache
-	rm -rf $(VENV) $(SIMULATORS) $(ISAAC) build dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) $(SIMULATORS) $(ISAAC) $(RLLIB) build dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 	find src tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
 
 %/bin/python:
@@ -62,12 +64,17 @@ $(VENV)/installed: extras :=
 $(VENV)/installed-test: extras := [test]
 $(VENV)/installed-check: extras := [test,check]
 $(VENV)/installed-bench: extras := [bench]
-$(SIMULATORS)/installed: extras := [test,ale,envpool,maniskill,pettingzoo,piper,sb3]
+$(SIMULATORS)/installed: extras := [test,ale,envpool,maniskill,pettingzoo,piper,sb3,torchrl]
 $(VENV)/installed $(VENV)/installed-test $(VENV)/installed-check $(VENV)/installed-bench: | $(PY)
 $(SIMULATORS)/installed: | $(SIMULATORS)/bin/python
 $(VENV)/installed $(VENV)/installed-test $(VENV)/installed-check $(VENV)/installed-bench \
     $(SIMULATORS)/installed: pyproject.toml constraints.txt
 	$(PIP_INSTALL) --constraint constraints.txt --editable '.$(extras)'
+	@touch $@
+
+$(RLLIB)/installed: pyproject.toml constraints.txt | $(RLLIB)/bin/python
+	grep -v '^gymnasium==' constraints.txt > $(RLLIB)/constraints.txt
+	$(PIP_INSTALL) --constraint $(RLLIB)/constraints.txt --editable '.[ray,test]' 'ray[rllib]' torch
 	@touch $@
 
 $(ISAAC)/installed: pyproject.toml tests/simulators/isaac.txt | $(ISAAC)/bin/python

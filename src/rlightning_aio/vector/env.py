@@ -432,6 +432,8 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
                 stacklevel=3,
             )
         self.group.close()
+        # They are views of shared memory, which ends with its last one.
+        self._observations, self._answerable = None, BatchedData([], [])
 
 
 def _equal(one: Any, other: Any) -> bool:
