@@ -22,8 +22,8 @@ HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results"
 README = HERE / "README.md"
 SCRIPTS = (
-    "cheetah", "batches", "peers", "humanoid", "cartpole", "pong", "round_trip", "facade",
-    "trainer_cpu", "stragglers", "uneven", "start", "memory", "remote", "worker", "pool",
+    "adapters", "cheetah", "batches", "peers", "humanoid", "cartpole", "pong", "round_trip",
+    "facade", "trainer_cpu", "stragglers", "uneven", "start", "memory", "remote", "worker", "pool",
 )  # fmt: skip
 
 

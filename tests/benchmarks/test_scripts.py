@@ -25,6 +25,7 @@ ONE_STAGE = Path(__file__).with_name("one_stage.py")
 # Of each script the contenders that take part, by parts of their names; all if there are none.
 ASKED = {
     "cheetah": ["rlightning_aio async"],
+    "adapters": ["rlightning_aio VectorEnv", "sb3.VecEnv"],
     "batches": ["aio, HalfCheetah x 32", "aio, 16 of HalfCheetah", "ceiling"],
     "cartpole": ["rlightning_aio sync", "loop"],
     "humanoid": ["rlightning_aio sync"],
@@ -42,7 +43,7 @@ ASKED = {
 WITHOUT_SECONDS = ("start", "memory")
 TOGETHER = (
     ("cheetah", "batches", "cartpole", "humanoid", "start", "memory"),
-    ("round_trip", "facade", "trainer_cpu", "stragglers", "uneven", "peers", "pong"),
+    ("round_trip", "facade", "trainer_cpu", "stragglers", "uneven", "peers", "pong", "adapters"),
 )
 RARELY_SLOW = "all work 50 µs, 2 of 8 rarely take 100 ms, 4 to a worker"
 
@@ -179,6 +180,14 @@ def test_lateness_is_measured_from_the_kth_of_all_outstanding(
         calls.came(envs, done)
     # Called at 1, the second of 2, 3 and 4 was ready at 3; the next at once, called at 6.
     assert calls.late_ms() == [2000.0, 1000.0]
+
+
+def test_adapters(report_of: ReportOf) -> None:
+    """Each interface steps, where the library that it belongs to is installed."""
+    asked = {"rlightning_aio VectorEnv"}
+    if importlib.util.find_spec("stable_baselines3") is not None:
+        asked.add("rlightning_aio sb3.VecEnv")
+    assert report_of("adapters")["results"].keys() == asked
 
 
 def test_pong(report_of: ReportOf) -> None:
