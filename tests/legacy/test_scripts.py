@@ -22,11 +22,13 @@ pytestmark = pytest.mark.skipif(is_rlightning_installed(), reason="RLightning it
 TEXTS = Path(__file__).parents[2].parent / "shared" / "reference"
 
 
-def run(script: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+def run(
+    script: Path, *arguments: str, folder: Path | None = None
+) -> subprocess.CompletedProcess[str]:
     environment = {name: v for name, v in os.environ.items() if name != "PYTHONASYNCIODEBUG"}
     return subprocess.run(
         [sys.executable, "-m", "rlightning_aio.legacy", str(script), *arguments],
-        cwd=script.parent,
+        cwd=folder or script.parent,
         env=environment,
         capture_output=True,
         text=True,
@@ -35,8 +37,8 @@ def run(script: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def check(script: Path, *arguments: str) -> str:
-    done = run(script, *arguments)
+def check(script: Path, *arguments: str, folder: Path | None = None) -> str:
+    done = run(script, *arguments, folder=folder)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -72,6 +74,7 @@ env:
   - {name: swing, backend: swing, task: Pendulum-v1, max_episode_steps: 7, gravity: 9.0}
 """
 SCRIPT = """
+import os
 import sys
 import warnings
 
@@ -124,7 +127,7 @@ with env_group.auto_reset(max_episode_steps=4):
         env_group.step_async(answers(batch))
     env_group.collect_async(wait_all=True)
 env_group.close()
-print("ran as", __name__, sys.argv[1:])
+print("ran as", __name__, os.path.isabs(__file__), sys.argv[1:])
 """
 
 
@@ -134,7 +137,8 @@ def test_a_script_of_our_own(tmp_path: Path) -> None:
     (tmp_path / "entries.yaml").write_text(ENTRIES)
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
-    assert check(script, "entries.yaml", "0.5") == "ran as __main__ ['entries.yaml', '0.5']\n"
+    told = check(Path("script.py"), "entries.yaml", "0.5", folder=tmp_path)
+    assert told == "ran as __main__ True ['entries.yaml', '0.5']\n"
 
 
 def test_a_script_that_is_not_there(tmp_path: Path) -> None:

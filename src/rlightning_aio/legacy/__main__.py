@@ -20,7 +20,8 @@ def main() -> None:
     # In place of the current directory, which `-m` has put there.
     sys.path[0] = str(Path(script).resolve().parent)
     install()
-    runpy.run_path(script, run_name="__main__")
+    # `__file__` is absolute in a script that Python runs itself.
+    runpy.run_path(str(Path(script).absolute()), run_name="__main__")
 
 
 if __name__ == "__main__":
