@@ -487,6 +487,22 @@ def test_every_problem_of_a_file_is_in_the_one_message(write: Write) -> None:
 
 
 @pytest.mark.parametrize(
+    ("entry", "said"),
+    [
+        ({"make_env": dict, "placement": "here"}, "placement: should be .* got 'here'"),
+        ({"task": "os:getcwd", "num_workers": 0}, "num_workers: should be .* got 0"),
+        ({"make_env": 3}, "make_env: should be callable .* got 3"),
+        ({"make_env": [dict, dict], "num_workers": "two"}, "num_workers: should be .* got 'two'"),
+    ],
+    ids=str,
+)
+def test_an_entry_of_a_callable_has_its_own_problems_alone(entry: Any, said: str) -> None:
+    """The backend that goes without saying is none of them."""
+    with pytest.raises(ConfigError, match=rf"configuration: envs\.0 \('e'\), {said}$"):
+        parse_configs({"name": "e", **entry})
+
+
+@pytest.mark.parametrize(
     ("text", "said"),
     [
         ("envs: [1\nb: 2", "line 2, column 2: not valid YAML"),

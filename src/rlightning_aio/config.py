@@ -380,7 +380,7 @@ def _read_entry(entry: object, place: str, problems: _Problems) -> _Entry | None
     known = EnvConfig.model_fields
     for unknown in (k for k in given if k not in known):
         problems.add(f"{place}, {unknown}", _unknown_field(unknown, known))
-    fields = {k: _plain(v, place) for k, v in given.items() if k in known}
+    fields = _with_backend({k: _plain(v, place) for k, v in given.items() if k in known})
     try:
         return _Entry(place, EnvConfig.model_validate(fields), set())
     except ValidationError as error:
@@ -438,7 +438,9 @@ def _runs_here(config: EnvConfig) -> bool:
 
 def _check_entry(entry: _Entry, problems: _Problems) -> None:
     for name, check in _CHECKS.items():
-        if name not in entry.faulty and (text := check(entry.config)) is not None:
+        if {name, *_COMPARED_WITH.get(name, ())} & entry.faulty:
+            continue
+        if (text := check(entry.config)) is not None:
             problems.add(f"{entry.place}, {name}", text)
     for name, why in _refused(entry.config).items():
         if name not in entry.faulty:
@@ -509,6 +511,8 @@ def _check_interpreter(config: EnvConfig) -> str | None:
     return f"{path!r} {reason}"
 
 
+_COMPARED_WITH = {"task": ("make_env",), "make_env": ("num_workers",)}
+"""Fields without which nothing can be said of others."""
 _CHECKS: dict[str, Callable[[EnvConfig], str | None]] = {
     "backend": _check_backend,
     "task": _check_task,

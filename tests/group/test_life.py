@@ -190,7 +190,9 @@ async def test_groups_of_both_kinds_side_by_side() -> None:
         rlightning_aio.build_env_group(PROBE) as one,
         rlightning_aio.build_env_group({**PROBE, "name": "other"}) as other,
     ):
+        threads = threading.active_count()
         with sync.build_env_group({**PROBE, "name": "third"}) as third:
+            assert threading.active_count() == threads, "it needs none, and no loop of its own"
             batches = await asyncio.gather(one.reset(seed=1), other.reset(seed=2))
             assert [batch.observation[0, 3] for batch, _ in batches] == [1, 2]
             assert use(third) == [4.0] * 3
