@@ -14,7 +14,7 @@ RLLIB := .venv-rllib
 PIP_INSTALL = $(@D)/bin/python -m pip install --quiet --disable-pip-version-check
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-simulators check format bench clean
+.PHONY: help run test test-simulators test-gpu check format bench clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 24
@@ -34,6 +34,14 @@ test-simulators: $(SIMULATORS)/installed $(ISAAC)/installed $(RLLIB)/installed #
 	tests/simulators/install_debian.sh
 	$(ISAAC)/bin/python -m pytest -m simulators -rs tests/envs/test_isaac.py
 	$(SIMULATORS)/bin/python -m pytest -m simulators -rs tests/envs tests/vector tests/test_docs.py
+
+# With -rs, each test that is skipped says what it lacks.
+test-gpu: export WARP_CACHE_PATH := $(CURDIR)/$(ISAAC)/warp-cache
+test-gpu: $(SIMULATORS)/installed $(ISAAC)/installed ## the tests of simulators on a CUDA GPU; skipped where there is none
+	@for python in $(ISAAC)/bin/python $(SIMULATORS)/bin/python; do \
+	    $$python -c 'import torch; print(torch.__version__, "CUDA", torch.cuda.is_available())'; done
+	$(ISAAC)/bin/python -m pytest -m gpu -rs tests/envs/test_gpu.py
+	$(SIMULATORS)/bin/python -m pytest -m gpu -rs tests/envs/test_gpu.py tests/envs/test_maniskill.py
 
 check: $(VENV)/installed-check ## the static checks: ruff, pyright, import-linter
 	$(VENV)/bin/ruff check

@@ -114,6 +114,19 @@ def test_inline_results_are_handed_over_uncopied() -> None:
         assert np.array_equal(batch.observation, kept)
 
 
+@pytest.mark.parametrize("task", ["LunarLander-v3", "WalkerRun-v1"])
+def test_a_space_that_excludes_its_observations_is_no_refusal(task: str) -> None:
+    """One warning names the task, and what EnvPool gives is handed out."""
+    with sync.build_env_group(entry(task, 2, placement="inline")) as group:
+        with pytest.warns(UserWarning, match=f"task '{task}'.*an observation.* holds") as said:
+            batch, _ = group.reset(seed=0)
+        assert len(said) == 1
+        space = group.get_action_spaces()[0]
+        assert space is not None
+        for _ in range(5):
+            batch, _ = group.step(batch.respond(action=[space.sample()]))
+
+
 def test_a_result_belongs_to_its_caller() -> None:
     """Who writes to its ids changes nothing of where the next actions go."""
     env, alone = make(num_envs=4), make(num_envs=4)

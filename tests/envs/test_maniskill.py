@@ -116,6 +116,7 @@ class TestRgb(ManiskillContract):
             assert image.float().std() > 10
 
 
+@pytest.mark.gpu
 @needs_gpu
 class TestBatchOnAGpu(GroupContract):
     config = entry(num_envs=4)

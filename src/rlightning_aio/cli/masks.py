@@ -12,12 +12,19 @@ from typing import TYPE_CHECKING, Any, cast
 import gymnasium as gym
 import numpy as np
 
+from rlightning_aio.protocol.columns import is_dict
 from rlightning_aio.types import EnvRet, MultiAgentEnvRet
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-__all__ = ["allowed_action", "has_masks"]
+__all__ = ["allowed_action", "can_be_masked", "has_masks"]
+
+
+def can_be_masked(space: gym.Space[Any]) -> bool:
+    """Whether actions of `space`, or of an agent in it, are discrete."""
+    parts = space.spaces.values() if is_dict(space) else (space,)
+    return any(map(_is_discrete, parts))
 
 
 def has_masks(result: Any) -> bool:
@@ -56,11 +63,15 @@ def _mask(observation: Any, info: Any) -> Any:
     return None
 
 
-def _allowed(space: gym.Space[Any], action: Any, mask: Any, rng: np.random.Generator) -> Any:
+def _is_discrete(space: gym.Space[Any]) -> bool:
     # Gymnasium's spaces are generic over dtypes that nobody states.
     spaces: Any = gym.spaces
+    return isinstance(space, (spaces.Discrete, spaces.MultiDiscrete))
+
+
+def _allowed(space: gym.Space[Any], action: Any, mask: Any, rng: np.random.Generator) -> Any:
     known = cast("Any", space)
-    if mask is None or not isinstance(space, (spaces.Discrete, spaces.MultiDiscrete)):
+    if mask is None or not _is_discrete(space):
         return action
     # A vectorised env has a row for each sub-environment, and as many actions.
     weights = np.asarray(mask, np.bool_)

@@ -15,7 +15,7 @@ import gymnasium as gym
 import numpy as np
 
 from rlightning_aio.batch import BatchedData
-from rlightning_aio.cli.masks import allowed_action, has_masks
+from rlightning_aio.cli.masks import allowed_action, can_be_masked, has_masks
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.protocol.columns import index, stacked
 
@@ -103,7 +103,7 @@ class RandomPolicy:
         """Actions for a batch: columns if its envs share one action space, else a list."""
         env_ids = batch.env_ids()
         samplers = [
-            self._samplers.get(id_) or self._meet(id_, batch.values()[row])
+            self._samplers.get(id_) or self._meet(id_, batch, row)
             for row, id_ in enumerate(env_ids)
         ]
         first = samplers[0]
@@ -122,7 +122,7 @@ class RandomPolicy:
                 chosen[row] = allowed_action(space, chosen[row], result, self._rng)
         return chosen if listed else stacked(chosen)
 
-    def _meet(self, env_id: str, result: Any) -> Sampler:
+    def _meet(self, env_id: str, batch: BatchedData, row: int) -> Sampler:
         space = self._space_of(env_id)
         if space is None:
             raise ConfigError(f"env {env_id!r} reports no action space; give a --policy")
@@ -131,7 +131,8 @@ class RandomPolicy:
             sampler = _sampler(space, self._rng)
             self._kinds.append((space, sampler))
         self._samplers[env_id] = sampler
-        if has_masks(result):
+        # Others' infos are left alone: they may hold what can't be unpickled here.
+        if can_be_masked(space) and has_masks(batch.values()[row]):
             self._masked[env_id] = space
         return sampler
 

@@ -31,6 +31,7 @@ from rlightning_aio.errors import (
 from rlightning_aio.group.actions import write_actions
 from rlightning_aio.group.auto_reset import NO_RESETS, AutoReset
 from rlightning_aio.group.dispatch import Dispatch
+from rlightning_aio.group.first_looks import FirstLooks
 from rlightning_aio.group.hint import HINT_AFTER_BATCHES
 from rlightning_aio.group.intake import Intake
 from rlightning_aio.group.recovery import Recovery
@@ -97,6 +98,7 @@ class Core:
         self._layout = layout
         self._watcher = watcher
         self._results = Results(envs, layout, zero_copy=zero_copy)
+        self._first_looks = FirstLooks(envs)
         self._recovery = Recovery()
         self._dispatch = Dispatch(envs, requests, supervisor)
         self._intake = Intake(
@@ -332,6 +334,8 @@ class Core:
         """
         try:
             batch, limits, parts = self._batch(slots)
+            if self._first_looks.left:
+                self._first_looks.look(parts)
             flags = [False] * len(slots) if limits is None else limits.tolist()
             self.stats.account(parts, synchronous=synchronous)
             self._results.let_go(slots)

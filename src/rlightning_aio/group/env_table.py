@@ -16,6 +16,7 @@ from rlightning_aio.errors import UnknownEnv
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    import gymnasium as gym
     from numpy.typing import NDArray
 
     from rlightning_aio.config import EnvConfig
@@ -43,6 +44,7 @@ class EnvTable:
         num_sub_envs: of each; seed_offset: how many seeds come before its own; num_seeds:
             those of all local envs.
         resets_itself: it needs no reset after an end; any_resets_itself: true of any env.
+        observation_spaces: of the local envs.
     """
 
     def __init__(
@@ -82,6 +84,7 @@ class EnvTable:
         self.num_seeds = 0
         self.resets_itself = np.zeros(size, np.bool_)
         self.any_resets_itself = False
+        self.observation_spaces: list[gym.Space[Any] | None] = []
 
     def __len__(self) -> int:
         return len(self.configs)
@@ -95,6 +98,7 @@ class EnvTable:
 
     def note_started(self, started: Sequence[EnvStarted]) -> None:
         """Take note of what the local envs are like, in the order of their slots."""
+        self.observation_spaces = [env.meta.observation_space for env in started]
         for slot, env in enumerate(started):
             fits_row = env.layout.action_leaves is not None
             self.out_of_band_actions[slot] = env.transforms_actions or not fits_row

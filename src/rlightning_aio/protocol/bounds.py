@@ -1,0 +1,64 @@
+"""Whether a value lies within the bounds of its space.
+
+Rule: nothing here refuses or raises. Simulators declare bounds that their own observations don't
+keep to; structure, shapes and dtypes are what `columns` checks, and what doesn't have those of
+its space is passed over. So are tensors, which may be on another device.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, cast
+
+import gymnasium as gym
+import numpy as np
+
+from rlightning_aio.protocol.columns import Leaf, is_dict, is_tuple
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+__all__ = ["out_of_bounds"]
+
+_NUMBERS = (np.ndarray, np.generic, int, float)
+
+
+def out_of_bounds(space: gym.Space[Any], value: Any, what: str) -> str | None:
+    """What of `value` its space excludes, in words; None if nothing."""
+    return next(_faults(space, value, what, ()), None)
+
+
+def _faults(
+    space: gym.Space[Any], value: Any, what: str, path: tuple[str | int, ...]
+) -> Iterator[str]:
+    if is_dict(space):
+        parts = cast("dict[str, Any]", value) if isinstance(value, dict) else {}
+        for key in space.spaces.keys() & parts.keys():
+            yield from _faults(space.spaces[key], parts[key], what, (*path, key))
+    elif is_tuple(space):
+        items = cast("tuple[Any, ...]", value) if isinstance(value, tuple) else ()
+        for position, (inner, part) in enumerate(zip(space.spaces, items, strict=False)):
+            yield from _faults(inner, part, what, (*path, position))
+    elif (bounds := _bounds(space)) is not None and isinstance(value, _NUMBERS):
+        array = np.asarray(value)
+        if array.shape != space.shape or array.dtype.kind not in "biuf":
+            return
+        low, high = (np.broadcast_to(bound, array.shape) for bound in bounds)
+        # Written so that NaN lies outside.
+        outside = ~((array >= low) & (array <= high))
+        if outside.any():
+            name = Leaf(path, (), array.dtype).name
+            found, least, most = (one[outside][0] for one in (array, low, high))
+            yield f"{what}{name} holds {found}, and the space goes from {least} to {most}"
+
+
+def _bounds(space: gym.Space[Any]) -> tuple[Any, Any] | None:
+    # Gymnasium's spaces are generic over dtypes that nobody states.
+    spaces: Any = gym.spaces
+    known = cast("Any", space)
+    if isinstance(space, spaces.Box):
+        return known.low, known.high
+    if isinstance(space, spaces.Discrete):
+        return known.start, known.start + known.n - 1
+    if isinstance(space, spaces.MultiDiscrete):
+        return known.start, known.start + known.nvec - 1
+    return (0, 1) if isinstance(space, spaces.MultiBinary) else None
