@@ -18,7 +18,14 @@ from group.sample_envs import Gate
 
 import rlightning_aio
 import rlightning_aio.sync
-from rlightning_aio import BatchedData, EnvBusy, NothingPending, PolicyResponse
+from rlightning_aio import (
+    BatchedData,
+    EnvBusy,
+    EnvRaised,
+    NothingPending,
+    PolicyResponse,
+    UnknownEnv,
+)
 from rlightning_aio.errors import GroupClosed, RLightningError
 
 if TYPE_CHECKING:
@@ -26,6 +33,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 IDS = [f"gated-{k}" for k in range(4)]
+RAISE = 3
 
 
 def responses(*indices: int) -> BatchedData:
@@ -114,6 +122,39 @@ def test_a_minimum_is_waited_for_and_a_maximum_kept(sync_group: Any, gates: list
         assert len(batch) == len(flags) == size
         came += batch.ids()
     assert came == ["gated-3", "gated-1", "gated-0"]
+
+
+def test_results_of_some_entries_are_taken_alone(tmp_path: Path) -> None:
+    """Training beside evaluation: the others' results, and their errors, wait to be asked for."""
+    ids = ["gated-0", "gated-1", "tested-0", "tested-1"]
+    gates = [Gate(str(tmp_path), env_id).make() for env_id in ids]
+    entries = [
+        entry(tmp_path, name=name, num_workers=2, envs_per_process=1)
+        for name in ("gated", "tested")
+    ]
+    steps = BatchedData(ids, [PolicyResponse(id_, [0, k]) for k, id_ in enumerate(ids)])
+    with rlightning_aio.sync.build_env_group(entries) as group:
+        group.reset()
+        with pytest.raises(UnknownEnv, match=r"no entry .* called 'teste'; they are gated, tested"):
+            group.collect_async(entries=["gated", "teste"])
+        group.step_async(steps)
+        with opened(gates[2], gates[0], gates[1]):
+            batch, _ = group.collect_async(entries=["gated"], wait_all=True)
+        assert sorted(batch.ids()) == ids[:2]
+        with pytest.raises(NothingPending, match="of entries gated"):
+            group.collect_async(entries=["gated"])
+        with opened(gates[3]):
+            batch, _ = group.collect_async(entries=["tested", "gated"], min_results=2)
+        assert batch.ids() == ids[2:]
+        steps["tested-0"].action = [RAISE, 0]
+        group.step_async(steps)
+        with opened(gates[2], gates[1], gates[0]):
+            batch, _ = group.collect_async(entries=["gated"], wait_all=True, ordered=True)
+        assert batch.ids() == ids[:2]
+        with pytest.raises(EnvRaised, match="'tested-0'"):
+            group.collect_async(entries=["tested"])
+        with opened(gates[3]):
+            assert group.collect_async(entries=["tested"])[0].ids() == ["tested-1"]
 
 
 def test_waiting_for_all_ignores_a_window_and_says_so(sync_group: Any, gates: list[Gate]) -> None:

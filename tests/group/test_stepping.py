@@ -426,6 +426,12 @@ async def test_what_a_group_has_measured(start: Any, capsys: pytest.CaptureFixtu
     assert (stats["batch_size"]["min"], stats["batch_size"]["max"]) == (1, 5)
     for kind in ("step", "wait", "transfer"):
         assert 0 <= stats["latency_us"][kind]["p50"] <= stats["latency_us"][kind]["p99"]
+    by_entry = group.get_env_stats(by_entry=True)
+    assert [(name, sums["episodes"]) for name, sums in by_entry.items()] == [
+        ("probe", 2),
+        ("more", 1),
+    ]
+    assert by_entry["probe"]["mean_return"] == 4.0
     by_env = group.get_env_stats(reset=True)
     assert list(by_env) == group.env_ids
     assert (by_env["probe-0"]["episodes"], by_env["probe-0"]["mean_return"]) == (2, 4.0)

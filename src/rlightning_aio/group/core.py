@@ -296,8 +296,10 @@ class Core:
                 self._raise_fault(among)
                 ready, total = self.requests.pending(among)
                 if not total and not self.supervisor.has_members:
+                    whose = "" if entries is None else f" of entries {', '.join(entries)}"
                     raise NothingPending(
-                        "nothing to collect: no request is outstanding; send one with step_async"
+                        f"nothing to collect: no request{whose} is outstanding; send one with "
+                        "step_async"
                     )
                 most = total if max_results is None else min(total, max_results)
                 need = most if wait_all else min(min_results, most)
