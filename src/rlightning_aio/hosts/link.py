@@ -105,7 +105,7 @@ class Link:
         if sent < len(data):
             self._outgoing += data[sent:]
             self._watcher.watch_writable(self, True)
-        else:
+        elif self._frames_outgoing:
             self._all_written()
 
     def _write_some(self, data: bytes | bytearray) -> int:

@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ARMED",
+    "IN_ORDER",
     "LINE",
     "PACE_MASK",
     "PACE_SHIFT",
-    "STORES_STAY_IN_ORDER",
     "TrainerBell",
     "WorkerBell",
     "bell_size",
@@ -40,8 +40,9 @@ __all__ = [
 
 LINE: Final = 8
 """Words of a cache line."""
-STORES_STAY_IN_ORDER: Final = platform.machine() in ("x86_64", "AMD64")
-"""x86 publishes stores in program order; elsewhere an entry could be seen after its count."""
+IN_ORDER: Final = platform.machine() in ("x86_64", "AMD64")
+"""x86 keeps loads and stores in program order, but for a load that may overtake an earlier store;
+elsewhere an entry could be seen after its count, or be read before it."""
 
 ARMED: Final = 0
 _COUNTERS: Final = LINE

@@ -19,10 +19,10 @@ import numpy as np
 
 from rlightning_aio.protocol.bell import (
     ARMED,
+    IN_ORDER,
     LINE,
     PACE_MASK,
     PACE_SHIFT,
-    STORES_STAY_IN_ORDER,
     new_fence,
 )
 
@@ -95,7 +95,8 @@ class TrainerRings:
             self._requests[start:] = entries[:room]
             self._requests[: count - room] = entries[room:]
         self._sent += count
-        self._fence()
+        if not IN_ORDER:
+            self._fence()
         self._words[_REQUESTS_SENT] = self._sent
         return self.worker_sleeps()
 
@@ -125,14 +126,16 @@ class TrainerRings:
         count = sent - self._read
         if not count:
             return self._reports[:0]
-        self._fence()
+        if not IN_ORDER:
+            self._fence()
         start = self._read & self._mask
         room = self._capacity - start
         if count <= room:
             found = self._reports[start : start + count].copy()
         else:
             found = np.concatenate((self._reports[start:], self._reports[: count - room]))
-        self._fence()
+        if not IN_ORDER:
+            self._fence()
         self._read = sent
         self._bell.took(self._index, count)
         return found
@@ -167,7 +170,8 @@ class WorkerRings:
         sent = self._words[_REQUESTS_SENT]
         if sent == self._read:
             return []
-        self._fence()
+        if not IN_ORDER:
+            self._fence()
         start = self._read & self._mask
         end = start + sent - self._read
         self._read = sent
@@ -209,7 +213,7 @@ class WorkerRings:
                 continue
             reports[self._sent & mask] = request
             self._sent = sent = self._sent + 1
-            if not STORES_STAY_IN_ORDER:
+            if not IN_ORDER:
                 self._fence()
             # `WorkerBell.publish`, spelt out: it would be felt in every step.
             words[own] = sent
@@ -228,7 +232,7 @@ class WorkerRings:
         """Report an entry that came in a frame and whose reply is all in its row; see `serve`."""
         self._reports[self._sent & self._mask] = request
         self._sent += 1
-        if not STORES_STAY_IN_ORDER:
+        if not IN_ORDER:
             self._fence()
         self._bell.publish(self._sent)
         if self._bell.is_due():
