@@ -33,7 +33,8 @@ test-simulators: export ISAAC_PYTHON := $(CURDIR)/$(ISAAC)/bin/python
 test-simulators: $(SIMULATORS)/installed $(ISAAC)/installed $(RLLIB)/installed ## the tests of every backend, on the real simulators (7 GB of packages)
 	tests/simulators/install_debian.sh
 	$(ISAAC)/bin/python -m pytest -m simulators -rs tests/envs/test_isaac.py
-	$(SIMULATORS)/bin/python -m pytest -m simulators -rs tests/envs tests/vector tests/test_docs.py
+	$(SIMULATORS)/bin/python -m pytest -m simulators -rs tests/envs tests/vector tests/test_docs.py tests/test_wheel.py
+	$(RLLIB)/bin/python -m pytest -m simulators -rs tests/vector/test_pages.py
 
 # With -rs, each test that is skipped says what it lacks.
 test-gpu: export WARP_CACHE_PATH := $(CURDIR)/$(ISAAC)/warp-cache

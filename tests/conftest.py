@@ -81,9 +81,11 @@ def _repeats(item: pytest.Item) -> bool:
     return synchronous and on_uvloop
 
 
-def _children() -> set[str]:
-    """Child processes, zombies included."""
-    found: set[str] = set()
+def _children() -> dict[str, str]:
+    """Child processes, zombies included, with what they run: one that has only just been started
+    may still run what this one does.
+    """
+    found: dict[str, str] = {}
     for children in Path("/proc/self/task").glob("*/children"):
         try:
             pids = children.read_text().split()
@@ -94,7 +96,8 @@ def _children() -> set[str]:
                 command = Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ")
             except (FileNotFoundError, ProcessLookupError):
                 continue
-            found.add(f"process {pid}: {command.decode()[:80] or 'a zombie'}")
+            name = f"process {pid}"
+            found[name] = f"{name}: {command.decode()[:80] or 'a zombie'}"
     return found
 
 
@@ -123,18 +126,18 @@ def _shared_memory() -> set[str]:
     return found
 
 
-def _held() -> set[str]:
-    return _children() | _descriptors() | _shared_memory()
+def _held() -> dict[str, str]:
+    """What this process holds, and how each of it is told."""
+    return _children() | {name: name for name in _descriptors() | _shared_memory()}
 
 
 @pytest.fixture(autouse=True)
 def nothing_left_behind() -> Iterator[None]:
     before = _held()
     yield
-    left = _held() - before
-    if left:
+    if _held().keys() - before:
         gc.collect()  # What merely awaits collection is in nobody's hands.
-        left = _held() - before
+    left = [told for name, told in _held().items() if name not in before]
     assert not left, f"the test left behind {sorted(left)}"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -24,6 +25,12 @@ MODES = [
     pytest.param(AutoresetMode.SAME_STEP, id="SameStep"),
     pytest.param(AutoresetMode.DISABLED, id="Disabled"),
 ]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def tracker_of_multiprocessing() -> None:
+    """Peers start it, one for the whole process; it stays until that ends."""
+    resource_tracker.ensure_running()
 
 
 def make(task: str, k: int) -> gym.Env[Any, Any]:
