@@ -189,7 +189,9 @@ def test_killed_trainer_takes_its_workers_along(moment: str, tmp_path: Path) -> 
         # The others may have closed already.
         assert len(workers) in {"importing": (1,), "closing": (2, 3)}.get(moment, (3,))
         for pid in (process.pid, *workers):
-            assert "/dev/shm/" not in Path(f"/proc/{pid}/maps").read_text()
+            # Of those, some may close just now.
+            with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+                assert "/dev/shm/" not in Path(f"/proc/{pid}/maps").read_text()
         with watched(workers) as ended:
             process.kill()
             ended()
