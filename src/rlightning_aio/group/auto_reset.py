@@ -56,11 +56,10 @@ class AutoReset:
         self._requests = requests
         # Numbers of the last resets, and one more for each later request that was no step.
         self._base = np.zeros(len(envs), np.int64)
-        self._due = np.zeros(len(envs), np.bool_)
-        self._any_due = False
         # Whose last result has reached the limit of a context; whose episode has ended by itself.
         self._cut = np.zeros(len(envs), np.bool_)
         self._over = np.zeros(len(envs), np.bool_)
+        self._any_due = False
         # For so many batches no env can reach its limit.
         self._margin = 0
         self._limits: NDArray[np.int64] | None = None
@@ -90,7 +89,7 @@ class AutoReset:
         self._margin = 0
         self._on_done = on_done
         self.mark_truncated = mark_truncated
-        self._set_due(np.flatnonzero(self._cut | self._over if on_done else self._cut))
+        self._note_due()
 
     def _chosen_limits(self, given: int | None) -> NDArray[np.int64]:
         envs = self._envs
@@ -124,8 +123,6 @@ class AutoReset:
     def end(self) -> None:
         """Close the context: steps are plain again."""
         self._limits = None
-        self._due[:] = False
-        self._any_due = False
         self.mark_truncated = False
 
     def due(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
@@ -133,7 +130,15 @@ class AutoReset:
         if self._limits is None:
             self._cut[slots] = False  # Their episodes go on, whatever limit they had reached.
             return NO_RESETS
-        return self._due[slots] if self._any_due else NO_RESETS
+        return self._due(slots) if self._any_due else NO_RESETS
+
+    def _due(self, slots: NDArray[np.intp] | EllipsisType) -> NDArray[np.bool_]:
+        """Whose episode is over, as the context has it."""
+        cut = self._cut[slots]
+        return cut | self._over[slots] if self._on_done else cut
+
+    def _note_due(self) -> None:
+        self._any_due = np.count_nonzero(self._due(...)) > 0
 
     def not_completed(self, slots: NDArray[np.intp]) -> None:
         """Leave the counters of `slots` as they are, though their request has a number."""
@@ -148,7 +153,8 @@ class AutoReset:
             slots: of all results.
             flagged: those parts in which any flag is set.
         """
-        over = [self._note_flags(part) for part in flagged]
+        for part in flagged:
+            self._note_flags(part)
         if self._limits is None:
             return None
         self._margin -= 1
@@ -156,35 +162,24 @@ class AutoReset:
         if self._margin <= 0:
             self._margin = int((self._limits - self._counts(...)).min())
             reached = self._counts(slots) >= self._limits[slots]
-            cut = slots[reached]
-            if len(cut):
-                self._cut[cut] = True
-                self._set_due(cut)
-        if self._on_done:
-            for ended in over:
-                self._set_due(ended)
+            self._cut[slots[reached]] = True
+        if flagged or reached is not None:
+            self._note_due()
         return reached if reached is not None and np.count_nonzero(reached) else None
 
-    def _note_flags(self, part: ResultColumns) -> NDArray[np.intp]:
-        """Start the counters of those that were reset anew; slots that are to be."""
+    def _note_flags(self, part: ResultColumns) -> None:
+        """Start the counters of those that were reset anew; note whose episode has ended."""
         resets = part.is_reset
         if resets.ndim > 1:
             resets = resets.all(axis=1)
         begun = part.slots[resets]
         if len(begun):
             self._base[begun] = self._requests.numbers(begun)
-            self._due[begun] = self._cut[begun] = self._over[begun] = False
-            self._any_due = np.count_nonzero(self._due) > 0
+            self._cut[begun] = self._over[begun] = False
         over = part.over
         if self._envs.any_resets_itself:
             over &= ~self._envs.resets_itself[part.slots]
-        ended = part.slots[over]
-        self._over[ended] = True
-        return ended
-
-    def _set_due(self, slots: NDArray[np.intp]) -> None:
-        if len(slots):
-            self._due[slots] = self._any_due = True
+        self._over[part.slots[over]] = True
 
     def _counts(self, slots: NDArray[np.intp] | EllipsisType) -> NDArray[np.int64]:
         """Counters of `slots`; too high by 1 where a request is in flight."""
