@@ -18,6 +18,7 @@ from rlightning_aio.envs.base import (
     result_of,
 )
 from rlightning_aio.envs.tensors import as_numpy
+from rlightning_aio.envs.wrappers import wrappers_of
 from rlightning_aio.types import EnvRet, PolicyResponse
 
 if TYPE_CHECKING:
@@ -104,12 +105,7 @@ class GymnasiumEnv(BaseEnv):
 
     def is_wrapped(self, wrapper_class: type[Any]) -> bool:
         """Whether `wrapper_class` is among the env's wrappers."""
-        env = self.env
-        while isinstance(env, gym.Wrapper):
-            if isinstance(env, wrapper_class):
-                return True
-            env = env.env  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
-        return False
+        return any(isinstance(wrapper, wrapper_class) for wrapper in wrappers_of(self.env))
 
     def close(self) -> None:
         self.env.close()

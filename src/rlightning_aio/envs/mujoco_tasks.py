@@ -9,13 +9,15 @@ Where NumPy computes arrays otherwise than numbers, so is it said. Actions are
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 
+from rlightning_aio.envs.wrappers import wrappers_of
+
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
     from numpy.typing import NDArray
 
@@ -34,6 +36,7 @@ class Task:
 
     Attributes:
         needs_forces: `mj_rnePostConstraint` must follow each step.
+        position: reads where each simulation's body is, for its velocity.
         actions: of the step.
         observations: after it.
     """
@@ -45,14 +48,17 @@ class Task:
         self._simulations = simulations
         self._num = len(simulations)
         self._observed = self.gathered(*self.observed())
+        self.position = self.gathered(*self.placed())
         self._before: Any = None
         self.actions: Any = None
         self.observations: Any = None
 
     def gathered(self, *parts: Callable[[Any], Any]) -> Callable[[], NDArray[np.float64]]:
         """What reads parts of each simulation's arrays, flat and one after the other."""
-        views = [part(s).reshape(-1) for s in self._simulations for part in parts]
         num = self._num
+        views = [part(s).reshape(-1) for s in self._simulations for part in parts]
+        if not views:
+            return lambda: np.empty((num, 0))
         return lambda: np.concatenate(views).reshape(num, -1)
 
     # -- what a task says of itself -----------------------------------------------------
@@ -64,9 +70,9 @@ class Task:
     def finish(self, observations: NDArray[np.float64]) -> None:
         """Change what was observed, in place."""
 
-    def position(self) -> NDArray[np.float64]:
-        """Where each simulation's body is, for its velocity."""
-        return np.empty(0)
+    def placed(self) -> list[Callable[[Any], Any]]:
+        """The parts that tell where its body is; none where nobody asks for its velocity."""
+        return []
 
     def judge(self) -> Judgement:
         """What the step was worth, and where it ends an episode."""
@@ -110,18 +116,14 @@ def _lengths(vectors: NDArray[np.float64]) -> Any:
 
 
 class HalfCheetah(Task):
-    def __init__(self, env: Any, simulations: list[Any]) -> None:
-        super().__init__(env, simulations)
-        self.x = self.gathered(lambda s: s.qpos[:1])
-
     def observed(self) -> list[Callable[[Any], Any]]:
         return _skipping(self.env, 1)
 
-    def position(self) -> NDArray[np.float64]:
-        return self.x()[:, 0]
+    def placed(self) -> list[Callable[[Any], Any]]:
+        return [lambda s: s.qpos[:1]]
 
     def judge(self) -> Judgement:
-        x, velocity = self.velocity()
+        x, velocity = (column[:, 0] for column in self.velocity())
         forward = self.env._forward_reward_weight * velocity
         control = self.env._ctrl_cost_weight * _squares(self.actions)
         infos = {
@@ -134,15 +136,11 @@ class HalfCheetah(Task):
 
 
 class Swimmer(Task):
-    def __init__(self, env: Any, simulations: list[Any]) -> None:
-        super().__init__(env, simulations)
-        self.xy = self.gathered(lambda s: s.qpos[:2])
-
-    def position(self) -> NDArray[np.float64]:
-        return self.xy()
-
     def observed(self) -> list[Callable[[Any], Any]]:
         return _skipping(self.env, 2)
+
+    def placed(self) -> list[Callable[[Any], Any]]:
+        return [lambda s: s.qpos[:2]]
 
     def judge(self) -> Judgement:
         xy, velocity = self.velocity()
@@ -164,7 +162,6 @@ class Hopper(Task):
     def __init__(self, env: Any, simulations: list[Any]) -> None:
         super().__init__(env, simulations)
         self.state = self.gathered(lambda s: s.qpos, lambda s: s.qvel)
-        self.x = self.gathered(lambda s: s.qpos[:1])
         self.velocities = env.observation_space.shape[0] - env.model.nv
 
     def observed(self) -> list[Callable[[Any], Any]]:
@@ -174,8 +171,8 @@ class Hopper(Task):
         velocities = observations[:, self.velocities :]
         np.clip(velocities, -10, 10, out=velocities)
 
-    def position(self) -> NDArray[np.float64]:
-        return self.x()[:, 0]
+    def placed(self) -> list[Callable[[Any], Any]]:
+        return [lambda s: s.qpos[:1]]
 
     def healthy(self, state: NDArray[np.float64]) -> NDArray[np.bool_]:
         least, most = self.env._healthy_state_range
@@ -189,7 +186,7 @@ class Hopper(Task):
 
     def judge(self) -> Judgement:
         env, state = self.env, self.state()
-        x, velocity = self.velocity()
+        x, velocity = (column[:, 0] for column in self.velocity())
         healthy = self.healthy(state)
         forward = env._forward_reward_weight * velocity
         survive = healthy * env._healthy_reward
@@ -215,14 +212,13 @@ class Ant(Task):
 
     def __init__(self, env: Any, simulations: list[Any]) -> None:
         super().__init__(env, simulations)
-        body = env.model.body(env._main_body).id
         self.state = self.gathered(lambda s: s.qpos, lambda s: s.qvel)
         self.forces = self.gathered(lambda s: s.cfrc_ext)
-        self.xy = self.gathered(lambda s: s.xpos[body, :2])
         self.first_force = env.observation_structure["qpos"] + env.observation_structure["qvel"]
 
-    def position(self) -> NDArray[np.float64]:
-        return self.xy()
+    def placed(self) -> list[Callable[[Any], Any]]:
+        body = self.env.model.body(self.env._main_body).id
+        return [lambda s: s.xpos[body, :2]]
 
     def observed(self) -> list[Callable[[Any], Any]]:
         parts = _skipping(self.env, 2)
@@ -294,8 +290,9 @@ class Humanoid(_Humanoid):
         super().__init__(env, simulations)
         self.masses = env.model.body_mass
         self.centres = self.gathered(lambda s: s.xipos)
+        self.position = self.centre_of_mass
 
-    def position(self) -> NDArray[np.float64]:
+    def centre_of_mass(self) -> NDArray[np.float64]:
         centres = self.centres().reshape(self._num, -1, 3)
         return (np.einsum("b,kbj->kj", self.masses, centres) / self.masses.sum())[:, :2]
 
@@ -469,13 +466,7 @@ def task_of(env: gym.Env[Any, Any], simulations: list[Any]) -> Task:
     )
     if found is None:
         raise NotImplementedError(f"{kind.__name__} is none of Gymnasium's MuJoCo tasks, version 5")
-    for wrapper in _wrappers(env):
+    for wrapper in wrappers_of(env):
         if not isinstance(wrapper, gym.wrappers.OrderEnforcing | gym.wrappers.TimeLimit):
             raise NotImplementedError(f"it is wrapped in {type(wrapper).__name__}")
     return found(env.unwrapped, simulations)
-
-
-def _wrappers(env: Any) -> Iterator[Any]:
-    while isinstance(env, gym.Wrapper):
-        yield env
-        env = cast("Any", env).env
