@@ -56,6 +56,11 @@ def is_mask(key: str, info: Container[str]) -> bool:
     return key.startswith("_") and key[1:] in info
 
 
+def _has_mask(key: str, info: Container[str]) -> bool:
+    """Whether `key` needs none made: it has one among the infos, or is one."""
+    return f"_{key}" in info or is_mask(key, info)
+
+
 def vector_infos(infos: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """One dict of columns for `infos`: a typed array for each key, and a mask ``_key``.
 
@@ -128,15 +133,12 @@ def _rows_by_schema(part: ResultColumns) -> dict[InfoSchema, list[int]]:
 
 def _agree(schemas: Iterable[InfoSchema]) -> bool:
     """Whether each key has one typed column in all of `schemas`."""
-    kinds: dict[str, tuple[Any, Any]] = {}
-    masked: dict[str, bool] = {}
+    kinds: dict[str, tuple[Any, ...]] = {}
     for schema in schemas:
-        for key in schema.keys:
-            # Some have a mask of their own, others not.
-            if masked.setdefault(key, f"_{key}" in schema.keys) != (f"_{key}" in schema.keys):
-                return False
         for key, kind, array in zip(schema.keys, schema.types, schema.arrays, strict=True):
-            if kinds.setdefault(key, (kind, array)) != (kind, array) or kind is _AS_OBJECTS:
+            # Some may have a mask of their own, others not.
+            known = kind, array, f"_{key}" in schema.keys
+            if kinds.setdefault(key, known) != known or kind is _AS_OBJECTS:
                 return False
             if key == "final_obs" or (array is not None and 0 in array[0]):
                 return False
@@ -147,7 +149,7 @@ def _of_all(fields: dict[str, Any]) -> dict[str, Any]:
     columns: dict[str, Any] = {}
     for key, values in fields.items():
         columns[key] = values.copy()
-        if not (is_mask(key, fields) or f"_{key}" in fields):
+        if not _has_mask(key, fields):
             columns[f"_{key}"] = np.ones(len(values), np.bool_)
     return columns
 
@@ -157,12 +159,12 @@ def _of_some(info: Any, rows: dict[InfoSchema, list[int]]) -> dict[str, Any]:
     for schema, chosen in rows.items():
         fields = schema.fields(info[chosen])
         for key, values in fields.items():
-            own_mask = is_mask(key, fields) or f"_{key}" in fields
+            has_mask = _has_mask(key, fields)
             if key not in columns:
                 columns[key] = np.zeros((len(info), *values.shape[1:]), values.dtype)
-                if not own_mask:
+                if not has_mask:
                     columns[f"_{key}"] = np.zeros(len(info), np.bool_)
             columns[key][chosen] = values
-            if not own_mask:
+            if not has_mask:
                 columns[f"_{key}"][chosen] = True
     return columns

@@ -39,11 +39,11 @@ class FirstLooks:
     def look(self, parts: Iterable[ResultColumns]) -> None:
         """Look at a batch's parts, and warn."""
         for part in parts:
-            for entry, row in zip(
-                *np.unique(part.names.entries[part.slots], return_index=True), strict=True
-            ):
-                if entry in self.left:
-                    self._look_at(part, int(row), int(entry))
+            entries = part.names.entries[part.slots]
+            for entry in list(self.left):
+                rows = np.flatnonzero(entries == entry)
+                if len(rows):
+                    self._look_at(part, int(rows[0]), entry)
 
     def _look_at(self, part: ResultColumns, row: int, entry: int) -> None:
         slot: int = part.slots.item(row)
