@@ -25,7 +25,6 @@ from rlightning_aio.legacy.handles import EnvHandle, ServerHandle
 from rlightning_aio.legacy.hosted import ARGUMENTS, restored
 from rlightning_aio.legacy.names import names_in_use
 from rlightning_aio.legacy.plan import Plan, define_env_instance_cfgs, listed_configs, repeated
-from rlightning_aio.legacy.tasks import TaskSubmitter
 from rlightning_aio.sync import build_env_group as build_core
 from rlightning_aio.types import PolicyResponse
 
@@ -78,7 +77,6 @@ class EnvGroup:
             raise ValueError(f"{len(fns)} preprocess functions for {len(env_cfg_list)} envs")
         plan = Plan(env_cfg_list, fns)
         num_local = len(plan.local)
-        self._task_submitter = TaskSubmitter()
         self._names = names_in_use()
         self._local_core_ids = plan.core_ids[:num_local]
         self._local_entries = [entry.name for entry in plan.entries if entry.backend == "callable"]
@@ -409,17 +407,14 @@ class EnvGroup:
 
     def get_env_stats(self, reset: bool = False) -> dict[str, float]:
         """Means of the metrics in ``info["episode_info"]``; `reset` starts them anew."""
-        submit = self._task_submitter.submit
-        handles: list[Any] = [*self.env_list, *self.env_servers]
         total: dict[str, list[float]] = {}
-        for env in handles:
-            stats = submit(env.get_env_stats, reset, _block=True)
+        # Clients of env_servers keep what they count.
+        for stats in self._call_all("of_env", "get_env_stats", (reset,), {}):
             for name, (part, count) in stats.items():
                 sums = total.setdefault(name, [0.0, 0])
                 sums[0] += part
                 sums[1] += count
-        for env in handles:
-            submit(env.finish_rollout)
+        self._call_all("of_env", "finish_rollout", (), {})
         return {name: part / count for name, (part, count) in total.items() if count > 0}
 
     def print_timing_summary(self, reset: bool = False) -> None:
