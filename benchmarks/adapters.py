@@ -8,50 +8,45 @@ makes them when somebody reads them, and nobody does.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
-from contenders import GymnasiumAsync, OursSync, StableBaselines3, Stepped, Work, sampled
+from contenders import (
+    GymnasiumAsync,
+    GymnasiumVector,
+    OursSync,
+    Sb3Vector,
+    StableBaselines3,
+    Work,
+)
 from harness import Question, Target, main
 
 WORK = Work("HalfCheetah-v5", num_envs=32, backend="mujoco")
 
 
 @dataclass
-class OursVector(Stepped):
+class OursVector(GymnasiumVector):
     """`rlightning_aio.vector.VectorEnv`, its workers kept on their cores as the bare group's."""
 
     package = "rlightning_aio"
 
-    def setup(self) -> None:
+    def make(self) -> Any:
         from rlightning_aio.vector import VectorEnv
 
-        self._envs = VectorEnv(self.work.makers(), cpu_affinity=True)
-        self._actions = sampled(self._envs.single_action_space, self.work.num_envs)
-        self._envs.reset(seed=0)
-
-    def step(self) -> int:
-        self._envs.step(next(self._actions))
-        return self.work.num_envs
+        return VectorEnv(self.work.makers(), cpu_affinity=True)
 
 
 @dataclass
-class OursSb3(Stepped):
+class OursSb3(Sb3Vector):
     """`rlightning_aio.sb3.VecEnv`, likewise."""
 
     @property
     def requires(self) -> tuple[str, ...]:
         return ("rlightning_aio", "stable_baselines3")
 
-    def setup(self) -> None:
+    def make(self) -> Any:
         from rlightning_aio.sb3 import VecEnv
 
-        self._envs = VecEnv(self.work.makers(), cpu_affinity=True)
-        self._actions = sampled(self._envs.action_space, self.work.num_envs)
-        self._envs.seed(0)
-        self._envs.reset()
-
-    def step(self) -> int:
-        self._envs.step(next(self._actions))
-        return self.work.num_envs
+        return VecEnv(self.work.makers(), cpu_affinity=True)
 
 
 VECTOR = "rlightning_aio VectorEnv"

@@ -242,49 +242,55 @@ class OursAsync(Contender):
 
 
 @dataclass
-class GymnasiumAsync(Stepped):
+class GymnasiumVector(Stepped):
+    """What has Gymnasium's vector interface."""
+
+    def make(self) -> Any:
+        """All envs."""
+        raise NotImplementedError
+
+    def setup(self) -> None:
+        self._envs = self.make()
+        self._actions = sampled(self._envs.single_action_space, self.work.num_envs)
+        self._envs.reset(seed=0)
+
+    def step(self) -> int:
+        self._envs.step(next(self._actions))
+        return self.work.num_envs
+
+
+@dataclass
+class GymnasiumAsync(GymnasiumVector):
     """`gymnasium.vector.AsyncVectorEnv` with shared memory: one process for each env."""
 
-    def setup(self) -> None:
+    def make(self) -> Any:
         from gymnasium.vector import AsyncVectorEnv
 
-        self._envs = AsyncVectorEnv(self.work.makers(), shared_memory=True)
-        self._actions = sampled(self._envs.single_action_space, self.work.num_envs)
-        self._envs.reset(seed=0)
-
-    def step(self) -> int:
-        self._envs.step(next(self._actions))
-        return self.work.num_envs
+        return AsyncVectorEnv(self.work.makers(), shared_memory=True)
 
 
 @dataclass
-class GymnasiumSync(Stepped):
+class GymnasiumSync(GymnasiumVector):
     """`gymnasium.vector.SyncVectorEnv`: all envs in turn, in the trainer's own process."""
 
-    def setup(self) -> None:
+    def make(self) -> Any:
         from gymnasium.vector import SyncVectorEnv
 
-        self._envs = SyncVectorEnv(self.work.makers())
-        self._actions = sampled(self._envs.single_action_space, self.work.num_envs)
-        self._envs.reset(seed=0)
-
-    def step(self) -> int:
-        self._envs.step(next(self._actions))
-        return self.work.num_envs
+        return SyncVectorEnv(self.work.makers())
 
 
 @dataclass
-class StableBaselines3(Stepped):
-    """`SubprocVecEnv` of Stable-Baselines3: one process for each env, results pickled."""
+class Sb3Vector(Stepped):
+    """What has Stable-Baselines3's vector interface."""
 
     package = "stable_baselines3"
 
-    def setup(self) -> None:
-        from stable_baselines3.common.vec_env import SubprocVecEnv
+    def make(self) -> Any:
+        """All envs."""
+        raise NotImplementedError
 
-        # By default each of its processes imports torch anew, for minutes in all; how fast
-        # they step afterwards is the same.
-        self._envs = SubprocVecEnv(self.work.makers(), start_method="fork")
+    def setup(self) -> None:
+        self._envs = self.make()
         self._actions = sampled(self._envs.action_space, self.work.num_envs)
         self._envs.seed(0)
         self._envs.reset()
@@ -292,6 +298,18 @@ class StableBaselines3(Stepped):
     def step(self) -> int:
         self._envs.step(next(self._actions))
         return self.work.num_envs
+
+
+@dataclass
+class StableBaselines3(Sb3Vector):
+    """`SubprocVecEnv` of Stable-Baselines3: one process for each env, results pickled."""
+
+    def make(self) -> Any:
+        from stable_baselines3.common.vec_env import SubprocVecEnv
+
+        # By default each of its processes imports torch anew, for minutes in all; how fast
+        # they step afterwards is the same.
+        return SubprocVecEnv(self.work.makers(), start_method="fork")
 
 
 @dataclass
@@ -493,18 +511,12 @@ class Ceiling(Limit):
 
 
 @dataclass
-class VectorEntryPoint(Stepped):
+class VectorEntryPoint(GymnasiumVector):
     """The task's own vector environment, in the trainer's process."""
 
-    def setup(self) -> None:
+    def make(self) -> Any:
         import gymnasium as gym
 
-        self._envs = gym.make_vec(
+        return gym.make_vec(
             self.work.task, self.work.num_envs, vectorization_mode="vector_entry_point"
         )
-        self._actions = sampled(self._envs.single_action_space, self.work.num_envs)
-        self._envs.reset(seed=0)
-
-    def step(self) -> int:
-        self._envs.step(next(self._actions))
-        return self.work.num_envs

@@ -6,15 +6,12 @@ The other programs of the documents are in test_examples.py.
 from __future__ import annotations
 
 import inspect
-import os
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-from patience import HANG
+from run_python import output_of
 
 from rlightning_aio import EnvGroup, build_env_group
 from rlightning_aio.hosts.listener import ServerSettings
@@ -40,27 +37,11 @@ def blocks(language: str, page: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
 
 
-def run(*command: str, folder: Path) -> str:
-    # Asyncio's debug mode, which holds for tests, would log what takes longer than a blink.
-    environment = {name: v for name, v in os.environ.items() if name != "PYTHONASYNCIODEBUG"}
-    done = subprocess.run(
-        [sys.executable, *command],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=HANG,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
 def run_programs(programs: list[str], folder: Path) -> str:
     files = [folder / f"{number}.py" for number in range(len(programs))]
     for file, program in zip(files, programs, strict=True):
         file.write_text(program)
-    return run(str(PROGRAMS), *map(str, files), folder=folder)
+    return output_of(PROGRAMS, *files, folder=folder, asyncio_debug=False)
 
 
 def test_programs_come_over_from_rlightning(tmp_path: Path) -> None:
@@ -68,7 +49,9 @@ def test_programs_come_over_from_rlightning(tmp_path: Path) -> None:
     script, *programs = blocks("python", "rlightning.md")
     (command,) = blocks("sh", "rlightning.md")
     (tmp_path / "steps.py").write_text(script)
-    assert "env steps per second" in run(*shlex.split(command)[1:], folder=tmp_path)
+    assert "env steps per second" in output_of(
+        *shlex.split(command)[1:], folder=tmp_path, asyncio_debug=False
+    )
     assert "(16, 17)" in run_programs(programs, tmp_path)
 
 

@@ -6,13 +6,11 @@ import importlib
 import importlib.util
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import pytest
-from patience import HANG
+from run_python import output_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -55,18 +53,6 @@ def short_round(script: str, folder: Path) -> list[str]:
     return [script, "--rounds", "1", *seconds, "--json", str(folder / f"{script}.json"), *only]
 
 
-def run(*command: str | Path, folder: Path) -> None:
-    found = subprocess.run(
-        [sys.executable, *command],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=HANG,
-        check=False,
-    )
-    assert found.returncode == 0, found.stderr
-
-
 @pytest.fixture(scope="module")
 def report_of(tmp_path_factory: pytest.TempPathFactory) -> ReportOf:
     """What a script reports of one short round; those of `TOGETHER` are run in one process."""
@@ -76,7 +62,9 @@ def report_of(tmp_path_factory: pytest.TempPathFactory) -> ReportOf:
     def report_of(script: str) -> dict[str, Any]:
         if script not in reports:
             (scripts,) = (scripts for scripts in TOGETHER if script in scripts)
-            run(ONE_STAGE, json.dumps([short_round(s, folder) for s in scripts]), folder=folder)
+            output_of(
+                ONE_STAGE, json.dumps([short_round(s, folder) for s in scripts]), folder=folder
+            )
             reports.update({s: json.loads((folder / f"{s}.json").read_text()) for s in scripts})
         return reports[script]
 
@@ -86,7 +74,7 @@ def report_of(tmp_path_factory: pytest.TempPathFactory) -> ReportOf:
 def test_a_script_run_by_itself(tmp_path: Path) -> None:
     """Contenders have processes of their own then, and their figures come from there."""
     script, *arguments = short_round("cartpole", tmp_path)
-    run(BENCHMARKS / f"{script}.py", *arguments, folder=tmp_path)
+    output_of(BENCHMARKS / f"{script}.py", *arguments, folder=tmp_path)
     report = json.loads((tmp_path / "cartpole.json").read_text())
     assert report["results"].keys() == {"rlightning_aio sync", "in-process loop"}
     assert all(found["median"] > 0 for found in report["results"].values())

@@ -105,29 +105,26 @@ def test_every_task_is_gymnasiums(task: str) -> None:
     compare(task, {"max_episode_steps": 4}, 2, 12)
 
 
+def compare_with_any_options(task: str, examples: int, num_steps: int) -> None:
+    @settings(max_examples=examples)
+    @given(OPTIONS[task], st.integers(0, 1000))
+    def check(options: dict[str, Any], seed: int) -> None:
+        compare(task, options, seed, num_steps)
+
+    check()
+
+
 @pytest.mark.parametrize("task", TASKS)
 def test_options_mean_what_they_mean_to_gymnasium(task: str) -> None:
     """Whatever a task's constructor takes."""
-
-    @settings(max_examples=3)
-    @given(OPTIONS[task], st.integers(0, 1000))
-    def check(options: dict[str, Any], seed: int) -> None:
-        compare(task, options, seed, 15)
-
-    check()
+    compare_with_any_options(task, 3, 15)
 
 
 @pytest.mark.simulators
 @pytest.mark.parametrize("task", TASKS)
 def test_a_thousand_steps_with_any_options(task: str) -> None:
     """As above, for long."""
-
-    @settings(max_examples=6)
-    @given(OPTIONS[task], st.integers(0, 1000))
-    def check(options: dict[str, Any], seed: int) -> None:
-        compare(task, options, seed, 1000)
-
-    check()
+    compare_with_any_options(task, 6, 1000)
 
 
 @pytest.mark.parametrize("placement", ["inline", "process"])

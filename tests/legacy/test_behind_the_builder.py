@@ -6,13 +6,10 @@ that are touched, with classes of its own. tests/peers/run_rlightning.py takes t
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 import textwrap
 from typing import TYPE_CHECKING
 
-from patience import HANG
+from run_python import output_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -130,14 +127,5 @@ def test_rlightnings_own_engine_gets_its_own_values(tmp_path: Path) -> None:
         file.write_text(textwrap.dedent(text))
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
-    environment = {name: v for name, v in os.environ.items() if name != "PYTHONASYNCIODEBUG"}
-    done = subprocess.run(
-        [sys.executable, "-m", "rlightning_aio.legacy", str(script)],
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=HANG,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout == f"with {tmp_path / 'rlightning' / '__init__.py'}\n"
+    printed = output_of("-m", "rlightning_aio.legacy", script, asyncio_debug=False)
+    assert printed == f"with {tmp_path / 'rlightning' / '__init__.py'}\n"

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import importlib.util
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-from patience import HANG
+from run_python import output_of
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -26,13 +24,4 @@ def test_program_runs(page: str, needed: list[str], tmp_path: Path) -> None:
     (block,) = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     program = tmp_path / "program.py"
     program.write_text(block)
-    done = subprocess.run(
-        [sys.executable, program],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=HANG,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.strip()
+    assert output_of(program, folder=tmp_path).strip()
