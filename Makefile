@@ -14,7 +14,7 @@ RLLIB := .venv-rllib
 PIP_INSTALL = $(@D)/bin/python -m pip install --quiet --disable-pip-version-check
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-simulators test-gpu check format bench clean
+.PHONY: help run test test-ray test-simulators test-gpu check format bench clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 24
@@ -27,13 +27,18 @@ run: $(VENV)/installed ## collect 100,000 steps of HalfCheetah-v5 asynchronously
 test: $(VENV)/installed-test ## the tests
 	$(PY) -m pytest --numprocesses 4 --dist worksteal
 
+# What is said of every place where envs may live, and what only Ray can be asked.
+test-ray: $(VENV)/installed-ray ## the tests of `placement: ray`, on clusters of this machine
+	$(PY) -m pytest -m ray tests/on_ray
+	RLIGHTNING_AIO_ON_RAY=1 $(PY) -m pytest tests/group
+
 # Kernels that Isaac Lab compiled once are found again, by workers and tests alike.
 test-simulators: export WARP_CACHE_PATH := $(CURDIR)/$(ISAAC)/warp-cache
 test-simulators: export ISAAC_PYTHON := $(CURDIR)/$(ISAAC)/bin/python
 test-simulators: $(SIMULATORS)/installed $(ISAAC)/installed $(RLLIB)/installed ## the tests of every backend, on the real simulators (7 GB of packages)
 	tests/simulators/install_debian.sh
 	$(ISAAC)/bin/python -m pytest -m simulators -rs tests/envs/test_isaac.py
-	$(SIMULATORS)/bin/python -m pytest -m simulators -rs tests/envs tests/vector tests/test_docs.py tests/test_wheel.py
+	$(SIMULATORS)/bin/python -m pytest -m simulators -rs tests/benchmarks tests/envs tests/examples tests/vector tests/test_docs.py tests/test_wheel.py
 	$(RLLIB)/bin/python -m pytest -m simulators -rs tests/vector/test_pages.py
 
 # With -rs, each test that is skipped says what it lacks.
@@ -73,11 +78,12 @@ $(VENV)/installed: extras :=
 $(VENV)/installed-test: extras := [test]
 $(VENV)/installed-check: extras := [test,check]
 $(VENV)/installed-bench: extras := [bench]
-$(SIMULATORS)/installed: extras := [test,ale,envpool,maniskill,pettingzoo,piper,sb3,torchrl]
-$(VENV)/installed $(VENV)/installed-test $(VENV)/installed-check $(VENV)/installed-bench: | $(PY)
+$(VENV)/installed-ray: extras := [test,ray]
+$(SIMULATORS)/installed: extras := [test,ale,envpool,examples,maniskill,pettingzoo,piper,sb3,torchrl]
+$(VENV)/installed $(VENV)/installed-test $(VENV)/installed-check $(VENV)/installed-bench $(VENV)/installed-ray: | $(PY)
 $(SIMULATORS)/installed: | $(SIMULATORS)/bin/python
 $(VENV)/installed $(VENV)/installed-test $(VENV)/installed-check $(VENV)/installed-bench \
-    $(SIMULATORS)/installed: pyproject.toml constraints.txt
+    $(VENV)/installed-ray $(SIMULATORS)/installed: pyproject.toml constraints.txt
 	$(PIP_INSTALL) --constraint constraints.txt --editable '.$(extras)'
 	@touch $@
 

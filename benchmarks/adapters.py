@@ -1,13 +1,15 @@
 """HalfCheetah-v5, 32 envs, through the interfaces of Gymnasium and Stable-Baselines3.
 
 How far ahead is each of ours of the class whose place it takes, and what does it cost beside the
-bare group? Infos are part of both interfaces, so they are made in every step; the bare group
-makes them when somebody reads them, and nobody does.
+bare group? Over callables, which make separate envs, and by the task's name, which has each worker
+step its envs together. Infos are part of both interfaces, so they are made in every step; the bare
+group makes them when somebody reads them, and nobody does.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import os
+from dataclasses import dataclass, replace
 from typing import Any
 
 from contenders import (
@@ -20,6 +22,7 @@ from contenders import (
 )
 from harness import Question, Target, main
 
+CORES = len(os.sched_getaffinity(0))
 WORK = Work("HalfCheetah-v5", num_envs=32, backend="mujoco")
 
 
@@ -49,7 +52,37 @@ class OursSb3(Sb3Vector):
         return VecEnv(self.work.makers(), cpu_affinity=True)
 
 
+@dataclass
+class OursMadeVector(GymnasiumVector):
+    """`rlightning_aio.vector.make_vec`, which has each worker step its envs together."""
+
+    package = "rlightning_aio"
+
+    def make(self) -> Any:
+        from rlightning_aio.vector import make_vec
+
+        return make_vec(self.work.task, self.work.num_envs, vector_kwargs={"cpu_affinity": True})
+
+
+@dataclass
+class OursMadeSb3(Sb3Vector):
+    """`rlightning_aio.sb3.make_vec_env`, likewise, without its monitor, which no peer has."""
+
+    @property
+    def requires(self) -> tuple[str, ...]:
+        return ("rlightning_aio", "stable_baselines3")
+
+    def make(self) -> Any:
+        from rlightning_aio.sb3 import make_vec_env
+
+        arguments = {"env_kwargs": {"render_mode": None}, "vec_env_kwargs": {"cpu_affinity": True}}
+        return make_vec_env(self.work.task, self.work.num_envs, **arguments).venv
+
+
 VECTOR = "rlightning_aio VectorEnv"
+MADE_VECTOR = "rlightning_aio make_vec, together"
+MADE_SB3 = "rlightning_aio sb3.make_vec_env, together"
+BARE_TOGETHER = "rlightning_aio sync, together"
 SB3 = "rlightning_aio sb3.VecEnv"
 BARE = "rlightning_aio sync"
 GYMNASIUM = "Gymnasium AsyncVectorEnv"
@@ -63,6 +96,9 @@ QUESTION = Question(
         OursVector(VECTOR, WORK),
         OursSb3(SB3, WORK),
         OursSync(BARE, WORK),
+        OursMadeVector(MADE_VECTOR, WORK),
+        OursMadeSb3(MADE_SB3, WORK),
+        OursSync(BARE_TOGETHER, replace(WORK, together=WORK.num_envs // CORES)),
         GymnasiumAsync(GYMNASIUM, WORK),
         StableBaselines3(SUBPROC, WORK),
     ],
@@ -71,6 +107,10 @@ QUESTION = Question(
         Target(SB3, SUBPROC, 3.5),
         Target(VECTOR, BARE, 0.85),
         Target(SB3, BARE, 0.85),
+        Target(MADE_VECTOR, GYMNASIUM, 3.5),
+        Target(MADE_SB3, SUBPROC, 3.5),
+        Target(MADE_VECTOR, BARE_TOGETHER, 0.85),
+        Target(MADE_SB3, BARE_TOGETHER, 0.85),
     ],
 )
 

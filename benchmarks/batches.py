@@ -75,6 +75,9 @@ against(
     VectorEntryPoint("Gymnasium's vector_entry_point, CartPole x 1,024", carts),
     1.2,
 )
+# The same loop with the runtime around it: what that costs, and what wake-ups would.
+inline = replace(carts, together=1024, placement="inline")
+contenders.append(OursSync("rlightning_aio inline, CartPole x 1,024", inline))
 
 QUESTION = Question(
     name="batches",

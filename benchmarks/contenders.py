@@ -40,6 +40,7 @@ class Work:
         backend: this library's name for the simulator.
         max_episode_steps: limit for tasks that have none of their own.
         together: how many of them this library steps with one request (its `num_envs`).
+        placement: where this library has them.
     """
 
     task: str
@@ -48,6 +49,7 @@ class Work:
     backend: str = "gymnasium"
     max_episode_steps: int | None = None
     together: int = 1
+    placement: str = "process"
 
     @property
     def num_requests(self) -> int:
@@ -116,6 +118,13 @@ class Stepped(Contender):
 
 def group_config(work: Work, envs_per_process: int | str) -> dict[str, Any]:
     """One config entry for all envs of `work`."""
+    workers: dict[str, Any] = {}
+    if work.placement == "process":
+        # One worker on each core is best kept there.
+        workers = {
+            "envs_per_process": envs_per_process,
+            "cpu_affinity": envs_per_process == "auto",
+        }
     return {
         "name": "bench",
         "backend": work.backend,
@@ -123,9 +132,8 @@ def group_config(work: Work, envs_per_process: int | str) -> dict[str, Any]:
         "num_workers": work.num_requests,
         "num_envs": work.together,
         "max_episode_steps": work.episode_limit(),
-        "envs_per_process": envs_per_process,
-        # One worker on each core is best kept there.
-        "cpu_affinity": envs_per_process == "auto",
+        "placement": work.placement,
+        **workers,
         "imports": list(work.modules),
     }
 

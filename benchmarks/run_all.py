@@ -2,6 +2,7 @@
 
     python benchmarks/run_all.py              # all of them, about a quarter of an hour
     python benchmarks/run_all.py cheetah pong
+    python benchmarks/run_all.py training     # hours, and so only if it is named
 
 Each script runs in an interpreter of its own, one after the other.
 """
@@ -25,6 +26,8 @@ SCRIPTS = (
     "adapters", "cheetah", "batches", "peers", "humanoid", "cartpole", "pong", "round_trip",
     "facade", "trainer_cpu", "stragglers", "uneven", "start", "memory", "remote", "worker", "pool",
 )  # fmt: skip
+# Run only if they are named.
+LONG = ("training",)
 
 
 def run_script(name: str) -> bool:
@@ -56,14 +59,15 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of: {', '.join(SCRIPTS)}")
+    known = (*SCRIPTS, *LONG)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of: {', '.join(known)}")
     names = parser.parse_args().names or SCRIPTS
-    if unknown := set(names) - set(SCRIPTS):
+    if unknown := set(names) - set(known):
         parser.error(f"no such benchmark: {', '.join(sorted(unknown))}")
     RESULTS.mkdir(exist_ok=True)
     failed = [name for name in names if not run_script(name)]
     text = README.read_text()
-    for name in SCRIPTS:
+    for name in known:
         text = with_table(text, name)
     README.write_text(text)
     if failed:

@@ -334,7 +334,7 @@ def test_an_overridden_field_is_checked_like_any_other(write: Write) -> None:
         ("step_timeout", -1, "should be greater than 0, got -1"),
         ("start_timeout", math.nan, "should be greater than 0, got nan"),
         ("placement", "inlin", "should be 'process', 'inline' or 'ray', got 'inlin'"),
-        ("on_worker_death", "ignore", "should be 'restart' or 'raise', got 'ignore'"),
+        ("on_worker_death", "ignore", "should be 'restart', 'raise' or 'resume', got 'ignore'"),
         ("envs_per_process", "many", "should be a valid integer or 'auto', got 'many'"),
         ("envs_per_process", 0, "should be greater than or equal to 1 or 'auto', got 0"),
         ("env_kwargs", [1], "should be a valid dictionary, got [1]"),
@@ -405,10 +405,12 @@ VALUES: dict[str, Any] = {
     "reset_timeout": 1.0,
     "start_timeout": 120.0,
     "on_worker_death": "restart",
+    "snapshot_every": 5,
     "max_restarts": 0,
     "interpreter": sys.executable,
     "env_vars": {"A": "1"},
     "cpu_affinity": True,
+    "ray_options": {"max_restarts": 0},
 }
 """A value for each field that some place for envs refuses."""
 INLINE = HOPPER | {"placement": "inline"}

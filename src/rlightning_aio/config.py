@@ -32,6 +32,7 @@ from pydantic import (
 
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.registry import BACKENDS, ENVS, PLACEMENTS, placement_of
+from rlightning_aio.sharing import num_batches, num_cores
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -64,7 +65,8 @@ class EnvConfig(BaseModel):
     """What makes an env, called in the worker with ``env_kwargs``: one callable, or one for each
     env. It returns a `gymnasium.Env`, a `gymnasium.vector.VectorEnv` or a `BaseEnv`."""
     num_workers: int = Field(default=1, ge=1)
-    """Envs of this entry."""
+    """Envs of this entry. ``auto`` has `num_envs` be the sub-environments of all of them
+    together, and lays these over the cores: both fields then hold what came of it."""
     num_envs: int = Field(default=1, ge=1)
     """Vectorised sub-environments in each env, where the backend supports them."""
     max_episode_steps: int | None = Field(default=None, ge=1)
@@ -72,7 +74,8 @@ class EnvConfig(BaseModel):
     num_cpus: float = Field(default=1, ge=0)
     """CPUs of each worker, 0 for a share of what others leave (``placement: ray`` only)."""
     num_gpus: float = Field(default=0.0, ge=0)
-    """GPUs of each worker (``placement: ray`` only)."""
+    """GPUs of each worker: of those that Ray has, or that this process sees; whole ones, or a part
+    of one."""
     env_kwargs: dict[str, Any] = Field(default_factory=dict)
     """Passed to the backend."""
     placement: str = "process"
@@ -85,10 +88,12 @@ class EnvConfig(BaseModel):
     """Seconds that one reset may take."""
     start_timeout: float = Field(default=120.0, gt=0)
     """Seconds from the start of a worker until its envs are built."""
-    on_worker_death: Literal["restart", "raise"] = Field(
+    on_worker_death: Literal["restart", "raise", "resume"] = Field(
         default_factory=lambda fields: _ending_for(fields.get("backend", ""))
     )
     """What to do when a worker dies or hangs; ``raise`` by default for hardware."""
+    snapshot_every: int | None = Field(default=None, ge=1)
+    """Steps after which an env's state is kept, for ``on_worker_death: resume``."""
     max_restarts: int = Field(default=3, ge=0)
     """Restarts in a row, without a step in between, before giving up."""
     imports: tuple[str, ...] = Field(default=(), strict=False)
@@ -96,9 +101,13 @@ class EnvConfig(BaseModel):
     interpreter: str | None = None
     """Python of another virtual environment for this entry's workers."""
     env_vars: dict[str, str] = Field(default_factory=dict)
-    """Environment variables of the worker, set before anything is imported."""
+    """Environment variables of the worker, set before anything is imported; ``{worker_index}`` in a
+    value is the number of the worker among the entry's."""
     cpu_affinity: bool = False
     """Pin worker k to the k-th core this process may use."""
+    ray_options: dict[str, Any] = Field(default_factory=dict)
+    """Options of a Ray actor beside `num_cpus` and `num_gpus`, as its ``.options()`` takes them,
+    and ``address``, the cluster's (``placement: ray`` only)."""
 
     @model_validator(mode="before")
     @classmethod
@@ -109,7 +118,7 @@ class EnvConfig(BaseModel):
         for name in given:
             if name not in cls.model_fields:
                 raise ValueError(f"{name}: {_unknown_field(name, cls.model_fields)}")
-        return _with_backend(given)
+        return _laid_out(_with_backend(given))
 
     @field_validator("backend")
     @classmethod
@@ -117,6 +126,16 @@ class EnvConfig(BaseModel):
         if not backend:
             raise ValueError("is required")
         return backend
+
+    @field_validator("num_workers", mode="before")
+    @classmethod
+    def _know_how_many(cls, num_workers: Any) -> Any:
+        if num_workers == "auto":
+            raise ValueError(
+                "'auto' lays the sub-environments that num_envs says over the cores, and these "
+                "have none; give a number"
+            )
+        return num_workers
 
     @field_validator("make_env", mode="before")
     @classmethod
@@ -166,6 +185,19 @@ def _with_backend(fields: Mapping[str, Any]) -> Mapping[str, Any]:
     if "backend" in fields or ("make_env" not in fields and ":" not in str(fields.get("task"))):
         return fields
     return {**fields, "backend": _CALLABLE}
+
+
+def _laid_out(fields: Mapping[str, Any]) -> Mapping[str, Any]:
+    """`fields`, with as many envs as suit the cores where that is asked for, and can be."""
+    total, name = fields.get("num_envs", 1), str(fields.get("backend"))
+    backend = BACKENDS.get(name)
+    several = name != _CALLABLE and (backend is None or backend.vectorized)
+    if fields.get("num_workers") != "auto" or not several or type(total) is not int or total < 1:
+        return fields
+    # Others compute many at once by themselves.
+    spread = fields.get("placement") != "inline" and ENVS.is_cpu_bound(name)
+    count = num_batches(total, num_cores()) if spread else 1
+    return {**fields, "num_workers": count, "num_envs": total // count}
 
 
 def moved(config: EnvConfig, placement: str) -> EnvConfig:
@@ -433,7 +465,7 @@ def _path(location: Sequence[int | str], fields: Mapping[str, Any]) -> str:
 
 def _runs_here(config: EnvConfig) -> bool:
     """Whether the entry's workers see the modules that this process sees."""
-    return config.interpreter is None and config.placement != "ray"
+    return config.interpreter is None and placement_of(config.backend, config.placement).local
 
 
 def _check_entry(entry: _Entry, problems: _Problems) -> None:
@@ -511,7 +543,24 @@ def _check_interpreter(config: EnvConfig) -> str | None:
     return f"{path!r} {reason}"
 
 
-_COMPARED_WITH = {"task": ("make_env",), "make_env": ("num_workers",)}
+def _check_snapshot_every(config: EnvConfig) -> str | None:
+    if "snapshot_every" in placement_of(config.backend, config.placement).refuses:
+        return None
+    resumes = config.on_worker_death == "resume"
+    if resumes and ENVS.is_hardware(config.backend):
+        return f"on_worker_death: resume can't put back what backend {config.backend!r} moves"
+    if resumes and config.snapshot_every is None:
+        return "is required with on_worker_death: resume; so many steps are lost at most"
+    if config.snapshot_every is not None and not resumes:
+        return "has no meaning without on_worker_death: resume"
+    return None
+
+
+_COMPARED_WITH = {
+    "task": ("make_env",),
+    "make_env": ("num_workers",),
+    "snapshot_every": ("on_worker_death",),
+}
 """Fields without which nothing can be said of others."""
 _CHECKS: dict[str, Callable[[EnvConfig], str | None]] = {
     "backend": _check_backend,
@@ -519,6 +568,7 @@ _CHECKS: dict[str, Callable[[EnvConfig], str | None]] = {
     "make_env": _check_make_env,
     "num_envs": _check_num_envs,
     "interpreter": _check_interpreter,
+    "snapshot_every": _check_snapshot_every,
 }
 
 

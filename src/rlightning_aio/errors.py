@@ -25,6 +25,8 @@ __all__ = [
     "NothingPending",
     "RLightningError",
     "RemoteTraceback",
+    "ReplayDiverged",
+    "SnapshotError",
     "StartFailed",
     "UnknownEnv",
     "WorkerDied",
@@ -82,8 +84,19 @@ class NothingPending(RLightningError, RuntimeError):
     """A collect would never end: no request is outstanding."""
 
 
+class ReplayDiverged(RLightningError, RuntimeError):
+    """A replay can't hand out results in the recorded order; the message says where it left it."""
+
+
 class GroupClosed(RLightningError, RuntimeError):
     """The group was used before ``init`` or after ``close``."""
+
+
+class SnapshotError(RLightningError, ValueError):
+    """A snapshot can't be put back: it is spoilt, or of other envs; nothing was changed.
+
+    Or envs can't be taken one of: robots, clients, those that were never reset.
+    """
 
 
 class RemoteTraceback(Exception):

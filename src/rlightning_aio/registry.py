@@ -133,26 +133,35 @@ class Placement:
     """Where the envs of an entry may live.
 
     Attributes:
-        target: ``module:Class`` of the host; None if there is none yet.
+        target: ``module:Class`` of the host.
         spreads: an entry's envs may be spread over several hosts, to which functions travel
             by pickle.
         refuses: fields of an entry that mean nothing there, and why: whoever sets one counts on
-            something that would not happen. (`num_cpus` and `num_gpus` are no promise of ours
-            anywhere but with Ray, and are found in configs for any place.)
+            something that would not happen. (`num_cpus` is no promise of ours anywhere but
+            with Ray, nor `num_gpus` in this process, and both are found in configs for any place.)
+        local: its workers use this machine's cores and see this process's modules.
+        extra: the extra of this package that it needs; empty for none.
     """
 
-    target: str | None
+    target: str
     spreads: bool
     refuses: Mapping[str, str] = field(default_factory=dict[str, str])
+    local: bool = True
+    extra: str = ""
 
 
 _THIS_PROCESS = "the envs live in this process, which is as it is"
 _NO_WORKER = "there is no worker that could die or be replaced"
 _NO_LIMIT = "nothing can end what an env does in this process"
 _CLIENTS_OWN = "its envs live with its clients, which start them as they like"
+_NOT_RAYS = "it is for Ray actors (placement: ray)"
 
 PLACEMENTS: dict[str, Placement] = {
-    "process": Placement("rlightning_aio.hosts.process:ProcessHost", spreads=True),
+    "process": Placement(
+        "rlightning_aio.hosts.process:ProcessHost",
+        spreads=True,
+        refuses={"ray_options": _NOT_RAYS},
+    ),
     "inline": Placement(
         "rlightning_aio.hosts.inline:InlineHost",
         spreads=False,
@@ -161,14 +170,26 @@ PLACEMENTS: dict[str, Placement] = {
             "reset_timeout": _NO_LIMIT,
             "start_timeout": _NO_LIMIT,
             "on_worker_death": _NO_WORKER,
+            "snapshot_every": _NO_WORKER,
             "max_restarts": _NO_WORKER,
             "envs_per_process": "all of the entry's envs live in this process",
             "interpreter": _THIS_PROCESS,
             "env_vars": _THIS_PROCESS,
             "cpu_affinity": _THIS_PROCESS,
+            "ray_options": _NOT_RAYS,
         },
     ),
-    "ray": Placement(None, spreads=True),
+    "ray": Placement(
+        "rlightning_aio.hosts.ray_host:RayHost",
+        spreads=True,
+        refuses={
+            "interpreter": "Ray starts the actors; ray_options.runtime_env may name another "
+            "Python or other packages",
+            "cpu_affinity": "Ray deals out the cores of its nodes",
+        },
+        local=False,
+        extra="ray",
+    ),
 }
 
 _PLACED_BY_BACKEND: dict[str, Placement] = {
@@ -185,11 +206,13 @@ _PLACED_BY_BACKEND: dict[str, Placement] = {
             "interpreter": _CLIENTS_OWN,
             "env_vars": _CLIENTS_OWN,
             "cpu_affinity": _CLIENTS_OWN,
+            "ray_options": _CLIENTS_OWN,
             "start_timeout": "its envs come when they like; env_kwargs.connect_timeout says how "
             "long a reset waits for them",
             "on_worker_death": "it has no workers; what a client owes that is gone is answered by "
             "a truncated result, and it may come back",
             "max_restarts": "it has no workers; a client that is gone may come back",
+            "snapshot_every": "it has no workers; a client that is gone begins anew",
         },
     ),
 }

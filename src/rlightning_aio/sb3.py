@@ -8,51 +8,96 @@ from __future__ import annotations
 
 import contextlib
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.vector import AutoresetMode
 
 from rlightning_aio.batch import BatchedData
-from rlightning_aio.batch.data import reported_info_list
-from rlightning_aio.envs.same_step import SameStepOf
+from rlightning_aio.envs.gymnasium import spec_of
+from rlightning_aio.envs.of_spec import BatchOf, OneOf
+from rlightning_aio.envs.sub_envs import adapted
 from rlightning_aio.errors import ConfigError, EnvRaised
 from rlightning_aio.sync import EnvGroup, build_env_group
 from rlightning_aio.types import PolicyResponse
 from rlightning_aio.vector.leftovers import drop_outstanding
+from rlightning_aio.vector.making import imports_of, laid_out, steps_together
+from rlightning_aio.vector.rows import rows_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterable, Sequence
+    from collections.abc import Callable, Generator, Sequence
 
     from numpy.typing import NDArray
 
-__all__ = ["VecEnv"]
+__all__ = ["VecEnv", "make_vec_env"]
 
 # Optional and typed in part, so imported by name.
 _Base: Any = import_module("stable_baselines3.common.vec_env.base_vec_env").VecEnv
+_OF_SINGLE_ENVS: Final = ("wrapper_class", "wrapper_kwargs", "monitor_dir", "monitor_kwargs")
+"""Arguments of Stable-Baselines3's `make_vec_env` that keep envs from being stepped together."""
+
+
+def make_vec_env(
+    env_id: str | Callable[..., gym.Env[Any, Any]],
+    n_envs: int = 1,
+    seed: int | None = None,
+    env_kwargs: dict[str, Any] | None = None,
+    vec_env_kwargs: dict[str, Any] | None = None,
+    **more: Any,
+) -> Any:
+    """Monitored envs of one task; see `stable_baselines3.common.env_util.make_vec_env`.
+
+    Envs of a MuJoCo task that `rlightning_aio.envs.mujoco_batch` knows are stepped together, as
+    many in each worker, inside a `VecMonitor`. Those of any other are separate, each in a
+    `Monitor`, as are those that are to have a wrapper, or a file, each.
+
+    Args:
+        env_id: a registered name, or what makes an env.
+        n_envs: how many.
+        seed: env k gets ``seed + k`` at the next reset.
+        env_kwargs: of `gymnasium.make`.
+        vec_env_kwargs: of `VecEnv`: fields of a config entry.
+        more: of Stable-Baselines3's function.
+    """
+    fields, kwargs = vec_env_kwargs or {}, {"render_mode": "rgb_array", **(env_kwargs or {})}
+    single = any(more.get(name) for name in _OF_SINGLE_ENVS)
+    if isinstance(env_id, str) and not single and steps_together(spec := spec_of(env_id), kwargs):
+        count, fields = laid_out(n_envs, {**imports_of(spec), **fields})
+        one = OneOf(spec, {"disable_env_checker": True, **kwargs})
+        batch = BatchOf(one, n_envs // count, AutoresetMode.SAME_STEP)
+        made = VecEnv([batch if count < n_envs else one] * count, **fields)
+        made.seed(seed)
+        return import_module("stable_baselines3.common.vec_env").VecMonitor(made)
+    make: Any = import_module("stable_baselines3.common.env_util").make_vec_env
+    given = {"env_kwargs": env_kwargs, "vec_env_kwargs": vec_env_kwargs, **more}
+    return make(env_id, n_envs, seed, vec_env_cls=VecEnv, **given)
 
 
 class VecEnv(_Base):
     """Envs in worker processes behind Stable-Baselines3's vector interface.
 
     Args:
-        env_fns: one callable for each env. They run in the workers, and only there; lambdas
-            and functions of ``__main__`` will do.
+        env_fns: one callable for each env, or for as many vector environments, each of as many
+            sub-environments that reset themselves in the same step. They run in the workers, and
+            only there; lambdas and functions of ``__main__`` will do.
         start_method: accepted, and without meaning here.
         entry: further fields of `EnvConfig` (``envs_per_process``, ``step_timeout``, …).
 
     Attributes:
-        group: the `EnvGroup` that does the work; its envs are called ``env-0``, ``env-1``, …
+        group: the `EnvGroup` that does the work; its envs, one for each callable, are called
+            ``env-0``, ``env-1``, …
 
     Raises:
         ConfigError: a callable can't be sent to a worker, `entry` is wrong, or the envs'
             spaces differ.
         StartFailed: a callable raised, or returned no env.
+        RuntimeError: vector environments are not of as many.
     """
 
     def __init__(
         self,
-        env_fns: Sequence[Callable[[], gym.Env[Any, Any]]],
+        env_fns: Sequence[Callable[[], gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]]],
         start_method: str | None = None,
         **entry: Any,
     ) -> None:
@@ -61,23 +106,23 @@ class VecEnv(_Base):
             {
                 "name": "env",
                 "num_workers": len(env_fns),
-                "make_env": [SameStepOf(make) for make in env_fns],
+                "make_env": adapted(env_fns, AutoresetMode.SAME_STEP),
                 **entry,
             }
         )
         metas = self.group.init()
         try:
-            first = metas[0]
-            for meta in metas:
-                spaces = (meta.observation_space, meta.action_space)
-                if spaces != (first.observation_space, first.action_space):
+            self._rows = rows_of(self.group, metas)
+            first = self._rows.spaces[0]
+            for k, spaces in enumerate(self._rows.spaces):
+                if spaces is not first and spaces != first:
                     raise ConfigError(
-                        f"the spaces of env {meta.env_id!r} are not those of {first.env_id!r}; "
-                        "Stable-Baselines3 batches what is alike"
+                        f"the spaces of env {k} are not those of env 0; Stable-Baselines3 batches "
+                        "what is alike"
                     )
             # Results of all envs, in order, which actions can answer.
             self._answerable = BatchedData(self.group.env_ids, [None] * len(metas))
-            _Base.__init__(self, len(metas), first.observation_space, first.action_space)
+            _Base.__init__(self, self._rows.num_envs, *first)
         except BaseException:
             self.group.close()
             raise
@@ -92,16 +137,12 @@ class VecEnv(_Base):
             EnvRaised, WorkerDied, EnvHung: an env failed; the others' results are dropped.
         """
         with self._dropping_the_rest():
-            for env_id, seed, options in zip(
-                self.group.env_ids, self._seeds, self._options, strict=True
-            ):
-                seeds = {} if seed is None else {env_id: int(seed)}
-                self.group.reset_async(seeds, options or None, [env_id])
+            self._rows.send_resets(self._seeds, self._options, range(self.num_envs))
             batch, _ = self.group.collect_async(wait_all=True, ordered=True)
-        self.reset_infos = reported_info_list(batch)
+        self.reset_infos = self._rows.info_list(batch)
         self._reset_seeds()
         self._reset_options()
-        return batch.observation
+        return self._rows.observation(batch)
 
     def step_async(self, actions: Any) -> None:
         """Send one action to each env, from an array or a sequence; cast to the space's dtype."""
@@ -110,7 +151,8 @@ class VecEnv(_Base):
             responses = [PolicyResponse(env_id, action) for env_id, action in pairs]
             self.group.step_async(BatchedData(self.group.env_ids, responses))
         else:
-            self.group.step_async(self._answerable.respond(action=np.asarray(actions)))
+            columns = self._rows.actions(np.asarray(actions))
+            self.group.step_async(self._answerable.respond(action=columns))
 
     def step_wait(self) -> tuple[Any, NDArray[np.float64], NDArray[np.bool_], list[dict[str, Any]]]:
         """Wait for the steps.
@@ -125,14 +167,15 @@ class VecEnv(_Base):
         with self._dropping_the_rest():
             batch, _ = self.group.collect_async(wait_all=True, ordered=True)
         self._answerable = batch
-        infos = reported_info_list(batch)
-        truncated = (batch.truncated & ~batch.terminated).tolist()
-        done = batch.done
+        rows = self._rows
+        infos = rows.info_list(batch)
+        truncated = rows.flat(batch.truncated & ~batch.terminated).tolist()
+        done = rows.flat(batch.done)
         for k in np.flatnonzero(done).tolist():
             infos[k], self.reset_infos[k] = _last_and_first(infos[k])
         for info, cut in zip(infos, truncated, strict=True):
             info["TimeLimit.truncated"] = cut
-        return batch.observation, batch.reward, done, infos
+        return rows.observation(batch), rows.flat(batch.reward), done, infos
 
     @contextlib.contextmanager
     def _dropping_the_rest(self) -> Generator[None]:
@@ -163,8 +206,12 @@ class VecEnv(_Base):
             raise
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute of the outermost wrapper of envs."""
-        self._call(indices, "__setattr__", attr_name, value)
+        """Set an attribute of the outermost wrapper of envs.
+
+        Raises:
+            ValueError: of some envs that are stepped together with others.
+        """
+        self._rows.set_outermost(attr_name, value, list(self._get_indices(indices)))
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
@@ -174,20 +221,16 @@ class VecEnv(_Base):
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
         """Whether `wrapper_class` is among the wrappers of envs."""
-        return self._values(indices, "is_wrapped", wrapper_class)
+        return self._rows.are_wrapped(wrapper_class, list(self._get_indices(indices)))
 
     def get_images(self) -> list[Any]:
         """One frame of each env, as it renders it."""
         return self._call(None, "render")
 
     def _call(self, indices: Any, name: str, *args: Any, **kwargs: Any) -> list[Any]:
-        return self._values(indices, "call_wrapped", name, *args, **kwargs)
-
-    def _values(self, indices: Any, name: str, *args: Any, **kwargs: Any) -> list[Any]:
-        chosen: Iterable[int] = self._get_indices(indices)
-        env_ids = [self.group.env_ids[k] for k in chosen]
-        self.group.call_async(name, *args, env_ids=env_ids, **kwargs)
-        return self.group.collect_calls()
+        chosen: list[int] = list(self._get_indices(indices))
+        self._rows.call(name, args, kwargs, chosen)
+        return self._rows.values(self.group.collect_calls(), chosen)
 
 
 def _last_and_first(info: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -190,7 +190,7 @@ def test_every_script_has_its_place_in_the_readme(monkeypatch: pytest.MonkeyPatc
     monkeypatch.syspath_prepend(BENCHMARKS)
     run_all = importlib.import_module("run_all")
     marked = re.findall(r"^<!-- (\w+) -->$", (BENCHMARKS / "README.md").read_text(), re.MULTILINE)
-    assert sorted(set(marked) - {"end"}) == sorted(run_all.SCRIPTS)
+    assert sorted(set(marked) - {"end"}) == sorted((*run_all.SCRIPTS, *run_all.LONG))
 
 
 def test_a_renewed_table_stands_between_its_marks(
@@ -215,3 +215,12 @@ def test_a_renewed_table_stands_between_its_marks(
     assert "old" not in renewed
     assert renewed.endswith("<!-- b -->\nkept\n<!-- end -->\n")
     assert run_all.with_table(renewed, "a") == renewed
+
+
+def test_what_keeping_states_costs_is_told(tmp_path: Path) -> None:
+    """Beside the same without, for each number of steps."""
+    where = ["--backend", "gymnasium", "--task", "CartPole-v1", "--envs", "2", "--every", "3"]
+    program = [BENCHMARKS / "keeping.py", *where, "--steps", "20", "--rounds", "1", "--json"]
+    told = json.loads(output_of(*program, folder=tmp_path))
+    assert told.keys() == {"never", "3"}
+    assert told["never"]["ratio"] == 1

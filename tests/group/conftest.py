@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
 import inspect
+import os
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import pytest
 import pytest_asyncio
+import ray_cluster
 from group import sample_envs
 
 import rlightning_aio
@@ -76,7 +80,40 @@ INLINE = Place("inline", {"placement": "inline"})
 INLINE_SYNC = Place("inline", {"placement": "inline"}, synchronous=True)
 ONE_SYNC = Place("one worker", {"envs_per_process": 100}, synchronous=True)
 SEVERAL = Place("several workers", {"envs_per_process": 2})
-PLACES = [INLINE, INLINE_SYNC, ONE_SYNC, SEVERAL]
+RAY = Place("ray", {"placement": "ray", "envs_per_process": 2, "num_cpus": 0})
+RAY_SYNC = Place("ray", {"placement": "ray", "envs_per_process": 100, "num_cpus": 0}, True)
+# Ray takes an environment and some minutes of its own: `make test-ray`.
+ON_RAY = "RLIGHTNING_AIO_ON_RAY" in os.environ
+PLACES = [RAY, RAY_SYNC] if ON_RAY else [INLINE, INLINE_SYNC, ONE_SYNC, SEVERAL]
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """On Ray, run what is said of every place, once for each facade, and nothing else."""
+    here = Path(__file__).parent
+    other = [item for item in items if ON_RAY and here in item.path.parents and _is_other(item)]
+    config.hook.pytest_deselected(items=other)
+    items[:] = [item for item in items if item not in other]
+
+
+def _is_other(item: pytest.Item) -> bool:
+    params = item.callspec.params if hasattr(item, "callspec") else {}
+    place = params.get("place")
+    on_asyncio = any(value is asyncio.new_event_loop for value in params.values())
+    return place is None or (on_asyncio and not place.synchronous)
+
+
+if ON_RAY:
+
+    @pytest.fixture(scope="session", autouse=True)
+    def ray_nodes() -> Iterator[None]:
+        with ray_cluster.cluster(num_cpus=4):
+            yield
+
+    @pytest.fixture(autouse=True)
+    def nothing_left_behind() -> Iterator[None]:
+        """Ray keeps connections open for a while, so that descriptors tell nothing."""
+        yield
+        ray_cluster.no_actor_left()
 
 
 @pytest.fixture(params=PLACES, ids=lambda p: f"{p.name}{', sync' if p.synchronous else ''}")

@@ -21,6 +21,7 @@ from rlightning_aio.group.core import Core
 from rlightning_aio.group.env_table import EnvTable
 from rlightning_aio.group.poller import Poller
 from rlightning_aio.group.requests import Requests
+from rlightning_aio.group.resumption import Resumption
 from rlightning_aio.group.slab_layout import SlabLayout
 from rlightning_aio.group.supervisor import Supervisor
 from rlightning_aio.hosts.arena import Arena, map_shared
@@ -383,10 +384,12 @@ class FakeGroup:
         envs = EnvTable([self.config] * size, self.env_ids)
         requests = Requests(np.repeat(np.arange(len(rows)), rows), len(rows))
         layout = SlabLayout(size)
+        resumption = Resumption(requests)
         supervisor = Supervisor(
             envs,
             requests,
             layout,
+            resumption,
             arena,
             completions.append,
             mixed_actions=False,
@@ -404,7 +407,15 @@ class FakeGroup:
             supervisor.add(host, self.config)
             poller.add(host)
         self.core = Core(
-            envs, requests, layout, supervisor, poller, completions, self, zero_copy=False
+            envs,
+            requests,
+            layout,
+            resumption,
+            supervisor,
+            poller,
+            completions,
+            self,
+            zero_copy=False,
         )
         self.running: list[Running] = []
         opened = self.begin(self.core.start(self.now))

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import sys
 from typing import Any
 
 import pytest
 
 from rlightning_aio import sync
+from rlightning_aio.errors import ConfigError
 
 POLE = {"backend": "gymnasium", "task": "CartPole-v1"}
 OTHER = {"backend": "probe", "task": "x"}
@@ -47,3 +49,14 @@ def test_entries_share_the_cores(
     hosts = [host.num_envs for host in group._core.supervisor.hosts]
     assert hosts == [count for counts in spread for count in counts]
     group.close()
+
+
+def test_a_placement_whose_package_is_missing_says_how_to_install_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Before anything is started."""
+    monkeypatch.delitem(sys.modules, "rlightning_aio.hosts.ray", raising=False)
+    monkeypatch.delitem(sys.modules, "rlightning_aio.hosts.ray_host", raising=False)
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(ConfigError, match=r"entry 'e'.*pip install 'rlightning-aio\[ray\]'"):
+        sync.build_env_group(POLE | {"name": "e", "placement": "ray"})

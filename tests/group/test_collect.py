@@ -145,7 +145,7 @@ def test_results_of_some_entries_are_taken_alone(tmp_path: Path) -> None:
             group.collect_async(entries=["gated"])
         with opened(gates[3]):
             batch, _ = group.collect_async(entries=["tested", "gated"], min_results=2)
-        assert batch.ids() == ids[2:]
+        assert sorted(batch.ids()) == ids[2:]
         steps["tested-0"].action = [RAISE, 0]
         group.step_async(steps)
         with opened(gates[2], gates[1], gates[0]):

@@ -15,6 +15,7 @@ from rlightning_aio.errors import ConfigError, EnvHung, GroupClosed, StartFailed
 from rlightning_aio.group import supervisor
 from rlightning_aio.group.env_table import EnvTable
 from rlightning_aio.group.requests import COLLECTOR, Requests
+from rlightning_aio.group.resumption import Resumption
 from rlightning_aio.group.slab_layout import SlabLayout
 from rlightning_aio.group.supervisor import GivenUp, Replaced, Supervisor
 from rlightning_aio.hosts.arena import Arena
@@ -154,6 +155,7 @@ class Fleet:
             envs,
             self.requests,
             SlabLayout(size),
+            Resumption(self.requests),
             Arena(),
             self.told.append,
             mixed_actions=False,

@@ -145,9 +145,10 @@ class Scene:
     # -- the trainer
 
     def read(self) -> None:
-        """As the driver does when the channel is readable."""
+        """As the driver does when the channel is readable, and then who waits for reports."""
         for source in list(self.watched):
             source.on_readable()
+        self.host.poll()
 
     def told(self) -> list[Any]:
         """What the host has told since the last time; entries of reports as lists."""

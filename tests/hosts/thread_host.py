@@ -34,9 +34,10 @@ from rlightning_aio.hosts.messages import (
     Raised,
     Reported,
     Result,
+    Saved,
     Value,
 )
-from rlightning_aio.hosts.runner import placed
+from rlightning_aio.hosts.runner import attach_all
 from rlightning_aio.protocol.entries import Operation, answers_with_value, op_of, slot_of
 from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
 
@@ -190,6 +191,9 @@ class EnvThread(threading.Thread):
         """Say how infos lie in the rows, before the first that lies there so."""
         self._tell(NewSchema(self._host_id, number, schema))
 
+    def _keep(self, index: int, standing: bytes, before: bool) -> None:
+        self._tell(Saved(self._host_id, index, standing, before))
+
     # -- tasks --------------------------------------------------------------------
 
     def build(self, order: StartOrder) -> None:
@@ -210,8 +214,7 @@ class EnvThread(threading.Thread):
         """Give each env the row for its results. Once we are closing, the arena may be gone."""
         if self.closing:
             return
-        for runner, slab, row in placed(self._runners, order, map_part):
-            runner.attach(slab, row, self._schemas.announce)
+        attach_all(self._runners, order, map_part, self._schemas.announce, self._keep)
         self._tell(Attached(self._host_id))
 
     def execute(self, entry: int, arguments: Any) -> None:

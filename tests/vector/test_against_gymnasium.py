@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.error import ClosedEnvironmentError
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from hypothesis import given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from vector.toys import assert_alike, toy
 
 from rlightning_aio.errors import EnvRaised
-from rlightning_aio.vector import VectorEnv
+from rlightning_aio.vector import VectorEnv, make_vec
 
 SIZE = 3
 MODES = list(AutoresetMode)
@@ -21,24 +22,54 @@ seeds = st.none() | st.integers(0, 99) | st.lists(
     st.none() | st.integers(0, 99), min_size=SIZE, max_size=SIZE + 1
 )  # fmt: skip
 masks = st.lists(st.booleans(), min_size=SIZE, max_size=SIZE).map(np.array)
-doings = st.one_of(
-    st.tuples(st.just("step"), st.lists(st.integers(0, 2), min_size=SIZE, max_size=SIZE)),
-    st.tuples(st.just("step"), st.lists(st.integers(0, 2), min_size=SIZE, max_size=SIZE)),
-    st.tuples(st.just("reset"), seeds, st.none() | masks),
-    st.tuples(st.just("call"), st.sampled_from([("double", 2.0), ("own",), ("no_such",)])),
-    st.tuples(st.just("get_attr"), st.sampled_from(["speed", "own", "render_mode"])),
-    st.tuples(
-        st.just("set_attr"),
-        st.sampled_from(["speed", "own"]),
-        st.sampled_from([0.5, [1.0, 2.0, 3.0], (1.0, 2.0)]),
-    ),
-    st.tuples(st.just("render")),
+Doing = tuple[Any, ...]
+
+
+def doings(
+    action: st.SearchStrategy[Any], calls: list[Any], attributes: list[str], assignments: list[Any]
+) -> st.SearchStrategy[Doing]:
+    """What can be done to envs with such methods and attributes."""
+    step = st.tuples(st.just("step"), st.lists(action, min_size=SIZE, max_size=SIZE))
+    return st.one_of(
+        step,
+        step,
+        st.tuples(st.just("reset"), seeds, st.none() | masks),
+        st.tuples(st.just("call"), st.sampled_from(calls)),
+        st.tuples(st.just("get_attr"), st.sampled_from(attributes)),
+        st.tuples(st.just("set_attr"), st.sampled_from(assignments)).map(lambda d: (d[0], *d[1])),
+        st.tuples(st.just("render")),
+    )
+
+
+def histories(doings: st.SearchStrategy[Doing]) -> st.SearchStrategy[list[Doing]]:
+    """Some doings, the end, and what may come after it."""
+    parts = st.tuples(
+        st.lists(doings, min_size=1, max_size=25),
+        st.just([("close",)]),
+        st.lists(doings | st.tuples(st.just("close")), max_size=3),
+    )
+    return parts.map(lambda parts: [doing for part in parts for doing in part])
+
+
+TOY = doings(
+    st.integers(0, 2),
+    [("double", 2.0), ("own",), ("no_such",)],
+    ["speed", "own", "render_mode"],
+    [(name, value) for name in ("speed", "own") for value in (0.5, [1.0, 2.0, 3.0], (1.0, 2.0))],
 )
-histories = st.tuples(
-    st.lists(doings, min_size=1, max_size=25),
-    st.just([("close",)]),
-    st.lists(doings | st.tuples(st.just("close")), max_size=3),
-).map(lambda parts: [doing for part in parts for doing in part])
+PENDULUM = doings(
+    st.sampled_from([[-3.0], [0.1], [2.0]]),
+    [
+        ("state_vector",),
+        ("set_state", np.array([0.1, 0.0]), np.array([0.0, 0.2])),
+        ("np_random_seed",),
+        ("_elapsed_steps",),
+        ("no_such",),
+    ],
+    ["dt", "_max_episode_steps", "render_mode", "np_random_seed"],
+    [("frame_skip", 3), ("frame_skip", [1, 1, 1]), ("_max_episode_steps", 4), ("own", (1.0, 2.0))],
+)
+"""All that simulations which share a model can do; what differs between them, they refuse."""
 
 
 def outcome(env: Any, doing: tuple[Any, ...], due: np.ndarray) -> Any:
@@ -48,7 +79,7 @@ def outcome(env: Any, doing: tuple[Any, ...], due: np.ndarray) -> Any:
         what, arguments = "reset", [None, due.copy()]
     try:
         if what == "step":
-            return env.step(np.array(arguments[0]))
+            return env.step(np.array(arguments[0], env.action_space.dtype))
         if what == "reset":
             seed, mask = arguments
             options = None if mask is None else {"reset_mask": mask, "more": 1}
@@ -68,17 +99,8 @@ def outcome(env: Any, doing: tuple[Any, ...], due: np.ndarray) -> Any:
         return "an env raised"
 
 
-@pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.value)
-@given(did=histories, seed=st.integers(0, 99))
-def test_whatever_is_done_to_both_they_do_the_same(
-    mode: AutoresetMode, did: list[Any], seed: int
-) -> None:
-    """Resets with seeds and masks, steps over ends, calls, attributes, frames, refusals.
-
-    What is closed is refused, as by Gymnasium's processes; its loop doesn't look.
-    """
-    ours = VectorEnv([toy] * SIZE, autoreset_mode=mode, placement="inline")
-    theirs = SyncVectorEnv([toy] * SIZE, autoreset_mode=mode)
+def compare(ours: Any, theirs: Any, did: list[Doing], seed: int) -> None:
+    """Do it to both; what is closed is refused, as by Gymnasium's processes, not by its loop."""
     due = np.zeros(SIZE, np.bool_)
     assert_alike(ours.reset(seed=seed), theirs.reset(seed=seed))
     for turn, doing in enumerate(did):
@@ -92,3 +114,35 @@ def test_whatever_is_done_to_both_they_do_the_same(
             due = due & ~doing[2] if doing[2] is not None else np.zeros(SIZE, np.bool_)
         elif doing[0] == "step" and isinstance(expected, tuple):
             due = np.zeros(SIZE, np.bool_)
+
+
+@pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.value)
+@given(did=histories(TOY), seed=st.integers(0, 99))
+def test_whatever_is_done_to_both_they_do_the_same(
+    mode: AutoresetMode, did: list[Any], seed: int
+) -> None:
+    """Resets with seeds and masks, steps over ends, calls, attributes, frames, refusals."""
+    ours = VectorEnv([toy] * SIZE, autoreset_mode=mode, placement="inline")
+    compare(ours, SyncVectorEnv([toy] * SIZE, autoreset_mode=mode), did, seed)
+
+
+@pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.value)
+@settings(max_examples=12)
+@example(
+    did=[
+        ("call", ("set_state", np.array([0.1, 0.0]), np.array([0.0, 0.2]))),
+        ("reset", None, np.array([False, False, True])),
+        ("close",),
+    ],
+    seed=0,
+)
+@given(did=histories(PENDULUM), seed=st.integers(0, 99))
+def test_envs_that_are_stepped_together_do_the_same(
+    mode: AutoresetMode, did: list[Any], seed: int
+) -> None:
+    """Simulations of one model, with the states that they share lent to each in turn."""
+    arguments = {"autoreset_mode": mode}
+    task, kwargs = "InvertedPendulum-v5", {"max_episode_steps": 7}
+    ours = make_vec(task, SIZE, vector_kwargs={**arguments, "placement": "inline"}, **kwargs)
+    theirs = gym.make_vec(task, SIZE, "sync", arguments, **kwargs)
+    compare(ours, theirs, did, seed)

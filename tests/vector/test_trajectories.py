@@ -13,7 +13,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 from vector.toys import assert_alike
 
-from rlightning_aio.vector import VectorEnv
+from rlightning_aio.vector import VectorEnv, make_vec
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -49,8 +49,8 @@ def makers_of(task: str) -> list[Any]:
     return [functools.partial(make, task, k) for k in range(SIZE)]
 
 
-def actions_for(space: gym.Space[Any], count: int) -> list[Any]:
-    batched = batch_space(space, SIZE)
+def actions_for(space: gym.Space[Any], count: int, size: int = SIZE) -> list[Any]:
+    batched = batch_space(space, size)
     batched.seed(0)
     return [batched.sample() for _ in range(count)]
 
@@ -67,20 +67,21 @@ def stepped(env: Any, actions: list[Any]) -> Iterator[Any]:
     env.close()
 
 
-def looped(task: str, mode: AutoresetMode, actions: list[Any]) -> Iterator[Any]:
+def looped(makers: list[Any], mode: AutoresetMode, actions: list[Any]) -> Iterator[Any]:
     """The same without infos, by single envs one after the other; and what episodes ended with."""
-    envs = [make(task, k) for k in range(SIZE)]
+    envs = [make() for make in makers]
+    size = len(envs)
     space = envs[0].observation_space
 
     def all_of(observations: list[Any]) -> Any:
-        return concatenate(space, observations, create_empty_array(space, SIZE))
+        return concatenate(space, observations, create_empty_array(space, size))
 
     now = [env.reset(seed=SEED + k)[0] for k, env in enumerate(envs)]
     yield (all_of(now),)
-    due = np.zeros(SIZE, np.bool_)
+    due = np.zeros(size, np.bool_)
     for each in actions:
-        rewards, ends = np.zeros(SIZE), np.zeros((2, SIZE), np.bool_)
-        last: list[Any] = [None] * SIZE
+        rewards, ends = np.zeros(size), np.zeros((2, size), np.bool_)
+        last: list[Any] = [None] * size
         for k, env in enumerate(envs):
             if due[k]:
                 now[k] = env.reset()[0]
@@ -99,11 +100,12 @@ def looped(task: str, mode: AutoresetMode, actions: list[Any]) -> Iterator[Any]:
         env.close()
 
 
-def compare(ours: Any, theirs: Any, task: str, count: int) -> None:
+def compare(ours: Any, theirs: Any, task: str, count: int, makers: list[Any] | None = None) -> None:
     """All three go through the same episodes, of which there are several."""
-    actions = actions_for(theirs.single_action_space, count)
+    makers = makers or makers_of(task)
+    actions = actions_for(theirs.single_action_space, count, len(makers))
     mode, ends = theirs.autoreset_mode, 0
-    rollouts = stepped(ours, actions), stepped(theirs, actions), looped(task, mode, actions)
+    rollouts = stepped(ours, actions), stepped(theirs, actions), looped(makers, mode, actions)
     for turn, (found, expected, plain) in enumerate(zip(*rollouts, strict=True)):
         assert_alike(found, expected, f"{task}, {turn}")
         *columns, last = plain if len(plain) == 5 else (*plain, [])
@@ -126,13 +128,39 @@ def test_inline(task: str, mode: AutoresetMode) -> None:
 
 @pytest.mark.parametrize("mode", MODES)
 def test_in_workers(mode: AutoresetMode) -> None:
-    """A thousand steps over many ends."""
+    """Over a few ends."""
     makers = makers_of("HalfCheetah-v5")
     ours = VectorEnv(makers, autoreset_mode=mode)
-    compare(ours, SyncVectorEnv(makers, autoreset_mode=mode), "HalfCheetah-v5", 1000)
+    compare(ours, SyncVectorEnv(makers, autoreset_mode=mode), "HalfCheetah-v5", 200)
+
+
+def compare_together(task: str, mode: AutoresetMode, count: int, peer: str, limit: int) -> None:
+    """Four simulations in two workers, which step theirs together."""
+    kwargs, arguments = {"max_episode_steps": limit}, {"autoreset_mode": mode}
+    ours = make_vec(task, 4, vector_kwargs={**arguments, "max_concurrency": 2}, **kwargs)
+    assert len(ours.group.env_ids) == 2
+    if peer == "async":
+        arguments["shared_memory"] = False
+    theirs: Any = gym.make_vec(task, 4, peer, arguments, **kwargs)
+    compare(ours, theirs, task, count, [functools.partial(gym.make, task, **kwargs)] * 4)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_together(mode: AutoresetMode) -> None:
+    """Ends of some, and of all at once."""
+    compare_together("Hopper-v5", mode, 60, "sync", 20)
+
+
+def test_together_with_goals_that_a_reset_draws() -> None:
+    compare_together("Reacher-v5", AutoresetMode.NEXT_STEP, 60, "sync", 20)
 
 
 TASKS = ["HalfCheetah-v5", "CartPole-v1", "Dict", "ALE/Breakout-v5"]
+TOGETHER = [
+    "Ant-v5", "HalfCheetah-v5", "Hopper-v5", "Humanoid-v5", "HumanoidStandup-v5",
+    "InvertedDoublePendulum-v5", "InvertedPendulum-v5", "Pusher-v5", "Reacher-v5", "Swimmer-v5",
+    "Walker2d-v5",
+]  # fmt: skip
 
 
 @pytest.mark.simulators
@@ -150,6 +178,17 @@ def test_beside_gymnasiums_processes(task: str, mode: AutoresetMode) -> None:
 
 
 @pytest.mark.simulators
+@pytest.mark.parametrize(
+    ("task", "mode"),
+    [(task, AutoresetMode.NEXT_STEP) for task in TOGETHER]
+    + [("Hopper-v5", AutoresetMode.SAME_STEP), ("Hopper-v5", AutoresetMode.DISABLED)],
+)
+def test_together_beside_gymnasiums_processes(task: str, mode: AutoresetMode) -> None:
+    """A thousand steps of each task of MuJoCo, and in each mode: modes are the same for all."""
+    compare_together(task, mode, 1000, "async", 150)
+
+
+@pytest.mark.simulators
 @pytest.mark.parametrize("task", TASKS)
 def test_beside_stable_baselines3s_processes(task: str) -> None:
     """A thousand steps of each task: observations, rewards, ends, infos, and those of resets."""
@@ -160,11 +199,40 @@ def test_beside_stable_baselines3s_processes(task: str) -> None:
 
     makers = makers_of(task)
     # Forked, it leaves no fork server behind.
-    ours, theirs = VecEnv(makers), vec_env.SubprocVecEnv(makers, start_method="fork")
-    actions = actions_for(theirs.action_space, 1000)
+    theirs = vec_env.SubprocVecEnv(makers, start_method="fork")
+    compare_with_stable_baselines3(VecEnv(makers), theirs, task, makers)
+
+
+@pytest.mark.simulators
+@pytest.mark.parametrize("task", TOGETHER)
+def test_together_beside_stable_baselines3s_processes(task: str) -> None:
+    """The same where each of two workers steps two simulations together."""
+    vec_env = pytest.importorskip("stable_baselines3.common.vec_env")
+    from rlightning_aio.sb3 import make_vec_env
+
+    makers = [functools.partial(gym.make, task, max_episode_steps=150, render_mode="rgb_array")] * 4
+    theirs = vec_env.SubprocVecEnv(makers, start_method="fork")
+    # What monitors add to infos is rounded in two ways; the envs themselves are compared.
+    ours = make_vec_env(
+        task, 4, env_kwargs={"max_episode_steps": 150}, vec_env_kwargs={"envs_per_process": 2}
+    ).venv
+    assert len(ours.group.env_ids) == 2
+    compare_with_stable_baselines3(ours, theirs, task, makers)
+
+
+def as_numpys(infos: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Infos whose numbers are NumPy's, as those of simulations that are stepped together."""
+    kinds = {int: np.int64, float: np.float64}
+    return [{key: kinds.get(type(v), lambda v: v)(v) for key, v in info.items()} for info in infos]
+
+
+def compare_with_stable_baselines3(ours: Any, theirs: Any, task: str, makers: list[Any]) -> None:
+    """A thousand steps of both, and of a plain loop."""
+    together = len(ours.group.env_ids) < ours.num_envs
+    actions = actions_for(theirs.action_space, 1000, len(makers))
     for env in (ours, theirs):
         env.seed(SEED)
-    plain = looped(task, AutoresetMode.SAME_STEP, actions)
+    plain = looped(makers, AutoresetMode.SAME_STEP, actions)
     found = ours.reset()
     assert_alike(found, theirs.reset())
     assert_alike(found, next(plain)[0])
@@ -172,8 +240,12 @@ def test_beside_stable_baselines3s_processes(task: str) -> None:
     for turn, (each, of_loop) in enumerate(zip(actions, plain, strict=True)):
         found = ours.step(each)
         *expected, infos = theirs.step(each)
-        assert_alike(found, (*expected, list(infos)), f"{task}, {turn}")
-        assert_alike(ours.reset_infos, list(theirs.reset_infos), f"{task}, {turn}")
+        expected[1] = expected[1].astype(np.float64)  # Some tasks' rewards are ints there.
+        infos, reset_infos = list(infos), list(theirs.reset_infos)
+        if together:
+            infos, reset_infos = (as_numpys(told) for told in (infos, reset_infos))
+        assert_alike(found, (*expected, infos), f"{task}, {turn}")
+        assert_alike(ours.reset_infos, reset_infos, f"{task}, {turn}")
         observations, rewards, terminated, truncated, last = of_loop
         assert_alike(found[:3], (observations, rewards, terminated | truncated), f"{task}, {turn}")
         for info, observation, done in zip(found[3], last, found[2], strict=True):

@@ -10,5 +10,6 @@ case, and knows no group.
 from __future__ import annotations
 
 from rlightning_aio.batch.data import BatchedData
+from rlightning_aio.batch.joining import joined
 
-__all__ = ["BatchedData"]
+__all__ = ["BatchedData", "joined"]

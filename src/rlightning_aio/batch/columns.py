@@ -5,7 +5,7 @@ from __future__ import annotations
 import pickle
 import time
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from rlightning_aio.batch.names import EnvNames
 
-__all__ = ["ResultColumns"]
+__all__ = ["BY_ROW", "ResultColumns"]
 
 # The monotonic clock's distance to the epoch; workers stamp results with the former.
 _EPOCH_NS = time.time_ns() - time.monotonic_ns()
@@ -119,15 +119,16 @@ class ResultColumns:
     def over(self) -> NDArray[np.bool_]:
         """Whether all episodes of an env have ended and none was reset since: ``[n]``."""
         over = self.flags[..., OVER]
-        return np.logical_and.reduce(over.reshape(len(over), -1), axis=1)
+        return over if over.ndim == 1 else np.logical_and.reduce(over.reshape(len(over), -1), 1)
 
     def by_sub_env(self, column: NDArray[Any] | None) -> NDArray[Any]:
         """A column of envs, ``[n]``, in the shape of `is_reset`; None is all False."""
         shape = self.is_reset.shape
         if column is None:
             return np.zeros(shape, np.bool_)
-        spread = np.broadcast_to(column.reshape(len(self), *[1] * (len(shape) - 1)), shape)
-        return spread.copy()
+        spread = np.empty(shape, column.dtype)
+        spread[...] = column.reshape(len(self), *[1] * (len(shape) - 1))
+        return spread
 
     def _spread(self, column: NDArray[np.bool_]) -> NDArray[np.bool_]:
         return column.reshape(len(self), *[1] * (self.reward.ndim - 1))
@@ -143,6 +144,11 @@ class ResultColumns:
         for row in np.flatnonzero(self.names.turns[self.slots]).tolist():
             places[row] = self.info_of(row)["env_id"]
         return first + places
+
+    @property
+    def ready_ns(self) -> NDArray[np.int64]:
+        """When each result was ready, on the monotonic clock: ``[n]``."""
+        return self.times[:, 0]
 
     @property
     def busy_ns(self) -> NDArray[np.int64]:
@@ -200,6 +206,8 @@ class ResultColumns:
         """The sums of the episode that has just ended; empty if none has."""
         if self.episode_return is None or self.episode_length is None:
             return {}
+        if self.restarted is not None and self.restarted[row]:
+            return {}  # It has lost the episode, or goes on with it.
         ended = self.ended[row]
         if self.limit_reached is not None and self.limit_reached[row]:
             ended = np.ones_like(ended)
@@ -272,7 +280,7 @@ class ResultColumns:
             out_of_band={
                 k: self.out_of_band[row] for k, row in enumerate(rows) if row in self.out_of_band
             },
-            **{name: taken(getattr(self, name)) for name in _BY_ROW},
+            **{name: taken(getattr(self, name)) for name in BY_ROW},
         )
 
     def stacked_head(self, column: str) -> Any:
@@ -295,7 +303,7 @@ def _like(told: Any, value: Any) -> Any:
     return told.new_tensor(value) if hasattr(told, "new_tensor") else value
 
 
-_BY_ROW = (
+BY_ROW: Final = (
     "reward",
     "flags",
     "info_marks",
@@ -307,3 +315,4 @@ _BY_ROW = (
     "times",
     "sent_ns",
 )
+"""Attributes of `ResultColumns` that are arrays of rows, or None."""

@@ -10,7 +10,12 @@ from typing import TYPE_CHECKING, Any, cast, overload
 
 import numpy as np
 
-from rlightning_aio.batch.infos import info_list_of_rows, infos_of_rows, vector_infos
+from rlightning_aio.batch.infos import (
+    info_list_of_rows,
+    infos_of_rows,
+    sub_env_infos_of_rows,
+    vector_infos,
+)
 from rlightning_aio.batch.sent import Sent, taken_sources
 from rlightning_aio.batch.stacking import columns_where_possible, differing, stacked_values
 from rlightning_aio.errors import BadAction
@@ -33,10 +38,13 @@ __all__ = [
     "batch_of_results",
     "columns_of_responses",
     "names_of",
+    "origin_of",
     "parts_of",
     "reported_info_list",
     "reported_infos",
+    "reported_sub_env_infos",
     "slots_of",
+    "sources_of",
 ]
 
 _MISSING: Any = object()
@@ -299,6 +307,16 @@ class BatchedData:
         """
         return self._by_row(lambda part: part.index).astype(np.int64, copy=False)
 
+    @property
+    def ready_ns(self) -> NDArray[np.int64]:
+        """When each result was ready, by `time.monotonic_ns`; ``[n]``, one for each env."""
+        return self._by_row(lambda part: part.ready_ns)
+
+    @property
+    def busy_ns(self) -> NDArray[np.int64]:
+        """How long each env took for its step or reset, in ns; ``[n]``, one for each env."""
+        return self._by_row(lambda part: part.busy_ns)
+
     def _by_row(self, column: Callable[[ResultColumns], Any]) -> NDArray[Any]:
         """A column that every part has, in the batch's order."""
         if self._origin is not None and self._columns is None and not len(self):
@@ -385,30 +403,33 @@ class BatchedData:
         positions: dict[str, list[int]] = {}
         for position, name in enumerate(names):
             positions.setdefault(name, []).append(position)
-        return {name: self._taken(chosen) for name, chosen in positions.items()}
+        return {name: self.take(chosen) for name, chosen in positions.items()}
 
     def _names(self) -> list[str]:
         if self._origin is not None:
             return self._origin.names.names(self._origin.slots)
         return [id_.rpartition("-")[0] or id_ for id_ in self.ids()]
 
-    def _taken(self, chosen: list[int]) -> BatchedData:
-        """The values at the chosen places."""
+    def take(self, rows: Sequence[int]) -> BatchedData:
+        """The results (or values) at the places `rows`, in that order, in fresh columns."""
+        chosen = list(rows)
         if self._origin is None:
             ids, values = self.ids(), self.values()
             return BatchedData([ids[k] for k in chosen], [values[k] for k in chosen])
-        rows: dict[int, list[int]] = {}
+        rows_of: dict[int, list[int]] = {}
         positions: dict[int, list[int]] = {}
         places = _by_position(self._parts, len(self))
         for position, k in enumerate(chosen):
             part, row = places[k]
-            rows.setdefault(id(part), []).append(row)
+            rows_of.setdefault(id(part), []).append(row)
             positions.setdefault(id(part), []).append(position)
         parts = [
-            part.subset(rows[id(part)], positions[id(part)])
+            part.subset(rows_of[id(part)], positions[id(part)])
             for part in self._parts
-            if id(part) in rows
+            if id(part) in rows_of
         ]
+        if len(parts) == 1:
+            parts[0].positions = None
         origin = Origin(self._origin.group, self._origin.slots[chosen], self._origin.names)
         sources = self._sources
         if sources is not None:
@@ -487,6 +508,15 @@ def reported_infos(batch: BatchedData) -> dict[str, Any]:
     return _infos_of(batch, episodes=False)
 
 
+def reported_sub_env_infos(batch: BatchedData, num_envs: int) -> dict[str, Any]:
+    """`reported_infos` of envs of `num_envs` sub-environments each, as of one row of envs.
+
+    All are of one layout, in the group's order.
+    """
+    (part,) = batch._parts
+    return sub_env_infos_of_rows(part, num_envs)
+
+
 def reported_info_list(batch: BatchedData) -> list[dict[str, Any]]:
     """`BatchedData.info` of a batch of results, without the sums of episodes."""
     parts = batch._parts
@@ -511,6 +541,16 @@ def slots_of(batch: BatchedData, group: object) -> NDArray[np.intp] | None:
     """Slots of the envs, if the batch is of `group`'s own making."""
     origin = batch._origin
     return origin.slots if origin is not None and origin.group is group else None
+
+
+def origin_of(batch: BatchedData) -> Origin | None:
+    """Where the results of `batch` came from; None for plain values."""
+    return batch._origin
+
+
+def sources_of(batch: BatchedData) -> Sources | None:
+    """What the results of `batch` answer; None for any other batch."""
+    return batch._sources
 
 
 def names_of(batch: BatchedData) -> EnvNames | None:

@@ -6,21 +6,28 @@ which goes env by env and key by key, says what they mean and does the rest.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from gymnasium.vector import VectorEnv
 
+from rlightning_aio.protocol.info import has_mask, is_mask
+
 if TYPE_CHECKING:
-    from collections.abc import Container, Iterable, Sequence
+    from collections.abc import Iterable, Sequence
+
+    from numpy.typing import NDArray
 
     from rlightning_aio.batch.columns import ResultColumns
     from rlightning_aio.protocol.info import InfoSchema
 
-__all__ = ["info_list_of_rows", "infos_of_rows", "vector_infos"]
-
-_AS_OBJECTS = np.bool_
-"""A kind of number of which Gymnasium makes no typed array."""
+__all__ = [
+    "info_list_of_rows",
+    "infos_of_rows",
+    "listed",
+    "sub_env_infos_of_rows",
+    "vector_infos",
+]
 
 
 class _Columns(VectorEnv[Any, Any, Any]):
@@ -49,16 +56,6 @@ class _Columns(VectorEnv[Any, Any, Any]):
                 columns[key] = np.broadcast_to(outer, (self.num_envs, *mask.shape)).copy()
             columns[key][env_num] = mask
         return columns
-
-
-def is_mask(key: str, info: Container[str]) -> bool:
-    """Whether a vector environment tells by `key` which sub-environments have another one."""
-    return key.startswith("_") and key[1:] in info
-
-
-def _has_mask(key: str, info: Container[str]) -> bool:
-    """Whether `key` needs none made: it has one among the infos, or is one."""
-    return f"_{key}" in info or is_mask(key, info)
 
 
 def vector_infos(infos: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -101,14 +98,108 @@ def info_list_of_rows(part: ResultColumns) -> list[dict[str, Any]]:
     return infos
 
 
+def sub_env_infos_of_rows(part: ResultColumns, num_envs: int) -> dict[str, Any]:
+    """Infos of rows with sub-environments as those of one row of envs: ``[n * num_envs, ...]``.
+
+    What an env tells of all its sub-environments is each one's.
+    """
+    columns = None
+    if not part.out_of_band:
+        schema = _schema_of_all(part)
+        # Uncopied: to flatten a column of several rows is to copy it.
+        columns = _taken_at_once(part) if schema is None else _fields(part, schema)
+    if columns is None:
+        return _joined([part.reported_info_of(row) for row in range(len(part))], num_envs)
+    flat: dict[str, Any] = {}
+    for key, column in columns.items():
+        if column.shape[1:2] == (num_envs,):
+            flat[key] = column.reshape(-1, *column.shape[2:])
+        else:
+            flat[key] = column.repeat(num_envs, axis=0)
+    return flat
+
+
+def _joined(infos: Sequence[dict[str, Any]], num_envs: int) -> dict[str, Any]:
+    """Infos of vector environments of `num_envs` each, one after the other."""
+    total = len(infos) * num_envs
+    joined: dict[str, Any] = {}
+    for key in dict.fromkeys(key for info in infos for key in info):
+        told = [info.get(key) for info in infos]
+        if any(isinstance(value, dict) for value in told):
+            joined[key] = _joined([value or {} for value in told], num_envs)
+            continue
+        for k, value in enumerate(told):
+            if value is None:
+                continue
+            is_column = getattr(value, "shape", ())[:1] == (num_envs,)
+            values: Any = value if is_column else _repeated(value, num_envs)
+            if key not in joined:
+                joined[key] = np.zeros((total, *values.shape[1:]), values.dtype)
+                if values.dtype == object:
+                    joined[key][:] = None
+            joined[key][k * num_envs : (k + 1) * num_envs] = values
+    for key in [key for key in joined if not has_mask(key, joined)]:
+        mask = np.array([key in info for info in infos])
+        joined[f"_{key}"] = mask.repeat(num_envs)
+    return joined
+
+
+def _repeated(value: Any, num_envs: int) -> Any:
+    if isinstance(value, np.ndarray):
+        return np.stack([cast("NDArray[Any]", value)] * num_envs)
+    is_number = isinstance(value, int | float | np.generic)
+    return np.full(num_envs, value, None if is_number else object)
+
+
+def listed(columns: dict[str, Any], count: int) -> list[dict[str, Any]]:
+    """Columns with masks as one info for each of `count` envs; numbers are NumPy's."""
+    names = [name for name in columns if not is_mask(name, columns)]
+    masks = [columns[f"_{name}"] for name in names]
+    values = [
+        listed(cast("dict[str, Any]", column), count) if isinstance(column, dict) else list(column)
+        for column in (columns[name] for name in names)
+    ]
+    if all(mask.all() for mask in masks):
+        if not names:
+            return [{} for _ in range(count)]
+        return [dict(zip(names, own, strict=True)) for own in zip(*values, strict=True)]
+    infos: list[dict[str, Any]] = [{} for _ in range(count)]
+    for name, mask, each in zip(names, masks, values, strict=True):
+        for k in np.flatnonzero(mask).tolist():
+            infos[k][name] = each[k]
+    return infos
+
+
 def _taken_at_once(part: ResultColumns) -> dict[str, Any] | None:
     """Columns of infos that all lie in the rows; None where they need to be looked at singly."""
+    schema = _schema_of_all(part)
+    if schema is not None:
+        return {key: values.copy() for key, values in _fields(part, schema).items()}
     rows = _rows_by_schema(part)
-    if len(rows) == 1 and part.info is not None:
-        ((schema, chosen),) = rows.items()
-        if len(chosen) == len(part) and _agree(rows):
-            return _of_all(schema.fields(part.info))
     return _of_some(part.info, rows) if _agree(rows) else None
+
+
+def _schema_of_all(part: ResultColumns) -> InfoSchema | None:
+    """The one shape that the infos of all rows have, if they become typed columns."""
+    if part.info is None or part.info_marks is None:
+        return None
+    found: InfoSchema | None = None
+    slots: list[int] = part.slots.tolist()
+    marks: list[int] = part.info_marks.tolist()
+    for slot, mark in zip(slots, marks, strict=True):
+        schema = part.schemas[slot].get(mark)
+        if schema is None or (found is not None and found is not schema and found != schema):
+            return None
+        found = schema
+    return found if found is not None and found.is_typed else None
+
+
+def _fields(part: ResultColumns, schema: InfoSchema) -> dict[str, Any]:
+    """Views of columns that all rows have, each with its mask."""
+    fields = schema.fields(cast("NDArray[np.uint8]", part.info))
+    for key in schema.without_mask:
+        fields[f"_{key}"] = np.ones(len(part), np.bool_)
+    return fields
 
 
 def _rows_by_schema(part: ResultColumns) -> dict[InfoSchema, list[int]]:
@@ -138,20 +229,11 @@ def _agree(schemas: Iterable[InfoSchema]) -> bool:
         for key, kind, array in zip(schema.keys, schema.types, schema.arrays, strict=True):
             # Some may have a mask of their own, others not.
             known = kind, array, f"_{key}" in schema.keys
-            if kinds.setdefault(key, known) != known or kind is _AS_OBJECTS:
+            if kinds.setdefault(key, known) != known:
                 return False
-            if key == "final_obs" or (array is not None and 0 in array[0]):
-                return False
+        if not schema.is_typed:
+            return False
     return True
-
-
-def _of_all(fields: dict[str, Any]) -> dict[str, Any]:
-    columns: dict[str, Any] = {}
-    for key, values in fields.items():
-        columns[key] = values.copy()
-        if not _has_mask(key, fields):
-            columns[f"_{key}"] = np.ones(len(values), np.bool_)
-    return columns
 
 
 def _of_some(info: Any, rows: dict[InfoSchema, list[int]]) -> dict[str, Any]:
@@ -159,12 +241,12 @@ def _of_some(info: Any, rows: dict[InfoSchema, list[int]]) -> dict[str, Any]:
     for schema, chosen in rows.items():
         fields = schema.fields(info[chosen])
         for key, values in fields.items():
-            has_mask = _has_mask(key, fields)
+            masked = has_mask(key, fields)
             if key not in columns:
                 columns[key] = np.zeros((len(info), *values.shape[1:]), values.dtype)
-                if not has_mask:
+                if not masked:
                     columns[f"_{key}"] = np.zeros(len(info), np.bool_)
             columns[key][chosen] = values
-            if not has_mask:
+            if not masked:
                 columns[f"_{key}"][chosen] = True
     return columns

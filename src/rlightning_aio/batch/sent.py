@@ -21,7 +21,14 @@ if TYPE_CHECKING:
 
     from rlightning_aio.types import PolicyResponse
 
-__all__ = ["Sent", "Sources", "columns_of_values", "kept_columns", "taken_sources"]
+__all__ = [
+    "Sent",
+    "Sources",
+    "columns_of_values",
+    "joined_sources",
+    "kept_columns",
+    "taken_sources",
+]
 
 Sources: TypeAlias = "tuple[Any, NDArray[np.intp] | None]"
 """For each row the columns it came from (a mapping, or None) and the place there.
@@ -52,6 +59,17 @@ def taken_sources(sources: Sources, rows: list[int]) -> Sources:
     if places is None:
         return np.full(len(rows), columns, object), np.array(rows, np.intp)
     return columns[rows], places[rows]
+
+
+def joined_sources(parts: Sequence[tuple[Sources | None, int]]) -> Sources:
+    """Those of several batches, each with its number of rows, one behind the other."""
+    columns: list[Any] = []
+    places: list[NDArray[np.intp]] = []
+    for sources, count in parts:
+        own, rows = (None, None) if sources is None else sources
+        columns.append(np.full(count, own, object) if rows is None else own)
+        places.append(np.arange(count) if rows is None else rows)
+    return np.concatenate(columns), np.concatenate(places)
 
 
 class Sent:

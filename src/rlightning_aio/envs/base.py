@@ -14,6 +14,7 @@ import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from rlightning_aio.envs.state import load_state, save_state
 from rlightning_aio.types import (
     Autoreset,
     EnvMeta,
@@ -213,6 +214,24 @@ class BaseEnv(abc.ABC):
         if len(seed) != count:
             raise ValueError(f"env {self.env_id!r}: {len(seed)} seeds for {count} sub-environments")
         return [int(one) for one in seed]
+
+    def save_state(self) -> Any:
+        """All that the env needs to go on from here exactly as it would have, as a value that can
+        be pickled; see `load_state`.
+
+        By default what this object and the layers of its simulator hold, see docs/state.md. Define
+        both methods if that can't be pickled, or isn't all.
+
+        Raises:
+            NotImplementedError: the env can't give its state; the message says why.
+        """
+        return save_state(self)
+
+    def load_state(self, state: Any) -> None:
+        """Go on from where `save_state` was called: on this env or on another of the same entry,
+        in this process or another, perhaps before its first reset.
+        """
+        load_state(self, state)
 
     def render(self) -> Any:
         """One frame, as the simulator renders it."""

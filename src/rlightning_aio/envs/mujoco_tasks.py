@@ -19,9 +19,10 @@ from rlightning_aio.envs.wrappers import wrappers_of
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from gymnasium.envs.registration import EnvSpec
     from numpy.typing import NDArray
 
-__all__ = ["Task", "task_of"]
+__all__ = ["Task", "is_batched", "task_of"]
 
 Judgement = tuple[Any, Any, dict[str, Any]]
 """Rewards, terminations, infos."""
@@ -451,6 +452,12 @@ _KINDS: dict[str, type[Task]] = {
     "swimmer_v5:SwimmerEnv": Swimmer,
     "walker2d_v5:Walker2dEnv": Walker2d,
 }
+
+
+def is_batched(spec: EnvSpec) -> bool:
+    """Whether `task_of` knows what `gymnasium.make` makes of `spec` without its checker."""
+    entry = str(spec.entry_point).removeprefix("gymnasium.envs.mujoco.")
+    return entry in _KINDS and spec.order_enforce and not spec.additional_wrappers
 
 
 def task_of(env: gym.Env[Any, Any], simulations: list[Any]) -> Task:

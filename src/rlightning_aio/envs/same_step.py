@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 from gymnasium.vector import AutoresetMode
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-__all__ = ["SameStep", "SameStepOf"]
+__all__ = ["SameStep"]
 
 
 class SameStep(gym.Wrapper[Any, Any, Any, Any]):
@@ -43,13 +40,3 @@ class SameStep(gym.Wrapper[Any, Any, Any, Any]):
             observation, info = self.env.reset()
             info = {**final, **info}
         return observation, reward, terminated, truncated, info
-
-
-class SameStepOf:
-    """Makes what a callable makes, wrapped in `SameStep`."""
-
-    def __init__(self, make_env: Callable[[], gym.Env[Any, Any]]) -> None:
-        self._make_env = make_env
-
-    def __call__(self) -> gym.Env[Any, Any]:
-        return SameStep(self._make_env())

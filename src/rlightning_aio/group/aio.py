@@ -406,6 +406,54 @@ class EnvGroup(Facade):
         """
         return await self._driver.run(self._collect_calls(deadline))
 
+    async def snapshot(self, env_ids: Sequence[str] | None = None) -> bytes:
+        """All that envs need to go on from here exactly as they would have, as bytes.
+
+        Args:
+            env_ids: which envs, all idle and reset before; None: all local ones.
+
+        What is in it: the simulators' and wrappers' state, their generators, the sums of the
+        episodes under way, the counters of `auto_reset`, and what is due for a reset. See
+        docs/state.md, also for what isn't. The bytes can be stored, and `restore` takes them in
+        this group or another, in this process or another.
+
+        Raises:
+            EnvBusy: an env has a reply outstanding; nothing was sent.
+            UnknownEnv: no env of this group has that id.
+            SnapshotError: an env is a robot's, or was never reset.
+            NotImplementedError: an env is a client's.
+            EnvRaised: an env can't give its state; the message says why.
+            WorkerDied, EnvHung: a worker ended meanwhile.
+            GroupClosed: the group was not initialised, or is closed.
+        """
+        return await self._driver.run(self._core.snapshot(time.monotonic(), env_ids))
+
+    async def restore(
+        self, snapshot: bytes, env_ids: Sequence[str] | None = None
+    ) -> tuple[BatchedData, list[bool]]:
+        """Have envs go on from where a snapshot was taken of them: all of them, or none.
+
+        Args:
+            snapshot: what `snapshot` returned. It holds pickles, which can have a worker execute
+                anything: only take what you have written yourself.
+            env_ids: into which envs, all idle, in the order of the snapshot's; None: into those
+                of the same ids. Any env of an equal entry will do.
+
+        Returns what the envs showed last when the snapshot was taken, as `reset` returns first
+        observations: `is_reset`, since no transition ends here, with no reward. Cancelled, the
+        envs begin anew with their next step, which says so as after a restart.
+
+        Raises:
+            SnapshotError: the bytes are spoilt, or of another number of envs, another task,
+                other options or another version of a library; nothing was changed.
+            EnvBusy: an env has a reply outstanding; nothing was sent.
+            UnknownEnv: no env of this group has that id.
+            NotImplementedError: an env is a client's.
+            EnvRaised, WorkerDied, EnvHung: an env failed; the others are where they were before.
+            GroupClosed: the group was not initialised, or is closed.
+        """
+        return await self._driver.run(self._core.restore(time.monotonic(), snapshot, env_ids))
+
     def __getitem__(self, env_id: str) -> EnvHandle:
         """A handle on one env (an `EnvHandle`), or on one env_server (a `ServerHandle`).
 

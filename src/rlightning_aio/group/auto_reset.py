@@ -59,6 +59,9 @@ class AutoReset:
         # Whose last result has reached the limit of a context; whose episode has ended by itself.
         self._cut = np.zeros(len(envs), np.bool_)
         self._over = np.zeros(len(envs), np.bool_)
+        # Of those that show where they were put back to: by which request, their counter, and
+        # whether they were cut.
+        self._restored: dict[int, tuple[int, int, bool]] = {}
         self._any_due = False
         # For so many batches no env can reach its limit.
         self._margin = 0
@@ -144,6 +147,30 @@ class AutoReset:
         """Leave the counters of `slots` as they are, though their request has a number."""
         self._base[slots] += 1
 
+    def counters(self, slots: NDArray[np.intp]) -> list[tuple[int, bool]]:
+        """Counters of `slots`, all idle, and whether their last results have reached a limit."""
+        counts = self._counts(slots)
+        return list(zip(counts.tolist(), self._cut[slots].tolist(), strict=True))
+
+    def restore(self, slots: NDArray[np.intp], counters: Sequence[tuple[int, bool]]) -> None:
+        """The next requests of `slots` show where the envs were put back to."""
+        for slot, (count, cut) in zip(slots.tolist(), counters, strict=True):
+            self._restored[slot] = self._requests.number(slot) + 1, count, cut
+
+    def rewind(self, slot: int, num_steps: int, *, owes: bool) -> None:
+        """The next request of `slot` shows where the env stood so many steps ago.
+
+        Args:
+            slot: of the env.
+            num_steps: completed ones that it knows nothing of any more.
+            owes: its last request was not answered.
+        """
+        number = self._requests.number(slot)
+        shown_by, count, _ = self._restored.get(slot, (0, 0, False))
+        if shown_by != number:
+            count = max(number - owes - int(self._base[slot]) - num_steps, 0)
+        self._restored[slot] = number + 1, count, False
+
     def account(
         self, slots: NDArray[np.intp], flagged: Sequence[ResultColumns]
     ) -> NDArray[np.bool_] | None:
@@ -153,8 +180,7 @@ class AutoReset:
             slots: of all results.
             flagged: those parts in which any flag is set.
         """
-        for part in flagged:
-            self._note_flags(part)
+        shown = [slot for part in flagged for slot in self._note_flags(part)]
         if self._limits is None:
             return None
         self._margin -= 1
@@ -162,13 +188,18 @@ class AutoReset:
         if self._margin <= 0:
             self._margin = int((self._limits - self._counts(...)).min())
             reached = self._counts(slots) >= self._limits[slots]
+            if shown:  # What they show was flagged when it was new.
+                reached &= ~np.isin(slots, shown)
             self._cut[slots[reached]] = True
         if flagged or reached is not None:
             self._note_due()
         return reached if reached is not None and np.count_nonzero(reached) else None
 
-    def _note_flags(self, part: ResultColumns) -> None:
-        """Start the counters of those that were reset anew; note whose episode has ended."""
+    def _note_flags(self, part: ResultColumns) -> list[int]:
+        """Start the counters of those that were reset anew; note whose episode has ended.
+
+        Returns those that are no new episodes, but show where they were put back to.
+        """
         resets = part.is_reset
         if resets.ndim > 1:
             resets = resets.all(axis=1)
@@ -176,10 +207,21 @@ class AutoReset:
         if len(begun):
             self._base[begun] = self._requests.numbers(begun)
             self._cut[begun] = self._over[begun] = False
+        shown = [slot for slot in begun.tolist() if self._is_shown(slot)]
+        for slot in shown:
+            _, count, cut = self._restored[slot]
+            self._base[slot] -= count
+            self._cut[slot] = cut
+            self._margin = 0
         over = part.over
         if self._envs.any_resets_itself:
-            over &= ~self._envs.resets_itself[part.slots]
+            over = over & ~self._envs.resets_itself[part.slots]
         self._over[part.slots[over]] = True
+        return shown
+
+    def _is_shown(self, slot: int) -> bool:
+        """Whether the last result of `slot` is no new episode, but shows where the env stands."""
+        return slot in self._restored and self._restored[slot][0] == self._requests.number(slot)
 
     def _counts(self, slots: NDArray[np.intp] | EllipsisType) -> NDArray[np.int64]:
         """Counters of `slots`; too high by 1 where a request is in flight."""

@@ -5,9 +5,10 @@ Rule: everything that can be known to be wrong without starting a process is sai
 
 from __future__ import annotations
 
+import inspect
 import os
 import warnings
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, cast
@@ -17,9 +18,11 @@ import numpy as np
 from rlightning_aio.config import EnvConfig, check_installed, parse_configs
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.group.core import Core
+from rlightning_aio.group.devices import dealt_out
 from rlightning_aio.group.env_table import EnvTable
 from rlightning_aio.group.poller import Poller
 from rlightning_aio.group.requests import Requests
+from rlightning_aio.group.resumption import Resumption
 from rlightning_aio.group.single import SingleEnvCore, StepsAtOnce
 from rlightning_aio.group.slab_layout import SlabLayout
 from rlightning_aio.group.supervisor import Supervisor
@@ -83,19 +86,28 @@ def _place(config: EnvConfig) -> Placement:
     return placement_of(config.backend, config.placement)
 
 
+def _has_worker_here(config: EnvConfig) -> bool:
+    """Whether its envs live in processes of their own, on this machine."""
+    place = _place(config)
+    return place.spreads and place.local
+
+
 def host_class(config: EnvConfig) -> HostFactory:
     """What makes the hosts of an entry.
 
     Raises:
-        ConfigError: its placement is not available.
+        ConfigError: a package is missing that its placement needs.
     """
-    target = _place(config).target
-    if target is None:
+    place = _place(config)
+    try:
+        return load(place.target)
+    except ImportError as error:
+        if not place.extra:
+            raise
         raise ConfigError(
-            f"entry {config.name!r}: placement {config.placement!r} is not available yet; use "
-            "'process'"
-        )
-    return load(target)
+            f"entry {config.name!r}: placement {config.placement!r} needs a package that is not "
+            f"installed ({error}): pip install 'rlightning-aio[{place.extra}]'"
+        ) from error
 
 
 def _check_server(config: EnvConfig, *, ignored: bool) -> None:
@@ -161,6 +173,7 @@ def _check_sendable(config: EnvConfig, field: str, fn: Any) -> None:
 
 def _culprit(fn: Any) -> str:
     """Which captured variable of a function can't be pickled."""
+    fn = inspect.unwrap(fn)
     cells = zip(
         getattr(getattr(fn, "__code__", None), "co_freevars", ()),
         getattr(fn, "__closure__", None) or (),
@@ -210,11 +223,13 @@ def _assembled(plan: Plan, watcher: Watcher, arena: Arena, *, shares_thread: boo
         len(orders),
     )
     layout = SlabLayout(len(envs))
+    resumption = Resumption(requests)
     completions: Completions = deque()
     supervisor = Supervisor(
         envs,
         requests,
         layout,
+        resumption,
         arena,
         completions.append,
         mixed_actions=plan.mixed_actions,
@@ -229,7 +244,7 @@ def _assembled(plan: Plan, watcher: Watcher, arena: Arena, *, shares_thread: boo
         bell=bell,
         bell_offset=bell_offset,
         num_hosts=len(orders),
-        configs=plan.configs,
+        configs=[order.config for order in orders],
         objection=supervisor.objection,
         is_idle=requests.is_idle,
         resources=supervisor.resources,
@@ -240,7 +255,7 @@ def _assembled(plan: Plan, watcher: Watcher, arena: Arena, *, shares_thread: boo
         supervisor.add(host, order.config)
         poller.add(host)
         first_slot += host.num_envs
-    parts = (envs, requests, layout, supervisor, poller, completions, watcher)
+    parts = (envs, requests, layout, resumption, supervisor, poller, completions, watcher)
     host = supervisor.hosts[0]
     if not shares_thread and len(envs) == 1 and isinstance(host, StepsAtOnce):
         core = SingleEnvCore(*parts, zero_copy=plan.zero_copy)
@@ -262,10 +277,13 @@ def _orders(plan: Plan, servers: Sequence[EnvConfig], cores: Sequence[int]) -> l
         for (config, fns), num_hosts in zip(local, nums_hosts, strict=True)
         for share in _shares(fns, num_hosts)
     ]
-    num_processes = sum(_place(config).spreads for config, _ in shares)
+    num_processes = sum(_has_worker_here(config) for config, _ in shares)
+    surroundings = _surroundings([config for config, _ in shares])
     orders = [
         StartOrder(
-            config=_own_makers(config, [index for index, _ in share]),
+            config=_own_makers(config, [index for index, _ in share]).model_copy(
+                update={"env_vars": surroundings[host_id]}
+            ),
             env_class=ENVS.registered(config.backend),
             worker_indices=tuple(index for index, _ in share),
             preprocess_fns=tuple(fn for _, fn in share),
@@ -281,6 +299,24 @@ def _orders(plan: Plan, servers: Sequence[EnvConfig], cores: Sequence[int]) -> l
     ]
 
 
+def _surroundings(workers: Sequence[EnvConfig]) -> list[dict[str, str]]:
+    """The environment variables of each worker, given its entry.
+
+    Those of the entry come before what says which devices it has; ``{worker_index}`` in one is
+    the number of the worker among the entry's.
+    """
+    devices = iter(dealt_out([config for config in workers if _has_worker_here(config)]))
+    count = Counter[str]()
+    found: list[dict[str, str]] = []
+    for config in workers:
+        index = str(count[config.name])
+        count[config.name] += 1
+        own = {k: v.replace("{worker_index}", index) for k, v in config.env_vars.items()}
+        dealt = next(devices) if _has_worker_here(config) else {}
+        found.append({**dealt, **own})
+    return found
+
+
 def _own_makers(config: EnvConfig, indices: Sequence[int]) -> EnvConfig:
     """`config` for a host of some of the entry's envs, with what makes these."""
     makers: Any = config.make_env
@@ -293,7 +329,8 @@ def _own_makers(config: EnvConfig, indices: Sequence[int]) -> EnvConfig:
 def _nums_hosts(configs: Sequence[EnvConfig], num_cores: int) -> list[int]:
     """Over how many hosts the envs of each entry are spread.
 
-    Entries of CPU-bound simulators that don't say it share the cores, by their numbers of envs.
+    Entries of CPU-bound simulators that don't say it share the cores, by their numbers of envs;
+    not those on other machines, whose cores nobody knows here.
     """
     nums: list[int] = []
     sharing: list[int] = []
@@ -302,7 +339,7 @@ def _nums_hosts(configs: Sequence[EnvConfig], num_cores: int) -> list[int]:
             nums.append(1)
         elif config.envs_per_process != "auto":
             nums.append(-(-config.num_workers // config.envs_per_process))
-        elif ENVS.is_cpu_bound(config.backend):
+        elif ENVS.is_cpu_bound(config.backend) and _place(config).local:
             nums.append(1)
             sharing.append(k)
         else:

@@ -25,8 +25,11 @@ from rlightning_aio.batch.data import (
 from rlightning_aio.batch.sent import columns_of_values
 from rlightning_aio.errors import (
     BadAction,
+    EnvFault,
     NothingPending,
     RLightningError,
+    SnapshotError,
+    WorkerDied,
 )
 from rlightning_aio.group.actions import write_actions
 from rlightning_aio.group.auto_reset import NO_RESETS, AutoReset
@@ -38,10 +41,12 @@ from rlightning_aio.group.recovery import Recovery
 from rlightning_aio.group.requests import COLLECTOR
 from rlightning_aio.group.results import Results
 from rlightning_aio.group.seeds import checked_seed, seeds_for
+from rlightning_aio.group.snapshots import EnvSnapshot, check_same, identity_of, pack, unpack
 from rlightning_aio.group.stats import Stats
 from rlightning_aio.group.wait import Procedure, Wait, earliest
 from rlightning_aio.protocol.entries import Operation
-from rlightning_aio.protocol.slab import TRUNCATED
+from rlightning_aio.protocol.slab import AS_RESTORED, TRUNCATED
+from rlightning_aio.registry import ENVS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -52,6 +57,7 @@ if TYPE_CHECKING:
     from rlightning_aio.group.env_table import EnvTable
     from rlightning_aio.group.poller import Poller
     from rlightning_aio.group.requests import Requests, Ticket
+    from rlightning_aio.group.resumption import Resumption
     from rlightning_aio.group.seeds import Seeds
     from rlightning_aio.group.slab_layout import SlabLayout
     from rlightning_aio.group.supervisor import Supervisor
@@ -70,7 +76,7 @@ class Core:
     """What an `EnvGroup` can be asked to do.
 
     Args:
-        envs, requests, layout: the group's tables.
+        envs, requests, layout, resumption: the group's tables.
         supervisor, poller: of its hosts.
         completions: where these tell what has become of requests.
         watcher: the driver.
@@ -82,6 +88,7 @@ class Core:
         envs: EnvTable,
         requests: Requests,
         layout: SlabLayout,
+        resumption: Resumption,
         supervisor: Supervisor,
         poller: Poller,
         completions: Completions,
@@ -100,6 +107,7 @@ class Core:
         self._results = Results(envs, layout, zero_copy=zero_copy)
         self._first_looks = FirstLooks(envs)
         self._recovery = Recovery()
+        self._resumption = resumption
         self._dispatch = Dispatch(envs, requests, supervisor)
         self._intake = Intake(
             completions,
@@ -110,6 +118,7 @@ class Core:
             self._dispatch,
             self._results,
             self._recovery,
+            resumption,
             self.auto,
             self.stats,
         )
@@ -169,7 +178,9 @@ class Core:
         self._results.note_sent(slots, _columns(batch))
         resets = self.auto.due(slots)
         if self._recovery.any_untold:
-            resets = resets | self._recovery.tell(slots)
+            telling = self._recovery.tell(slots)
+            self._show_standings(slots[telling], ~np.broadcast_to(resets, len(slots))[telling])
+            resets = resets | telling
             self.supervisor.note_recovery(any_telling=self._recovery.any_telling)
         entries = self.requests.submit(slots, Operation.STEP, _owner(ticket), now)
         if resets is not NO_RESETS and np.count_nonzero(resets):
@@ -184,6 +195,13 @@ class Core:
             )
         if self.supervisor.has_members:
             self._intake.drain()  # What was withdrawn at once.
+
+    def _show_standings(self, slots: NDArray[np.intp], stepped: NDArray[np.bool_]) -> None:
+        """Have envs of replaced workers show where they stand, if they would be `stepped`."""
+        seeds, lost = self._resumption.seeds(slots, stepped)
+        self._layout.write_seeds(slots, seeds)
+        for slot, num_steps in lost.items():
+            self.auto.rewind(slot, num_steps, owes=False)
 
     def _without_gone(
         self, batch: BatchedData, slots: NDArray[np.intp]
@@ -384,11 +402,11 @@ class Core:
     def _await(self, ticket: Ticket, now: float) -> Procedure[None]:
         """Until all replies of `ticket` are there. Given up, they go to `collect_async`."""
         try:
-            while True:
-                self._poll()
-                if ticket.remaining <= 0:
-                    break
+            if self.supervisor.has_members:
+                self._poll()  # What clients have sent already may wake nobody any more.
+            while ticket.remaining > 0:
                 now = yield from self._wait(ticket.remaining, now, None)
+                self._poll()
         except BaseException:
             self.requests.give_up(ticket)
             if self._wanted:
@@ -555,6 +573,115 @@ class Core:
             for slot in slots.tolist():
                 self._results.drop(slot)
 
+    # -- states of envs ---------------------------------------------------------------
+
+    def snapshot(self, now: float, env_ids: Sequence[str] | None) -> Procedure[bytes]:
+        """See `EnvGroup.snapshot`."""
+        slots = self.envs.all if env_ids is None else self._dispatch.distinct(env_ids)
+        self._check_restorable(slots)
+        snapshots = yield from self._snapshots(now, slots)
+        for snapshot, begun in snapshots:
+            if not begun:
+                raise SnapshotError(
+                    f"env {snapshot.env_id!r} has no state yet: reset it before its snapshot is "
+                    "taken"
+                )
+        return pack([snapshot for snapshot, _ in snapshots])
+
+    def _check_restorable(self, slots: NDArray[np.intp]) -> None:
+        self._dispatch.check_local(slots, "take a snapshot of, or restore,")
+        each: list[int] = slots.tolist()
+        for slot in each:
+            if ENVS.is_hardware(self.envs.configs[slot].backend):
+                raise SnapshotError(
+                    f"{self.envs.describe(slot)} moves something real: no snapshot puts that back"
+                )
+
+    def _snapshots(
+        self, now: float, slots: NDArray[np.intp]
+    ) -> Procedure[list[tuple[EnvSnapshot, bool]]]:
+        """Of each env what it is and where it stands, and whether it was reset ever."""
+        op, nothing = Operation.SNAPSHOT, [()] * len(slots)
+        ticket = self._send_for_values(now, slots, op, "snapshot", nothing, "nothing")
+        yield from self._await(ticket, now)
+        each: list[int] = slots.tolist()
+        told = zip(each, self.auto.counters(slots), _values([ticket]), strict=True)
+        snapshots: list[tuple[EnvSnapshot, bool]] = []
+        for slot, (count, cut), (versions, begun, standing) in told:
+            identity = identity_of(self.envs.configs[slot], self.supervisor.metas[slot], versions)
+            env_id = self.envs.env_ids[slot]
+            snapshots.append((EnvSnapshot(env_id, identity, count, cut, standing), begun))
+        return snapshots
+
+    def restore(
+        self, now: float, data: bytes, env_ids: Sequence[str] | None
+    ) -> Procedure[tuple[BatchedData, Flags]]:
+        """See `EnvGroup.restore`."""
+        snapshots = unpack(data)
+        slots = self._slots_for(snapshots, env_ids)
+        self._check_restorable(slots)
+        # What they are, and the way back, should any of them fail.
+        before = yield from self._snapshots(now, slots)
+        for slot, snapshot, (own, _) in zip(slots.tolist(), snapshots, before, strict=True):
+            check_same(snapshot, own.identity, self.envs.describe(slot))
+        yield from self._put_back(now, slots, snapshots, [own.standing for own, _ in before])
+        self._forget_losses(slots)
+        ticket = self.requests.open_ticket(slots)
+        self.auto.restore(slots, [(snapshot.count, snapshot.cut) for snapshot in snapshots])
+        self._resumption.note_no_step(slots.tolist())
+        self._submit_resets(slots, np.full(len(slots), AS_RESTORED), None, ticket.owner, now)
+        yield from self._await(ticket, now)
+        return self._settled(ticket, slots)
+
+    def _slots_for(
+        self, snapshots: Sequence[EnvSnapshot], env_ids: Sequence[str] | None
+    ) -> NDArray[np.intp]:
+        """The slots of `env_ids`, or else of the envs that the snapshots are of."""
+        if env_ids is None:
+            env_ids = [snapshot.env_id for snapshot in snapshots]
+        if len(env_ids) != len(snapshots):
+            raise SnapshotError(
+                f"the snapshot is of {len(snapshots)} envs, and is to go into {len(env_ids)}; name "
+                "as many in env_ids, in order; nothing was changed"
+            )
+        return self._dispatch.distinct(env_ids)
+
+    def _put_back(
+        self,
+        now: float,
+        slots: NDArray[np.intp],
+        snapshots: Sequence[EnvSnapshot],
+        before: Sequence[bytes],
+    ) -> Procedure[None]:
+        """Have all envs stand where their snapshots do; if any fails, where they stood before.
+
+        One that can't even go back there, and all if this is cancelled, begin anew.
+        """
+        standings = [(snapshot.standing, True) for snapshot in snapshots]
+        try:
+            yield from self._send_standings(now, slots, standings)
+        except EnvFault as fault:
+            failed = {one.env_id for one in (fault, *fault.others) if isinstance(one, WorkerDied)}
+            kept = [k for k, slot in enumerate(slots) if self.envs.env_ids[slot] not in failed]
+            back = [(before[k], False) for k in kept]
+            try:
+                yield from self._send_standings(now, slots[kept], back)
+            except EnvFault:
+                self._recovery.lose(slots[kept].tolist(), "could not be put back")
+            fault.add_note("nothing was restored: the other envs are where they were before")
+            raise
+        except BaseException:
+            self._recovery.lose(slots.tolist(), "was being restored when that was cancelled")
+            raise
+
+    def _send_standings(
+        self, now: float, slots: NDArray[np.intp], standings: Sequence[tuple[bytes, bool]]
+    ) -> Procedure[None]:
+        op = Operation.RESTORE
+        ticket = self._send_for_values(now, slots, op, "restore", standings, "its snapshot")
+        yield from self._await(ticket, now)
+        _values([ticket])
+
     # -- methods of envs --------------------------------------------------------------
 
     def call(self, now: float, slot: int, call: Call) -> Procedure[Any]:
@@ -576,16 +703,36 @@ class Core:
         self._calls.append(self._send_calls(now, slots, call))
 
     def _send_calls(self, now: float, slots: NDArray[np.intp], call: Call) -> Ticket:
-        name = call[0]
+        return self._send_for_values(
+            now,
+            slots,
+            Operation.CALL,
+            call[0],
+            [call] * len(slots),
+            f"the arguments of {call[0]}()",
+        )
+
+    def _send_for_values(
+        self,
+        now: float,
+        slots: NDArray[np.intp],
+        op: Operation,
+        name: str,
+        arguments: Sequence[Any],
+        what: str,
+    ) -> Ticket:
+        """Send what is answered by a value, with one of the `arguments`, called `what`, each."""
         self._intake.drain()
         self._dispatch.check_local(slots, f"call {name} of")
         self._dispatch.check_sendable(slots, f"call {name} of")
         packed = [
-            self._dispatch.packed(k, call, f"the arguments of {name}()") for k in slots.tolist()
+            self._dispatch.packed(slot, own, what)
+            for slot, own in zip(slots.tolist(), arguments, strict=True)
         ]
         ticket = self.requests.open_ticket(slots, method=name)
-        entries = self.requests.submit(slots, Operation.CALL, ticket.owner, now)
+        entries = self.requests.submit(slots, op, ticket.owner, now)
         self.auto.not_completed(slots)
+        self._resumption.note_no_step(slots.tolist())
         self._dispatch.hand_over(slots, entries, packed)
         return ticket
 

@@ -180,6 +180,15 @@ class Facade:
         """Local envs of the group."""
         return len(self._core.envs.local_ids)
 
+    @property
+    def metas(self) -> list[EnvMeta]:
+        """What `init` has returned.
+
+        Raises:
+            GroupClosed: the group was not initialised, or is closed.
+        """
+        return self._metas
+
     def get_observation_spaces(self) -> list[gym.Space[Any] | None]:
         """Observation space of each env, in the order of `env_ids`; None for an env_server.
 
@@ -325,6 +334,11 @@ class Facade:
             RuntimeError: contexts don't nest.
         """
         return AutoResetContext(self._core, max_episode_steps, on_done, mark_truncated)
+
+    @property
+    def resets_by_itself(self) -> bool:
+        """Whether an `auto_reset` context is open."""
+        return self._core.auto.active
 
     # -- what was measured --------------------------------------------------------
 

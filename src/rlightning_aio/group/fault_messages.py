@@ -78,15 +78,15 @@ def cause_of(record: HostRecord, death: Death, entries: NDArray[np.int64]) -> st
         error = record.rebuild_error
         return f"could not be rebuilt: {error.summary}"
     if record.late:
-        return f"did not start again within {record.config.start_timeout} s and was killed"
+        why = f" (it {death.cause})" if death.exit_code is None else ""
+        return f"did not start again within {record.config.start_timeout} s and was killed{why}"
     return death.cause
 
 
 def _doing(entry: int) -> str:
     op = op_of(entry)
-    return (
-        f"a {Operation(op).name.lower()}" if op in (Operation.STEP, Operation.RESET) else "a call"
-    )
+    named = (Operation.STEP, Operation.RESET, Operation.SNAPSHOT, Operation.RESTORE)
+    return f"a {Operation(op).name.lower()}" if op in named else "a call"
 
 
 def death_error(

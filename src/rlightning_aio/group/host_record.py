@@ -7,6 +7,7 @@ from enum import Enum, auto
 from typing import TYPE_CHECKING, Any
 
 from rlightning_aio.hosts.base import Killable
+from rlightning_aio.registry import placement_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -52,6 +53,7 @@ class HostRecord:
         idle: how far it had got when it was last seen to do nothing (`Supervisor._progress`).
         failure: makes the error for a caller that asks a host that was given up.
         killable: the host, if it can be ended by force.
+        is_local: its envs use this machine's cores.
         timed: any of its requests has a time limit, which the supervisor must watch.
     """
 
@@ -75,11 +77,13 @@ class HostRecord:
     failure: Callable[[], WorkerDied] | None = None
     killable: Killable | None = field(init=False)
     timed: bool = field(init=False)
+    is_local: bool = field(init=False)
 
     def __post_init__(self) -> None:
         limits = (self.config.step_timeout, self.config.reset_timeout)
         self.killable = self.host if isinstance(self.host, Killable) else None
         self.timed = self.killable is not None and limits != (None, None)
+        self.is_local = placement_of(self.config.backend, self.config.placement).local
 
     @property
     def slots(self) -> range:

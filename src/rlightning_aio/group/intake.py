@@ -27,11 +27,11 @@ from rlightning_aio.hosts.messages import (
     Raised,
     Reported,
     Result,
+    Saved,
     Value,
     Withdrawn,
 )
 from rlightning_aio.protocol.entries import Operation, answers_with_value
-from rlightning_aio.protocol.slab import NO_SEED
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from rlightning_aio.group.recovery import Recovery
     from rlightning_aio.group.requests import Requests
     from rlightning_aio.group.results import Results
+    from rlightning_aio.group.resumption import Resumption
     from rlightning_aio.group.slab_layout import SlabLayout
     from rlightning_aio.group.stats import Stats
     from rlightning_aio.group.supervisor import Supervisor
@@ -75,6 +76,7 @@ class Intake:
         dispatch: Dispatch,
         results: Results,
         recovery: Recovery,
+        resumption: Resumption,
         auto: AutoReset,
         stats: Stats,
     ) -> None:
@@ -87,6 +89,7 @@ class Intake:
         self._dispatch = dispatch
         self._results = results
         self._recovery = recovery
+        self._resumption = resumption
         self._auto = auto
         self._stats = stats
         self.held_back: dict[int, Joined] = {}
@@ -99,6 +102,7 @@ class Intake:
             Withdrawn: self._on_withdrawn,
             NewSchema: self._on_new_schema,
             Joined: self._on_joined,
+            Saved: self._on_saved,
             Died: self._on_died,
             **dict.fromkeys((Built, NotBuilt, Attached, Closed), supervisor.handle),
         }
@@ -199,6 +203,10 @@ class Intake:
         self._results.note_sent(self._requests.alone(slot), None)
         self._results.keep(slot, told.write() or {})
 
+    def _on_saved(self, told: Saved) -> None:
+        slot = self._supervisor.hosts[told.host_id].first_slot + told.env_index
+        self._resumption.note_saved(slot, told.standing, before=told.before)
+
     def _fail(
         self, slots: NDArray[np.intp], error_for: Callable[[NDArray[np.intp]], EnvFault]
     ) -> None:
@@ -211,6 +219,7 @@ class Intake:
         verdict = self._supervisor.bury(told)
         if isinstance(verdict, GivenUp):
             self._recovery.give_up(_slots_of_host(verdict.host))
+            self._resumption.forget(_slots_of_host(verdict.host))
             self._supervisor.note_recovery(any_telling=self._recovery.any_telling)
             self._fail(verdict.owed, verdict.error_for)
         elif verdict is not None:
@@ -234,8 +243,12 @@ class Intake:
         owed = owed[~calls]
         if len(owed):
             self._recovery.tell(owed)
+            stepped = self._requests.ops(owed) == int(Operation.STEP)
+            seeds, lost = self._resumption.seeds(owed, stepped)
+            for slot, num_steps in lost.items():
+                self._auto.rewind(slot, num_steps, owes=True)
             entries = self._requests.restart(owed)
-            self._layout.write_seeds(owed, np.full(len(owed), NO_SEED))
+            self._layout.write_seeds(owed, seeds)
             self._dispatch.hand_over(owed, entries)
 
     def _awaits_value(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
@@ -248,7 +261,7 @@ class Intake:
         for slot in slots.tolist():
             cause = self._recovery.told(slot)
             if cause is not None:
-                self._results.mark_restarted(slot, cause)
+                self._results.mark_restarted(slot, cause, self._resumption.told(slot))
             elif self._requests.op(slot) == Operation.STEP:
                 self._supervisor.note_step(slot)
         self._supervisor.note_recovery(any_telling=self._recovery.any_telling)

@@ -90,12 +90,20 @@ class Results:
         self._schemas[first_slot][number] = schema
         self._info_width = max(self._info_width, schema.size, 1)
 
-    def mark_restarted(self, slot: int, cause: str) -> None:
-        """Mark a result as the first of a replaced worker."""
+    def mark_restarted(self, slot: int, cause: str, steps_lost: int | None) -> None:
+        """Mark a result as the first of a replaced worker.
+
+        Args:
+            slot: of the env.
+            cause: of its worker's end.
+            steps_lost: where the env goes on with its episode.
+        """
         self.detach_info(slot)
         found = self._out_of_band.get(slot)
         if isinstance(found, dict):
             found["info"]["worker_restarted"] = cause
+            if steps_lost is not None:
+                found["info"]["worker_resumed"] = steps_lost
         self.mark_lost(slot)
 
     def mark_lost(self, slot: int) -> None:

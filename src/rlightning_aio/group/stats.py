@@ -37,8 +37,8 @@ class _Sample:
 
     Attributes:
         batch: number of the batch.
-        num_steps: env steps that each result stands for; None where none is a reset, so that
-            each stands for ``num_envs`` of them.
+        num_envs: sub-environments of each result.
+        resets: which of them were reset; None where none was.
     """
 
     batch: int
@@ -47,14 +47,14 @@ class _Sample:
     sent_ns: NDArray[np.int64]
     times: NDArray[np.int64]
     num_envs: int
-    num_steps: NDArray[np.int64] | None
+    resets: NDArray[np.bool_] | None
     synchronous: bool
 
     def steps(self) -> NDArray[np.int64]:
         """Env steps that each result stands for: ``[n]``."""
-        if self.num_steps is None:
+        if self.resets is None:
             return np.full(len(self.slots), self.num_envs)
-        return self.num_steps
+        return self.num_envs - self.resets.reshape(len(self.slots), -1).sum(axis=1)
 
 
 @dataclass(slots=True)
@@ -119,9 +119,7 @@ class Stats:
         for part in parts:
             slots, resets = part.slots, part.is_reset
             num_envs = resets.shape[1] if resets.ndim > 1 else 1
-            num_steps = None
-            if np.count_nonzero(resets):
-                num_steps = num_envs - np.count_nonzero(resets.reshape(len(part), -1), axis=1)
+            any_flagged = part.episode_return is not None
             self._samples.append(
                 _Sample(
                     self._batches,
@@ -130,7 +128,7 @@ class Stats:
                     sent_ns[slots],
                     part.times,
                     num_envs,
-                    num_steps,
+                    resets.copy() if any_flagged else None,
                     synchronous,
                 )
             )
@@ -141,27 +139,49 @@ class Stats:
         self, part: ResultColumns, returns: NDArray[np.float64], lengths: NDArray[np.int64]
     ) -> None:
         ended = part.done & (lengths > 0)
-        rows = np.flatnonzero(ended if ended.ndim == 1 else ended.reshape(len(part), -1).any(1))
-        if not len(rows):
+        if part.restarted is not None:
+            ended[part.restarted] = False
+        if not np.count_nonzero(ended):
             return
-        slots = part.slots[rows]
         if ended.ndim == 1:
-            outcomes = np.ones((len(rows), 3))
-            outcomes[:, 1], outcomes[:, 2] = returns[rows], lengths[rows]
+            rows = ended.nonzero()[0]
+            slots = part.slots[rows]
+            outcomes = np.empty((len(rows), 3))
+            outcomes[:, 0], outcomes[:, 1], outcomes[:, 2] = 1, returns[rows], lengths[rows]
             self._sums[slots] += outcomes
             self._last[slots] = outcomes[:, 1:]
         else:
-            for slot, row in zip(slots.tolist(), rows.tolist(), strict=True):
-                # Several sub-environments or agents may end in one result.
-                mask = ended[row]
-                own_returns, own_lengths = returns[row][mask], lengths[row][mask]
-                self._sums[slot] += (len(own_returns), own_returns.sum(), own_lengths.sum())
-                self._last[slot] = own_returns[-1], own_lengths[-1]
+            rows = self._note_several(part.slots, ended, returns, lengths)
+            slots = part.slots[rows]
         if part.info_marks is not None or part.out_of_band:
             for slot, row in zip(slots.tolist(), rows.tolist(), strict=True):
                 if part.may_hold(row, _VERDICTS):
                     with suppress(Exception):  # It may hold anything; its reader learns.
                         self._note_verdicts(slot, part.info_of(row), ended[row])
+
+    def _note_several(
+        self,
+        slots: NDArray[np.intp],
+        ended: NDArray[np.bool_],
+        returns: NDArray[np.float64],
+        lengths: NDArray[np.int64],
+    ) -> NDArray[np.intp]:
+        """Count episodes of sub-environments or agents, of which several may end in one result.
+
+        Returns the rows in which any has ended.
+        """
+        flat = np.flatnonzero(ended)
+        owners = flat // (ended.size // len(ended))
+        own_returns, own_lengths = returns.reshape(-1)[flat], lengths.reshape(-1)[flat]
+        # Where each row's begin among those that have ended.
+        begins = np.flatnonzero(np.diff(owners, prepend=-1))
+        rows, counts = owners[begins], np.diff(begins, append=len(flat))
+        chosen, ends = slots[rows], begins + counts - 1
+        self._sums[chosen, 0] += counts
+        self._sums[chosen, 1] += np.add.reduceat(own_returns, begins)
+        self._sums[chosen, 2] += np.add.reduceat(own_lengths, begins)
+        self._last[chosen, 0], self._last[chosen, 1] = own_returns[ends], own_lengths[ends]
+        return rows
 
     def _note_verdicts(self, slot: int, info: dict[str, Any], ended: NDArray[np.bool_]) -> None:
         """Count what the env says of the episodes that have `ended`."""

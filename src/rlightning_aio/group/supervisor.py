@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.group.env_table import EnvTable
     from rlightning_aio.group.requests import Requests
+    from rlightning_aio.group.resumption import Resumption
     from rlightning_aio.group.slab_layout import SlabLayout
     from rlightning_aio.hosts.arena import Arena
     from rlightning_aio.hosts.base import Host, Shared
@@ -119,6 +120,7 @@ class Supervisor:
 
     Args:
         envs: names them in messages; requests: what they owe; layout: where they write.
+        resumption: where envs of a replacement are to stand.
         arena: of the group.
         tell: takes the death of a replacement that could not be started; `bury` has the rest.
         num_cores: cores that this process and its workers may use.
@@ -126,6 +128,7 @@ class Supervisor:
 
     Attributes:
         metas: one for each local env, and for each env_server; empty before the start.
+        has_members: envs may come and go.
         timed: some requests have a time limit.
         recovering: some worker was replaced and has not shown yet that it works.
         close_errors: of envs' `close`, with their ids.
@@ -138,6 +141,7 @@ class Supervisor:
         envs: EnvTable,
         requests: Requests,
         layout: SlabLayout,
+        resumption: Resumption,
         arena: Arena,
         tell: Callable[[Died], object],
         *,
@@ -155,12 +159,14 @@ class Supervisor:
         self._envs = envs
         self._requests = requests
         self._layout = layout
+        self._resumption = resumption
         self._arena = arena
         self._tell = tell
         self._clock = clock
         self._mixed_actions = mixed_actions
         self._num_cores = num_cores
         self._records: list[HostRecord] = []
+        self.has_members = False
         self._env_servers: list[tuple[Host, Membership]] = []
         self._start_fault: Exception | None = None
         self._now = 0.0
@@ -176,6 +182,7 @@ class Supervisor:
         self.timed = self.timed or self._records[-1].timed
         if isinstance(host, Membership):
             self._env_servers.append((host, host))
+            self.has_members = True
 
     # -- start --------------------------------------------------------------------
 
@@ -347,11 +354,6 @@ class Supervisor:
         else:
             held.append((entries, arguments))
 
-    @property
-    def has_members(self) -> bool:
-        """Whether envs may come and go."""
-        return bool(self._env_servers)
-
     def env_server(self, server_id: str) -> tuple[Host, Membership] | None:
         """The env_server of that id, if there is one."""
         return next((pair for pair in self._env_servers if pair[1].server_id == server_id), None)
@@ -393,7 +395,11 @@ class Supervisor:
 
     def give_hint(self, latency_us: Mapping[str, Mapping[str, Any]]) -> None:
         """Log, at INFO, what the measured times say of the group's settings."""
-        workers = Counter(r.config.name for r in self._records if r.killable is not None)
+        workers = Counter(
+            record.config.name
+            for record in self._records
+            if record.killable is not None and record.is_local
+        )
         configs = [record.config for record in self._records]
         text = hint(configs, workers, self._num_cores, latency_us)
         if text is not None:
@@ -512,6 +518,7 @@ class Supervisor:
             self._fail_start(start_fault(self._envs, record, death))
             return None
         owed = self._requests.owed(np.array(record.slots, np.intp))
+        self._resumption.settle(record.slots)
         was_up = record.stage is Stage.UP
         error_for, cause, is_last = self._judge(record, death, owed)
         if is_last:
@@ -546,7 +553,8 @@ class Supervisor:
             self._tell(Died(record.host.host_id, Death(cause)))
             return
         assert record.order is not None
-        record.host.attach(record.order)
+        standings = self._resumption.standings(record.slots)
+        record.host.attach(replace(record.order, standings=standings))
 
     def _judge(
         self, record: HostRecord, death: Death, owed: NDArray[np.intp]

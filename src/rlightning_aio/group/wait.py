@@ -30,5 +30,8 @@ Before it goes on, its driver has the core take in what hosts have told (`Core.d
 
 def earliest(*times: float | None) -> float | None:
     """The first of the times that are known."""
-    known = [time for time in times if time is not None]
-    return min(known) if known else None
+    first = None
+    for time in times:
+        if time is not None and (first is None or time < first):
+            first = time
+    return first

@@ -6,6 +6,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from rlightning_aio.hosts.runner import EnvRunner
+from rlightning_aio.hosts.saving import SavingRunner
 from rlightning_aio.registry import ENVS
 
 if TYPE_CHECKING:
@@ -42,4 +43,7 @@ def built_envs(order: StartOrder, *, inline: bool = False) -> Iterator[EnvRunner
             config = config.model_copy(update={"make_env": makers[place]})
         env = build_env(config, order.env_class, index, fn)
         env.trainer_pid = None if inline else order.trainer_pid
-        yield EnvRunner(env, inline=inline)
+        if config.snapshot_every is None:
+            yield EnvRunner(env, inline=inline)
+        else:
+            yield SavingRunner(env, config.snapshot_every, inline=inline)

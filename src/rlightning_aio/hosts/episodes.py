@@ -82,16 +82,23 @@ class EpisodeSums:
         self, reward: NDArray[np.float64], ended: NDArray[np.bool_] | None, which: Which
     ) -> NDArray[np.bool_] | None:
         over = self.over[which].copy()
-        if ended is None:
-            ended = np.zeros_like(over)
-        if self._autoreset == "same_step":
+        # A few of many, as a rule, or none.
+        chosen = over if which is ... else which[over]
+        same_step, next_step = self._autoreset == "same_step", self._autoreset == "next_step"
+        some = self._any_over and np.count_nonzero(over) > 0
+        if same_step and some:
             # What is over has begun anew already.
-            self.returns[which] = np.where(over, 0.0, self.returns[which]) + reward
-            self.lengths[which] = np.where(over, 0, self.lengths[which]) + 1
-            self.over[which] = ended
+            self.returns[chosen] = self.lengths[chosen] = 0
+        self.returns[which] += reward
+        self.lengths[which] += 1
+        if some and not same_step:
+            self.returns[chosen] = self.lengths[chosen] = 0
+        if ended is None:
+            now = np.zeros_like(over) if same_step or next_step else over
+        elif same_step:
+            now = ended
         else:
-            self.returns[which] = np.where(over, 0.0, self.returns[which] + reward)
-            self.lengths[which] = np.where(over, 0, self.lengths[which] + 1)
-            self.over[which] = (ended & ~over) if self._autoreset == "next_step" else over | ended
-        self._any_over = bool(self.over.any())
-        return over if self._autoreset == "next_step" and over.any() else None
+            now = ended & ~over if next_step else over | ended
+        self.over[which] = now
+        self._any_over = np.count_nonzero(self.over) > 0
+        return over if next_step and some else None

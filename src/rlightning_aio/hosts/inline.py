@@ -26,9 +26,10 @@ from rlightning_aio.hosts.messages import (
     Raised,
     Reported,
     Result,
+    Saved,
     Value,
 )
-from rlightning_aio.hosts.runner import placed
+from rlightning_aio.hosts.runner import attach_all
 from rlightning_aio.protocol.entries import Operation, answers_with_value, op_of, slot_of
 from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
 
@@ -81,12 +82,14 @@ class InlineHost:
     def attach(self, order: AttachOrder) -> None:
         """See `base.Host.attach`."""
         map_part = partial(map_shared, self._arena.descriptor)
-        for runner, slab, row in placed(self._runners, order, map_part):
-            runner.attach(slab, row, self._schemas.announce)
+        attach_all(self._runners, order, map_part, self._schemas.announce, self._keep)
         self._tell(Attached(self.host_id))
 
     def _announce(self, number: int, schema: InfoSchema) -> None:
         self._tell(NewSchema(self.host_id, number, schema))
+
+    def _keep(self, index: int, standing: bytes, before: bool) -> None:
+        self._tell(Saved(self.host_id, index, standing, before))
 
     def packed(self, arguments: Any) -> Any:
         """See `base.Host.packed`."""

@@ -19,6 +19,7 @@ from rlightning_aio.hosts.messages import (
     Raised,
     Reported,
     Result,
+    Saved,
     Value,
 )
 from rlightning_aio.protocol.frames import BELL, CHUNK_BYTES, Frame, FrameKind, FrameReader, encode
@@ -136,9 +137,10 @@ class Link:
     # -- replies ------------------------------------------------------------------
 
     def on_readable(self) -> None:
-        """See `base.Source.on_readable`."""
+        """See `base.Source.on_readable`. Who waits for reports polls for them, of all workers
+        at once.
+        """
         self.read_channel()
-        self.poll()
 
     def poll(self) -> None:
         """See `base.Polled.poll`."""
@@ -174,6 +176,8 @@ class Link:
         host_id, tell = self._host_id, self._completions.append
         if kind == FrameKind.RESULT:
             tell(Result(host_id, number, payload))
+        elif kind == FrameKind.SAVED:
+            tell(Saved(host_id, number >> 1, payload, bool(number & 1)))
         elif kind == FrameKind.INFO_SCHEMA:
             tell(NewSchema(host_id, number, pickle.loads(payload)))
         elif kind == FrameKind.ERROR:

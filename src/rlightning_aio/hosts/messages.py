@@ -48,6 +48,7 @@ __all__ = [
     "Raised",
     "Reported",
     "Result",
+    "Saved",
     "StartOrder",
     "Value",
     "Withdrawn",
@@ -76,7 +77,7 @@ class StartOrder:
         preprocess_fns: one for each of them; None for the default.
         spins: whether waiting may burn a core for some microseconds.
         core: the core to stay on; None for any.
-        trainer_pid: the process that gives the order.
+        trainer_pid: the process that gives the order; None where it runs on another machine.
     """
 
     config: EnvConfig
@@ -85,7 +86,7 @@ class StartOrder:
     preprocess_fns: tuple[Any, ...]
     spins: bool
     core: int | None
-    trainer_pid: int = field(default_factory=os.getpid)
+    trainer_pid: int | None = field(default_factory=os.getpid)
 
 
 @dataclass(frozen=True)
@@ -95,10 +96,13 @@ class AttachOrder:
     Attributes:
         slabs: offset in the arena and number of rows of each slab of the group.
         rows: for each env which slab and which row of it.
+        standings: where envs of a replacement are to stand, see `Saved`; None for one that
+            begins anew. Empty where all do.
     """
 
     slabs: tuple[tuple[int, int], ...]
     rows: tuple[tuple[int, int], ...]
+    standings: tuple[bytes | None, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -238,6 +242,20 @@ class NewSchema(NamedTuple):
     schema: InfoSchema
 
 
+class Saved(NamedTuple):
+    """An env has given its standing away: its state, and what it shows.
+
+    Attributes:
+        standing: a pickle that none but a worker reads.
+        before: it is from before the request that is being executed, and not from after.
+    """
+
+    host_id: int
+    env_index: int
+    standing: bytes
+    before: bool
+
+
 class Reported(NamedTuple):
     """These requests to one host are done, and their results lie in the rows."""
 
@@ -309,7 +327,7 @@ class Joined(NamedTuple):
 
 Completion: TypeAlias = (
     Built | NotBuilt | Attached | Died | Closed | NewSchema
-    | Reported | Result | Value | Raised | Failed | Withdrawn | Joined
+    | Saved | Reported | Result | Value | Raised | Failed | Withdrawn | Joined
 )  # fmt: skip
 Completions: TypeAlias = deque[Completion]
 """A group's queue: every host appends, the core takes out."""

@@ -49,6 +49,9 @@ class RowWriter:
     Attributes:
         write_observation: into the row; None where observations don't travel there.
         write_info: into the row; returns its mark (see `protocol.info`).
+        read_info: what it wrote last, given that mark.
+        out_of_band: what was last returned as such.
+        shows_some: results come from some of the sub-environments at a time.
     """
 
     def __init__(
@@ -72,12 +75,15 @@ class RowWriter:
             self.write_observation = row_writer(
                 layout.observation_space, slab.observation, row, "observation"
             )
-        self.write_info = InfoWriter(memoryview(slab.info[row]), announce).write
+        infos = InfoWriter(memoryview(slab.info[row]), announce)
+        self.write_info, self.read_info = infos.write, infos.read
+        self.out_of_band: OutOfBand = {}
         # With an ellipsis an entry of a plain column is a view, too.
         self._reward, self._flags = slab.reward[row, ...], slab.flags[row, ...]
         self._terminated, self._truncated = slab.terminated[row, ...], slab.truncated[row, ...]
         self._is_reset = slab.is_reset[row, ...]
         self._turns = turns
+        self.shows_some = turns > 0
         self._sums = _sums(slab, row, autoreset, turns)
 
     def begin_episode(self, info: Mapping[str, Any]) -> None:
@@ -180,11 +186,14 @@ class RowWriter:
     def handed_over(self, observation: Any, info: dict[str, Any]) -> OutOfBand:
         """What the row would only copy."""
         space = self._slab.layout.observation_space
-        return {"observation": fitted_tree(space, observation, "observation"), "info": info}
+        observation = fitted_tree(space, observation, "observation")
+        self.out_of_band = {"observation": observation, "info": info}
+        return self.out_of_band
 
     def kept(self, out_of_band: OutOfBand) -> OutOfBand:
         """`out_of_band` as the trainer may keep it; pickling copies what leaves the process."""
-        return copied(out_of_band) if self._copies else out_of_band
+        self.out_of_band = copied(out_of_band) if self._copies else out_of_band
+        return self.out_of_band
 
 
 def _sums(slab: Slab, row: int, autoreset: Autoreset, turns: int) -> EpisodeSums:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from functools import partial
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
 
 from rlightning_aio.envs.results import (
     has_preprocess_fn,
@@ -18,9 +18,11 @@ from rlightning_aio.envs.results import (
     reads_extras,
     step_of,
 )
+from rlightning_aio.envs.state import versions_of
 from rlightning_aio.envs.tensors import as_numpy, holds_tensor
 from rlightning_aio.hosts.messages import NO_ACTION, EnvStarted, OutOfBand
 from rlightning_aio.hosts.row_writer import RowWriter
+from rlightning_aio.hosts.shown import packed_standing, show, shown_in, standing_of
 from rlightning_aio.protocol.columns import leaves, row_reader
 from rlightning_aio.protocol.entries import Operation
 from rlightning_aio.protocol.info import NO_INFO, PICKLED, InfoSchema
@@ -33,12 +35,15 @@ if TYPE_CHECKING:
 
     from rlightning_aio.envs.base import BareReset, BareResult, BareStep, BaseEnv
     from rlightning_aio.hosts.messages import AttachOrder
+    from rlightning_aio.hosts.shown import Shown
     from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet
 
-__all__ = ["EnvRunner", "Execute", "placed"]
+__all__ = ["EnvRunner", "Execute", "attach_all", "placed", "resume_all"]
 
 Execute: TypeAlias = "Callable[[], OutOfBand | None]"
 """Executes a step or a reset; returns what of its result is out of band."""
+Keep: TypeAlias = "Callable[[bytes, bool], None]"
+"""Takes a standing, and whether it is from before the request that is being executed."""
 _Take: TypeAlias = "Callable[[], Any]"
 """Gives what one step is taken with."""
 
@@ -73,6 +78,12 @@ class EnvRunner:
         self._input = input_of(env)
         self.begin_step: Callable[[], Execute] | None = None
         self.reset_from_row: Execute = self._not_attached
+        self._own_reset: Execute = self._not_attached
+        self._keep: Keep = _nobody_keeps
+        # It has a result; what it is to show of what was put back.
+        self._began = False
+        self._restored: Shown | None = None
+        self._whole: Any = None
 
     def started(self) -> EnvStarted:
         """What a trainer is told of the env."""
@@ -125,7 +136,8 @@ class EnvRunner:
         # Where there is a short way, it and the writer tell each other what they have written.
         self._before_writing: Callable[[], None] = _nothing
         self._after_writing: Callable[[], None] = _nothing
-        self.reset_from_row = self._reset_from_row
+        self._own_reset = self._reset_from_row
+        self.reset_from_row = self._first_reset
         self.step = self._step_taking = self._stepper(layout)
 
     def execute(self, op: int, arguments: Any) -> Any:
@@ -137,7 +149,56 @@ class EnvRunner:
             return self._call(*arguments)
         if op == Operation.RESET:
             return self._reset(*arguments)
+        if op == Operation.SNAPSHOT:
+            return versions_of(self.env), self._began, self.standing()
+        if op == Operation.RESTORE:
+            return self._restore(*arguments)
         return self._step_with(*arguments)
+
+    # -- standings ----------------------------------------------------------------
+
+    def standing(self) -> bytes:
+        """The env's state, and what it shows."""
+        if self._writer.shows_some:
+            raise NotImplementedError(
+                f"env {self.env.env_id!r} gives results of some sub-environments at a time; there "
+                "is no moment at which all of them stand still"
+            )
+        shown = self._restored
+        if shown is None and self._began:
+            shown = shown_in(self._slab, self._row, self._writer, self._whole)
+        return packed_standing(self.env.save_state(), shown)
+
+    def _restore(self, standing: bytes, shows: bool) -> None:
+        """Put the env where it stood; if it `shows` that, by the next reset `AS_RESTORED`."""
+        state, shown = standing_of(standing)
+        self.env.load_state(state)
+        if shows and shown is not None:
+            self._began, self._restored = True, shown
+            self.reset_from_row = self._show_restored
+
+    def resume(self, standing: bytes) -> None:
+        """Stand where the env of a worker that was replaced stood."""
+        try:
+            self._restore(standing, True)
+        except ValueError:
+            # Some parts of it may come with its first reset alone.
+            self.env.reset()
+            self._restore(standing, True)
+
+    def _show_restored(self) -> OutOfBand | None:
+        shown, self._restored = self._restored, None
+        self.reset_from_row = self._own_reset
+        if shown is None or not self._slab.take_as_restored(self._row):
+            return self._own_reset()
+        self._whole = shown.whole
+        out_of_band = show(shown, self._slab, self._row, self._writer, time.monotonic_ns())
+        self._after_writing()
+        return out_of_band
+
+    def keep_with(self, keep: Keep) -> None:
+        """Have the env's standings given to `keep`, if it gives any away by itself."""
+        self._keep = keep
 
     def _call(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """Call a method of the env, or of what it wraps, from the outside in."""
@@ -219,7 +280,7 @@ class EnvRunner:
             resets_itself=self.meta.autoreset == "same_step",
         )
         if bare_reset is not None:
-            self.reset_from_row = reset
+            self._own_reset = reset
         return step
 
     def _bare_store(self, layout: RowLayout) -> Callable[[BareResult, int], OutOfBand | None]:
@@ -252,11 +313,18 @@ class EnvRunner:
 
     # -- resets -------------------------------------------------------------------
 
+    def _first_reset(self) -> OutOfBand | None:
+        outcome = self._own_reset()
+        self._began, self.reset_from_row = True, self._own_reset
+        return outcome
+
     def _reset(self, seed: int | None, options: dict[str, Any] | None) -> OutOfBand | None:
         """Start a new episode."""
+        self._restored = None
         began = time.monotonic_ns()
         returned = self.env.reset(seed=seed, options=options)
         busy_ns = time.monotonic_ns() - began
+        self._began = True
         return self._store(one_result(self.env, "reset", returned), busy_ns, stepped=False)
 
     def _reset_from_row(self) -> OutOfBand | None:
@@ -278,22 +346,27 @@ class EnvRunner:
             writer.begin_episode(result.info)
         self._after_writing()
         observation = result.observation
+        self._whole = None
         if holds_tensor(observation):
             if self._inline:
+                self._whole = result
                 return {"ret": result}
             observation = as_numpy(observation)
         return writer.write_data(observation, result.info, result._extra)  # pyright: ignore[reportPrivateUsage]
 
 
+_Placed = TypeVar("_Placed", "EnvRunner", "EnvStarted")
+
+
 def placed(
-    runners: Sequence[EnvRunner],
+    runners: Sequence[_Placed],
     order: AttachOrder,
     map_part: Callable[[int, int], memoryview],
-) -> Iterator[tuple[EnvRunner, Slab, int]]:
+) -> Iterator[tuple[_Placed, Slab, int]]:
     """Each env of a host with the slab and the row that it is given.
 
     Args:
-        runners: of the host's envs.
+        runners: of the host's envs, or what is known of these where they live elsewhere.
         order: of the group.
         map_part: maps a part of the arena, given its offset and size.
     """
@@ -303,6 +376,39 @@ def placed(
             (offset, rows), layout = order.slabs[slab_index], runner.layout
             slabs[slab_index] = Slab(layout, map_part(offset, layout.size(rows)), rows)
         yield runner, slabs[slab_index], row
+
+
+def attach_all(
+    runners: Sequence[EnvRunner],
+    order: AttachOrder,
+    map_part: Callable[[int, int], memoryview],
+    announce: Callable[[InfoSchema], int],
+    keep: Callable[[int, bytes, bool], None],
+) -> None:
+    """Give each env of a host the row for its results, and have it stand where it is to.
+
+    Args:
+        runners: of the host's envs.
+        order: of the group.
+        map_part: maps a part of the arena, given its offset and size.
+        announce: tells the trainer of a new way in which infos lie in rows.
+        keep: tells the trainer of a standing: the env's index, and as of `messages.Saved`.
+    """
+    for index, (runner, slab, row) in enumerate(placed(runners, order, map_part)):
+        runner.attach(slab, row, announce)
+        runner.keep_with(partial(keep, index))
+    resume_all(runners, order.standings)
+
+
+def resume_all(runners: Sequence[EnvRunner], standings: Sequence[bytes | None]) -> None:
+    """Have the envs of a replacement stand where they were kept, as far as they were."""
+    for runner, standing in zip(runners, standings, strict=False):
+        if standing is not None:
+            runner.resume(standing)
+
+
+def _nobody_keeps(standing: bytes, before: bool) -> None:
+    del standing, before
 
 
 def _nothing() -> None: ...

@@ -21,7 +21,7 @@ from rlightning_aio.hosts.arena import make_private, map_shared
 from rlightning_aio.hosts.build_env import built_envs
 from rlightning_aio.hosts.messages import ErrorText
 from rlightning_aio.hosts.pickling import dumped, dumped_with_code
-from rlightning_aio.hosts.runner import placed
+from rlightning_aio.hosts.runner import attach_all
 from rlightning_aio.hosts.spinner import Spinner
 from rlightning_aio.protocol.bell import WorkerBell, bell_size
 from rlightning_aio.protocol.entries import (
@@ -223,8 +223,8 @@ class Worker:
     def _attach(self, frame: Frame) -> None:
         """Map the slabs; the arena's descriptor was inherited for this."""
         order: AttachOrder = pickle.loads(frame.payload)
-        for runner, slab, row in placed(self._runners, order, self._map_part):
-            runner.attach(slab, row, self._schemas.announce)
+        announce = self._schemas.announce
+        attach_all(self._runners, order, self._map_part, announce, self._send_standing)
         self._steps = [runner.step for runner in self._runners]
         os.close(self._arena)
         self._attached = True
@@ -300,6 +300,9 @@ class Worker:
 
     def _send_error(self, request: int, error: BaseException) -> None:
         self._send(FrameKind.ERROR, request, pickle.dumps(ErrorText.of(error)))
+
+    def _send_standing(self, index: int, standing: bytes, before: bool) -> None:
+        self._send(FrameKind.SAVED, index << 1 | before, standing)
 
     def _send_schema(self, number: int, schema: InfoSchema) -> None:
         self._send(FrameKind.INFO_SCHEMA, number, pickle.dumps(schema))

@@ -36,8 +36,13 @@ class Operation(IntEnum):
     """Of a method; its value is the reply, and no result."""
     JOIN = 4
     """Asked for by nobody: the first result of an env that comes by itself."""
+    SNAPSHOT = 5
+    """Its value is the env's state."""
+    RESTORE = 6
+    """Puts a state back, and shows nothing of it; a reset `AS_RESTORED` does."""
 
 
+_WITH_VALUE: Final = (Operation.CALL, Operation.SNAPSHOT, Operation.RESTORE)
 OP_BITS: Final = 8
 SLOT_BITS: Final = 20
 NUMBER_SHIFT: Final = OP_BITS + SLOT_BITS
@@ -52,7 +57,7 @@ def entry(number: int, slot: int, op: int) -> int:
 
 def answers_with_value(op: int) -> bool:
     """Whether the reply to an operation is a value of its own, and no result in a row."""
-    return op == Operation.CALL
+    return op in _WITH_VALUE
 
 
 def number_of(entry: int) -> int:

@@ -33,6 +33,7 @@ class FrameKind(IntEnum):
     INFO_SCHEMA = 10  # worker; its number: a new way in which rows hold infos
     CLOSE = 11  # trainer
     CLOSED = 12  # worker: errors of close(), by env
+    SAVED = 13  # worker; index of an env, and whether from before its request: where it stands
 
 
 class Frame(NamedTuple):

@@ -16,11 +16,20 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Container
 
     from numpy.typing import NDArray
 
-__all__ = ["INFO_BYTES", "INFO_BYTES_OF_SUB_ENV", "NO_INFO", "PICKLED", "InfoSchema", "InfoWriter"]
+__all__ = [
+    "INFO_BYTES",
+    "INFO_BYTES_OF_SUB_ENV",
+    "NO_INFO",
+    "PICKLED",
+    "InfoSchema",
+    "InfoWriter",
+    "has_mask",
+    "is_mask",
+]
 
 INFO_BYTES: Final = 512
 """Of a row; with sub-environments at least."""
@@ -29,6 +38,8 @@ NO_INFO: Final = 0
 PICKLED: Final = 255
 """Row marks: 0 no info, 1 to 254 the number of a schema, 255 the info is out of band."""
 
+_AS_OBJECTS: Final = np.bool_
+"""A kind of number of which Gymnasium makes no typed array."""
 _MAX_SCHEMAS: Final = 254
 
 _SCALARS: Final[dict[type, str]] = {
@@ -41,6 +52,16 @@ _SCALARS: Final[dict[type, str]] = {
     bool: "?",
     np.bool_: "?",
 }
+
+
+def is_mask(key: str, info: Container[str]) -> bool:
+    """Whether a vector environment tells by `key` which sub-environments have another one."""
+    return key.startswith("_") and key[1:] in info
+
+
+def has_mask(key: str, info: Container[str]) -> bool:
+    """Whether `key` needs none made: it has one among the infos, or is one."""
+    return f"_{key}" in info or is_mask(key, info)
 
 
 @dataclass(frozen=True)
@@ -93,6 +114,20 @@ class InfoSchema:
             ]
         )
 
+    @cached_property
+    def is_typed(self) -> bool:
+        """Whether Gymnasium makes typed arrays of all values, one column for each key."""
+        return (
+            _AS_OBJECTS not in self.types
+            and "final_obs" not in self.keys
+            and not any(array is not None and 0 in array[0] for array in self.arrays)
+        )
+
+    @cached_property
+    def without_mask(self) -> tuple[str, ...]:
+        """Keys that are no mask, and have none among the others."""
+        return tuple(key for key in self.keys if not has_mask(key, self.keys))
+
     def fields(self, rows: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
         """What ``rows [n, bytes]`` hold, one column for each key; views of a copy."""
         values = np.ascontiguousarray(rows[:, : self.size]).view(self._dtype)[:, 0]
@@ -143,6 +178,7 @@ class InfoWriter:
         self._types: list[type] = []
         self._arrays: list[tuple[int, tuple[int, ...], np.dtype[Any]]] = []
         self._number = PICKLED
+        self._schema: InfoSchema | None = None
         self._pack: Callable[..., None] = struct.Struct("").pack_into
 
     def write(self, info: dict[str, Any]) -> int:
@@ -161,6 +197,12 @@ class InfoWriter:
             return PICKLED
         return self._number
 
+    def read(self, mark: int) -> dict[str, Any]:
+        """The info that was written last, with its mark; empty if it isn't in the row."""
+        if mark in (NO_INFO, PICKLED) or self._schema is None:
+            return {}
+        return self._schema.decode(self._row)
+
     def _write_arrays(self, info: dict[str, Any]) -> int:
         values = list(info.values())
         for position, shape, dtype in self._arrays:
@@ -178,6 +220,7 @@ class InfoWriter:
         schema = InfoSchema.of(info)
         if schema is not None and schema.size > len(self._row):
             schema = None
+        self._schema = schema
         self._number = PICKLED if schema is None else self._announce(schema)
         if schema is not None:
             self._pack = struct.Struct(schema.format).pack_into

@@ -24,9 +24,20 @@ if TYPE_CHECKING:
     import gymnasium as gym
     from numpy.typing import NDArray
 
-__all__ = ["IS_RESET", "NO_SEED", "OVER", "TERMINATED", "TRUNCATED", "RowLayout", "Slab"]
+__all__ = [
+    "AS_RESTORED",
+    "IS_RESET",
+    "NO_SEED",
+    "OVER",
+    "TERMINATED",
+    "TRUNCATED",
+    "RowLayout",
+    "Slab",
+]
 
 NO_SEED: Final = -1
+AS_RESTORED: Final = -2
+"""In place of a seed: no new episode; the env shows where it was put back to."""
 TERMINATED: Final = 0
 TRUNCATED: Final = 1
 IS_RESET: Final = 2
@@ -121,7 +132,8 @@ class Slab:
             of the episode that is under way or ends here, this step included; length 0 where
             the step belongs to none.
         info_mark: ``[rows]`` uint8, see `info`; info: ``[rows, bytes]`` uint8.
-        seed: ``[rows]`` int64, of the reset that was sent, plus 1; 0 for none.
+        seed: ``[rows]`` int64, of the reset that was sent, plus 1; 0 for none (see
+            `AS_RESTORED`).
         times: ``[rows, 2]`` int64; its halves are done_ns, the monotonic time at which the
             reply was ready, and busy_ns, the time that the env itself took.
         sent_ns: ``[rows]`` int64, ns since the epoch by the env's own clock, where that is
@@ -152,6 +164,13 @@ class Slab:
         self.done_ns, self.busy_ns = self.times[:, 0], self.times[:, 1]
         self.info = next(arrays)
         self.sent_ns: NDArray[np.int64] | None = None
+
+    def take_as_restored(self, row: int) -> bool:
+        """Whether `AS_RESTORED` was sent to `row`; it is good for one reset alone."""
+        asked = bool(self.seed[row] == AS_RESTORED + 1)
+        if asked:
+            self.seed[row] = 0
+        return asked
 
     def take_seed(self, row: int) -> int | None:
         """The seed of the reset that was sent to `row`; it is good for that one alone."""

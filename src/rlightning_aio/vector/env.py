@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING, Any, Final, cast
 import gymnasium as gym
 import numpy as np
 from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
-from gymnasium.spaces.utils import is_space_dtype_shape_equiv
 from gymnasium.vector import AutoresetMode, utils
 
 from rlightning_aio.batch import BatchedData
-from rlightning_aio.batch.data import reported_infos
-from rlightning_aio.envs.same_step import SameStepOf
+from rlightning_aio.envs.sub_envs import adapted
 from rlightning_aio.group.auto_reset import as_int
 from rlightning_aio.protocol.columns import leaves
 from rlightning_aio.sync import EnvGroup, build_env_group
 from rlightning_aio.types import PolicyResponse
 from rlightning_aio.vector.batching import batched, merged, spread
 from rlightning_aio.vector.leftovers import drop_outstanding
+from rlightning_aio.vector.rows import rows_of
+from rlightning_aio.vector.spaces import adopted_spaces
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from rlightning_aio.types import EnvMeta
 
-__all__ = ["VectorEnv"]
+__all__ = ["VectorEnv", "per_worker"]
 
 _NO_LIMIT: Final = 1 << 61
 """Step limits are the envs' own business here."""
@@ -41,8 +41,9 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
     """Envs in worker processes behind Gymnasium's vector interface.
 
     Args:
-        env_fns: one callable for each env. They run in the workers, and only there; lambdas
-            and functions of ``__main__`` will do.
+        env_fns: one callable for each env, or for as many vector environments, each of as many
+            sub-environments, whose `autoreset_mode` is this one's. They run in the workers, and
+            only there; lambdas and functions of ``__main__`` will do.
         shared_memory, context, daemon: accepted, and without meaning here.
         copy: observations are the caller's own. False spares a copy: who writes to them writes
             to what a later masked reset shows of envs that it doesn't reset.
@@ -55,17 +56,18 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         entry: further fields of `EnvConfig` (``step_timeout``, ``on_worker_death``, …).
 
     Attributes:
-        group: the `EnvGroup` that does the work; its envs are called ``env-0``, ``env-1``, …
+        group: the `EnvGroup` that does the work; its envs, one for each callable, are called
+            ``env-0``, ``env-1``, …
 
     Raises:
         ConfigError: a callable can't be sent to a worker, or `entry` is wrong.
         StartFailed: a callable raised, or returned no env.
-        RuntimeError: the envs' spaces don't go together.
+        RuntimeError: the envs' spaces, or their numbers, don't go together.
     """
 
     def __init__(
         self,
-        env_fns: Sequence[Callable[[], gym.Env[Any, Any]]],
+        env_fns: Sequence[Callable[[], gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]]],
         shared_memory: bool = True,
         copy: bool = True,
         context: str | None = None,
@@ -87,7 +89,6 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
                 "worker: the workers of rlightning_aio can't be replaced; see EnvGroup"
             )
         self.env_fns = env_fns
-        self.num_envs = len(env_fns)
         self.copy = copy
         self.observation_mode = observation_mode
         self.autoreset_mode = AutoresetMode(autoreset_mode)
@@ -96,12 +97,10 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         self._arguments: Any = None
         self._late = False
         if max_concurrency is not None:
-            entry = {"envs_per_process": _per_worker(max_concurrency, self.num_envs), **entry}
-        makers = list(env_fns)
-        if self.autoreset_mode == AutoresetMode.SAME_STEP:
-            makers = [SameStepOf(make) for make in makers]
+            entry = {"envs_per_process": per_worker(max_concurrency, len(env_fns)), **entry}
+        makers = adapted(env_fns, self.autoreset_mode)
         self.group: EnvGroup = build_env_group(
-            {"name": "env", "num_workers": self.num_envs, "make_env": makers, **entry},
+            {"name": "env", "num_workers": len(makers), "make_env": makers, **entry},
             mixed_actions=True,
             zero_copy=copy,
         )
@@ -115,7 +114,14 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
 
     def _adopt(self, metas: list[EnvMeta]) -> None:
         """Take the spaces and the metadata of the envs for the whole."""
-        self._adopt_spaces([(m.observation_space, m.action_space) for m in metas])
+        self._rows = rows_of(self.group, metas)
+        self.num_envs = self._rows.num_envs
+        (
+            self.single_observation_space,
+            self.observation_space,
+            self.single_action_space,
+            self.action_space,
+        ) = adopted_spaces(self._rows.spaces, self.observation_mode)
         for name in ("metadata", "render_mode"):
             self.group.call_async("call_wrapped", name, env_ids=self.group.env_ids[:1])
             (value,) = self.group.collect_calls()
@@ -124,45 +130,10 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         self._fits_rows = leaves(self.single_action_space) is not None
         self._observations: Any = None
         # Results of all envs, in order, which actions can answer.
-        self._answerable = BatchedData(self.group.env_ids, [None] * self.num_envs)
-        if self.autoreset_mode == AutoresetMode.NEXT_STEP:
+        self._answerable = BatchedData(self.group.env_ids, [None] * len(metas))
+        reset_themselves = metas[0].num_envs > 1
+        if self.autoreset_mode == AutoresetMode.NEXT_STEP and not reset_themselves:
             self.group.auto_reset(max_episode_steps=_NO_LIMIT).__enter__()
-
-    def _adopt_spaces(self, spaces: list[tuple[Any, Any]]) -> None:
-        single: Any
-        batched_space: Any
-        (observations, actions), mode = zip(*spaces, strict=True), self.observation_mode
-        if isinstance(mode, tuple):
-            batched_space, single = mode
-        elif mode == "same":
-            single = observations[0]
-            batched_space = utils.batch_space(single, self.num_envs)
-        elif mode == "different":
-            single = observations[0]
-            # Its stubs know it in part.
-            batched_space = cast("Any", utils).batch_differing_spaces(list(observations))
-        else:
-            raise ValueError(
-                "Invalid `observation_mode`, expected: 'same' or 'different' or tuple of single "
-                f"and batch observation space, actual got {mode}"
-            )
-        self.observation_space, self.single_observation_space = batched_space, single
-        alike = _equal if mode == "same" else is_space_dtype_shape_equiv
-        for k, own in enumerate(observations):
-            if not alike(single, own):
-                hint = "If this is intentional, use `observation_mode='different'` instead."
-                raise RuntimeError(
-                    f"the sub-environments observation spaces are not equivalent. That of env {k} "
-                    f"is {own}, not {single}. {hint * (mode == 'same')}"
-                )
-        self.single_action_space = actions[0]
-        self.action_space = utils.batch_space(actions[0], self.num_envs)
-        for k, own in enumerate(actions):
-            if own != actions[0]:
-                raise RuntimeError(
-                    f"the action space of env {k}, {own}, isn't that of env 0, {actions[0]}; "
-                    "actions are batched, so they must be equal"
-                )
 
     # -- resets -----------------------------------------------------------------------
 
@@ -200,14 +171,12 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         if options is not None and "reset_mask" in options:
             options = dict(options)
             mask = self._checked_mask(options.pop("reset_mask"))
+            # Envs that are stepped together share a row, which is about to be written.
+            self._observations = copying.deepcopy(self._observations)
         which = range(self.num_envs) if mask is None else np.flatnonzero(mask).tolist()
-        env_ids = self.group.env_ids
-        self.group.reset_async(
-            {env_ids[k]: seeds[k] for k in which if seeds[k] is not None},
-            options,
-            [env_ids[k] for k in which],
-        )
-        self._pending, self._arguments = "reset", mask
+        self._late = True  # One that can't be sent leaves those before it.
+        self._rows.send_resets(seeds, [options] * self.num_envs, which)
+        self._pending, self._arguments, self._late = "reset", mask, False
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> list[Any]:
         if seed is None or isinstance(seed, int | np.integer):
@@ -243,10 +212,11 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         batch = self._finish("reset", timeout, self._collect)
         mask = self._arguments
         if mask is None or mask.all():
-            return self._observed(batch.observation), reported_infos(batch)
+            return self._observed(self._rows.observation(batch)), self._rows.infos(batch)
         chosen = np.flatnonzero(mask)
-        observations = merged(self._observations, batch.observation, chosen, self.num_envs)
-        return self._observed(observations), spread(reported_infos(batch), chosen, self.num_envs)
+        observations, infos = self._rows.of_mask(batch, mask)
+        observations = merged(self._observations, observations, chosen, self.num_envs)
+        return self._observed(observations), spread(infos, chosen, self.num_envs)
 
     # -- steps ------------------------------------------------------------------------
 
@@ -291,17 +261,21 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
             if not actions.ndim:
                 raise TypeError(f"actions must be as many as envs, {self.num_envs}, not a scalar")
         if self._fits_rows:
-            return self._answerable.respond(action=actions)
+            return self._answerable.respond(action=self._rows.actions(actions))
         env_ids = self.group.env_ids
         each = list(utils.iterate(self.action_space, actions))
         pairs = zip(env_ids, each, strict=True)
         return BatchedData(env_ids, [PolicyResponse(id_, action) for id_, action in pairs])
 
     def _stepped(self, batch: BatchedData) -> tuple[Any, Any, Any, Any, Any]:
-        observations = self._observed(batch.observation)
+        rows = self._rows
         return (
-            observations, batch.reward, batch.terminated, batch.truncated, reported_infos(batch)
-        )  # fmt: skip
+            self._observed(rows.observation(batch)),
+            rows.flat(batch.reward),
+            rows.flat(batch.terminated),
+            rows.flat(batch.truncated),
+            rows.infos(batch),
+        )
 
     # -- both -------------------------------------------------------------------------
 
@@ -368,7 +342,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         self._begin("call_async")
         if name in _NOT_TO_BE_CALLED:
             raise ValueError(f"call {name}() of the vector env itself, not of its envs")
-        self.group.call_async("call_wrapped", name, *args, **kwargs)
+        self._rows.call(name, args, kwargs)
         self._pending = "call"
 
     def call_wait(self, timeout: float | None = None) -> tuple[Any, ...]:
@@ -378,7 +352,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
             TimeoutError: the methods run all the same; what comes late is dropped.
             NoAsyncCallError: nothing was sent.
         """
-        return tuple(self._finish("call", timeout, self.group.collect_calls))
+        return tuple(self._rows.values(self._finish("call", timeout, self.group.collect_calls)))
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """Attribute `name` of every env, found through its wrappers."""
@@ -396,10 +370,9 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
             )
         self._begin("set_attr")
         self._late = True  # A value that can't be sent leaves the calls before it.
-        for env_id, value in zip(self.group.env_ids, each, strict=True):
-            self.group.call_async("call_wrapped", "set_wrapper_attr", name, value, env_ids=[env_id])
+        self._rows.set_attr(name, each)
         self._pending = "call"
-        self.call_wait()
+        self._finish("call", None, self.group.collect_calls)
 
     def render(self) -> tuple[Any, ...]:
         """One frame of each env, as it renders it."""
@@ -436,11 +409,8 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         self._observations, self._answerable = None, BatchedData([], [])
 
 
-def _equal(one: Any, other: Any) -> bool:
-    return one == other
-
-
-def _per_worker(max_concurrency: Any, num_envs: int) -> int:
+def per_worker(max_concurrency: Any, num_envs: int) -> int:
+    """How many envs share a worker where there are `max_concurrency` workers at most."""
     count = as_int(max_concurrency)
     if count is None or count < 1:
         raise ValueError(f"max_concurrency must be an int above 0 or None, not {max_concurrency!r}")

@@ -1,0 +1,88 @@
+"""The baseline of `training.py`: PPO as CleanRL writes it, on Gymnasium's vector environments.
+
+Rule: the loop, the wrappers around each environment and the hyperparameters are CleanRL's
+(ppo.py, ppo_continuous_action.py, with SAME_STEP as its change to Gymnasium 1 has it). The
+network and the learner are those of `examples/ppo.py`, so what differs is how experience comes.
+"""
+
+from __future__ import annotations
+
+import sys
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
+
+from ppo import Agent, advantages, learn  # Examples are no package.
+from training_run import Run
+
+if TYPE_CHECKING:
+    from ppo import Args
+
+KINDS = {"AsyncVectorEnv": AsyncVectorEnv, "SyncVectorEnv": SyncVectorEnv}
+
+
+def make_env(args: Args) -> gym.Env[Any, Any]:
+    """One environment in CleanRL's wrappers."""
+    env = gym.make(args.task)
+    if not args.normalize:
+        return gym.wrappers.RecordEpisodeStatistics(env)
+    env = gym.wrappers.RecordEpisodeStatistics(gym.wrappers.FlattenObservation(env))
+    env = gym.wrappers.NormalizeObservation(gym.wrappers.ClipAction(env))
+    env = gym.wrappers.TransformObservation(env, lambda o: np.clip(o, -10, 10), None)
+    env = gym.wrappers.NormalizeReward(env, gamma=args.gamma)
+    return gym.wrappers.TransformReward(env, lambda r: np.clip(r, -10, 10))
+
+
+def train(args: Args, kind: str) -> tuple[Run, Agent]:
+    """Train on `kind` of Gymnasium's vector environments."""
+    torch.manual_seed(args.seed)
+    makers = [partial(make_env, args)] * args.num_envs
+    envs = KINDS[kind](makers, autoreset_mode=AutoresetMode.SAME_STEP)
+    agent = Agent(envs.single_observation_space, envs.single_action_space)
+    optimizer = torch.optim.Adam(agent.parameters(), args.learning_rate, eps=1e-5, fused=True)
+    shape = (args.num_steps, args.num_envs)
+    seen = torch.zeros((*shape, *envs.single_observation_space.shape))
+    chosen = torch.zeros((*shape, *envs.single_action_space.shape))
+    log_probs, rewards, dones, values = (torch.zeros(shape) for _ in range(4))
+    with Run(args.total_steps, args.folder) as run:
+        first, _ = envs.reset(seed=args.seed)
+        observation = torch.Tensor(first)
+        while run.goes_on():
+            returns: list[float] = []
+            for step in range(args.num_steps):
+                seen[step] = observation
+                with torch.no_grad():
+                    policy = agent.policy(observation)
+                    action = policy.sample()
+                    values[step] = agent.value(observation)
+                    log_probs[step] = agent.judged(policy, action)
+                chosen[step] = action
+                following, reward, ended, cut, infos = envs.step(action.numpy())
+                observation = torch.Tensor(following)
+                rewards[step] = torch.Tensor(reward)
+                dones[step] = torch.Tensor(ended | cut)
+                if "final_info" in infos:
+                    episodes = infos["final_info"]["episode"]
+                    returns += episodes["r"][infos["final_info"]["_episode"]].tolist()
+            with run.learning():
+                optimizer.param_groups[0]["lr"] = args.learning_rate * run.remaining
+                with torch.no_grad():
+                    last = agent.value(observation)
+                gains = advantages(rewards, values, dones, last, args)
+                columns = {
+                    "observation": seen, "action": chosen, "log_prob": log_probs,
+                    "value": values, "advantage": gains,
+                    "target": gains + values,
+                }  # fmt: skip
+                flat = {name: column.flatten(0, 1) for name, column in columns.items()}
+                figures = learn(agent, optimizer, args, flat)
+            run.record(args.num_steps * args.num_envs, returns, **figures)
+    envs.close()
+    return run, agent

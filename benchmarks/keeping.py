@@ -1,0 +1,79 @@
+"""What `on_worker_death: resume` costs while nothing dies, by processor time.
+
+Steps a task in workers, with and without `snapshot_every`, in alternating rounds in one run, and
+tells the processor time of the trainer and all that it has started, per step, and the ratio: the
+median over pairs of the same round.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+from contextlib import ExitStack
+
+import psutil
+
+from rlightning_aio import sync
+
+
+def processor_seconds() -> float:
+    """Of this process and of all below it."""
+    me = psutil.Process()
+    times = [process.cpu_times() for process in (me, *me.children(recursive=True))]
+    return sum(own.user + own.system for own in times)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--backend", default="mujoco")
+    parser.add_argument("--task", default="HalfCheetah-v5")
+    parser.add_argument("--envs", type=int, default=8)
+    parser.add_argument("--every", type=int, nargs="+", default=[10, 100, 1000])
+    parser.add_argument("--steps", type=int, default=2000, help="of each env in a round")
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args()
+    entry = {
+        "name": "e",
+        "backend": arguments.backend,
+        "task": arguments.task,
+        "num_workers": arguments.envs,
+    }
+    keeping = [{"on_worker_death": "resume", "snapshot_every": n} for n in arguments.every]
+    spent: list[list[float]] = [[] for _ in range(1 + len(keeping))]
+    for _ in range(arguments.rounds):
+        for figures, fields in zip(spent, [{}, *keeping], strict=True):
+            # A group each time: others would take processor time, too, where they spin.
+            with ExitStack() as stack:
+                group = stack.enter_context(sync.build_env_group({**entry, **fields}))
+                batch, _ = group.reset(seed=0)
+                space = group.get_action_spaces()[0]
+                assert space is not None
+                action = [space.sample() for _ in range(arguments.envs)]
+                began = processor_seconds()
+                with group.auto_reset():
+                    for _ in range(arguments.steps):
+                        batch, _ = group.step(batch.respond(action=action))
+                seconds = processor_seconds() - began
+            figures.append(1e6 * seconds / arguments.steps / arguments.envs)
+    told = {
+        str(every): {
+            "us_per_step": statistics.median(figures),
+            "ratio": statistics.median(a / b for a, b in zip(figures, spent[0], strict=True)),
+        }
+        for every, figures in zip(["never", *arguments.every], spent, strict=True)
+    }
+    if arguments.json:
+        print(json.dumps(told))
+        return
+    print(f"{arguments.task}, {arguments.envs} envs: processor time of all processes")
+    for every, figures in told.items():
+        print(
+            f"kept every {every:>6} steps: {figures['us_per_step']:8.1f} µs a step, "
+            f"{figures['ratio']:.3f} times that without"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,80 @@
+"""What ppo.py, ppo_async.py or ppo_overlap.py have learned, tried over some episodes.
+
+    python examples/evaluate.py --folder runs/ppo_async --episodes 10
+
+Each environment plays equally many episodes: to take those that end first would favour short ones.
+Actions are the likeliest ones, and observations are normalised by what training has seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import ppo
+import torch
+from normalizer import Normalizer
+from torch.distributions import Categorical
+from training_run import arguments
+
+import rlightning_aio as rl
+
+
+@dataclass
+class Args:
+    task: str = "as trained"
+    folder: str = "runs/ppo"
+    episodes: int = 5
+    num_envs: int = 8
+    seed: int = 1_000
+
+
+async def evaluate(args: Args) -> list[float]:
+    """The returns of all episodes."""
+    saved = torch.load(Path(args.folder) / "checkpoint.pt", weights_only=True)
+    trained = saved["args"]
+    task = trained["task"] if args.task == "as trained" else args.task
+    entry = {
+        "name": "env", "backend": trained["backend"], "task": task, "num_workers": args.num_envs,
+    }  # fmt: skip
+    async with rl.build_env_group(entry) as group:
+        observations, actions = group.get_observation_spaces()[0], group.get_action_spaces()[0]
+        agent = ppo.Agent(observations, actions)
+        agent.load_state_dict(saved["agent"])
+        each = len(saved["normalizer"]["sums"])
+        normalizer = Normalizer(each, observations.shape, trained["gamma"], trained["normalize"])
+        normalizer.load(saved["normalizer"])
+        normalizer = normalizer.merged()
+
+        def act(batch: rl.BatchedData) -> Any:
+            seen = normalizer.known(np.zeros(len(batch), np.intp), batch.observation)
+            with torch.inference_mode():
+                policy = agent.policy(torch.from_numpy(seen))
+            if isinstance(policy, Categorical):
+                return policy.probs.argmax(-1).numpy()
+            return policy.mean.numpy().clip(actions.low, actions.high)
+
+        returns: list[float] = []
+        sums, left = np.zeros(args.num_envs), np.full(args.num_envs, args.episodes)
+        batch, _ = await group.reset(seed=args.seed)
+        with group.auto_reset():
+            group.step_async(batch.respond(action=act(batch)))
+            while left.any():
+                batch, _ = await group.collect_async()
+                sums[batch.index] += batch.reward
+                over = batch.index[batch.done]
+                returns += sums[over].tolist()
+                sums[over] = 0.0
+                left[over] -= 1
+                going = batch.take(np.flatnonzero(left[batch.index]))
+                if len(going):
+                    group.step_async(going.respond(action=act(going)))
+    return returns
+
+
+if __name__ == "__main__":
+    found = np.array(rl.run(evaluate(arguments(Args))))
+    error = found.std(ddof=1) / np.sqrt(len(found))
+    print(f"{len(found)} episodes: return {found.mean():.1f} +- {1.96 * error:.1f} (95 %)")

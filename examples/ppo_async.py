@@ -1,0 +1,161 @@
+"""PPO on an asynchronous group: whoever is ready goes on, and chains are as long as they get.
+
+    python examples/ppo_async.py                              # HalfCheetah-v5, 16 environments
+    python examples/ppo_async.py --num-envs 2 --envs-each 8   # the same, 8 to a worker's call
+    python examples/ppo_async.py --task CartPole-v1
+
+Network, loss and hyperparameters are those of ppo.py. A rollout has a fixed total of transitions,
+of which a fast environment makes more than a slow one. Episodes that were cut short and chains
+that go on in the next rollout are bootstrapped, each from its own next observation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import ppo
+import torch
+from normalizer import Normalizer
+from player import Player, single
+from training_run import Run, arguments
+
+import rlightning_aio as rl
+from rlightning_aio.collecting import Collector, Rollout
+
+
+@dataclass
+class Collecting:
+    folder: str = "runs/ppo_async"
+    placement: str = "process"
+    envs_per_process: int = 0  # As many as there are cores for workers.
+    envs_each: int = 1
+    min_batch: int = 8
+
+
+@dataclass
+class Args(Collecting, ppo.Args):
+    """As CleanRL's, and how to collect."""
+
+
+@dataclass
+class CartPole(Collecting, ppo.CartPole):
+    # A step takes less than any way to another process: the task's own vector environment, here.
+    placement: str = "inline"
+    num_envs: int = 1
+    envs_each: int = 4
+    min_batch: int = 1
+
+
+class Learner:
+    """What learns, and all that a checkpoint keeps."""
+
+    def __init__(self, args: Args | CartPole, group: rl.EnvGroup, run: Run) -> None:
+        observations, actions = (
+            get()[0] for get in (group.get_observation_spaces, group.get_action_spaces)
+        )
+        if args.envs_each > 1:  # These spaces are those of all sub-environments.
+            observations, actions = single(observations), single(actions)
+        self.args = args
+        self.agent = ppo.Agent(observations, actions)
+        self.optimizer = torch.optim.Adam(
+            self.agent.parameters(), args.learning_rate, eps=1e-5, fused=True
+        )
+        count = args.num_envs * args.envs_each
+        self.normalizer = Normalizer(count, observations.shape, args.gamma, args.normalize)
+        if run.saved:
+            self.agent.load_state_dict(run.saved["agent"])
+            self.optimizer.load_state_dict(run.saved["optimizer"])
+            self.normalizer.load(run.saved["normalizer"])
+            torch.set_rng_state(run.saved["random"])
+        self.player = Player(self.agent, self.normalizer, actions, args.seed + run.steps)
+
+    def state(self) -> dict[str, Any]:
+        return {
+            "args": asdict(self.args),
+            "agent": self.agent.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "normalizer": self.normalizer.state(),
+            "random": torch.get_rng_state(),
+        }
+
+    def columns(self, rollout: Rollout) -> dict[str, torch.Tensor]:
+        """What `learn` wants to know of a rollout; the normaliser stands still meanwhile."""
+        after = rollout.end_observation.reshape(len(rollout.ends), -1)
+        after = self.normalizer.known(rollout.at_ends("index"), after)
+        rollout.reward[:] = self.normalizer.scaled(rollout.index, rollout.reward)
+        seen = torch.from_numpy(rollout.seen)
+        with torch.no_grad():
+            value, next_value = self.agent.value(seen), self.agent.value(torch.from_numpy(after))
+        gains = rollout.advantages(value, next_value, self.args.gamma, self.args.gae_lambda)
+        advantage = torch.from_numpy(gains)
+        return {
+            "observation": seen,
+            "action": torch.from_numpy(rollout.raw),
+            "log_prob": torch.from_numpy(rollout.log_prob),
+            "value": value,
+            "advantage": advantage,
+            "target": advantage + value,
+        }
+
+    def learn(self, columns: dict[str, torch.Tensor], rate: float) -> dict[str, float]:
+        self.optimizer.param_groups[0]["lr"] = rate
+        return ppo.learn(self.agent, self.optimizer, self.args, columns)
+
+
+def entry_of(args: Args | CartPole) -> dict[str, Any]:
+    entry = {
+        "name": "env",
+        "backend": args.backend,
+        "task": args.task,
+        "num_workers": args.num_envs,
+        "num_envs": args.envs_each,
+        "placement": args.placement,
+    }
+    if args.envs_per_process:
+        entry["envs_per_process"] = args.envs_per_process
+    return entry
+
+
+def waiting(rollout: Rollout) -> dict[str, float]:
+    """How many environments at a time stepped, waited for the policy, or for the learner."""
+    seconds = rollout.seconds
+    return {
+        "stepping": seconds.env_busy / seconds.elapsed,
+        "waiting_for_policy": seconds.waited_for_policy / seconds.elapsed,
+        "waiting_for_learner": seconds.waited_for_learner / seconds.elapsed,
+    }
+
+
+async def train(args: Args | CartPole) -> Run:
+    torch.manual_seed(args.seed)
+    run = Run(args.total_steps, args.folder, args.resume)
+    async with rl.build_env_group(entry_of(args)) as group:
+        learner = Learner(args, group, run)
+        player = learner.player
+        collector = Collector(
+            group,
+            player,
+            num_transitions=args.num_envs * args.envs_each * args.num_steps,
+            min_batch=args.min_batch,
+            seed=args.seed + run.steps,
+        )
+        with group.auto_reset(), run:
+            while run.goes_on():
+                rollout = await collector.collect()
+                with run.learning():
+                    rate = args.learning_rate * run.remaining
+                    figures = learner.learn(learner.columns(rollout), rate)
+                    player.take(learner.agent)
+                collector.policy_version += 1
+                figures |= waiting(rollout) | {"lag": rollout.lag.mean}
+                run.record(len(rollout), player.ended(), **figures)
+                if len(run.rows) % args.save_every == 0:
+                    run.save(learner.state())
+            run.save(learner.state())
+    return run
+
+
+if __name__ == "__main__":
+    trained = rl.run(train(arguments(Args, CartPole)))
+    print({name: round(value, 3) for name, value in trained.rows[-1].items()})

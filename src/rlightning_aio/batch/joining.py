@@ -1,0 +1,151 @@
+"""Batches of results put together: for whoever keeps some results and waits for others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from rlightning_aio.batch.columns import BY_ROW
+from rlightning_aio.batch.data import (
+    BatchedData,
+    Origin,
+    batch_of_results,
+    origin_of,
+    parts_of,
+    sources_of,
+)
+from rlightning_aio.batch.sent import joined_sources
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from rlightning_aio.batch.columns import ResultColumns
+    from rlightning_aio.protocol.columns import Tree
+
+__all__ = ["joined"]
+
+
+def joined(batches: Sequence[BatchedData]) -> BatchedData:
+    """The results of several batches of one group, one batch's after the other's.
+
+    Envs of one layout share columns again, which are fresh; `BatchedData.take` puts rows in
+    another order.
+
+    Raises:
+        ValueError: there is no batch, or one doesn't hold results of the same group.
+    """
+    if not batches:
+        raise ValueError("there is no batch to join")
+    if len(batches) == 1:
+        return batches[0]
+    origins = [origin_of(batch) for batch in batches]
+    last = origins[-1]
+    if last is None or any(o is None or o.group is not last.group for o in origins):
+        raise ValueError("only batches of results of one group can be joined")
+    slots = np.concatenate([cast("Origin", origin).slots for origin in origins])
+    placed = [part for k, batch in enumerate(batches) for part in _placed(batch, batches[:k])]
+    parts = _merged(placed)
+    if len(parts) == 1:
+        parts = [replace(parts[0], positions=None)]
+    sources = joined_sources([(sources_of(batch), len(batch)) for batch in batches])
+    return batch_of_results(parts, Origin(last.group, slots, last.names), sources)
+
+
+def _placed(batch: BatchedData, before: Sequence[BatchedData]) -> list[ResultColumns]:
+    """Its parts, each with the places of its rows behind all those of `before`."""
+    offset = sum(map(len, before))
+    return [
+        replace(
+            part,
+            positions=(np.arange(len(part)) if part.positions is None else part.positions) + offset,
+        )
+        for part in parts_of(batch)
+    ]
+
+
+def _merged(parts: list[ResultColumns]) -> list[ResultColumns]:
+    """Fewer parts: one for all whose rows lie alike."""
+    alike: dict[Any, list[ResultColumns]] = {}
+    for k, part in enumerate(parts):
+        alike.setdefault(_layout(part) or k, []).append(part)
+    return [group[0] if len(group) == 1 else _one(group) for group in alike.values()]
+
+
+def _layout(part: ResultColumns) -> Any:
+    """What parts must have in common; None for one that stays alone.
+
+    What a worker that was replaced has put into its rows only its own schemas can read.
+    """
+    shapes = _shapes(part.observation)
+    if shapes is None or part.whole_results:
+        return None
+    return (
+        shapes,
+        part.reward.shape[1:],
+        part.agents,
+        None if part.info is None else (part.info.shape[1:], id(part.schemas)),
+        part.sent_ns is None,
+    )
+
+
+def _shapes(tree: Tree | None) -> Any:
+    """Something hashable that is equal for trees which can be concatenated; None if none can."""
+    if isinstance(tree, dict):
+        inner = [(key, _shapes(part)) for key, part in cast("dict[str, Tree]", tree).items()]
+        return None if any(shapes is None for _, shapes in inner) else tuple(inner)
+    if isinstance(tree, tuple):
+        inner = [_shapes(part) for part in cast("tuple[Tree, ...]", tree)]
+        return None if None in inner else tuple(inner)
+    if isinstance(tree, np.ndarray):
+        array = cast("NDArray[Any]", tree)
+        return array.shape[1:], array.dtype
+    return None
+
+
+def _one(parts: list[ResultColumns]) -> ResultColumns:
+    """Parts of one layout as a single one, its rows in the order of their places."""
+    positions = np.concatenate([cast("NDArray[np.intp]", part.positions) for part in parts])
+    order = np.argsort(positions)
+    count = len(positions)
+
+    def joined_rows(name: str) -> Any:
+        columns: list[Any] = [getattr(part, name) for part in parts]
+        if all(column is None for column in columns):
+            return None
+        known = next(column for column in columns if column is not None)
+        filled = [
+            np.zeros((len(part), *known.shape[1:]), known.dtype) if column is None else column
+            for part, column in zip(parts, columns, strict=True)
+        ]
+        return np.concatenate(filled)[order]
+
+    first_rows = np.cumsum([0, *map(len, parts)]).tolist()
+    place = np.empty(count, np.intp)
+    place[order] = np.arange(count)
+    return replace(
+        parts[0],
+        names=parts[-1].names,
+        positions=positions[order],
+        observation=_concatenated([part.observation for part in parts], order),
+        out_of_band={
+            int(place[first + row]): kept
+            for first, part in zip(first_rows, parts, strict=False)
+            for row, kept in part.out_of_band.items()
+        },
+        **{name: joined_rows(name) for name in ("slots", *BY_ROW)},
+    )
+
+
+def _concatenated(trees: list[Tree], order: NDArray[np.intp]) -> Tree:
+    first = trees[0]
+    if isinstance(first, dict):
+        keys = cast("dict[str, Tree]", first)
+        return {key: _concatenated([tree[key] for tree in trees], order) for key in keys}
+    if isinstance(first, tuple):
+        count = len(cast("tuple[Tree, ...]", first))
+        return tuple(_concatenated([tree[k] for tree in trees], order) for k in range(count))
+    return np.concatenate(trees)[order]

@@ -1,0 +1,343 @@
+"""`Collector`: steps a group with a policy, and gives out rollouts.
+
+It stands on the public `EnvGroup` alone. Whatever comes between a result and the next request
+(a policy that raises, a task that is cancelled, a rollout that is full) leaves the results that
+are still to be answered with it, and the next `collect` goes on from there.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast, overload
+
+from rlightning_aio.collecting.clock import Clock
+from rlightning_aio.collecting.kind import Kind, Part
+from rlightning_aio.collecting.procedure import Procedure, run
+from rlightning_aio.collecting.record import RecordedGroup, ReplayedGroup
+from rlightning_aio.collecting.rollout import Rollout
+from rlightning_aio.group.aio import EnvGroup as AsyncEnvGroup
+from rlightning_aio.group.sync import EnvGroup as SyncEnvGroup
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine
+
+    from rlightning_aio.batch import BatchedData
+    from rlightning_aio.types import EnvMeta
+
+__all__ = ["Collector"]
+
+G = TypeVar("G", AsyncEnvGroup, SyncEnvGroup)
+H = TypeVar("H", AsyncEnvGroup, SyncEnvGroup)
+R = TypeVar("R", Rollout, dict[str, Rollout])
+
+
+class Collector(Generic[G, R]):
+    """Steps the envs of a group with a policy, and collects their transitions.
+
+    Without `wait_all` envs are stepped first come, first served: the policy is called as soon as
+    `min_batch` results are there, and a rollout has a fixed total of transitions, of which a fast
+    env makes more than a slow one. ``min_batch=len(group)`` waits for all envs each time, which
+    makes a run reproducible. With `wait_all` each env makes equally many transitions, and a
+    rollout is a block ``[T, N]``; envs whose episode is over are reset before the policy is
+    called, which therefore always has a batch of all envs, in the group's order.
+
+    Nothing is lost or doubled at the seams: what is in flight when a rollout is full begins the
+    next one, and the results that have filled it are answered by the next `collect`, with the
+    policy that is newest then. Rows that are resets, transitions that were lost with a worker,
+    and steps of a sub-environment that waits for others to end are in no rollout.
+
+    The group is the collector's alone while it is in use: who wants to step it otherwise takes
+    another one. Use it inside ``with group.auto_reset():``.
+
+        async with rl.build_env_group(config) as group:
+            with group.auto_reset():
+                collector = Collector(group, policy, num_transitions=2048, min_batch=4, seed=0)
+                for _ in range(updates):
+                    rollout = await collector.collect()
+                    learn(rollout)
+                    collector.policy_version += 1
+
+    Over a group of `rlightning_aio.sync` it is ``collector.collect()``, without ``await``.
+
+    Args:
+        group: initialised; or a `RecordedGroup` or `ReplayedGroup` in front of one.
+        policy: called with a batch of results (`BatchedData`); returns columns by name,
+            ``action`` among them, with one row for each result, ``[n, …]``, or for each
+            sub-environment of each, ``[n, num_envs, …]``: arrays, or CPU tensors without
+            gradient. It may be a coroutine function, if the group is asynchronous. Envs of
+            different kinds need one for each config entry, as a mapping by its name; `collect`
+            then returns a dict of rollouts, whose transitions together are `num_transitions`.
+        num_transitions: of each rollout, sub-environments counted; T * N with `wait_all`.
+        min_batch: results (each of all sub-environments of an env) to wait for before the policy
+            is called, or as many as are pending.
+        wait_all: collect blocks.
+        seed: of the first reset, as of `EnvGroup.reset`.
+
+    Attributes:
+        policy_version: yours to set: the number of the policy that acts. Each transition has
+            the one that its action was chosen under.
+
+    Raises:
+        ValueError: a number isn't above 0, or `min_batch` comes with `wait_all`.
+    """
+
+    @overload
+    def __init__(
+        self: Collector[H, Rollout],
+        group: H | RecordedGroup[H] | ReplayedGroup[H],
+        policy: Callable[[BatchedData], Any],
+        *,
+        num_transitions: int,
+        min_batch: int | None = None,
+        wait_all: bool = False,
+        seed: Any = None,
+    ) -> None: ...
+
+    @overload
+    def __init__(
+        self: Collector[H, dict[str, Rollout]],
+        group: H | RecordedGroup[H] | ReplayedGroup[H],
+        policy: Mapping[str, Callable[[BatchedData], Any]],
+        *,
+        num_transitions: int,
+        min_batch: int | None = None,
+        wait_all: bool = False,
+        seed: Any = None,
+    ) -> None: ...
+
+    def __init__(
+        self,
+        group: Any,
+        policy: Any,
+        *,
+        num_transitions: int,
+        min_batch: int | None = None,
+        wait_all: bool = False,
+        seed: Any = None,
+    ) -> None:
+        for name, number in (("num_transitions", num_transitions), ("min_batch", min_batch)):
+            if number is not None and number < 1:
+                raise ValueError(f"{name} must be at least 1, not {number!r}")
+        if wait_all and min_batch is not None:
+            raise ValueError("wait_all waits for all envs: give it no min_batch")
+        self.policy_version = 0
+        self._group = group
+        self._policy: Any = policy
+        self._quota = num_transitions
+        self._min_batch = min_batch or 1
+        self._block = wait_all
+        self._num_steps = 0
+        self._seed = seed
+        self._clock = Clock()
+        self._kinds: dict[str, Kind] = {}
+        self._started = False
+        self._collecting = False
+        self._metas: dict[str, EnvMeta] = {}
+        # What has come and was not looked at; of the rest, what is to be stored, and what is to
+        # be answered; whether more is to be waited for before anything else.
+        self._received: BatchedData | None = None
+        self._unstored: list[Part] = []
+        self._unanswered: list[Part] = []
+        self._expecting = False
+
+    @overload
+    def collect(self: Collector[SyncEnvGroup, R]) -> R: ...
+
+    @overload
+    def collect(self: Collector[AsyncEnvGroup, R]) -> Coroutine[Any, Any, R]: ...
+
+    def collect(self) -> Any:
+        """Step the envs until a rollout is full, and return it: to be awaited, if the group is.
+
+        The rollout's arrays are its own until this is called for the second time after it.
+        Cancelled, or ended by an error, it loses nothing: the next call goes on.
+
+        Raises:
+            RuntimeError: the group has no `auto_reset` context open, or this is being called
+                already.
+            ValueError, TypeError: the policy's answer doesn't fit; envs differ, and need a policy
+                for each entry; or a block can't be collected of these envs.
+            EnvRaised, WorkerDied, EnvHung: as of `EnvGroup.collect_async`: the answer to one
+                request. An env that raised takes part again after
+                ``group.reset_async(env_ids=[error.env_id])``.
+            BadAction: the policy's actions don't fit the action space; nothing was sent.
+            NothingPending: no env is left that could answer.
+        """
+        group = self._group
+        behind: Any = group
+        if isinstance(group, RecordedGroup | ReplayedGroup):
+            behind = cast("RecordedGroup[Any] | ReplayedGroup[Any]", group).group
+        return run(self._timed(), behind)
+
+    # -- the loop -----------------------------------------------------------------
+
+    def _timed(self) -> Procedure[R]:
+        if self._collecting:
+            raise RuntimeError("this collector is collecting already; one collect at a time")
+        if not self._group.resets_by_itself:
+            raise RuntimeError(
+                "envs whose episode is over must be reset: collect inside "
+                "`with group.auto_reset():`"
+            )
+        self._collecting = True
+        self._clock.enter()
+        try:
+            return (yield from self._collect())
+        finally:
+            self._clock.leave()
+            self._collecting = False
+
+    def _collect(self) -> Procedure[R]:
+        if not self._started:
+            yield from self._start()
+        while True:
+            if self._expecting:
+                yield from self._receive()
+            if self._received is not None:
+                self._take_in(self._received)
+                self._received = None
+            self._store()
+            if self._complete() == self._quota:
+                return self._full()
+            if self._block and not self._unanswered:
+                self._plan()
+            while self._unanswered:
+                yield from self._answer(self._unanswered[0])
+                del self._unanswered[0]
+            self._expecting = True
+
+    def _start(self) -> Procedure[None]:
+        """Reset all envs. Cancelled, that leaves its results to be collected."""
+        self._started = self._expecting = True
+        try:
+            batch, _ = yield lambda: self._group.reset(seed=self._seed)
+        except Exception:
+            self._started = self._expecting = False
+            raise
+        self._expecting = False
+        self._received = batch
+
+    def _receive(self) -> Procedure[None]:
+        if self._block:
+            batch, _ = yield lambda: self._group.collect_async(wait_all=True, ordered=True)
+        else:
+            wanted = self._min_batch
+            batch, _ = yield lambda: self._group.collect_async(min_results=wanted, ordered=True)
+        self._expecting = False
+        self._received = batch
+
+    def _take_in(self, batch: BatchedData) -> None:
+        self._unstored = [kind.part(part) for kind, part in self._split(batch)]
+        if not self._block:
+            self._unanswered = list(self._unstored)
+            return
+        for part in self._unstored:
+            part.kind.hold(part)
+        if not self._num_steps:
+            self._lay_out()
+
+    def _split(self, batch: BatchedData) -> list[tuple[Kind, BatchedData]]:
+        """What each policy is to answer."""
+        policy: Any = self._policy
+        if not isinstance(policy, Mapping):
+            return [(self._kind("", policy), batch)]
+        policies = cast("Mapping[str, Callable[[BatchedData], Any]]", policy)
+        parts = batch.by_name()
+        for name in parts.keys() - policies.keys():
+            raise ValueError(
+                f"no policy was given for the envs of entry {name!r}; those given are for "
+                f"{', '.join(policies)}"
+            )
+        return [(self._kind(name, policies[name]), part) for name, part in parts.items()]
+
+    def _kind(self, name: str, policy: Callable[[BatchedData], Any]) -> Kind:
+        if name not in self._kinds:
+            self._kinds[name] = Kind(policy, self._quota, self._meta_of)
+        return self._kinds[name]
+
+    def _meta_of(self, env_id: str) -> EnvMeta | None:
+        group = self._group
+        if not self._metas:
+            self._metas = {meta.env_id: meta for meta in group.metas}
+        if env_id not in self._metas:
+            for server_id in [meta.env_id for meta in group.metas if _is_server(meta)]:
+                self._metas.update((meta.env_id, meta) for meta in group[server_id].metas)
+        return self._metas.get(env_id)
+
+    # -- blocks -------------------------------------------------------------------
+
+    def _lay_out(self) -> None:
+        """Settle how many steps a block has, once all envs have been reset."""
+        for meta in self._group.metas:
+            if _is_server(meta) or (meta.num_envs > 1 and meta.autoreset != "same_step"):
+                why = (
+                    "has clients that come and go"
+                    if _is_server(meta)
+                    else "has sub-environments that are reset together, or each a step later"
+                )
+                raise ValueError(
+                    f"no [T, N] block can be made with env {meta.env_id!r}, which {why}; collect "
+                    "chains of any length, with min_batch instead of wait_all"
+                )
+        kinds = self._kinds.values()
+        counts = [len(kind.held.results.index) for kind in kinds if kind.held is not None]
+        num_steps, rest = divmod(self._quota, sum(counts))
+        if rest or not num_steps:
+            raise ValueError(
+                f"num_transitions={self._quota} makes no block of {sum(counts)} envs "
+                "(sub-environments counted); give a multiple of that"
+            )
+        self._num_steps = num_steps
+        for kind, count in zip(kinds, counts, strict=True):
+            kind.num_steps = num_steps
+            kind.quota = num_steps * count
+
+    def _plan(self) -> None:
+        """Say who is to be asked next: resets first, then envs that are a step behind others."""
+        parts = [kind.held for kind in self._kinds.values() if kind.held is not None]
+        over = [env_id for part in parts for env_id in part.waiting_for_reset()]
+        if over:
+            self._group.reset_async(env_ids=over)
+            return
+        most = max(int(part.steps().max()) for part in parts)
+        behind = [part.behind(most) for part in parts]
+        self._unanswered = [part for part in behind if part is not None] or parts
+
+    # -- one turn -----------------------------------------------------------------
+
+    def _complete(self) -> int:
+        return sum(kind.staging.complete for kind in self._kinds.values())
+
+    def _store(self) -> None:
+        for part in self._unstored:
+            part.store(self._quota - self._complete())
+        self._unstored = [part for part in self._unstored if len(part.unstored)]
+
+    def _answer(self, part: Part) -> Procedure[None]:
+        """Call the policy for `part`, and send what it says."""
+        version = self.policy_version
+        began = time.monotonic_ns()
+        answer = yield lambda: part.kind.policy(part.batch)
+        self._clock.note_policy(time.monotonic_ns() - began)
+        responses, columns = part.kind.columns_of(part, answer)
+        self._group.step_async(responses)
+        part.kind.staging.begin(part.results.index, columns, version)
+        self._clock.note_answered(part.batch)
+
+    def _full(self) -> R:
+        seconds = self._clock.seconds()
+        waiting = {id(part.kind): part.results for part in self._unanswered}
+        found = {
+            name: kind.rollout(
+                waiting.get(id(kind)) if kind.held is None else kind.held.results,
+                self.policy_version,
+                seconds,
+            )
+            for name, kind in self._kinds.items()
+        }
+        return cast("R", found if isinstance(self._policy, Mapping) else found[""])
+
+
+def _is_server(meta: EnvMeta) -> bool:
+    return meta.observation_space is None

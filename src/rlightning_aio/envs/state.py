@@ -1,0 +1,366 @@
+"""The state of an env, taken out of it and put back: of its simulator, wrappers and generators.
+
+Rule: what an env consists of stays where it is; what that holds is replaced. Its *parts* are
+the env itself, the layers of its simulator (wrappers, sub-environments), and what only its
+library can copy (MuJoCo's data, an ALE console); `parts_of` finds them and names each by its
+path. Everything else that the parts hold is one pickle, in which parts are referred to.
+Absent on purpose: what lies outside of the env, as the process's own generators
+(`numpy.random`, `random`), files and windows.
+"""
+
+from __future__ import annotations
+
+import io
+import pickle
+import sys
+from dataclasses import dataclass
+from types import FunctionType, ModuleType
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
+
+import cloudpickle
+import gymnasium as gym
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+
+from rlightning_aio.envs import mujoco_state
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+__all__ = ["SavedState", "load_state", "parts_of", "save_state", "versions_of"]
+
+NOT_STATE: Final = frozenset(("config", "worker_index", "env_id", "trainer_pid", "_preprocess_fn"))
+"""Attributes of a `BaseEnv` that say which env it is."""
+_PLAIN: Final[tuple[type[Any], ...]] = (str, bytes, int, float, bool, type(None), np.generic)
+
+
+_BUILT_IN: Final = frozenset((str, bytes, int, float, bool, type(None), tuple, list, dict))
+
+
+@dataclass(frozen=True)
+class SavedState:
+    """What an env held.
+
+    Attributes:
+        parts: the path of each part, and its type.
+        pickled: what each part held, by path.
+    """
+
+    parts: tuple[tuple[str, str], ...]
+    pickled: bytes
+
+
+class _Kind(NamedTuple):
+    """What is done with parts of one kind.
+
+    Attributes:
+        save: what a part holds, picklable; load: puts that back.
+        is_layer: its attributes may be parts, too.
+    """
+
+    save: Callable[[Any], Any]
+    load: Callable[[Any, Any], None]
+    is_layer: bool = False
+
+
+class _Part(NamedTuple):
+    value: Any
+    kind: _Kind
+
+
+# -- kinds of parts -----------------------------------------------------------------------
+
+
+def _nothing(part: Any) -> None:
+    del part
+
+
+def _as_it_is(part: Any, state: Any) -> None:
+    del part, state
+
+
+def _held(layer: Any) -> dict[str, Any]:
+    return cast("dict[str, Any]", vars(layer))
+
+
+def _attributes(layer: Any) -> dict[str, Any]:
+    return dict(_held(layer))
+
+
+def _set_attributes(layer: Any, state: dict[str, Any]) -> None:
+    held = _held(layer)
+    held.clear()
+    held.update(state)
+
+
+def _env_attributes(env: Any) -> dict[str, Any]:
+    return {name: value for name, value in _held(env).items() if name not in NOT_STATE}
+
+
+def _set_env_attributes(env: Any, state: dict[str, Any]) -> None:
+    kept = {name: value for name, value in _held(env).items() if name in NOT_STATE}
+    _set_attributes(env, {**kept, **state})
+
+
+def _spaces_in(space: Any) -> list[Any]:
+    inner: Any = getattr(space, "spaces", ())
+    return list(cast("Any", inner.values() if isinstance(inner, dict) else inner))
+
+
+def _generators(space: Any) -> list[Any]:
+    """The generators of a space and of those in it; None for one that nobody has used."""
+    # Asking for one by its property would make it.
+    own = space._np_random  # noqa: SLF001
+    return [own, *map(_generators, _spaces_in(space))]
+
+
+def _set_generators(space: Any, state: list[Any]) -> None:
+    space._np_random = state[0]  # noqa: SLF001
+    for one, own in zip(_spaces_in(space), state[1:], strict=True):
+        _set_generators(one, own)
+
+
+def _own_state(part: Any) -> Any:
+    return part.save_state()
+
+
+def _load_own_state(part: Any, state: Any) -> None:
+    part.load_state(state)
+
+
+def _console_state(console: Any) -> Any:
+    return console.cloneState(include_rng=True)
+
+
+def _set_console_state(console: Any, state: Any) -> None:
+    console.restoreState(state)
+
+
+_ENV = _Kind(_env_attributes, _set_env_attributes, is_layer=True)
+_LAYER = _Kind(_attributes, _set_attributes, is_layer=True)
+_OWN = _Kind(_own_state, _load_own_state)
+_SPACE = _Kind(_generators, _set_generators)
+_KEPT = _Kind(_nothing, _as_it_is)
+_OF_LIBRARIES: Final[dict[str, dict[str, _Kind]]] = {
+    "ale_py": {"ALEInterface": _Kind(_console_state, _set_console_state)},
+    "mujoco": {
+        "MjData": _Kind(mujoco_state.save_data, mujoco_state.load_data),
+        "MjModel": _Kind(mujoco_state.save_model, mujoco_state.load_model),
+    },
+}
+"""What only its library can copy, by module and name."""
+_ON_SCREEN: Final = ("pygame", "glfw", "gymnasium.envs.mujoco.mujoco_rendering")
+"""Modules whose objects show an env, and tell nothing of what it does next."""
+
+
+class _Plain:
+    pass
+
+
+def _kind_of(value: Any) -> _Kind | None:
+    """How `value` is saved in its place; None if it is a value as any other."""
+    kind = cast("type[Any]", type(value))
+    if kind is np.ndarray:
+        return _KEPT if _is_view_of_a_simulator(value) else None
+    if kind is FunctionType:
+        # Code is no state; what a closure holds may be.
+        return None if value.__closure__ else _KEPT
+    if kind not in _kinds:
+        _kinds[kind] = _kind_of_type(value)
+    return _kinds[kind]
+
+
+_kinds: dict[type, _Kind | None] = {}
+
+
+def _kind_of_type(value: Any) -> _Kind | None:
+    kind = cast("type[Any]", type(value))
+    module = kind.__module__
+    library = module.partition(".")[0]
+    if library in _OF_LIBRARIES and kind.__name__ in _OF_LIBRARIES[library]:
+        return _OF_LIBRARIES[library][kind.__name__]
+    if isinstance(value, gym.Space):
+        return _SPACE
+    if isinstance(value, EnvSpec | ModuleType) or library in _ON_SCREEN or module in _ON_SCREEN:
+        return _KEPT
+    if not _is_layer(value):
+        return None
+    return _OWN if hasattr(value, "save_state") and hasattr(value, "load_state") else _LAYER
+
+
+def _is_layer(value: Any) -> bool:
+    if isinstance(value, gym.Env | gym.vector.VectorEnv):
+        return True
+    # Without importing PettingZoo; and whatever pickles itself as what it was made of.
+    return not isinstance(value, type) and any(
+        base.__name__ == "EzPickle"
+        or (base.__name__ in ("AECEnv", "ParallelEnv") and base.__module__.startswith("pettingzoo"))
+        for base in type(value).__mro__
+    )
+
+
+def _is_view_of_a_simulator(array: np.ndarray[Any, Any]) -> bool:
+    """Whether its memory belongs to a library's object, and not to NumPy."""
+    base: Any = array
+    while isinstance(base, np.ndarray):
+        base = base.base
+    return base is not None and type(base).__name__ == "PyCapsule"
+
+
+# -- finding them -------------------------------------------------------------------------
+
+
+def parts_of(env: Any) -> dict[str, _Part]:
+    """The parts of an env by path, from the outermost in; each once."""
+    found = {"env": _Part(env, _ENV)}
+    known = {id(env)}
+    for path, part in (queue := list(found.items())):
+        if not part.kind.is_layer:
+            continue
+        # By its plainest path: some hold what they wrap by another name, too.
+        for name, value in sorted(_held(part.value).items(), key=_env_first):
+            if part.kind is _ENV and name in NOT_STATE:
+                continue
+            for inner_path, inner in _within(f"{path}.{name}", value):
+                kind = _kind_of(inner)
+                if kind is not None and id(inner) not in known:
+                    known.add(id(inner))
+                    found[inner_path] = _Part(inner, kind)
+                    queue.append((inner_path, found[inner_path]))
+    return found
+
+
+def _env_first(item: tuple[str, Any]) -> tuple[bool, str]:
+    return item[0] != "env", item[0]
+
+
+def _within(path: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """`value`, and what it holds if it is a container."""
+    items: Any = ()
+    if type(value) in (list, tuple):
+        items = enumerate(value) if value and not isinstance(value[0], _PLAIN) else ()
+    elif type(value) is dict:
+        items = cast("dict[Any, Any]", value).items()
+    elif not isinstance(value, _PLAIN):
+        yield path, value
+    for key, inner in items:
+        if not isinstance(inner, _PLAIN):
+            yield from _within(f"{path}[{key!r}]", inner)
+
+
+def versions_of(env: Any) -> dict[str, str]:
+    """The libraries that an env's parts come from, with their versions, sorted."""
+    values: list[Any] = []
+    for part in parts_of(env).values():
+        values.append(part.value)
+        if part.kind is _OWN:
+            values += _held(part.value).values()
+    names = {type(value).__module__.partition(".")[0] for value in values}
+    found = {name: getattr(sys.modules.get(name), "__version__", None) for name in names}
+    return {name: str(found[name]) for name in sorted(found) if isinstance(found[name], str)}
+
+
+# -- saving and loading -------------------------------------------------------------------
+
+
+class _Pickler(cloudpickle.Pickler):
+    """Refers to parts by their paths."""
+
+    def __init__(self, file: io.BytesIO, paths: Mapping[int, str]) -> None:
+        super().__init__(file, pickle.HIGHEST_PROTOCOL)  # pyright: ignore[reportUnknownMemberType]
+        self._paths = paths
+
+    def persistent_id(self, obj: Any) -> str | None:
+        if type(obj) in _BUILT_IN:  # As most are.
+            return None
+        path = self._paths.get(id(obj))
+        if path is None:
+            kind = _kind_of(obj)
+            if kind not in (None, _KEPT, _SPACE) or (kind is _KEPT and type(obj) is np.ndarray):
+                raise TypeError(
+                    f"a {type(obj).__name__} of a simulator lies where no layer holds it"
+                )
+        return path
+
+
+class _Unpickler(pickle.Unpickler):
+    def __init__(self, file: io.BytesIO, parts: Mapping[str, _Part]) -> None:
+        super().__init__(file)
+        self._parts = parts
+
+    def persistent_load(self, pid: str) -> Any:
+        return self._parts[pid].value
+
+
+def save_state(env: Any) -> SavedState:
+    """What an env holds, as a value.
+
+    Raises:
+        NotImplementedError: a part of it can't be saved; the message names it.
+    """
+    parts = parts_of(env)
+    for path, part in parts.items():
+        if part.kind.is_layer and type(part.value).__basicsize__ > _Plain.__basicsize__:
+            raise NotImplementedError(
+                f"{path} of env {env.env_id!r} is a {type(part.value).__name__}, whose state lies "
+                f"in a library that doesn't give it away; {_WAY_OUT}"
+            )
+    paths = {id(part.value): path for path, part in parts.items()}
+    states = {path: part.kind.save(part.value) for path, part in parts.items()}
+    try:
+        pickled = _pickled(states, paths)
+    except Exception as error:
+        raise NotImplementedError(_culprit(env, states, paths, error)) from error
+    return SavedState(tuple((path, _name_of(part)) for path, part in parts.items()), pickled)
+
+
+def _name_of(part: _Part) -> str:
+    """The type of a part; of a MuJoCo model its structure, too."""
+    name = type(part.value).__qualname__
+    return f"{name} {part.value.signature}" if name == "MjModel" else name
+
+
+_WAY_OUT: Final = "a BaseEnv of your own can define save_state() and load_state()"
+
+
+def _pickled(value: Any, paths: Mapping[int, str]) -> bytes:
+    file = io.BytesIO()
+    _Pickler(file, paths).dump(value)  # pyright: ignore[reportUnknownMemberType]
+    return file.getvalue()
+
+
+def _culprit(
+    env: Any, states: Mapping[str, Any], paths: Mapping[int, str], error: Exception
+) -> str:
+    """Says what it is that can't be pickled."""
+    for path, state in states.items():
+        held = cast("dict[str, Any]", state) if isinstance(state, dict) else {}
+        for name, value in held.items():
+            try:
+                _pickled(value, paths)
+            except Exception as own:  # noqa: BLE001  # An object may raise anything.
+                return (
+                    f"{path}.{name} of env {env.env_id!r}, a {type(value).__name__}, can't be "
+                    f"saved: {own}; {_WAY_OUT}"
+                )
+    return f"env {env.env_id!r} can't be saved: {error}; {_WAY_OUT}"
+
+
+def load_state(env: Any, state: SavedState) -> None:
+    """Put back what `save_state` has taken out of this env or of one like it.
+
+    Raises:
+        ValueError: the env consists of other parts; nothing was changed.
+    """
+    parts = parts_of(env)
+    for path, name in state.parts:
+        here = _name_of(parts[path]) if path in parts else "missing"
+        if here != name:
+            raise ValueError(
+                f"{path} is a {name} in the snapshot, and {here} in env {env.env_id!r}: it is "
+                "another env, or has not been reset yet"
+            )
+    states = _Unpickler(io.BytesIO(state.pickled), parts).load()
+    # A model before what is computed with it.
+    for path, _ in sorted(state.parts, key=lambda part: not part[1].startswith("MjModel")):
+        parts[path].kind.load(parts[path].value, states[path])

@@ -1,0 +1,365 @@
+"""`RayHost`: envs in a Ray actor, on whatever node of the cluster has room for it.
+
+One remote call carries a batch of requests, one array for each column, and its reply comes
+back alike. Ray's threads leave what has completed in an `Inbox`, whose descriptor wakes the
+trainer. A node that dies is a worker that dies, and its replacement is another actor.
+Absent on purpose: everything of Ray's own (see `ray`), and what envs do (see `actor`).
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import sys
+import time
+from collections import deque
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
+
+from rlightning_aio.hosts.actor import Batch, Late, NotStarted, Reply
+from rlightning_aio.hosts.arena import map_shared
+from rlightning_aio.hosts.inbox import Inbox
+from rlightning_aio.hosts.messages import (
+    Attached,
+    Built,
+    Closed,
+    Death,
+    Died,
+    ErrorText,
+    NewSchema,
+    NotBuilt,
+    Raised,
+    Reported,
+    Result,
+    Saved,
+    Value,
+)
+from rlightning_aio.hosts.pickling import dumped, dumped_with_code
+from rlightning_aio.hosts.ray import (
+    Connection,
+    actor_class,
+    beside,
+    call,
+    ending,
+    kill,
+    shortage,
+)
+from rlightning_aio.hosts.row_table import RowTable
+from rlightning_aio.hosts.runner import placed
+from rlightning_aio.protocol.entries import Operation, op_of, slot_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from rlightning_aio.config import EnvConfig
+    from rlightning_aio.hosts.base import Wiring
+    from rlightning_aio.hosts.messages import AttachOrder, Completion, EnvStarted, StartOrder
+
+__all__ = ["RayHost"]
+
+_ON_THE_WAY_NS: Final = 2_000_000_000
+"""How long a batch and its reply may be on their way, beside what the envs take."""
+
+_OF_ANOTHER_PROCESS: Final[list[_Life]] = []
+"""What a forked process has found in its memory. It keeps it: to let go of what is Ray's would be
+told to the cluster, through sockets in the middle of what the other process says there.
+"""
+
+
+class _Life:
+    """One actor, from its start to its end.
+
+    Attributes:
+        actor: Ray's handle.
+        inbox: where its replies arrive.
+        has_place: some node has started it.
+        is_built: its envs are.
+        sent: entries of the batches that it has not answered, in the order of execution.
+        began_ns: when it began with the first of them, as far as that can be known here.
+        late: a request that it has told to take too long, and since when that takes.
+        stacks: what all of its threads did then.
+    """
+
+    def __init__(self, actor: Any) -> None:
+        self.actor = actor
+        self.inbox = Inbox()
+        self.has_place = self.is_built = False
+        self.sent: deque[NDArray[np.int64]] = deque()
+        self.began_ns = 0
+        self.late: tuple[int, int] | None = None
+        self.stacks = ""
+        # What calls have left with us, by their number.
+        self._kept: dict[int, object] = {}
+        self._num_calls = 0
+
+    def call(self, method: Any, then: Callable[[_Life, Any], None], *arguments: Any) -> None:
+        """Call a method of the actor; `then` gets what comes of it, on the trainer's thread."""
+        self._num_calls = number = self._num_calls + 1
+        put = self.inbox.put
+
+        def completed(outcome: Any) -> None:
+            put(lambda: self._completed(number, then, outcome))
+
+        self._kept[number] = call(method, completed, *arguments)
+
+    def _completed(self, number: int, then: Callable[[_Life, Any], None], outcome: Any) -> None:
+        del self._kept[number]
+        then(self, outcome)
+
+    def end(self) -> None:
+        """Whatever the actor does, and whatever it has still told, is over."""
+        self.inbox.close()
+        self._kept.clear()
+        kill(self.actor)
+
+
+class RayHost:
+    """The trainer's handle on one actor; see `base.Host`, `Source` and `Killable`.
+
+    Raises:
+        ConfigError: `ray_options` can't be used.
+    """
+
+    def __init__(self, host_id: int, first_slot: int, order: StartOrder, wiring: Wiring) -> None:
+        self.host_id = host_id
+        self.first_slot = first_slot
+        self.num_envs = len(order.worker_indices)
+        self._config = order.config
+        self._limits = _limits(order.config)
+        self._actor_class = actor_class(order.config, watched=bool(self._limits))
+        self._start_payload = dumped_with_code(order)
+        self._wiring = wiring
+        self._tell = wiring.completions.append
+        self._pid = os.getpid()
+        self._life: _Life | None = None
+        self._started: list[EnvStarted] = []
+        self._table: RowTable | None = None
+        self._closing = False
+
+    # -- life ---------------------------------------------------------------------
+
+    def start(self) -> None:
+        """See `base.Host.start`."""
+        self._closing = False
+        try:
+            Connection.share(self._config, self._wiring)
+            actor = self._actor_class.remote(self.first_slot, self._limits, list(sys.path))
+        except Exception as error:
+            self._tell(Died(self.host_id, Death(f"has no Ray cluster to live in: {error}")))
+            return
+        life = self._life = _Life(actor)
+        self._wiring.watcher.watch(self)
+        life.call(actor.hello, self._on_placed)
+        life.call(actor.build, self._on_built, self._start_payload)
+        if self._limits:
+            life.call(beside(actor.watch), self._on_late)
+
+    def attach(self, order: AttachOrder) -> None:
+        """See `base.Host.attach`. The actor has rows of its own."""
+        if self._table is None:
+            map_part = partial(map_shared, self._wiring.arena.descriptor)
+            places = [(slab, row) for _, slab, row in placed(self._started, order, map_part)]
+            self._table = RowTable(self.first_slot, places)
+        elif self._life is not None and any(order.standings):
+            self._life.call(self._life.actor.resume, self._on_resumed, order.standings)
+        # A replacement is not built yet.
+        if self._life is not None and self._life.is_built:
+            self._tell(Attached(self.host_id))
+
+    def kill(self, *, dump: bool) -> None:
+        """See `base.Killable.kill`. Its stacks came when it was found to be late."""
+        del dump
+        if self._life is None:
+            return
+        if self._closing:
+            self._end("did not close in time and was killed")
+        elif not self._life.has_place:
+            self._end(f"could not be placed: {shortage(self._config)}")
+        else:
+            self._end("was killed", -9)
+
+    def destroy(self) -> None:
+        """See `base.Killable.destroy`. What `kill` ends is gone at once, as far as we know it."""
+        self.kill(dump=False)
+
+    def close(self) -> None:
+        """See `base.Host.close`."""
+        self._closing = True
+        if self._life is not None and self._life.has_place:
+            self._life.call(self._life.actor.close, self._on_closed)
+        else:
+            self.release()
+            self._tell(Closed(self.host_id, []))
+
+    def release(self) -> None:
+        """See `base.Host.release`."""
+        life, self._life = self._life, None
+        if life is None:
+            return
+        if os.getpid() != self._pid:
+            _OF_ANOTHER_PROCESS.append(life)
+            return
+        self._wiring.watcher.unwatch(self)
+        life.end()
+
+    def _end(self, cause: str, exit_code: int | None = None) -> None:
+        """Be done with the actor, and tell of its death."""
+        life = self._life
+        if life is None:
+            return
+        # It was executing the first batch.
+        requests: list[int] = [entry for entries in life.sent for entry in entries.tolist()]
+        self.release()
+        if self._closing:
+            index = slot_of(requests[0]) - self.first_slot if requests else 0
+            text = ErrorText("WorkerDied", f"its worker {cause}", life.stacks)
+            self._tell(Closed(self.host_id, [(index, text)]))
+        else:
+            death = Death(cause, exit_code, life.stacks, tuple(requests))
+            self._tell(Died(self.host_id, death))
+
+    # -- requests -----------------------------------------------------------------
+
+    def packed(self, arguments: Any) -> bytes:
+        """See `base.Host.packed`."""
+        return dumped(arguments, "it")
+
+    def submit(self, entries: NDArray[np.int64], arguments: Sequence[bytes] | None = None) -> None:
+        """See `base.Host.submit`."""
+        life = self._life
+        if life is None:
+            return
+        assert self._table is not None
+        columns = self._table.requests(entries, seeds=arguments is None)
+        if not life.sent:
+            life.began_ns = time.monotonic_ns()
+        life.sent.append(entries)
+        life.call(life.actor.execute, self._on_reply, Batch(entries, columns, arguments))
+
+    def executing(self) -> tuple[int, int]:
+        """See `base.Killable.executing`.
+
+        An actor tells by itself when a request takes too long. As long as it tells nothing, its
+        batch is given the time that all of its requests may take: so an actor that was stopped
+        or cut off is found as well.
+        """
+        life = self._life
+        if life is None or not life.sent:
+            return 0, 0
+        if life.late is not None:
+            return life.late
+        entries: list[int] = life.sent[0].tolist()
+        now_ns, since_ns = time.monotonic_ns(), life.began_ns + _ON_THE_WAY_NS
+        for entry in entries[:-1]:
+            limit = self._limits.get(op_of(entry))
+            if limit is None or now_ns < since_ns + limit * 1e9:
+                return entry, since_ns
+            since_ns += int(limit * 1e9)
+        return entries[-1], since_ns
+
+    # -- replies ------------------------------------------------------------------
+
+    def fileno(self) -> int:
+        """See `base.Source.fileno`."""
+        assert self._life is not None
+        return self._life.inbox.descriptor
+
+    def on_readable(self) -> None:
+        """See `base.Source.on_readable`."""
+        life = self._life
+        for task in life.inbox.take() if life is not None else ():
+            if self._life is life:  # And not at its end by one of them.
+                task()
+
+    def on_writable(self) -> None:
+        """Never asked for: Ray sends by itself."""
+
+    def _has_returned(self, outcome: Any) -> bool:
+        """Whether a call has returned; otherwise the actor has come to its end."""
+        if isinstance(outcome, BaseException):
+            self._end(*ending(outcome))
+            return False
+        return True
+
+    def _on_placed(self, life: _Life, outcome: Any) -> None:
+        if self._has_returned(outcome):
+            life.has_place = True
+
+    def _on_built(self, life: _Life, outcome: bytes | NotStarted | Exception) -> None:
+        if not self._has_returned(outcome):
+            return
+        started: Any = _loaded(outcome) if isinstance(outcome, bytes) else outcome
+        if isinstance(started, ErrorText):  # It holds what can't be read here.
+            started = NotStarted(0, started)
+        if isinstance(started, NotStarted):
+            self._tell(NotBuilt(self.host_id, started.env_index, started.error))
+            return
+        self._started = started
+        life.is_built = True
+        self._tell(Built(self.host_id, started))
+        if self._table is not None:  # A replacement has its rows already.
+            self._tell(Attached(self.host_id))
+
+    def _on_resumed(self, life: _Life, outcome: NotStarted | Exception | None) -> None:
+        del life
+        if self._has_returned(outcome) and isinstance(outcome, NotStarted):
+            self._tell(NotBuilt(self.host_id, outcome.env_index, outcome.error))
+
+    def _on_late(self, life: _Life, outcome: Late | Exception) -> None:
+        if self._has_returned(outcome):
+            assert isinstance(outcome, Late)
+            life.late = outcome.entry, time.monotonic_ns() - outcome.taken_ns
+            life.stacks = outcome.stacks
+
+    def _on_reply(self, life: _Life, outcome: Reply | Exception) -> None:
+        if self._has_returned(outcome):
+            assert isinstance(outcome, Reply)
+            life.sent.popleft()
+            life.began_ns = time.monotonic_ns()
+            for completion in self._taken_in(outcome):
+                self._tell(completion)
+
+    def _taken_in(self, reply: Reply) -> list[Completion]:
+        """Write results into their rows; what has become of the batch."""
+        assert self._table is not None
+        host_id = self.host_id
+        self._table.put_results(reply.with_rows(), reply.columns, time.monotonic_ns())
+        told: list[Completion] = [NewSchema(host_id, *schema) for schema in reply.schemas]
+        told += [Saved(host_id, *saved) for saved in reply.saved]
+        if len(reply.done):
+            told.append(Reported(host_id, reply.done))
+        told += [Result(host_id, entry, packed) for entry, packed in reply.beside]
+        for entry, packed in reply.values:
+            value = _loaded(packed)
+            told.append(
+                Raised(host_id, entry, value)
+                if isinstance(value, ErrorText)
+                else Value(host_id, entry, value)
+            )
+        told += [Raised(host_id, entry, error) for entry, error in reply.errors]
+        return told
+
+    def _on_closed(self, life: _Life, outcome: Any) -> None:
+        del life
+        if self._has_returned(outcome):
+            self.release()
+            self._tell(Closed(self.host_id, outcome))
+
+
+def _limits(config: EnvConfig) -> dict[int, float]:
+    """How many seconds an operation may take, where it has a limit."""
+    limits = {Operation.STEP: config.step_timeout, Operation.RESET: config.reset_timeout}
+    return {int(op): limit for op, limit in limits.items() if limit is not None}
+
+
+def _loaded(packed: bytes) -> Any:
+    """An object of the user's, whose class may be unknown here; an `ErrorText` of why not."""
+    try:
+        return pickle.loads(packed)
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # What it is made by may raise anything.
+        return ErrorText.of(error)

@@ -1,0 +1,85 @@
+"""`SavingRunner`: an env that gives its standing away now and then, for a replaced worker.
+
+It does so after each reset, after each end, and after every so many steps in between; and
+before a reset if it has stepped since, so that what an episode has made of generators and
+wrappers isn't lost. So whatever was answered last, the standing that was given away last lies
+in the same episode.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from rlightning_aio.hosts.runner import EnvRunner
+from rlightning_aio.protocol.entries import Operation
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rlightning_aio.envs.base import BaseEnv
+    from rlightning_aio.hosts.messages import OutOfBand
+    from rlightning_aio.hosts.runner import Execute
+    from rlightning_aio.protocol.info import InfoSchema
+    from rlightning_aio.protocol.slab import Slab
+
+__all__ = ["SavingRunner"]
+
+
+class SavingRunner(EnvRunner):
+    """See the module.
+
+    Args:
+        env: as of `EnvRunner`; inline: likewise.
+        every: so many steps come between two standings at most.
+    """
+
+    def __init__(self, env: BaseEnv, every: int, *, inline: bool = False) -> None:
+        super().__init__(env, inline=inline)
+        self._every = every
+        self._since = 0
+
+    def attach(self, slab: Slab, row: int, announce: Callable[[InfoSchema], int]) -> None:
+        super().attach(slab, row, announce)
+        self._over = slab.over[row, ...]
+        self.step = self._saving(self.step)
+        self._own_reset = self._resetting(self._own_reset)
+        # Its halves would not come by here.
+        self.begin_step = None
+
+    def execute(self, op: int, arguments: Any) -> Any:
+        if op == Operation.RESET:
+            return self._reset_saving(lambda: super(SavingRunner, self).execute(op, arguments))
+        outcome = super().execute(op, arguments)
+        if op == Operation.STEP:
+            self._note_step()
+        elif op == Operation.RESTORE:
+            self._save()
+        return outcome
+
+    def _saving(self, step: Execute) -> Execute:
+        def step_and_save() -> OutOfBand | None:
+            outcome = step()
+            self._note_step()
+            return outcome
+
+        return step_and_save
+
+    def _note_step(self) -> None:
+        self._since += 1
+        if self._since >= self._every or self._over.all():
+            self._save()
+
+    def _resetting(self, reset: Execute) -> Execute:
+        return lambda: self._reset_saving(reset)
+
+    def _reset_saving(self, reset: Execute) -> OutOfBand | None:
+        if self._since:
+            self._save(before=True)
+        outcome = reset()
+        self._began = True
+        self._save()
+        return outcome
+
+    def _save(self, *, before: bool = False) -> None:
+        self._keep(self.standing(), before)
+        self._since = 0

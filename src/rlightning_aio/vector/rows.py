@@ -1,0 +1,294 @@
+"""How one row of envs lies in the results of a group, for the interfaces that show such a row.
+
+`Singles` has an env in each result, `Batches` as many sub-environments in each. What is
+``[num_envs, ...]`` to a user is ``[results, each, ...]`` to the group: a view, either way.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from rlightning_aio.batch.data import (
+    reported_info_list,
+    reported_infos,
+    reported_sub_env_infos,
+)
+from rlightning_aio.batch.infos import listed
+from rlightning_aio.envs.sub_envs import SEEDS
+from rlightning_aio.protocol.columns import leaves, mapped
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from rlightning_aio.batch import BatchedData
+    from rlightning_aio.sync import EnvGroup
+    from rlightning_aio.types import EnvMeta
+
+__all__ = ["Batches", "Singles", "rows_of"]
+
+Options = dict[str, Any]
+
+
+class Singles:
+    """An env in each result.
+
+    Args:
+        group: initialised.
+        metas: of its envs.
+
+    Attributes:
+        num_envs: of the row.
+        spaces: observation and action space of each env.
+    """
+
+    def __init__(self, group: EnvGroup, metas: Sequence[EnvMeta]) -> None:
+        self._group = group
+        self.num_envs = len(metas)
+        self.spaces: list[tuple[Any, Any]] = [
+            (meta.observation_space, meta.action_space) for meta in metas
+        ]
+
+    # -- results ------------------------------------------------------------------------
+
+    def observation(self, batch: BatchedData) -> Any:
+        """Observations, as the columns that they are."""
+        return batch.observation
+
+    def flat(self, column: NDArray[Any]) -> NDArray[Any]:
+        """A column of rewards or ends, ``[num_envs]``."""
+        return column
+
+    def infos(self, batch: BatchedData) -> dict[str, Any]:
+        """Infos as columns with masks."""
+        return reported_infos(batch)
+
+    def info_list(self, batch: BatchedData) -> list[dict[str, Any]]:
+        """One info for each env."""
+        return reported_info_list(batch)
+
+    def of_mask(self, batch: BatchedData, mask: NDArray[np.bool_]) -> tuple[Any, dict[str, Any]]:
+        """Observations and infos of the envs of `mask` alone, for whose reset `batch` answers."""
+        del mask
+        return self.observation(batch), self.infos(batch)
+
+    # -- requests -----------------------------------------------------------------------
+
+    def actions(self, actions: Any) -> Any:
+        """Actions ``[num_envs, ...]`` as the group takes them.
+
+        Raises:
+            ValueError, TypeError: they are not as many.
+        """
+        return actions
+
+    def send_resets(
+        self, seeds: Sequence[int | None], options: Sequence[Options | None], chosen: Sequence[int]
+    ) -> None:
+        """Reset the envs at the places `chosen`, in order, each with its seed and its options."""
+        env_ids = self._group.env_ids
+        if all(options[k] is options[chosen[0]] for k in chosen):
+            given = {env_ids[k]: int(seed) for k in chosen if (seed := seeds[k]) is not None}
+            return self._group.reset_async(
+                given, options[chosen[0]] or None, [env_ids[k] for k in chosen]
+            )
+        for k in chosen:
+            self.send_resets(seeds, options, [k])
+        return None
+
+    def call(self, name: str, args: Any, kwargs: Any, chosen: Sequence[int] | None = None) -> None:
+        """Call a method of all envs, or of those at the places `chosen`."""
+        env_ids = self._group.env_ids
+        ids = None if chosen is None else [env_ids[k] for k in chosen]
+        self._group.call_async("call_wrapped", name, *args, env_ids=ids, **kwargs)
+
+    def values(self, collected: list[Any], chosen: Sequence[int] | None = None) -> list[Any]:
+        """Values of the calls, one for each env that was called."""
+        del chosen
+        return collected
+
+    def are_wrapped(self, wrapper_class: type[Any], chosen: Sequence[int]) -> list[bool]:
+        """Whether a wrapper is among those of the envs at the places `chosen`."""
+        env_ids = [self._group.env_ids[k] for k in chosen]
+        self._group.call_async("is_wrapped", wrapper_class, env_ids=env_ids)
+        return self._group.collect_calls()
+
+    def set_attr(self, name: str, each: Sequence[Any]) -> None:
+        """Send values of an attribute, one for each env."""
+        for env_id, value in zip(self._group.env_ids, each, strict=True):
+            self._group.call_async(
+                "call_wrapped", "set_wrapper_attr", name, value, env_ids=[env_id]
+            )
+
+    def set_outermost(self, name: str, value: Any, chosen: Sequence[int]) -> None:
+        """Set an attribute of the outermost wrapper of the envs at the places `chosen`."""
+        self.call("__setattr__", (name, value), {}, chosen)
+        self._group.collect_calls()
+
+
+class Batches(Singles):
+    """As many sub-environments in each result.
+
+    Raises:
+        RuntimeError: they are not as many everywhere, or have no fixed size.
+    """
+
+    def __init__(self, group: EnvGroup, metas: Sequence[EnvMeta]) -> None:
+        self._group = group
+        self._each = metas[0].num_envs
+        for meta in metas:
+            if meta.num_envs != self._each:
+                raise RuntimeError(
+                    f"env {meta.env_id!r} holds {meta.num_envs} sub-environments, and "
+                    f"{metas[0].env_id!r} {self._each}; they must be as many everywhere"
+                )
+        self.num_envs = len(metas) * self._each
+        found: list[list[Any]] = []
+        for name in ("single_observation_space", "single_action_space"):
+            group.call_async("call_wrapped", name)
+            found.append(group.collect_calls())
+        pairs = list(zip(*found, strict=True))
+        for space in pairs[0]:
+            if leaves(space) is None:
+                raise RuntimeError(
+                    f"values of {space} have no fixed size; make separate envs, each by a callable"
+                )
+        self.spaces = [pair for pair in pairs for _ in range(self._each)]
+        group.call_async("call_wrapped", "takes_masks")
+        self._takes_masks = all(group.collect_calls())
+
+    def observation(self, batch: BatchedData) -> Any:
+        return mapped(_flat, batch.observation)
+
+    def flat(self, column: NDArray[Any]) -> NDArray[Any]:
+        return column.reshape(-1)
+
+    def infos(self, batch: BatchedData) -> dict[str, Any]:
+        return reported_sub_env_infos(batch, self._each)
+
+    def info_list(self, batch: BatchedData) -> list[dict[str, Any]]:
+        return listed(self.infos(batch), self.num_envs)
+
+    def of_mask(self, batch: BatchedData, mask: NDArray[np.bool_]) -> tuple[Any, dict[str, Any]]:
+        by_batch = mask.reshape(-1, self._each)
+        wanted = by_batch[by_batch.any(axis=1)].reshape(-1)
+        return (
+            mapped(lambda column: column[wanted], self.observation(batch)),
+            _picked(self.infos(batch), wanted),
+        )
+
+    def actions(self, actions: Any) -> Any:
+        return mapped(self._folded, actions)
+
+    def _folded(self, column: Any) -> NDArray[Any]:
+        array = np.asarray(column)
+        if not array.ndim:
+            raise TypeError(f"actions must be as many as envs, {self.num_envs}, not a scalar")
+        if len(array) != self.num_envs:
+            raise ValueError(f"{len(array)} actions for num_envs={self.num_envs}")
+        return array.reshape(-1, self._each, *array.shape[1:])
+
+    def send_resets(
+        self, seeds: Sequence[int | None], options: Sequence[Options | None], chosen: Sequence[int]
+    ) -> None:
+        for batch, which in self._by_batch(chosen):
+            places = range(batch * self._each, (batch + 1) * self._each)
+            self._send_reset(batch, [seeds[k] for k in places], options, which)
+
+    def _send_reset(
+        self,
+        batch: int,
+        seeds: list[int | None],
+        options: Sequence[Options | None],
+        which: list[int],
+    ) -> None:
+        env_id = self._group.env_ids[batch]
+        own = [options[batch * self._each + k] for k in which]
+        if any(one is not own[0] and one != own[0] for one in own):
+            raise ValueError(
+                "options of a reset that differ between envs that are stepped together; make "
+                "separate envs"
+            )
+        given = dict(own[0] or {})
+        if len(which) < self._each:
+            if not self._takes_masks:
+                raise ValueError(
+                    "the vector environments of this task reset all of their sub-environments "
+                    "together; make separate envs (vectorization_mode='async') for reset_mask"
+                )
+            given["reset_mask"] = np.isin(np.arange(self._each), which)
+        first = seeds[0]
+        if first is not None and seeds == list(range(first, first + self._each)):
+            return self._group.reset_async({env_id: int(first)}, given or None, [env_id])
+        if any(seed is not None for seed in seeds):
+            given[SEEDS] = seeds
+        return self._group.reset_async(None, given or None, [env_id])
+
+    def _by_batch(self, chosen: Sequence[int]) -> Iterator[tuple[int, list[int]]]:
+        """Each batch that has some of the places `chosen`, and which these are of its own."""
+        found: dict[int, list[int]] = {}
+        for k in chosen:
+            found.setdefault(k // self._each, []).append(k % self._each)
+        yield from found.items()
+
+    def call(self, name: str, args: Any, kwargs: Any, chosen: Sequence[int] | None = None) -> None:
+        if chosen is None:
+            self._group.call_async("call_sub_envs", name, args, kwargs, None)
+            return
+        for batch, which in self._by_batch(chosen):
+            env_ids = [self._group.env_ids[batch]]
+            self._group.call_async("call_sub_envs", name, args, kwargs, which, env_ids=env_ids)
+
+    def values(self, collected: list[Any], chosen: Sequence[int] | None = None) -> list[Any]:
+        if chosen is None:
+            return [value for values in collected for value in values]
+        parts = [batch for batch, _ in self._by_batch(chosen)]
+        of_batch = {batch: iter(values) for batch, values in zip(parts, collected, strict=True)}
+        return [next(of_batch[k // self._each]) for k in chosen]
+
+    def are_wrapped(self, wrapper_class: type[Any], chosen: Sequence[int]) -> list[bool]:
+        self._group.call_async("sub_envs_wrapped", wrapper_class)
+        told = self._group.collect_calls()
+        return [told[k // self._each] for k in chosen]
+
+    def set_attr(self, name: str, each: Sequence[Any]) -> None:
+        for k, env_id in enumerate(self._group.env_ids):
+            own = list(each[k * self._each : (k + 1) * self._each])
+            self._group.call_async("set_sub_envs", name, own, env_ids=[env_id])
+
+    def set_outermost(self, name: str, value: Any, chosen: Sequence[int]) -> None:
+        found = list(self._by_batch(chosen))
+        if any(len(set(which)) < self._each for _, which in found):
+            raise ValueError(
+                f"{name} can't be set of some envs that are stepped together with others; make "
+                "separate envs, each by a callable"
+            )
+        for batch, _ in found:
+            values = [value] * self._each
+            self._group.call_async(
+                "set_sub_envs", name, values, env_ids=[self._group.env_ids[batch]]
+            )
+        self._group.collect_calls()
+
+
+def rows_of(group: EnvGroup, metas: Sequence[EnvMeta]) -> Singles:
+    """How the envs of a group make one row."""
+    several = any(meta.num_envs > 1 for meta in metas)
+    return Batches(group, metas) if several else Singles(group, metas)
+
+
+def _flat(column: NDArray[Any]) -> NDArray[Any]:
+    return column.reshape(-1, *column.shape[2:])
+
+
+def _picked(infos: dict[str, Any], wanted: NDArray[np.bool_]) -> dict[str, Any]:
+    """Columns of some alone."""
+    return {
+        key: _picked(cast("dict[str, Any]", column), wanted)
+        if isinstance(column, dict)
+        else column[wanted]
+        for key, column in infos.items()
+    }

@@ -1,0 +1,437 @@
+"""What a collector makes of the kinds of envs, of policies that wait or fail, and of its memory."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from collecting.scripted import Tickets, scripted_group
+from faults.driven import entry
+from faults.faulty import CODES
+from group import sample_envs
+from gymnasium.vector import AutoresetMode
+from patience import HANG
+from remote.counting import ClientThread, CountingEnv
+
+import rlightning_aio as rl
+from rlightning_aio import sync
+from rlightning_aio.collecting import Collector
+from rlightning_aio.errors import BadAction, EnvRaised
+
+if TYPE_CHECKING:
+    from rlightning_aio.batch import BatchedData
+
+assert sample_envs  # Registers its envs.
+
+POLE = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1", "placement": "inline"}
+
+
+def zeros(batch: BatchedData) -> dict[str, Any]:
+    return {"action": np.zeros(batch.is_reset.shape, int)}
+
+
+def poles(count: int, **fields: Any) -> Any:
+    return sync.build_env_group({**POLE, "num_workers": count, **fields})
+
+
+# -- kinds of envs
+
+
+def test_each_kind_of_env_has_a_policy_and_a_rollout_of_its_own() -> None:
+    """Together they have as many transitions as were asked for."""
+    entries = [
+        {**POLE, "num_workers": 3},
+        {"name": "probe", "backend": "probe", "task": "-", "num_workers": 2, "placement": "inline"},
+    ]
+
+    def probe(batch: BatchedData) -> dict[str, Any]:
+        assert batch.observation.shape == (len(batch), 4)
+        return {"action": np.zeros((len(batch), 2)), "note": np.arange(len(batch))}
+
+    for options, expected in (
+        ({"min_batch": 2}, {}),
+        ({"wait_all": True}, {"pole": (4, 3), "probe": (4, 2)}),
+    ):
+        group = sync.build_env_group(entries, mixed_actions=True)
+        with group, group.auto_reset(20):
+            collector = Collector(
+                group, {"pole": zeros, "probe": probe}, num_transitions=20, seed=0, **options
+            )
+            for _ in range(3):
+                rollouts = collector.collect()
+                assert list(rollouts) == ["pole", "probe"]
+                assert sum(map(len, rollouts.values())) == 20
+                assert "note" in rollouts["probe"]
+                assert "note" not in rollouts["pole"]
+                assert set(rollouts["probe"].index.flat) <= {3, 4}
+                for name, shape in expected.items():
+                    assert rollouts[name].shape == shape
+                    assert rollouts[name].action.shape[:2] == shape
+
+
+def test_an_entry_without_a_policy_is_named_again_and_again() -> None:
+    with poles(1) as group, group.auto_reset():
+        collector = Collector(group, {"cart": zeros}, num_transitions=4)
+        for _ in range(2):
+            with pytest.raises(ValueError, match=r"no policy was given for .* 'pole'.* cart"):
+                collector.collect()
+
+
+def test_envs_of_several_kinds_need_several_policies() -> None:
+    entries = [{**POLE}, {**POLE, "name": "car", "task": "MountainCar-v0"}]
+    with sync.build_env_group(entries, mixed_actions=True) as group, group.auto_reset():
+        collector = Collector(group, zeros, num_transitions=4)
+        with pytest.raises(ValueError, match="by_name"):
+            collector.collect()
+
+
+def test_columns_of_dict_observations_are_trees() -> None:
+    def policy(batch: BatchedData) -> dict[str, Any]:
+        return {"action": [sample_envs.MOVES.sample() for _ in range(len(batch))]}
+
+    tree = {"name": "tree", "backend": "gymnasium", "task": "Tree-v0", "num_workers": 2}
+    group = sync.build_env_group({**tree, "placement": "inline"})
+    with group, group.auto_reset(50):
+        rollout = Collector(group, policy, num_transitions=60, seed=1).collect()
+        assert rollout.observation["image"].shape == (60, 4, 5, 3)
+        assert rollout.observation["image"].dtype == np.uint8
+        assert rollout.observation["pair"][0].shape == (60, 2)
+        assert rollout.end_observation["inner"]["count"].shape == rollout.ends.shape
+        after = rollout.next_observation["place"]
+        for k in range(59):
+            if k not in rollout.ends:
+                assert (after[k] == rollout.observation["place"][k + 1]).all()
+        assert rollout.action.shape == (60,)  # What doesn't stack stays as it is.
+        assert set(rollout.action[0]) == {"push", "hands", "jump"}
+
+
+def test_agents_have_rewards_and_ends_of_their_own() -> None:
+    def policy(batch: BatchedData) -> dict[str, Any]:
+        count = len(batch)
+        action = {"tall": np.ones((count, 1), np.float32), "small": np.ones(count, int)}
+        return {"action": action, "value": {"tall": np.zeros(count), "small": np.zeros(count)}}
+
+    crowd = {"name": "crowd", "backend": "crowd", "task": "-", "num_workers": 2}
+    group = sync.build_env_group({**crowd, "placement": "inline"})
+    with group, group.auto_reset(9):
+        rollout = Collector(group, policy, num_transitions=9, min_batch=2).collect()
+        assert rollout.index.tolist() == [0] * 5 + [1] * 4
+        assert rollout.observation["small"].tolist() == [0, 1, 2, 0, 1, 0, 1, 2, 0]
+        assert rollout.terminated["tall"].tolist() == [0, 1, 1, 0, 1, 0, 1, 1, 0]
+        assert rollout.terminated["small"].tolist() == [0, 0, 1, 0, 0, 0, 0, 1, 0]
+        assert rollout.ends.tolist() == [4, 8, 2, 7]
+        values = {agent: np.zeros(4) for agent in ("tall", "small")}
+        found = rollout.advantages(rollout.value, values, 1.0, 1.0)
+        assert found["small"].tolist() == [3, 2, 1, 2, 1, 3, 2, 1, 1]
+        assert found["tall"][:2].tolist() == [2, 1]
+
+
+def test_a_sub_environment_that_waits_for_others_makes_no_transitions() -> None:
+    """Of a simulator without resets of its own, which is reset when all have ended."""
+    batched = {"name": "batched", "backend": "batched", "task": "-", "num_envs": 3}
+
+    def policy(batch: BatchedData) -> dict[str, Any]:
+        return {"action": np.array([[3, 5, 9]])}  # They end after 3 steps, 2 and 1.
+
+    group = sync.build_env_group({**batched, "placement": "inline"})
+    with group, group.auto_reset(99):
+        rollout = Collector(group, policy, num_transitions=12).collect()
+        assert rollout.index.tolist() == [0] * 6 + [1] * 4 + [2] * 2
+        assert rollout.reward.tolist() == [3, 6, 9, 3, 6, 9, 5, 10, 5, 10, 9, 9]
+        assert rollout.first.tolist() == [1, 0, 0, 1, 0, 0, 1, 0, 1, 0, 1, 1]
+
+
+def test_blocks_are_refused_where_they_would_have_holes() -> None:
+    group, _ = scripted_group("vector", 2, 0.1)
+    with group, group.auto_reset(99):
+        collector = Collector(group, Tickets(), num_transitions=8, wait_all=True)
+        with pytest.raises(ValueError, match=r"no \[T, N\] block.*min_batch instead"):
+            collector.collect()
+    with poles(3) as group, group.auto_reset():
+        collector = Collector(group, zeros, num_transitions=8, wait_all=True)
+        for _ in range(2):
+            with pytest.raises(ValueError, match=r"num_transitions=8 .* 3 envs"):
+                collector.collect()
+
+
+def test_a_block_has_what_gymnasiums_vector_env_steps_through() -> None:
+    """In the same step, as its own mode of that name: to the bit."""
+    generator = np.random.default_rng(0)
+    actions: list[Any] = []
+
+    def policy(batch: BatchedData) -> dict[str, Any]:
+        actions.append(generator.integers(2, size=len(batch)))
+        return {"action": actions[-1]}
+
+    with poles(3) as group, group.auto_reset():
+        collector = Collector(group, policy, num_transitions=90, wait_all=True, seed=7)
+        blocks = [collector.collect() for _ in range(2)]
+    assert len(actions) == 60
+    envs = gym.make_vec(
+        "CartPole-v1",
+        3,
+        vectorization_mode="sync",
+        vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
+    )
+    observation, _ = envs.reset(seed=7)
+    for k, action in enumerate(actions):
+        block, t = blocks[k // 30], k % 30
+        np.testing.assert_array_equal(block.observation[t], observation)
+        observation, reward, terminated, truncated, _ = envs.step(action)
+        np.testing.assert_array_equal(block.reward[t], reward)
+        np.testing.assert_array_equal(block.done[t], terminated | truncated)
+    envs.close()
+
+
+def test_the_step_limit_truncates() -> None:
+    with poles(1) as group, group.auto_reset(4):
+        rollout = Collector(group, zeros, num_transitions=10, seed=0).collect()
+    assert np.flatnonzero(rollout.truncated).tolist() == [3, 7]
+    assert not rollout.terminated.any()
+    assert rollout.ends.tolist() == [9, 3, 7]
+    assert (rollout.end_observation[1] != rollout.observation[4]).any()
+
+
+@pytest.mark.one_driver_for_each_place
+@pytest.mark.parametrize("options", [{"min_batch": 2}, {"wait_all": True}])
+async def test_a_lost_worker_cuts_a_chain(options: Any) -> None:
+    """The transition that was under way is in no rollout; behind the one before, what it led to."""
+    killed: list[int] = []
+
+    def policy(batch: BatchedData) -> dict[str, Any]:
+        actions = np.zeros((len(batch), 2))
+        doomed = (batch.observation[:, 0] == 0) & (batch.observation[:, 3] == 2)
+        if doomed.any() and not killed:
+            killed.append(1)
+            actions[doomed, 0] = CODES["sigkill"]
+        return {"action": actions}
+
+    async with rl.build_env_group(entry(2, envs_per_process=1)) as group:
+        with group.auto_reset(100):
+            rollout = await Collector(group, policy, num_transitions=12, **options).collect()
+    if rollout.shape == (6, 2):
+        own = rollout.observation[:, 0]
+        steps = own[:, 3]
+        assert len(steps) == 6
+    else:
+        own = rollout.observation[rollout.index == 0]
+        steps = own[:, 3]
+    assert killed
+    assert steps[:4].tolist() == [0, 1, 0, 1]
+    lives = own[:, 1].tolist()
+    assert lives[0] == lives[1] != lives[2] == lives[3]
+    assert not rollout.done.any()
+    assert len(rollout.ends) == 3
+    assert rollout.end_observation[2, [0, 1, 3]].tolist() == [0, lives[0], 2]
+
+
+def test_clients_join_while_it_collects() -> None:
+    """Their first result is a reset; a block of envs that come and go can't be made."""
+
+    def policy(batch: BatchedData) -> dict[str, Any]:
+        return {"action": np.zeros((len(batch), 2), np.float32)}
+
+    kwargs = {"heartbeat": 5.0, "connect_timeout": HANG}
+    server = {"name": "robots", "backend": "env_server", "env_kwargs": kwargs}
+    with sync.build_env_group(server) as group:
+        first = ClientThread(group["robots-0"].address, "c0", CountingEnv(0))
+        second = None
+        seen: set[int] = set()
+        with group.auto_reset(4):
+            collector = Collector(group, policy, num_transitions=6)
+            while len(seen) < 2:
+                rollout = collector.collect()
+                assert len(rollout) == 6
+                for index in set(rollout.index.tolist()):
+                    own = rollout.index == index
+                    after = rollout.next_observation[own]
+                    assert (after[:, 2] == rollout.observation[own][:, 2] + 1).all()
+                    assert (rollout.truncated[own] == (after[:, 2] == 4)).all()
+                    seen.add(index)
+                second = second or ClientThread(group["robots-0"].address, "c1", CountingEnv(1))
+            with pytest.raises(ValueError, match="'robots-0', which has clients"):
+                Collector(group, policy, num_transitions=6, wait_all=True)._lay_out()
+    first.join()
+    assert second is not None
+    second.join()
+
+
+# -- policies
+
+
+async def test_policies_may_be_awaited_and_cancelled() -> None:
+    """Cancelled anywhere, the next call goes on; nothing is lost or doubled."""
+    async with rl.build_env_group({**POLE, "num_workers": 3}) as group:
+        asked, answering = asyncio.Event(), asyncio.Event()
+        calls: list[list[int]] = []
+
+        async def policy(batch: BatchedData) -> dict[str, Any]:
+            calls.append(batch.index.tolist())
+            asked.set()
+            await answering.wait()
+            return zeros(batch)
+
+        with group.auto_reset():
+            collector = Collector(group, policy, num_transitions=6, min_batch=3, seed=0)
+            task = asyncio.ensure_future(collector.collect())
+            await asked.wait()
+            with pytest.raises(RuntimeError, match="collecting already"):
+                await collector.collect()
+            task.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await task
+            answering.set()
+            rollout = await collector.collect()
+            assert calls[:2] == [[0, 1, 2]] * 2
+            assert rollout.index.tolist() == [0, 0, 1, 1, 2, 2]
+
+
+def test_a_coroutine_needs_an_asynchronous_group() -> None:
+    async def policy(batch: BatchedData) -> dict[str, Any]:
+        return zeros(batch)
+
+    with poles(1) as group, group.auto_reset():
+        collector = Collector(group, policy, num_transitions=2)
+        with pytest.raises(TypeError, match="asynchronous group"):
+            collector.collect()
+
+
+@pytest.mark.parametrize(
+    ("answer", "error", "named"),
+    [
+        (np.zeros(2), TypeError, "columns by name"),
+        ({"actions": [0, 0]}, ValueError, "'action' among them; not 'actions'"),
+        (
+            {"action": np.zeros(2, int), "value": np.zeros(3)},
+            ValueError,
+            r"'value' has shape \[3\]",
+        ),
+        ({"action": np.zeros(2, int), "reward": np.zeros(2)}, ValueError, "'reward' of its own"),
+        ({"action": np.zeros((2, 5), int)}, BadAction, "nothing was sent"),
+    ],
+)
+def test_a_policy_that_answers_badly_is_told_and_asked_again(
+    answer: Any, error: type[Exception], named: str
+) -> None:
+    answers = [answer]
+
+    def policy(batch: BatchedData) -> Any:
+        return answers.pop() if answers else zeros(batch)
+
+    with poles(2) as group, group.auto_reset():
+        collector = Collector(group, policy, num_transitions=4, min_batch=2, seed=0)
+        with pytest.raises(error, match=named):
+            collector.collect()
+        assert collector.collect().index.tolist() == [0, 0, 1, 1]
+
+
+def test_an_env_that_raised_takes_part_again_after_a_reset() -> None:
+    def policy(batch: BatchedData) -> dict[str, Any]:
+        steps = batch.observation[:, 1:3]
+        raising = (steps == [1, 2]).all(axis=1) & (batch.index == 0)
+        return {"action": np.stack([3.0 * raising, batch.index], axis=1)}
+
+    probe = {"name": "probe", "backend": "probe", "task": "-", "num_workers": 2}
+    for options in ({"min_batch": 2}, {"wait_all": True}):
+        group = sync.build_env_group({**probe, "placement": "inline"})
+        with group, group.auto_reset(99):
+            collector = Collector(group, policy, num_transitions=8, **options)
+            with pytest.raises(EnvRaised) as raised:
+                collector.collect()
+            group.reset_async(env_ids=[raised.value.env_id])
+            rollout = collector.collect()
+            own = rollout.index == 0
+            assert rollout.observation[own][:4, 1:3].tolist() == [[1, 0], [1, 1], [2, 0], [2, 1]]
+            assert rollout.end_observation[-1][1:3].tolist() == [1, 2]
+
+
+def test_a_policy_must_give_the_same_columns_each_time() -> None:
+    """In shape and kind of number, too: 0.5 is no whole number."""
+    for more in (
+        {"value": np.zeros(2)},
+        {"note": np.full(2, 0.5)},
+        {"note": np.zeros((2, 2), int)},
+    ):
+        answers: list[Any] = [more, {"note": np.zeros(2, int)}]
+
+        def policy(batch: BatchedData, answers: Any = answers) -> Any:
+            return {**zeros(batch), **(answers.pop() if answers else {"note": np.ones(2, int)})}
+
+        with poles(2) as group, group.auto_reset():
+            collector = Collector(group, policy, num_transitions=4, min_batch=2, seed=0)
+            with pytest.raises(ValueError, match="before"):
+                collector.collect()
+            assert collector.collect().note.tolist() == [0, 1, 0, 1]
+
+
+# -- the collector itself
+
+
+def test_envs_must_be_reset_by_the_group() -> None:
+    with poles(1) as group, pytest.raises(RuntimeError, match=r"with group\.auto_reset"):
+        Collector(group, zeros, num_transitions=2).collect()
+
+
+def test_a_rollouts_memory_is_its_own_until_the_second_collect_after_it() -> None:
+    with poles(2) as group, group.auto_reset():
+        collector = Collector(group, zeros, num_transitions=6, min_batch=2, seed=0)
+        first = collector.collect()
+        kept = first.observation.copy()
+        for name in ("observation", "action", "reward", "index", "done"):
+            assert first[name].flags.c_contiguous
+            assert first[name].flags.writeable
+        second = collector.collect()
+        assert not np.shares_memory(first.observation, second.observation)
+        np.testing.assert_array_equal(first.observation, kept)
+        assert np.shares_memory(collector.collect().observation, first.observation)
+
+
+def test_lag_is_counted_in_versions() -> None:
+    with poles(2) as group, group.auto_reset():
+        collector = Collector(group, zeros, num_transitions=3, min_batch=2, seed=0)
+        collector.collect()  # The fourth transition is there already, and of version 0.
+        collector.policy_version += 2
+        rollout = collector.collect()
+        assert sorted(rollout.policy_version.tolist()) == [0, 2, 2]
+        assert rollout.lag == (0, 2 / 3, 2)
+
+
+def test_it_says_where_the_time_went() -> None:
+    """Each of two envs is in one place at a time; what is counted late is in a later rollout."""
+    with poles(2) as group, group.auto_reset():
+        collector = Collector(group, zeros, num_transitions=20, min_batch=2, seed=0)
+        seconds = [collector.collect().seconds for _ in range(3)]
+    for own in seconds:
+        assert 0 < own.policy <= own.collecting <= own.elapsed
+        assert own.env_busy > 0
+        assert own.waited_for_policy > 0
+        assert own.waited_for_learner >= 0
+    elapsed = sum(own.elapsed for own in seconds)
+    waited = sum(own.waited_for_policy + own.waited_for_learner for own in seconds)
+    assert sum(own.env_busy for own in seconds) + waited <= 2 * elapsed
+
+
+@pytest.mark.parametrize(
+    "options", [{"num_transitions": 0}, {"num_transitions": 1, "min_batch": 0}]
+)
+def test_numbers_must_be_above_zero(options: Any) -> None:
+    with pytest.raises(ValueError, match="at least 1"):
+        Collector(poles(1), zeros, **options)
+
+
+def test_columns_share_their_memory_with_torch() -> None:
+    torch = pytest.importorskip("torch")
+
+    def policy(batch: BatchedData) -> dict[str, Any]:
+        observation = torch.from_numpy(batch.observation)
+        return {"action": (observation[:, 2] > 0).long(), "value": observation.sum(1)}
+
+    with poles(2) as group, group.auto_reset():
+        rollout = Collector(group, policy, num_transitions=6, seed=0).collect()
+        torch.from_numpy(rollout.observation).zero_()
+        assert not rollout.observation.any()
+        next_values = torch.zeros(len(rollout.ends))
+        assert rollout.advantages(torch.from_numpy(rollout.value), next_values, 0.9, 0.9).any()

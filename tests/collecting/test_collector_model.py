@@ -1,0 +1,125 @@
+"""A collector over envs that remember, whatever comes when, against one list for each env."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from collecting.scripted import Disturbed, Step, Tickets, scripted_group
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rlightning_aio.collecting import Collector, Rollout
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+class Model:
+    """What was collected of each env, compared with what each env remembers."""
+
+    def __init__(self, logs: dict[int, list[Step]], tickets: Tickets) -> None:
+        self.logs = logs
+        self.tickets = tickets
+        self.collected = dict.fromkeys(logs, 0)
+
+    def check(self, rollout: Rollout, version: int) -> None:
+        rows = len(rollout.shape)
+
+        def flat(name: str) -> Any:
+            return rollout[name].reshape(len(rollout), *rollout[name].shape[rows:])
+
+        after = rollout.next_observation.reshape(len(rollout), -1)
+        numbers = np.arange(len(rollout)).reshape(rollout.shape)
+        if rows == 1:
+            chains = np.split(numbers, np.flatnonzero(np.diff(rollout.index)) + 1)
+        else:
+            chains = list(numbers.T)
+        assert rollout.num_chains == len(chains)
+        assert rollout.ends[: len(chains)].tolist() == [chain[-1] for chain in chains]
+        ends = set(rollout.ends.tolist())
+        assert len(ends) == len(rollout.ends)
+        for chain in chains:
+            env = int(flat("index")[chain[0]])
+            log = self.logs[env][self.collected[env] :][: len(chain)]
+            assert len(log) == len(chain)
+            self.collected[env] += len(chain)
+            for k, row in enumerate(chain.tolist()):
+                step = log[k]
+                assert flat("index")[row] == env
+                assert flat("observation")[row].tolist() == step.before
+                assert flat("action")[row].item() == step.action == flat("log_prob")[row]
+                assert flat("reward")[row] == step.reward
+                assert flat("terminated")[row] == step.terminated
+                assert flat("truncated")[row] == step.truncated
+                assert flat("done")[row] == (step.terminated or step.truncated)
+                assert flat("first")[row] == (step.before[2] == 0)
+                assert after[row].tolist() == step.after
+                assert flat("policy_version")[row] == self.tickets.version_of[step.action]
+                followed = k + 1 < len(chain) and not flat("first")[chain[k + 1]]
+                assert (row in ends) == (not followed)
+        ages = version - flat("policy_version")
+        assert rollout.lag == (ages.min(), ages.mean(), ages.max())
+
+    def uncollected(self) -> set[float]:
+        """Tickets of all that was stepped and is in no rollout."""
+        rests = (log[self.collected[env] :] for env, log in self.logs.items())
+        return {step.action for rest in rests for step in rest}
+
+
+def tickets_of(batch: Any) -> set[float]:
+    if batch.is_reset.all():
+        return set()
+    return set(batch.sent.log_prob[~batch.is_reset].tolist())
+
+
+def until_full(collect: Callable[[], Rollout]) -> Rollout:
+    while True:
+        try:
+            return collect()
+        except InterruptedError:
+            continue
+
+
+def chance_of(draw: Any, generator: Any, most: float) -> Callable[[], bool]:
+    share = draw(st.sampled_from([0.0, most / 4, most]))
+    return lambda: generator.random() < share
+
+
+@given(st.data(), st.sampled_from(["single", "same_step", "vector", "same_step_vector"]))
+@pytest.mark.parametrize("block", [False, True])
+def test_every_transition_is_in_one_rollout_in_order(block: bool, data: Any, kind: str) -> None:
+    """With what comes after each end, however results come, get lost and are interrupted."""
+    if block and kind == "vector":
+        return  # See test_collector.py.
+    draw = data.draw
+    generator = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    num_envs = draw(st.integers(1, 5))
+    group, logs = scripted_group(kind, num_envs, draw(st.sampled_from([0.0, 0.1, 0.5, 1.0])))
+    tickets = Tickets(chance_of(draw, generator, 0.2))
+    with group, group.auto_reset(10**6):
+        disturbed: Any = Disturbed(
+            group,
+            logs,
+            choose=lambda count: int(generator.integers(count)),
+            loses=chance_of(draw, generator, 0.3),
+            interrupts=chance_of(draw, generator, 0.3),
+        )
+        total = draw(st.integers(1, 12)) * (len(logs) if block else 1)
+        options = {"wait_all": True} if block else {"min_batch": draw(st.integers(1, 5))}
+        collector: Any = Collector(disturbed, tickets, num_transitions=total, **options)
+        tickets.version = lambda: collector.policy_version
+        model = Model(logs, tickets)
+        for _ in range(4):
+            rollout = until_full(collector.collect)
+            assert len(rollout) == total
+            assert rollout.shape == ((total // len(logs), len(logs)) if block else (total,))
+            model.check(rollout, collector.policy_version)
+            collector.policy_version += int(generator.integers(3))
+            left = model.uncollected()
+            in_flight = {t for row in disturbed.pool for t in tickets_of(row)}
+            assert left <= in_flight | tickets_of(disturbed.last)
+            assert in_flight <= left
+            if block:
+                assert not left

@@ -1,0 +1,169 @@
+"""The order of results is kept and kept to, so that an asynchronous run is repeated to the bit."""
+
+from __future__ import annotations
+
+import pickle
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from collecting.scripted import Disturbed, Tickets, scripted_group
+from group import sample_envs
+from hypothesis import given
+from hypothesis import strategies as st
+
+import rlightning_aio as rl
+from rlightning_aio import sync
+from rlightning_aio.collecting import Collector, Record, RecordedGroup, ReplayedGroup
+from rlightning_aio.errors import EnvRaised, ReplayDiverged
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from rlightning_aio.batch import BatchedData
+    from rlightning_aio.collecting import Rollout
+
+assert sample_envs  # Registers its envs.
+
+POLE = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1", "num_workers": 4}
+
+
+class Learner:
+    """A softmax over linear scores, and the policy gradient of its advantages."""
+
+    def __init__(self) -> None:
+        self.weights = np.zeros((4, 2), np.float32)
+        self.generator = np.random.default_rng(5)
+
+    def __call__(self, batch: BatchedData) -> dict[str, Any]:
+        share = self._shares(batch.observation)[:, 1]
+        return {"action": (self.generator.random(len(batch)) < share).astype(int)}
+
+    def _shares(self, observation: Any) -> Any:
+        scores = np.exp(observation @ self.weights)
+        return scores / scores.sum(axis=1, keepdims=True)
+
+    def learn(self, rollout: Rollout) -> None:
+        values = np.zeros(len(rollout), np.float32)
+        advantages = rollout.advantages(values, np.zeros(len(rollout.ends)), 0.99, 0.95)
+        chosen = np.eye(2, dtype=np.float32)[rollout.action]
+        direction = (chosen - self._shares(rollout.observation)) * advantages[:, None]
+        self.weights += 0.01 * rollout.observation.T @ direction / len(rollout)
+
+
+async def trained(group: Any) -> Any:
+    """Weights after some asynchronous updates, and what they were learned from."""
+    learner, seen = Learner(), []
+    with group.auto_reset():
+        collector = Collector(group, learner, num_transitions=60, seed=3)
+        for _ in range(6):
+            rollout = await collector.collect()
+            learner.learn(rollout)
+            collector.policy_version += 1
+            seen.append((rollout.index.tolist(), rollout.observation.copy(), rollout.lag))
+    return learner.weights, seen
+
+
+@pytest.mark.one_driver_for_each_place
+async def test_an_asynchronous_training_is_repeated_to_the_bit(tmp_path: Path) -> None:
+    """Weights included; in workers first, and then in this process, which has another order."""
+    async with rl.build_env_group({**POLE, "envs_per_process": 2}) as group:
+        recorded = RecordedGroup(group)
+        weights, seen = await trained(recorded)
+    recorded.record.save(tmp_path / "order")
+    record = Record.load(tmp_path / "order")
+    assert 0 < (tmp_path / "order").stat().st_size < 100 + 4 * 2 * (6 * 60 + 50)
+    for placement in ("process", "inline"):
+        async with rl.build_env_group({**POLE, "placement": placement}) as group:
+            again, seen_again = await trained(ReplayedGroup(group, record))
+        assert weights.any()
+        assert weights.tobytes() == again.tobytes()
+        for one, other in zip(seen, seen_again, strict=True):
+            assert one[0] == other[0]
+            assert one[1].tobytes() == other[1].tobytes()
+            assert one[2] == other[2]
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from(["single", "vector"]), st.integers(1, 4))
+def test_any_order_can_be_replayed(seed: int, kind: str, min_batch: int) -> None:
+    generator = np.random.default_rng(seed)
+
+    def collected(in_front: Any) -> tuple[list[Any], Any]:
+        group, logs = scripted_group(kind, 4, 0.2)
+        with group, group.auto_reset(10**6):
+            chosen = in_front(group, logs)
+            collector: Any = Collector(chosen, Tickets(), num_transitions=7, min_batch=min_batch)
+            found = [collector.collect() for _ in range(4)]
+            return [(r.index.copy(), r.action.copy(), r.end_observation) for r in found], chosen
+
+    def disturbed(group: Any, logs: Any) -> Any:
+        def choose(count: int) -> int:
+            return int(generator.integers(count))
+
+        return RecordedGroup(
+            Disturbed(group, logs, choose, loses=lambda: False, interrupts=lambda: False)  # type: ignore[arg-type]
+        )
+
+    first, recorded = collected(disturbed)
+    record = pickle.loads(pickle.dumps(recorded.record))
+    second, _ = collected(lambda group, _: ReplayedGroup(group, record))
+    for (*one, _), (*other, _) in zip(first, second, strict=True):
+        assert all(map(np.array_equal, one, other))
+
+
+def recorded_calls(count: int) -> Record:
+    """Of two envs that are stepped one after the other."""
+    with sync.build_env_group({**POLE, "num_workers": 2, "placement": "inline"}) as group:
+        recorded = RecordedGroup(group)
+        batch, _ = recorded.reset(seed=0)
+        recorded.step_async(batch.respond(action=[0, 0]))
+        for _ in range(count):
+            batch, _ = recorded.collect_async(max_results=1)
+            recorded.step_async(batch.respond(action=[0]))
+    return recorded.record
+
+
+def test_a_replay_tells_where_the_record_ends_or_is_left() -> None:
+    record = recorded_calls(3)
+    with sync.build_env_group({**POLE, "num_workers": 2, "placement": "inline"}) as group:
+        replayed = ReplayedGroup(group, record)
+        batch, _ = replayed.reset(seed=0)
+        replayed.step_async(batch.respond(action=[0, 0]))
+        batch, _ = replayed.collect_async(wait_all=True)
+        assert batch.ids() == ["pole-0"]  # As the record has it.
+        batch, _ = replayed.collect_async()
+        assert batch.ids() == ["pole-1"]
+        with pytest.raises(ReplayDiverged, match=r"call 3 .*of 3.*'pole-0'.*asked for nothing"):
+            replayed.collect_async()
+        group.reset_async(env_ids=["pole-0"])
+        with pytest.raises(ReplayDiverged, match=r"'pole-0'.*was a step, and is a reset now"):
+            replayed.collect_async()
+
+
+def test_what_was_not_recorded_is_not_replayed() -> None:
+    with sync.build_env_group({**POLE, "placement": "inline"}) as group:
+        replayed = ReplayedGroup(group, Record())
+        with pytest.raises(ReplayDiverged, match="ends here, after 0 calls"):
+            replayed.collect_async()
+
+
+def test_errors_are_raised_in_their_turn() -> None:
+    entry = {"name": "probe", "backend": "probe", "task": "-", "num_workers": 2}
+    record = None
+    for _ in range(2):
+        with sync.build_env_group({**entry, "placement": "inline"}) as group:
+            chosen: Any = RecordedGroup(group) if record is None else ReplayedGroup(group, record)
+            batch, _ = chosen.reset()
+            chosen.step_async(batch.respond(action=np.array([[3.0, 0.0], [0.0, 1.0]])))
+            with pytest.raises(EnvRaised):
+                chosen.collect_async(min_results=2)
+            batch, _ = chosen.collect_async()
+            assert batch.reward.tolist() == [1.0]
+            record = getattr(chosen, "record", None)
+
+
+def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "notes"
+    path.write_text("shopping list")
+    with pytest.raises(ValueError, match="notes holds no record"):
+        Record.load(path)

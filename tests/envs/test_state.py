@@ -1,0 +1,151 @@
+"""The state of each backend that gives it, on its real simulator, in this process."""
+
+from __future__ import annotations
+
+import pickle
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from rlightning_aio import PolicyResponse
+from rlightning_aio.config import EnvConfig
+from rlightning_aio.hosts.build_env import build_env
+
+TASKS = (
+    *("Ant", "HalfCheetah", "Hopper", "Humanoid", "HumanoidStandup", "InvertedDoublePendulum"),
+    *("InvertedPendulum", "Pusher", "Reacher", "Swimmer", "Walker2d"),
+)
+GYMNASIUM = ("CartPole-v1", "Acrobot-v1", "MountainCarContinuous-v0", "Taxi-v4", "CliffWalking-v1")
+
+
+class Made:
+    """An env of an entry, made and reset."""
+
+    def __init__(self, seed: int, **fields: Any) -> None:
+        self.env = build_env(EnvConfig(**{"name": "e", **fields}))
+        self.env.initialised()
+        self.env.reset(seed=seed)
+
+    def run(self, actions: list[Any]) -> list[Any]:
+        trace: list[Any] = []
+        for action in actions:
+            result = self.env.step(PolicyResponse(self.env.env_id, action))
+            ends = (result.last_terminated, result.last_truncated)
+            trace.append((result.observation, result.last_reward, *ends, result.info))
+            over = [all(end.values()) if isinstance(end, dict) else np.all(end) for end in ends]
+            if any(over) and self.env.autoreset == "disabled":
+                result = self.env.reset()
+                trace.append((result.observation, result.info))
+        return pickle.loads(pickle.dumps(trace))  # Envs reuse their arrays.
+
+
+def goes_on(before: int = 23, after: int = 40, **fields: Any) -> None:
+    """An env that is put back, and another one, go on as the first did."""
+    one, other = Made(3, **fields), Made(4, **fields)
+    space = one.env.get_action_space()
+    space.seed(0)
+    actions = [space.sample() for _ in range(before + after)]
+    one.run(actions[:before])
+    state = pickle.dumps(one.env.save_state())
+    expected = one.run(actions[before:])
+    for made in (one, other):
+        made.env.load_state(pickle.loads(state))
+        np.testing.assert_equal(made.run(actions[before:]), expected)
+    for made in (one, other):
+        made.env.close()
+
+
+@pytest.mark.parametrize("task", GYMNASIUM)
+def test_gymnasiums_own(task: str) -> None:
+    goes_on(backend="gymnasium", task=task)
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+@pytest.mark.parametrize("task", TASKS)
+def test_mujoco(task: str, num_envs: int) -> None:
+    goes_on(backend="mujoco", task=f"{task}-v5", num_envs=num_envs)
+
+
+class HeavierEachTime(gym.Wrapper[Any, Any, Any, Any]):
+    """Changes its model at each reset, and reads what the last step computed before the next."""
+
+    def reset(self, **kwargs: Any) -> Any:
+        observation, info = self.env.reset(**kwargs)
+        inner: Any = self.unwrapped
+        inner.model.body_mass[1] = inner.np_random.uniform(1, 9)
+        inner.model.opt.gravity[2] = -inner.np_random.uniform(5, 9)
+        return observation, info
+
+    def step(self, action: Any) -> Any:
+        before = self.unwrapped.data.xpos.copy()  # type: ignore[attr-defined]
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return np.concatenate((observation, before[1])), reward, terminated, truncated, info
+
+
+def heavier() -> gym.Env[Any, Any]:
+    env = HeavierEachTime(gym.make("Hopper-v5"))
+    env.observation_space = gym.spaces.Box(-np.inf, np.inf, (14,), np.float64)
+    return env
+
+
+def test_a_model_that_changes() -> None:
+    """Masses and gravity come back, and so does what one step computes for the next."""
+    goes_on(make_env=heavier)
+
+
+def test_a_model_of_another_structure_is_refused() -> None:
+    """Before anything is changed."""
+    one, other = (Made(1, backend="mujoco", task=task) for task in ("Hopper-v5", "Walker2d-v5"))
+    with pytest.raises(ValueError, match="in the snapshot"):
+        other.env.load_state(one.env.save_state())
+
+
+@pytest.mark.simulators
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        {},
+        {"preprocessing": True, "frame_stack": 4},
+        {"repeat_action_probability": 0.5, "obs_type": "ram"},
+    ],
+    ids=str,
+)
+def test_ale(kwargs: dict[str, Any]) -> None:
+    """With the generator of its sticky actions."""
+    pytest.importorskip("ale_py")
+    goes_on(200, 60, backend="ale", task="ALE/Breakout-v5", env_kwargs=kwargs)
+
+
+@pytest.mark.simulators
+@pytest.mark.parametrize(
+    "task", ["mpe2.simple_spread_v3", "pettingzoo.butterfly.pistonball_v6", "sisl/pursuit-v5"]
+)
+def test_pettingzoo(task: str) -> None:
+    pytest.importorskip("pettingzoo")
+    if task.startswith("pettingzoo"):
+        pytest.importorskip("pymunk")
+    goes_on(backend="pettingzoo", task=task)
+
+
+@pytest.mark.simulators
+@pytest.mark.filterwarnings("ignore:.*precision lowered")
+@pytest.mark.parametrize(
+    ("fields", "part"),
+    [
+        ({"backend": "envpool", "task": "CartPole-v1", "num_envs": 2}, "in a library that"),
+        ({"backend": "ale", "task": "ALE/Pong-v5", "num_envs": 2}, "env.env"),
+        ({"backend": "maniskill", "task": "PushCube-v1"}, "BackendInfo"),
+    ],
+    ids=["envpool", "ale", "maniskill"],
+)
+def test_what_can_not_be_saved_says_so(fields: dict[str, Any], part: str) -> None:
+    """With the part that stands in the way."""
+    pytest.importorskip(
+        {"ale": "ale_py", "maniskill": "mani_skill"}.get(fields["backend"], "envpool")
+    )
+    made = Made(0, **fields)
+    with pytest.raises(NotImplementedError, match=part):
+        made.env.save_state()
+    made.env.close()

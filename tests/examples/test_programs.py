@@ -1,0 +1,122 @@
+"""Each example that trains runs as a reader would run it, for a few updates, and goes on."""
+
+from __future__ import annotations
+
+import ast
+import csv
+import importlib
+import re
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+from run_python import output_of
+
+torch = pytest.importorskip("torch")
+pytestmark = pytest.mark.simulators
+
+ROOT = Path(__file__).parents[2]
+EXAMPLES = ROOT / "examples"
+SHORT = {
+    "ppo": "--task CartPole-v1 --num-steps 32",
+    "ppo_async": "--task CartPole-v1 --num-steps 32",
+    "ppo_overlap": "--num-envs 2 --envs-each 2 --min-batch 1 --num-steps 32 --epochs 1",
+    "sac": "--num-envs 4 --min-results 2 --learning-starts 240 --record-every 32 --hidden 16",
+}
+
+
+def curve(folder: Path) -> list[dict[str, str]]:
+    with (folder / "curve.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.mark.parametrize("name", SHORT)
+def test_example_trains_and_resumes(name: str, tmp_path: Path) -> None:
+    """Its curve grows by a row for each update, and a second run goes on where it ended."""
+    program = EXAMPLES / f"{name}.py"
+    given = [*SHORT[name].split(), "--folder", str(tmp_path), "--total-steps"]
+    assert "'steps': " in output_of("-W", "error", program, *given, "256", asyncio_debug=False)
+    first = curve(tmp_path)
+    assert int(first[-1]["steps"]) >= 256
+    output_of(program, *given, "512", "--resume", asyncio_debug=False)
+    both = curve(tmp_path)
+    assert both[: len(first)] == first
+    assert int(both[-1]["steps"]) >= 512
+    seconds = [float(row["seconds"]) for row in both]
+    assert seconds == sorted(seconds)
+
+
+def test_what_was_learned_is_evaluated(tmp_path: Path) -> None:
+    """Each environment plays as many episodes as were asked for, by the checkpoint's weights."""
+    given = [*SHORT["ppo_async"].split(), "--total-steps", "256", "--folder", tmp_path]
+    output_of(EXAMPLES / "ppo_async.py", *given, asyncio_debug=False)
+    asked = ["--folder", tmp_path, "--num-envs", "3", "--episodes", "2"]
+    printed = output_of("-W", "error", EXAMPLES / "evaluate.py", *asked, asyncio_debug=False)
+    assert re.match(r"6 episodes: return \d+\.\d \+- \d+\.\d", printed)
+
+
+@pytest.mark.parametrize("preset", ["Args", "CartPole"])
+def test_a_run_that_ctrl_c_ended_resumes_as_if_it_had_not(
+    preset: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """It ends after the update, with the same weights and curve in the end, amid episodes."""
+    monkeypatch.syspath_prepend(EXAMPLES)
+    ppo = importlib.import_module("ppo")
+    before, learn = signal.getsignal(signal.SIGINT), ppo.learn
+
+    def train(folder: str, **options: bool) -> dict[str, Any]:
+        short = {"num_envs": 3, "num_steps": 40, "num_minibatches": 4, "epochs": 1}
+        folder = str(tmp_path / folder)
+        ppo.train(getattr(ppo, preset)(total_steps=480, folder=folder, **short, **options))
+        return torch.load(Path(folder) / "checkpoint.pt", weights_only=True)
+
+    def interrupted(*given: Any) -> dict[str, float]:
+        signal.raise_signal(signal.SIGINT)
+        assert signal.getsignal(signal.SIGINT) is before
+        return learn(*given)
+
+    through = train("through")
+    monkeypatch.setattr(ppo, "learn", interrupted)
+    assert train("twice")["run"]["steps"] == 120
+    assert signal.getsignal(signal.SIGINT) is before
+    monkeypatch.setattr(ppo, "learn", learn)
+    resumed = train("twice", resume=True)
+    for name, value in through["agent"].items():
+        assert torch.equal(resumed["agent"][name], value), name
+    curves = [
+        [{k: v for k, v in row.items() if "seconds" not in k} for row in saved["run"]["rows"]]
+        for saved in (through, resumed)
+    ]
+    assert repr(curves[0]) == repr(curves[1])
+
+
+def test_the_readmes_program_learns(tmp_path: Path) -> None:
+    """It is complete, runs as it stands (with fewer updates), and is short."""
+    text = (ROOT / "README.md").read_text()
+    section = text.partition("## Training with it")[2]
+    (block,) = re.findall(
+        r"^```python\n(.*?)^```", section.partition("\n## ")[0], re.MULTILINE | re.DOTALL
+    )
+    assert len(block.splitlines()) <= 90
+    program = tmp_path / "program.py"
+    program.write_text(
+        block.replace(
+            "UPDATES, TRANSITIONS, MINIBATCH, EPOCHS = 60, 1024,",
+            "UPDATES, TRANSITIONS, MINIBATCH, EPOCHS = 10, 256,",
+        )
+    )
+    assert "steps to an episode" in output_of("-W", "error", program, asyncio_debug=False)
+
+
+def test_the_asynchronous_example_is_short() -> None:
+    """Beside its classes of arguments; the network is in ppo.py."""
+    text = (EXAMPLES / "ppo_async.py").read_text()
+    arguments = {
+        line
+        for node in ast.parse(text).body
+        if isinstance(node, ast.ClassDef) and node.decorator_list
+        for line in range(node.decorator_list[0].lineno, (node.end_lineno or 0) + 1)
+    }
+    lines = enumerate(text.splitlines(), 1)
+    assert len([line for k, line in lines if line.strip() and k not in arguments]) <= 120

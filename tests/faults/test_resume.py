@@ -1,0 +1,290 @@
+"""``on_worker_death: resume``: a replaced worker's envs go on from where they were kept last."""
+
+from __future__ import annotations
+
+import os
+import threading
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from faults.driven import Driven, kill
+from faults.drivers import on_one_driver
+from gymnasium.wrappers import NormalizeObservation
+
+from rlightning_aio.config import parse_configs
+from rlightning_aio.errors import ConfigError, EnvRaised, WorkerDied
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    Start: TypeAlias = Callable[..., Driven]
+
+
+class Walk(gym.Env[Any, Any]):
+    """A walk that draws at every step: what it returns depends on all that came before."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.steps, self.at = 0, self.np_random.normal()
+        return self.observation(), {"steps": 0}
+
+    def observation(self) -> Any:
+        return np.array([self.steps, self.at])
+
+    def step(self, action: Any) -> Any:
+        self.steps += 1
+        self.at += self.np_random.normal() * (1 + action)
+        over = bool(self.np_random.random() < 0.05)
+        return self.observation(), self.at, over, self.steps >= 30, {"steps": self.steps}
+
+
+ENTRY: dict[str, Any] = {
+    "name": "e",
+    "make_env": Walk,
+    "num_workers": 4,
+    "envs_per_process": 2,
+    "on_worker_death": "resume",
+    "snapshot_every": 5,
+    "max_restarts": 20,
+}
+
+
+def actions(observation: Any) -> list[int]:
+    """A policy: what it does depends on what it sees, and so on nothing that was lost."""
+    return [int(own[1] * 1000) % 2 for own in observation]
+
+
+class Episodes:
+    """Steps a group to so many episodes of each env, and notes how these ended."""
+
+    def __init__(self, group: Any) -> None:
+        self.group = group
+        self.ended: dict[str, list[tuple[float, int]]] = {
+            env_id: [] for env_id in group.group.env_ids
+        }
+        self.lost: list[int] = []
+        self.batch, _ = group.reset(seed=3)
+
+    def run(self, num_episodes: int, strike: Callable[[], bool] = lambda: False) -> None:
+        """Until each env has ended so many, and nobody strikes any more."""
+        with self.group.auto_reset(100):
+            while strike() or min(map(len, self.ended.values())) < num_episodes:
+                request = self.batch.respond(action=actions(self.batch.observation))
+                self.batch, _ = self.group.step(request)
+                for env_id, info in zip(self.batch.ids(), self.batch.info(), strict=True):
+                    if "episode" in info:
+                        self.ended[env_id].append((info["episode"]["r"], info["episode"]["l"]))
+                    if "worker_resumed" in info:
+                        assert "worker_restarted" in info
+                        self.lost.append(info["worker_resumed"])
+
+
+def with_deaths(start: Start, num_episodes: int, num_deaths: int) -> Episodes:
+    """Episodes under deaths of one of the workers, at random turns."""
+    draw = np.random.default_rng(1)
+    group = start(ENTRY)
+    hosts = group.group._core.supervisor.hosts
+    left = num_deaths
+
+    def strike() -> bool:
+        nonlocal left
+        before = left
+        pid = hosts[draw.integers(len(hosts))].pid
+        if left and draw.random() < 0.15 and pid is not None:
+            kill(pid)
+            left -= 1
+        return before > 0  # One more step after the last death: it has to be heard of.
+
+    episodes = Episodes(group)
+    episodes.run(num_episodes, strike)
+    return episodes
+
+
+@on_one_driver
+def test_episodes_go_on_after_deaths_with_the_returns_that_they_would_have_had(
+    start: Start,
+) -> None:
+    """And no more steps are lost at once than the entry says. ``RLIGHTNING_AIO_DEATHS`` says how
+    many deaths there are.
+    """
+    disturbed = with_deaths(start, 5, int(os.environ.get("RLIGHTNING_AIO_DEATHS", "4")))
+    undisturbed = Episodes(start({**ENTRY, "on_worker_death": "restart", "snapshot_every": None}))
+    undisturbed.run(max(map(len, disturbed.ended.values())))
+    assert any(disturbed.lost)
+    assert max(disturbed.lost) <= ENTRY["snapshot_every"]
+    for env_id, episodes in disturbed.ended.items():
+        assert episodes == undisturbed.ended[env_id][: len(episodes)]
+
+
+def test_a_resumed_env_says_how_many_steps_it_has_lost(start: Start) -> None:
+    """It shows what it showed when it was kept: no transition, no new episode, the same info."""
+    group = start({**ENTRY, "num_workers": 2, "on_worker_death": "resume"})
+    shown = []
+    with group.auto_reset(100):
+        batch, _ = group.reset(seed=3)
+        for _ in range(7):
+            batch, _ = group.step(batch.respond(action=[0, 0]))
+            shown.append(batch)
+        kill(group.group._core.supervisor.hosts[0].pid)
+        again, flags = group.step(batch.respond(action=[0, 0]))
+        assert again.restarted.all()
+        assert again.is_reset.all()
+        assert flags == [False, False]
+        np.testing.assert_equal(again.observation, shown[4].observation)
+        assert [info["worker_resumed"] for info in again.info()] == [2, 2]
+        assert [info["steps"] for info in again.info()] == [5, 5]
+        assert not any("episode" in info for info in again.info())
+        for old in shown[5:]:
+            again, _ = group.step(again.respond(action=[0, 0]))
+            np.testing.assert_equal(again.observation, old.observation)
+            assert not again.is_reset.any()
+
+
+@on_one_driver
+def test_a_step_limit_counts_the_steps_that_an_env_knows_of(start: Start) -> None:
+    """What was lost is made once more, and the limit comes as late as it would have."""
+    group = start({**ENTRY, "num_workers": 1, "make_env": Straight})
+    batch, _ = group.reset(seed=3)
+    lengths = []
+    with group.auto_reset(12):
+        for turn in range(40):
+            if turn in (8, 21):
+                kill(group.group._core.supervisor.hosts[0].pid)
+            batch, _ = group.step(batch.respond(action=[0]))
+            lengths += [info["episode"]["l"] for info in batch.info() if "episode" in info]
+            assert bool(batch.limit_reached[0]) == ("episode" in batch.info()[0])
+    assert lengths == [12, 12]
+
+
+@on_one_driver
+def test_wrappers_and_generators_go_on_after_a_death(start: Start) -> None:
+    """Running means are as they were, whatever was asked when the worker died."""
+    entry = {**ENTRY, "make_env": Averaged, "num_workers": 1, "snapshot_every": 1}
+    runs = []
+    for deaths in ((), (4, 11, 13)):
+        group = start(entry)
+        batch, _ = group.reset(seed=5)
+        seen = []
+        for turn in range(16):
+            if turn in deaths:
+                kill(group.group._core.supervisor.hosts[0].pid)
+                if turn != 11:
+                    batch, _ = group.step(batch.respond(action=[1]))
+                    assert batch.info()[0]["worker_resumed"] == 0
+            batch, _ = group.reset() if turn in (5, 11) else group.step(batch.respond(action=[1]))
+            seen.append(batch.observation)
+        runs.append(seen)
+    np.testing.assert_equal(runs[1], runs[0])
+
+
+@on_one_driver
+def test_an_env_that_was_put_back_resumes_there(start: Start) -> None:
+    """A worker that dies after a restore doesn't take its envs to where they were before it."""
+    group = start({**ENTRY, "num_workers": 1, "make_env": Straight, "snapshot_every": 50})
+    batch, _ = group.reset(seed=3)
+    for _ in range(3):
+        batch, _ = group.step(batch.respond(action=[0]))
+    snapshot = group.snapshot()
+    for _ in range(20):
+        batch, _ = group.step(batch.respond(action=[0]))
+    batch, _ = group.restore(snapshot)
+    batch, _ = group.step(batch.respond(action=[0]))
+    kill(group.group._core.supervisor.hosts[0].pid)
+    batch, _ = group.step(batch.respond(action=[0]))
+    assert batch.observation[0][0] == 3
+    assert batch.info()[0]["worker_resumed"] == 1
+
+
+@on_one_driver
+def test_a_death_in_a_restore_takes_nobody_along(start: Start) -> None:
+    """The others are where they were before it."""
+    group = start(
+        {
+            **ENTRY,
+            "make_env": Deadly,
+            "on_worker_death": "restart",
+            "snapshot_every": None,
+            "envs_per_process": 1,
+            "num_workers": 2,
+        }
+    )
+    batch, _ = group.reset(seed=3)
+    batch, _ = group.step(batch.respond(action=[0, 0]))
+    snapshot = group.snapshot()
+    group.call("e-1", "prepare")
+    for _ in range(2):
+        batch, _ = group.step(batch.respond(action=[0, 0]))
+    with pytest.raises(WorkerDied, match="exited with code 5"):
+        group.restore(snapshot)
+    batch, _ = group.step(batch.respond(action=[0, 0]))
+    assert batch.observation[:, 0].tolist() == [4, 0]
+    assert batch.restarted.tolist() == [False, True]
+
+
+class Straight(Walk):
+    """Never ends by itself."""
+
+    def step(self, action: Any) -> Any:
+        observation, reward, _, _, info = super().step(action)
+        return observation, reward, False, False, info
+
+
+class Averaged(NormalizeObservation):
+    def __init__(self) -> None:
+        super().__init__(Straight())
+
+
+class Deadly(Straight):
+    """Does not survive that its state is put back, once it is prepared."""
+
+    is_prepared = False
+
+    def prepare(self) -> None:
+        self.is_prepared = True
+
+    def save_state(self) -> Any:
+        return self.steps
+
+    def load_state(self, state: Any) -> None:
+        if self.is_prepared:
+            os._exit(5)
+        self.steps = state
+
+
+@on_one_driver
+def test_an_env_that_can_not_be_kept_says_so_at_its_first_reset(
+    build: Callable[..., Driven],
+) -> None:
+    """Not when it is too late."""
+    group = build({**ENTRY, "make_env": Locked, "num_workers": 1})
+    group.init()
+    with pytest.raises(EnvRaised, match=r"raised in reset: .*env\.env\.lock of env 'e-0'"):
+        group.reset()
+
+
+class Locked(Straight):
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"snapshot_every": None}, "snapshot_every: is required with on_worker_death: resume"),
+        ({"on_worker_death": "restart"}, "snapshot_every: has no meaning without"),
+        ({"placement": "inline", "envs_per_process": 1}, "no worker that could die"),
+        (
+            {"make_env": None, "backend": "piper", "task": "x"},
+            "can't put back what backend 'piper'",
+        ),
+    ],
+)
+def test_what_can_not_be_resumed_is_refused(fields: dict[str, Any], message: str) -> None:
+    """Before anything starts, with the field."""
+    with pytest.raises(ConfigError, match=message):
+        parse_configs({**ENTRY, **fields})

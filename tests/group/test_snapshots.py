@@ -1,0 +1,361 @@
+"""An env that is put back goes on exactly as it would have, wherever it lives."""
+
+from __future__ import annotations
+
+import os
+import threading
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.wrappers import NormalizeObservation, NormalizeReward, RecordEpisodeStatistics
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from run_python import output_of
+
+import rlightning_aio as rl
+from rlightning_aio import sync
+from rlightning_aio.errors import EnvBusy, EnvRaised, SnapshotError
+from rlightning_aio.registry import PLACEMENTS, Placement
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from rlightning_aio.batch import BatchedData
+
+
+class Clockless(RecordEpisodeStatistics):
+    """Its infos tell no time, which no snapshot stops."""
+
+    def step(self, action: Any) -> Any:
+        *values, info = super().step(action)
+        info.get("episode", {}).pop("t", None)
+        return *values, info
+
+
+def wrapped() -> gym.Env[Any, Any]:
+    """Wrappers with counters, running means and generators."""
+    env = NormalizeReward(NormalizeObservation(gym.make("Pendulum-v1", max_episode_steps=9)))
+    return gym.wrappers.TransformReward(Clockless(env), lambda reward: 2 * reward)
+
+
+class Wandering(gym.Env[Any, Any]):
+    """Draws at every step, and acts by its own action space's generator."""
+
+    observation_space = gym.spaces.Dict(
+        {"at": gym.spaces.Box(-99, 99, (2,)), "n": gym.spaces.Discrete(99)}
+    )
+    action_space = gym.spaces.Discrete(3)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.own_space = gym.spaces.Box(0, 1, (2,), seed=int(self.np_random.integers(99)))
+        self.at = self.np_random.normal(size=2).astype(np.float32)
+        return {"at": self.at, "n": 0}, {"nested": {"words": "here"}}
+
+    def step(self, action: Any) -> Any:
+        self.at += self.own_space.sample() * self.np_random.normal() * action
+        over = bool(self.np_random.random() < 0.2)
+        info = {"nested": {"words": str(action)}} if action else {"far": float(self.at.sum())}
+        return {"at": self.at, "n": int(action)}, float(self.at[0]), over, False, info
+
+
+ENTRIES: dict[str, dict[str, Any]] = {
+    "gymnasium": {"backend": "gymnasium", "task": "CartPole-v1"},
+    "gymnasium, several": {"backend": "gymnasium", "task": "CartPole-v1", "num_envs": 2},
+    "mujoco": {"backend": "mujoco", "task": "Hopper-v5"},
+    "mujoco, several": {"backend": "mujoco", "task": "InvertedPendulum-v5", "num_envs": 2},
+    "wrappers": {"make_env": wrapped},
+    "of its own": {"make_env": Wandering},
+}
+
+
+def told(batch: BatchedData, flags: Any) -> list[Any]:
+    columns = (batch.reward, batch.terminated, batch.truncated, batch.is_reset, batch.done)
+    return [batch.observation, *columns, batch.limit_reached, batch.info(), flags]
+
+
+class Run:
+    """A group under auto-reset, stepped with random actions."""
+
+    def __init__(self, group: sync.EnvGroup, seed: int) -> None:
+        self.group, self.seed = group, seed
+
+    def go_on(self, batch: BatchedData, num_steps: int, turn: int) -> tuple[BatchedData, list[Any]]:
+        space = self.group.get_action_spaces()[0]
+        assert space is not None
+        space.seed(self.seed + turn)
+        trace: list[Any] = []
+        for _ in range(num_steps):
+            batch, flags = self.group.step(
+                batch.respond(action=[space.sample() for _ in batch.ids()])
+            )
+            trace.append(told(batch, flags))
+        return batch, trace
+
+
+def entry_of(kind: str, **fields: Any) -> dict[str, Any]:
+    return {"name": "e", "num_workers": 2, **ENTRIES[kind], **fields}
+
+
+@pytest.fixture(
+    scope="module",
+    params=[
+        ("gymnasium", "process"),
+        ("gymnasium, several", "inline"),
+        ("mujoco", "inline"),
+        ("mujoco, several", "process"),
+        ("wrappers", "process"),
+        ("of its own", "inline"),
+        ("of its own", "thread"),
+    ],
+    ids=", in ".join,
+)
+def groups(request: pytest.FixtureRequest) -> Iterator[tuple[sync.EnvGroup, sync.EnvGroup]]:
+    """One group, and another of an equal entry elsewhere."""
+    kind, placement = request.param
+    with pytest.MonkeyPatch.context() as patch:
+        place = Placement("hosts.thread_host:ThreadHost", spreads=True)
+        patch.setitem(PLACEMENTS, "thread", place)
+        elsewhere = "process" if placement == "inline" else "inline"
+        fields = {"envs_per_process": 1} if placement != "inline" else {}
+        with (
+            sync.build_env_group(entry_of(kind, placement=placement, **fields)) as one,
+            sync.build_env_group(entry_of(kind, placement=elsewhere)) as other,
+        ):
+            yield one, other
+
+
+@settings(
+    max_examples=4 if "RLIGHTNING_AIO_EXAMPLES" not in os.environ else settings().max_examples
+)
+@given(
+    seed=st.integers(0, 2**20),
+    before=st.integers(0, 30),
+    between=st.integers(0, 12),
+    after=st.integers(1, 25),
+    limit=st.integers(2, 30),
+)
+def test_an_env_goes_on_as_it_would_have(
+    groups: tuple[sync.EnvGroup, sync.EnvGroup],
+    seed: int,
+    before: int,
+    between: int,
+    after: int,
+    limit: int,
+) -> None:
+    """To the last bit: in its place, and in another env of another group, in another process."""
+    for group in groups:
+        group.reset()  # The other has been elsewhere.
+    one, other = groups
+    run = Run(one, seed)
+    first, _ = one.reset(seed=seed)
+    with one.auto_reset(limit):
+        batch, _ = run.go_on(first, before, 0)
+        snapshot = one.snapshot()
+        _, expected = run.go_on(batch, after, 1)
+        run.go_on(batch, between, 2)
+        shown, flags = one.restore(snapshot)
+        assert shown.is_reset.all()
+        assert not any([*shown.done.ravel(), *shown.reward.ravel(), *flags])
+        np.testing.assert_equal(shown.observation, batch.observation)
+        shown, found = run.go_on(shown, after, 1)
+        np.testing.assert_equal(found, expected)
+    with other.auto_reset(limit):
+        shown, _ = other.restore(snapshot)
+        _, found = Run(other, seed).go_on(shown, after, 1)
+        np.testing.assert_equal(found, expected)
+
+
+def test_an_env_goes_on_in_another_run(tmp_path: Path) -> None:
+    """A snapshot is a file like any other; the env that it goes into was never reset."""
+    config = entry_of("mujoco")
+    with sync.build_env_group(config) as group:
+        batch, _ = group.reset(seed=1)
+        batch, _ = Run(group, 0).go_on(batch, 7, 0)
+        (tmp_path / "snapshot").write_bytes(group.snapshot())
+        batch, _ = Run(group, 0).go_on(batch, 5, 1)
+    program = tmp_path / "program.py"
+    program.write_text(
+        "from rlightning_aio import sync\n"
+        f"with sync.build_env_group({config!r}) as group:\n"
+        "    batch, _ = group.restore(open('snapshot', 'rb').read())\n"
+        "    space = group.get_action_spaces()[0]\n"
+        "    space.seed(1)\n"
+        "    for _ in range(5):\n"
+        "        actions = [space.sample() for _ in range(2)]\n"
+        "        batch, _ = group.step(batch.respond(action=actions))\n"
+        "    print(batch.observation.tobytes().hex())\n"
+    )
+    assert output_of(program, folder=tmp_path).strip() == batch.observation.tobytes().hex()
+
+
+async def test_some_envs_of_an_asynchronous_group() -> None:
+    """The others go on; an env takes another's place."""
+    async with rl.build_env_group(entry_of("gymnasium", num_workers=3)) as group:
+        first, _ = await group.reset(seed=0)
+        snapshot = await group.snapshot(env_ids=["e-1"])
+        batch, _ = await group.step(first.respond(action=[0, 1, 0]))
+        shown, _ = await group.restore(snapshot, env_ids=["e-2"])
+        assert shown.ids() == ["e-2"]
+        np.testing.assert_equal(shown.observation[0], first.observation[1])
+        twin, _ = await group.step(batch.respond(action=[0, 0, 1]))
+        np.testing.assert_equal(twin.observation[2], batch.observation[1])
+
+
+def test_sums_and_counters_come_back() -> None:
+    """The episode ends after as many steps as it would have, with the same return."""
+    with sync.build_env_group(entry_of("gymnasium", num_workers=1, placement="inline")) as group:
+        batch, _ = group.reset(seed=0)
+        with group.auto_reset(4):
+            for _ in range(4):
+                batch, flags = group.step(batch.respond(action=[0]))
+            assert flags == [True]
+            due = group.snapshot()  # A reset is due, and comes next.
+            for _ in range(3):
+                batch, _ = group.step(batch.respond(action=[0]))
+            assert batch.info()[0] == {}
+            shown, flags = group.restore(due)
+            assert flags == [False]
+            assert group.get_env_stats()["e-0"]["episodes"] == 1
+            batch, flags = group.step(shown.respond(action=[0]))
+            assert batch.is_reset.all()
+            for _ in range(4):
+                batch, flags = group.step(batch.respond(action=[0]))
+            assert (flags, batch.info()[0]["episode"]) == ([True], {"r": 4.0, "l": 4})
+            assert group.get_env_stats()["e-0"]["episodes"] == 2
+
+
+# -- misuse
+
+
+def spoilt(snapshot: bytes) -> list[bytes]:
+    middle = len(snapshot) // 2
+    flipped = snapshot[:middle] + bytes([snapshot[middle] ^ 1]) + snapshot[middle + 1 :]
+    return [b"", snapshot[:-1], snapshot[:10], flipped, snapshot + b"0", b"x" + snapshot]
+
+
+def test_a_spoilt_snapshot_is_refused() -> None:
+    """Before anything in it is read."""
+    with sync.build_env_group(entry_of("gymnasium", placement="inline")) as group:
+        group.reset(seed=0)
+        for data in spoilt(group.snapshot()):
+            with pytest.raises(SnapshotError, match="nothing was changed"):
+                group.restore(data)
+        with pytest.raises(SnapshotError, match="not a str"):
+            group.restore("a file's name")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"task": "Acrobot-v1"}, "its task is CartPole-v1, and here it is Acrobot-v1"),
+        ({"max_episode_steps": 7}, "its max_episode_steps is None, and here it is 7"),
+        ({"env_kwargs": {"sutton_barto_reward": True}}, "env_kwargs"),
+        ({"num_envs": 2}, "num_envs is 1, and here it is 2"),
+    ],
+)
+def test_a_snapshot_of_something_else_is_refused(changed: dict[str, Any], message: str) -> None:
+    """The message says what differs; the envs go on from where they are."""
+    with (
+        sync.build_env_group(entry_of("gymnasium", placement="inline")) as one,
+        sync.build_env_group(entry_of("gymnasium", placement="inline", **changed)) as other,
+    ):
+        one.reset(seed=0)
+        other.reset(seed=0)
+        with pytest.raises(SnapshotError, match=message):
+            other.restore(one.snapshot())
+
+
+def test_another_version_of_the_simulator_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It need not compute the same."""
+    with sync.build_env_group(entry_of("mujoco", placement="inline")) as group:
+        group.reset(seed=0)
+        snapshot = group.snapshot()
+        monkeypatch.setattr("mujoco.__version__", "2.0")
+        with pytest.raises(
+            SnapshotError, match=r"its version of mujoco is .*, and here it is 2\.0"
+        ):
+            group.restore(snapshot)
+
+
+def test_what_does_not_match_in_number_is_refused() -> None:
+    """As many envs as the snapshot is of, each once, idle, and known."""
+    with sync.build_env_group(entry_of("gymnasium", placement="inline")) as group:
+        with pytest.raises(SnapshotError, match="env 'e-0' has no state yet: reset it"):
+            group.snapshot()
+        batch, _ = group.reset(seed=0)
+        snapshot = group.snapshot()
+        with pytest.raises(SnapshotError, match="is of 2 envs, and is to go into 1"):
+            group.restore(snapshot, env_ids=["e-0"])
+        with pytest.raises(EnvBusy, match="twice"):
+            group.restore(snapshot, env_ids=["e-0", "e-0"])
+        with pytest.raises(rl.UnknownEnv):
+            group.restore(snapshot, env_ids=["e-0", "f-0"])
+        group.step_async(batch.respond(action=[0, 0]))
+        for call in (group.snapshot, lambda: group.restore(snapshot)):
+            with pytest.raises(EnvBusy):
+                call()
+        group.collect_async(wait_all=True)
+
+
+class Fragile(gym.Env[Any, Any]):
+    """Counts; its state can be taken, but the second env's can't be put back once."""
+
+    observation_space = gym.spaces.Box(0, 99, (1,), np.int64)
+    action_space = gym.spaces.Discrete(2)
+    fails: Any = None
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        self.count = 0
+        return np.array([0]), {}
+
+    def step(self, action: Any) -> Any:
+        self.count += 1
+        if action:
+            self.fails = "raise" if action == 1 else "exit"
+        return np.array([self.count]), 1.0, False, False, {}
+
+    def save_state(self) -> Any:
+        return self.count
+
+    def load_state(self, state: int) -> None:
+        self.count = state
+        if state == 1 and self.fails == "raise":
+            raise OSError("the disk is gone")
+
+
+def test_all_are_put_back_or_none() -> None:
+    """One fails at it; the others are where they were, and so is it."""
+    entry = {"name": "e", "make_env": Fragile, "num_workers": 3, "envs_per_process": 1}
+    with sync.build_env_group(entry) as group:
+        batch, _ = group.reset()
+        batch, _ = group.step(batch.respond(action=[0, 0, 0]))
+        snapshot = group.snapshot()
+        for _ in range(3):
+            batch, _ = group.step(batch.respond(action=[0, 1, 0]))
+        with pytest.raises(EnvRaised, match=r"env 'e-1'.*restore.*the disk is gone") as caught:
+            group.restore(snapshot)
+        assert "the other envs are where they were" in caught.value.__notes__[0]
+        batch, _ = group.step(batch.respond(action=[0, 0, 0]))
+        assert batch.observation.tolist() == [[5], [5], [5]]
+        assert not batch.is_reset.any()
+
+
+class Hidden(Fragile):
+    """Holds what nobody can pickle."""
+
+    save_state = load_state = property()  # type: ignore[assignment]  # As if it had none.
+
+    def __init__(self) -> None:
+        self.handle = threading.Lock()
+
+
+def test_what_can_not_be_saved_says_so() -> None:
+    """With the attribute that stands in the way."""
+    with sync.build_env_group({"name": "e", "make_env": Hidden, "placement": "inline"}) as group:
+        group.reset()
+        with pytest.raises(EnvRaised, match=r"env\.env\.handle of env 'e-0', a lock"):
+            group.snapshot()

@@ -1,0 +1,252 @@
+"""Envs in Ray actors do what they do anywhere else, beside those that live elsewhere."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from group.sample_envs import Gate, Probe
+
+from rlightning_aio import ENVS, BaseEnv, BatchedData, EnvRet, PolicyResponse
+from rlightning_aio.errors import ConfigError, EnvRaised, StartFailed
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from group.conftest import Place
+
+pytestmark = pytest.mark.ray
+
+CHEETAH = {"backend": "mujoco", "task": "HalfCheetah-v5", "num_workers": 4}
+THREE_PLACES = ("inline", "ray", "process")
+
+
+def entry(name: str, backend: str = "probe", placement: str = "ray", **fields: Any) -> Any:
+    fields = {"task": "-", "imports": ["group.sample_envs"], **fields}
+    return {"name": name, "backend": backend, "placement": placement, **fields}
+
+
+def steps(**actions: Any) -> BatchedData:
+    ids = [name.replace("_", "-") for name in actions]
+    responses = [PolicyResponse(i, a) for i, a in zip(ids, actions.values(), strict=True)]
+    return BatchedData(ids, responses)
+
+
+async def test_trajectories_are_those_of_inline_envs_and_of_processes(facade: Place) -> None:
+    """In one group, to the last bit, infos included, however results are waited for."""
+    entries = [
+        entry(place, placement=place, **CHEETAH, **apart)
+        for place, apart in zip(
+            THREE_PLACES, ({}, {"envs_per_process": 2}, {"envs_per_process": 2}), strict=True
+        )
+    ]
+    draw = np.random.default_rng(0)
+    resets = 0
+    async with facade.build(entries) as group:
+        batch, _ = await group.reset(seed={id_: 7 + int(id_[-1]) for id_ in group.env_ids})
+        with group.auto_reset(max_episode_steps=20):
+            for number in range(100):
+                action = np.tile(draw.uniform(-1, 1, (4, 6)), (3, 1))
+                if number % 2:
+                    batch, flags = await group.step(batch.respond(action=action))
+                else:
+                    group.step_async(batch.respond(action=action))
+                    batch, flags = await group.collect_async(wait_all=True, ordered=True)
+                for values in (
+                    *(batch.observation, batch.reward, batch.terminated, batch.truncated),
+                    *(batch.is_reset, batch.limit_reached, np.array(flags)),
+                ):
+                    inline, ray, process = np.split(np.asarray(values), 3)
+                    np.testing.assert_array_equal(ray, inline, strict=True)
+                    np.testing.assert_array_equal(process, inline, strict=True)
+                infos = [ret.info for ret in batch.values()]
+                assert infos[:4] == infos[4:8] == infos[8:]
+                resets += int(np.sum(batch.is_reset))
+        stats = group.get_env_stats()
+    episodes = [[stats[f"{place}-{k}"] for k in range(4)] for place in THREE_PLACES]
+    assert episodes[0] == episodes[1] == episodes[2]
+    assert resets == 4 * 12
+
+
+async def test_an_env_that_raises_stays_usable(sync_facade: Place) -> None:
+    """Its neighbour's result comes with the error, and both go on."""
+    async with sync_facade.build(entry("one", num_workers=2, envs_per_process=2)) as group:
+        await group.reset()
+        with pytest.raises(EnvRaised, match=r"env 'one-1'.* raised in step") as caught:
+            await group.step(steps(one_0=[0.0, 5.0], one_1=[Probe.RAISE, 0.0]))
+        assert caught.value.exception_type == "group.sample_envs.OddError"
+        assert "sample_envs.py" in caught.value.traceback_text
+        assert caught.value.results.reward.tolist() == [5]
+        batch, _ = await group.step(steps(one_0=[0.0, 6.0], one_1=[0.0, 7.0]))
+        assert batch.reward.tolist() == [6, 7]
+
+
+async def test_methods_are_called_in_the_actor(sync_facade: Place) -> None:
+    """In a process of its own; a value that can't be sent is the caller's error alone."""
+    async with sync_facade.build([entry("one"), entry("two", placement="process")]) as group:
+        handle = group["one-0"]
+        assert await handle.call("double", [4], times=3) == [4, 4, 4]
+        with pytest.raises(EnvRaised, match=r"raised in the call of double\(\): TypeError"):
+            await handle.call("double", None)
+        await handle.set_attr("label", "changed")
+        assert await handle.get_attr("label") == "changed"
+        await group.reset()
+        assert (await handle.step([0.0, 2.0])).last_reward == 2
+
+
+async def test_a_slow_actor_keeps_nobody_waiting(facade: Place, tmp_path: Path) -> None:
+    """Whoever is ready comes first, from an actor, a process or inline."""
+    gate = Gate(str(tmp_path), "slow-0").make()
+    quick = [entry(f"quick_{place}", placement=place) for place in THREE_PLACES]
+    slow = entry("slow", "gated", env_kwargs={"gates": str(tmp_path)})
+    async with facade.build([slow, *quick]) as group:
+        batch, _ = await group.reset()
+        group.step_async(batch.respond(action=np.zeros((4, 2))))
+        came: set[str] = set()
+        while len(came) < 3:
+            came.update((await group.collect_async())[0].ids())
+        assert came == {f"quick_{place}-0" for place in THREE_PLACES}
+        gate.open()
+        assert (await group.collect_async())[0].ids() == ["slow-0"]
+
+
+def wide() -> type[gym.Env[Any, Any]]:
+    """A class that no module holds, as that of a notebook's."""
+
+    class Wide(gym.Env[Any, Any]):
+        """Observations too large for a message of Ray's, which go through its object store."""
+
+        observation_space = gym.spaces.Box(-1, 1, (512, 1024), np.float64)
+        action_space = gym.spaces.Box(-1, 1, (1,), np.float64)
+
+        def reset(self, **_: Any) -> tuple[Any, dict[str, Any]]:
+            return np.zeros(self.observation_space.shape), {}
+
+        def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+            observation = np.full(self.observation_space.shape, action[0])
+            return observation, 0.0, False, False, {}
+
+    return Wide
+
+
+async def test_envs_of_several_layouts_share_an_actor(sync_facade: Place) -> None:
+    """Each has its row among those like it; large observations cross as well."""
+    makers = [lambda: gym.make("CartPole-v1"), wide()] * 2
+    config = {"name": "mixed", "make_env": makers, "num_workers": 4, "placement": "ray"}
+    async with sync_facade.build({**config, "envs_per_process": 4}, mixed_actions=True) as group:
+        await group.reset(seed=3)
+        with gym.make("CartPole-v1") as bare:
+            bare.reset(seed=5)
+            expected = bare.step(1)[0]
+        batch, _ = await group.step(steps(mixed_0=0, mixed_1=[0.5], mixed_2=1, mixed_3=[0.25]))
+        np.testing.assert_array_equal(batch["mixed-2"].observation, expected)
+        for env_id, value in (("mixed-1", 0.5), ("mixed-3", 0.25)):
+            assert batch[env_id].observation.shape == (512, 1024)
+            assert (batch[env_id].observation == value).all()
+
+
+async def test_what_the_user_wrote_reaches_the_actor(
+    sync_facade: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A class and functions that no module holds, environment variables, imports."""
+
+    class Local(BaseEnv):
+        def get_observation_space(self) -> gym.Space[Any]:
+            return gym.spaces.Box(-1, 1, (1,))
+
+        get_action_space = get_observation_space
+
+        def reset(self, seed: int | None = None, options: Any = None) -> EnvRet:
+            return EnvRet(
+                env_id=self.env_id,
+                observation=np.zeros(1),
+                info={"env": os.environ["FROM_THE_ENTRY"]},
+            )
+
+        def step(self, policy_resp: Any) -> EnvRet:
+            imported = "colorsys" in sys.modules
+            return EnvRet(
+                env_id=self.env_id,
+                observation=np.ones(1),
+                last_reward=self._preprocess_fn(policy_resp),
+                info={"is": imported},
+            )
+
+    monkeypatch.setitem(ENVS._classes, "local", Local)
+    fields = {"env_vars": {"FROM_THE_ENTRY": "7"}, "imports": ["colorsys"]}
+    async with sync_facade.build(
+        entry("one", "local", **fields), preprocess_fn=lambda response: response.action[0] * 10
+    ) as group:
+        batch, _ = await group.reset()
+        assert batch.values()[0].info == {"env": "7"}
+        batch, _ = await group.step(steps(one_0=np.array([0.5])))
+        assert batch.reward.tolist() == [5.0]
+        assert batch.values()[0].info == {"is": True}
+
+
+async def test_an_env_that_cannot_be_built_is_named(sync_facade: Place) -> None:
+    """Nothing is left running, whatever the others were about."""
+    fails = entry("bad", num_workers=3, envs_per_process=3, env_kwargs={"fails": 1})
+    with pytest.raises(StartFailed, match=r"env 'bad-1'.* could not be built: RuntimeError: no"):
+        await sync_facade.build([entry("good"), fails]).init()
+
+
+async def test_an_actor_without_a_place_says_what_it_asked_for(sync_facade: Place) -> None:
+    """And what the cluster has."""
+    asked = entry(
+        "big", start_timeout=1, num_cpus=3, num_gpus=2, ray_options={"resources": {"robot": 1}}
+    )
+    with pytest.raises(
+        StartFailed,
+        match=r"env 'big-0'.* did not start within 1\.0 s \(it could not be placed: it asks for 3 "
+        r"CPU and 2 GPU and 1 robot; free in the cluster: 4 of 4 CPU, 0 of 0 GPU, 0 of 0 robot\)",
+    ):
+        await sync_facade.build(asked).init()
+
+
+async def test_a_node_that_lacks_the_package_is_named(sync_facade: Place, tmp_path: Path) -> None:
+    """And what to do about it."""
+    (tmp_path / "rlightning_aio.py").write_text("raise ModuleNotFoundError('rlightning_aio')")
+    lacking = entry("one", env_vars={"PYTHONPATH": str(tmp_path)})
+    with pytest.raises(StartFailed, match="its node can't import this package; install it"):
+        await sync_facade.build(lacking).init()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"num_cpus": 2}, r"ray_options.num_cpus: leave it out; it is a field of the entry"),
+        ({"lifetime": "detached"}, "ray_options.lifetime: .* outlive the trainer"),
+        ({"num_gpu": 2}, "entry 'one', ray_options: Invalid option keyword num_gpu"),
+        ({"resources": 3}, "entry 'one', ray_options: .*resources"),
+    ],
+)
+def test_options_that_mean_nothing_are_refused(
+    options: dict[str, Any], said: str, sync_facade: Place
+) -> None:
+    """Before anything starts."""
+    with pytest.raises(ConfigError, match=said):
+        sync_facade.build(entry("one", ray_options=options))
+
+
+async def test_closing_errors_are_told_with_ids(
+    sync_facade: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each env is closed, whatever another's close has raised."""
+
+    class Loud(Probe):
+        def close(self) -> None:
+            raise ValueError(f"stuck at {self.worker_index}")
+
+    monkeypatch.setitem(ENVS._classes, "loud", Loud)
+    group = sync_facade.build(entry("one", "loud", num_workers=2, envs_per_process=2))
+    with (
+        pytest.warns(UserWarning, match="env 'one-0' raised ValueError: stuck at 0"),
+        pytest.warns(UserWarning, match="env 'one-1' raised ValueError: stuck at 1"),
+    ):
+        async with group:
+            await group.reset()

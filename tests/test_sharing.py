@@ -1,0 +1,46 @@
+"""Simulations over workers: all of them, evenly, and in few batches."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rlightning_aio.config import EnvConfig
+from rlightning_aio.sharing import num_batches, num_cores
+
+
+@given(total=st.integers(1, 3000), workers=st.integers(1, 128))
+def test_no_worker_has_much_more_than_its_share(total: int, workers: int) -> None:
+    """And batches are of one size, with no fewer of them that would do."""
+    count = num_batches(total, workers)
+    assert total % count == 0
+    best = -(-total // workers)
+    loads = {n: -(-n // workers) * (total // n) for n in range(1, count + 1) if total % n == 0}
+    assert loads[count] <= 1.15 * best
+    assert all(load > 1.15 * best for n, load in loads.items() if n < count)
+
+
+@pytest.mark.parametrize(
+    ("total", "workers", "count"), [(256, 2, 2), (32, 2, 2), (100, 16, 25), (31, 2, 31), (3, 8, 3)]
+)
+def test_a_batch_for_each_worker_where_that_goes(total: int, workers: int, count: int) -> None:
+    """Else some more; a number that can't be divided leaves each alone."""
+    assert num_batches(total, workers) == count
+
+
+def test_an_entry_is_laid_over_the_cores_where_it_asks_for_it() -> None:
+    """Simulators that compute many at once by themselves, and this process, have one env."""
+    entry = {"name": "a", "backend": "mujoco", "task": "Hopper-v5", "num_workers": "auto"}
+    total = 8 * num_cores()
+
+    def laid_out(**fields: object) -> tuple[int, int]:
+        config = EnvConfig.model_validate({**entry, "num_envs": total, **fields})
+        return config.num_workers, config.num_envs
+
+    assert laid_out() == (num_cores(), 8)
+    assert laid_out(placement="inline") == laid_out(backend="envpool") == (1, total)
+    assert laid_out(num_envs=1) == (1, 1)
+    for fields in ({"backend": "pettingzoo"}, {"backend": "callable"}):
+        with pytest.raises(ValueError, match="and these have none; give a number"):
+            laid_out(**fields)
