@@ -27,6 +27,7 @@ import rlightning_aio
 from rlightning_aio.errors import GroupClosed
 from rlightning_aio.group import supervisor
 from rlightning_aio.hosts import fork_server
+from rlightning_aio.protocol.entries import Operation, op_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -65,6 +66,12 @@ def descendants(pid: int) -> set[int]:
             for child in map(int, children.read_text().split()):
                 found |= {child} | descendants(child)
     return found
+
+
+def processes_of(group: rlightning_aio.EnvGroup) -> set[int]:
+    """Its workers, and the process that forked them."""
+    server: int = fork_server_of(group)._process.pid
+    return {server} | descendants(server)
 
 
 @contextlib.contextmanager
@@ -290,7 +297,7 @@ def test_forgotten_group_warns_and_leaves_nothing(build: Start) -> None:
         group.group = build(two_workers()).group
         gc.collect()
 
-    with watched(descendants(os.getpid())) as ended:
+    with watched(processes_of(group.group)) as ended:
         with pytest.warns(ResourceWarning, match="not closed"):
             forget()
         ended()
@@ -419,7 +426,7 @@ def test_env_that_hangs_in_a_step_does_not_hold_up_close(start: Start) -> None:
     """Whatever its own timeout says."""
     group, tokens = start(two_workers(step_timeout=10 * HANG)), Tokens()
     group.step_async(tokens.steps(["faulty-1"], {"faulty-1": "deadlock with the GIL"}))
-    while not group.group._core.supervisor.hosts[0].executing()[0]:
+    while op_of(group.group._core.supervisor.hosts[0].executing()[0]) != Operation.STEP:
         os.sched_yield()
     with pytest.warns(UserWarning, match="did not close in time and was killed"):
         group.close()
@@ -431,7 +438,7 @@ def test_stopped_fork_server_does_not_hold_up_close(start: Start) -> None:
     server = fork_server_of(group.group)
     os.kill(pid_of(group, "faulty-0"), signal.SIGSTOP)
     os.kill(server._process.pid, signal.SIGSTOP)
-    with watched(descendants(os.getpid())) as ended:
+    with watched(processes_of(group.group)) as ended:
         group.close()
         ended()
 
@@ -460,7 +467,7 @@ async def test_cancelled_close_still_closes() -> None:
     group = rlightning_aio.build_env_group(two_workers())
     await group.init()
     await group["faulty-0"].call("arm", "closing", "sleep")
-    with watched(descendants(os.getpid())) as ended:
+    with watched(processes_of(group)) as ended:
         with pytest.raises(TimeoutError):
             await asyncio.wait_for(group.close(), 0.05)
         ended()
@@ -514,7 +521,7 @@ def test_replaced_workers_leave_no_zombies(start: Start) -> None:
 
     def held() -> tuple[int, int, int]:
         return (
-            len(descendants(os.getpid())),
+            len(processes_of(group.group)),
             len(list(Path("/proc/self/fd").iterdir())),
             len(list(Path(f"/proc/{server._process.pid}/fd").iterdir())),
         )
