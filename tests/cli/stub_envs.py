@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import atexit
 import os
+import subprocess
 import threading
 from pathlib import Path
 from typing import Any, ClassVar
@@ -118,6 +120,26 @@ class Unclosable(Stub):
 
     def close(self) -> None:
         raise RuntimeError("the lid is stuck")
+
+
+@rl.ENVS.register("talkative")
+class Talkative(Stub):
+    """Prints in every way there is, to the end of its process."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        print("made")  # noqa: T201
+        atexit.register(print, "gone")
+
+    def step(self, policy_resp: rl.PolicyResponse) -> rl.EnvRet:
+        if self.count == 0:
+            print("stepped")  # noqa: T201
+            os.write(1, b"stepped in C\n")
+            subprocess.run(["echo", "stepped elsewhere"], check=True)
+        return super().step(policy_resp)
+
+    def close(self) -> None:
+        print("closed")  # noqa: T201
 
 
 @rl.ENVS.register("finishing")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import Any
 
 furthest_seen: list[int] = []
@@ -28,6 +29,12 @@ def respond(batch: Any) -> Any:
     return batch.respond(action=[1] * len(batch), value=[0.5] * len(batch))
 
 
+async def later(batch: Any) -> list[int]:
+    """Takes its time, as one that asks a server does."""
+    await asyncio.sleep(0)
+    return [1] * len(batch)
+
+
 def too_few(batch: Any) -> list[int]:
     """Forgets an env."""
     return [0] * (len(batch) - 1)
@@ -36,3 +43,6 @@ def too_few(batch: Any) -> list[int]:
 def broken(batch: Any) -> list[int]:
     """Fails."""
     raise LookupError("no such weights")
+
+
+print("policies that print when they are imported")  # noqa: T201

@@ -178,13 +178,23 @@ def test_actions_that_do_not_fit_are_code_1(tmp_path: Path) -> None:
     assert "2 rows for a batch of 3" in done.stderr
 
 
-def test_a_policy_that_raises_shows_its_own_traceback(tmp_path: Path) -> None:
-    """It is the user's code: where it went wrong is what they need."""
-    config = write_config(tmp_path, {**CARTPOLE, "num_workers": 2})
-    done = run("rollout", config, "--policy", "cli.stub_policies:broken")
-    assert done.returncode == 1
-    assert "no such weights" in done.stderr
-    assert "stub_policies.py" in done.stderr
+def test_a_policy_that_raises_shows_the_way_through_its_own_code(tmp_path: Path) -> None:
+    """It is the user's code: where it went wrong is what they need, and nothing else."""
+    config = write_config(tmp_path, {**STUB, "placement": "inline"})
+    done = invoke("rollout", config, "--policy", "cli.stub_policies:broken")
+    assert (done.exit_code, done.stdout) == (1, "")
+    message = done.stderr.partition("error: ")[2]
+    assert message.startswith("the policy raised LookupError: no such weights\n")
+    places = [line for line in message.splitlines() if line.startswith("  File ")]
+    assert ["stub_policies.py" in place for place in places] == [True]
+
+
+def test_clients_that_do_not_come_are_one_message(tmp_path: Path) -> None:
+    """It names the server, its address and for how long it has waited."""
+    server = {"name": "robots", "backend": "env_server", "env_kwargs": {"connect_timeout": 0.01}}
+    done = invoke("rollout", write_config(tmp_path, server))
+    assert (done.exit_code, done.stdout) == (1, "")
+    assert "error: 0 of 1 clients have joined 'robots-0' at tcp://127.0.0.1" in done.stderr
 
 
 def test_a_warning_is_one_line(tmp_path: Path) -> None:

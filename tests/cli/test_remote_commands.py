@@ -189,6 +189,14 @@ def test_keygen_says_what_goes_where(tmp_path: Path) -> None:
     assert {stat.S_IMODE(path.stat().st_mode) for path in secrets} == {0o600}
 
 
+def test_keys_that_can_not_be_written_are_one_message(tmp_path: Path) -> None:
+    """The folder is named, and what is in its way."""
+    (tmp_path / "keys").write_text("a file")
+    done = invoke("keygen", tmp_path / "keys", "left")
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert done.stderr.startswith(f"error: no keys can be written into {tmp_path / 'keys'}: ")
+
+
 def test_keygen_replaces_no_keys(tmp_path: Path) -> None:
     """A second client is added beside the first, whose keys stay as they are."""
     top = tmp_path / "keys"

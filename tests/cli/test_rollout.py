@@ -115,6 +115,25 @@ def test_a_policy_may_answer_with_a_batch_of_responses(tmp_path: Path) -> None:
     assert document["steps"] == 30
 
 
+def test_a_policy_may_be_awaited(tmp_path: Path) -> None:
+    """As one that asks an inference server."""
+    config = write_config(tmp_path, {**STUB, "num_workers": 2})
+    document = invoke_json("rollout", config, "--steps", 30, "--policy", "cli.stub_policies:later")
+    assert document["steps"] == 30
+
+
+@pytest.mark.parametrize("placement", ["process", "inline"])
+def test_nobody_who_prints_gets_into_the_results(tmp_path: Path, placement: str) -> None:
+    """What an env, what it starts, or a policy prints is on stderr, to the end of the process."""
+    talkative = {"name": "a", "backend": "talkative", "task": "any", "placement": placement}
+    words = ("--steps", 20, "--policy", "cli.stub_policies:respond", "--json")
+    done = run("rollout", write_config(tmp_path, talkative), *words)
+    assert json.loads(done.stdout)["steps"] == 20
+    printed = {"made", "stepped", "stepped in C", "stepped elsewhere", "closed"}
+    printed |= {"policies that print when they are imported"}
+    assert printed <= set(done.stderr.splitlines())
+
+
 @pytest.mark.parametrize("differing", [{"observation_size": 2}, {"actions": 3}])
 def test_a_policy_gets_one_batch_for_each_entry_where_spaces_differ(
     tmp_path: Path, differing: dict[str, int]
@@ -153,6 +172,7 @@ def test_help_teaches_by_example(command: list[str]) -> None:
     """Each help text has command lines to copy."""
     done = invoke(*command, "--help")
     assert done.exit_code == 0
+    assert invoke(*command, "-h").stdout == done.stdout
     assert f"rlightning-aio {' '.join(command)}".strip() in done.stdout
 
 

@@ -7,6 +7,7 @@ Absent on purpose: rules of environments, and anything a program couldn't call i
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import sys
@@ -22,14 +23,23 @@ def main() -> None:
     signal.signal(signal.SIGINT, _quit)
     warnings.showwarning = _say
     from rlightning_aio.cli.app import app  # noqa: PLC0415
+    from rlightning_aio.hosts.standard_streams import stdout_set_aside  # noqa: PLC0415
+
+    sys.stdout = stdout_set_aside()
+    if sys.stderr is None:  # pyright: ignore[reportUnnecessaryComparison]  # Closed by the caller.
+        sys.stderr = open(2, "w", closefd=False)  # noqa: SIM115  # To the end of the process.
 
     try:
         app()
     except KeyboardInterrupt:
         sys.exit(130)
     finally:
-        # All is said; what the interpreter still does to end is not worth a traceback.
+        # All is said; what the interpreter still does to end is not worth a traceback, and what is
+        # printed then is no result.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+        with contextlib.suppress(OSError):  # Nobody reads it any more.
+            sys.stdout.flush()
+        sys.stdout = sys.stderr
 
 
 def _quit(*_: object) -> None:

@@ -22,7 +22,7 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     name="rlightning-aio",
     no_args_is_help=True,
-    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
 )
 

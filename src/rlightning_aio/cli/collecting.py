@@ -62,9 +62,9 @@ def _differ(spaces: Sequence[gym.Space[Any] | None]) -> bool:
     return any(space != spaces[0] for space in spaces[1:])
 
 
-def respond_to_all(group: EnvGroup, respond: Responder, batch: BatchedData) -> None:
+async def respond_to_all(group: EnvGroup, respond: Responder, batch: BatchedData) -> None:
     """Have every env of `batch` go on."""
-    for response in respond(batch):
+    for response in await respond(batch):
         group.step_async(response)
 
 

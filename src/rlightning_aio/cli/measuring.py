@@ -249,7 +249,7 @@ class Stand:
         first, began = self.statistics.steps, time.monotonic()
         now = began
         while limits.not_reached(self.statistics.steps - first, now - began):
-            responses = _joined(self._respond(self._everyone))
+            responses = _joined(await self._respond(self._everyone))
             sent_at = time.monotonic()
             batch, _ = await self._group.step(responses)
             now = time.monotonic()
@@ -263,7 +263,7 @@ class Stand:
         first, began = self.statistics.steps, time.monotonic()
         now = began
         sent_at[:] = now
-        respond_to_all(group, self._respond, self._everyone)
+        await respond_to_all(group, self._respond, self._everyone)
         while limits.not_reached(self.statistics.steps - first, now - began):
             batch, _ = await group.collect_async(min_results=min_results)
             now = time.monotonic()
@@ -271,7 +271,7 @@ class Stand:
             for part in parts_of(batch):
                 latencies.append(now - sent_at[part.slots])
                 sent_at[part.slots] = now
-            respond_to_all(group, self._respond, batch)
+            await respond_to_all(group, self._respond, batch)
         steps = self.statistics.steps - first
         batch, _ = await group.collect_async(wait_all=True)
         self.statistics.add(batch)

@@ -1,28 +1,33 @@
 """Where a rollout's actions come from: at random, or from a callable that the user names.
 
-A policy is a callable that takes a `BatchedData` of results and returns actions
-(``[n, *action]``, one row for each result, in order), or a batch of responses made with
+A policy is a callable, or a coroutine function, that takes a `BatchedData` of results and returns
+actions (``[n, *action]``, one row for each result, in order), or a batch of responses made with
 `BatchedData.respond`. Sampling works on whole columns: it costs a batch, not an env.
 """
 
 from __future__ import annotations
 
 import importlib
+import inspect
+import traceback
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
 
 import gymnasium as gym
 import numpy as np
 
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.cli.masks import allowed_action, can_be_masked, has_masks
-from rlightning_aio.errors import ConfigError
+from rlightning_aio.errors import ConfigError, RLightningError
 from rlightning_aio.protocol.columns import index, stacked
 
 if TYPE_CHECKING:
+    from types import TracebackType
+
     from numpy.typing import NDArray
 
-__all__ = ["Policy", "RandomPolicy", "Responder", "load_policy"]
+__all__ = ["Policy", "PolicyRaised", "RandomPolicy", "Responder", "load_policy"]
 
 Policy: TypeAlias = Callable[[BatchedData], Any]
 Sampler: TypeAlias = Callable[[int], Any]
@@ -30,6 +35,11 @@ Sampler: TypeAlias = Callable[[int], Any]
 _UNBOUNDED_SCALE = 0.1
 """Standard deviation where a space has no bounds: simulators take such actions in units of
 a joint's range, and larger ones throw a robot about."""
+_PACKAGE: Final = str(Path(__file__).parents[1])
+
+
+class PolicyRaised(RLightningError):
+    """The user's policy raised; the message has the way through its own code."""
 
 
 def load_policy(name: str) -> Policy:
@@ -44,9 +54,8 @@ def load_policy(name: str) -> Policy:
     try:
         found: Any = importlib.import_module(module_name)
     except Exception as error:
-        raise ConfigError(
-            f"--policy {name!r}: importing {module_name} raised {type(error).__name__}: {error}"
-        ) from error
+        words = traceback.format_exception_only(error)[-1].strip()
+        raise ConfigError(f"--policy {name!r}: importing {module_name} raised {words}") from error
     for part in path.split("."):
         if not hasattr(found, part):
             raise ConfigError(f"--policy {name!r}: {module_name} has no {path!r}")
@@ -68,14 +77,34 @@ class Responder:
         self._policy = policy
         self._separate = separate
 
-    def __call__(self, batch: BatchedData) -> list[BatchedData]:
-        """Batches of responses, which together answer `batch`."""
-        parts = list(batch.by_name().values()) if self._separate else [batch]
-        return [self._respond(part) for part in parts]
+    async def __call__(self, batch: BatchedData) -> list[BatchedData]:
+        """Batches of responses, which together answer `batch`.
 
-    def _respond(self, batch: BatchedData) -> BatchedData:
-        answer = self._policy(batch)
+        Raises:
+            PolicyRaised: by the policy.
+        """
+        parts = list(batch.by_name().values()) if self._separate else [batch]
+        return [await self._respond(part) for part in parts]
+
+    async def _respond(self, batch: BatchedData) -> BatchedData:
+        try:
+            answer = self._policy(batch)
+            if inspect.isawaitable(answer):
+                answer = await answer
+        except ConfigError:
+            raise  # Random actions can't be had.
+        except Exception as error:
+            raise PolicyRaised(_told(error)) from error
         return answer if isinstance(answer, BatchedData) else batch.respond(action=answer)
+
+
+def _told(error: Exception) -> str:
+    """What a policy raised, and where: from the first line that is not of this package."""
+    trace: TracebackType | None = error.__traceback__
+    while trace is not None and trace.tb_frame.f_code.co_filename.startswith(_PACKAGE):
+        trace = trace.tb_next
+    words = traceback.format_exception_only(error)[-1].strip()
+    return "".join([f"the policy raised {words}\n", *traceback.format_tb(trace)]).rstrip()
 
 
 class RandomPolicy:

@@ -111,7 +111,7 @@ def rollout(
         raise typer.Exit(INTERRUPTED) from None
     finally:
         # Also after an error: what was collected until then is worth knowing.
-        if interrupted or statistics.began:
+        if interrupted or statistics.steps:
             _report(config, group, statistics, interrupted=interrupted, as_json=as_json)
 
 
@@ -132,14 +132,14 @@ async def _collect(
         display.ready()
         statistics.begin(roster)
         with resetting(group, configs):
-            respond_to_all(group, respond, batch)
+            await respond_to_all(group, respond, batch)
             while (left := order.steps - statistics.steps) > 0:
                 most = -(-left // sub_envs)
                 batch, _ = await group.collect_async(
                     min_results=min(order.min_results, most), max_results=most
                 )
                 statistics.add(batch)
-                respond_to_all(group, respond, batch)
+                await respond_to_all(group, respond, batch)
                 if display.due():
                     display.show()
                     # Where results never keep us waiting, nothing else would let Ctrl-C in.

@@ -1,7 +1,7 @@
 """What every command shares: the two output streams, how errors end it, how figures look.
 
-Rule: an error of the library is one message on stderr and an exit code, never a traceback;
-only an error in the user's own code (a policy) shows where it happened, in full.
+Rule: stdout has results and nothing else, whoever prints. An error is one message on stderr and
+an exit code, never a traceback; one in the user's own code (a policy) says where it happened there.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import json
 import re
 import signal
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
 from rich.console import Console
@@ -35,6 +35,7 @@ __all__ = [
     "number",
     "out",
     "print_json",
+    "print_result",
 ]
 
 INTERRUPTED = 130
@@ -44,19 +45,43 @@ _WIDE = 160
 """Columns of a table that goes to a file: what reads it wraps lines itself."""
 
 
+_results: list[TextIO] = []
+"""Where results go while a command runs; stdout itself leads to stderr then."""
+
+
 def out() -> Console:
     """The console for results."""
-    return Console(highlight=False, width=None if sys.stdout.isatty() else _WIDE)
+    return _console(_results[-1] if _results else sys.stdout)
 
 
 def err() -> Console:
     """The console for what is said on the way."""
-    return Console(stderr=True, highlight=False, width=None if sys.stderr.isatty() else _WIDE)
+    return _console(sys.stderr)
+
+
+def _console(file: TextIO) -> Console:
+    return Console(file=file, highlight=False, width=None if file.isatty() else _WIDE)
+
+
+def print_result(text: str) -> None:
+    """Print `text` on stdout as it is."""
+    typer.echo(text, file=_results[-1] if _results else None)
 
 
 def print_json(value: Any) -> None:
     """Print `value` as the one JSON document on stdout."""
-    typer.echo(json.dumps(value, indent=2, allow_nan=False))
+    print_result(json.dumps(value, indent=2, allow_nan=False))
+
+
+@contextlib.contextmanager
+def _prints_on_stderr() -> Generator[None]:
+    """What anybody prints in here goes to stderr; stdout has results and nothing else."""
+    _results.append(sys.stdout)
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            yield
+    finally:
+        _results.pop().flush()
 
 
 def guarded(command: Callable[..., None]) -> Callable[..., None]:
@@ -65,10 +90,14 @@ def guarded(command: Callable[..., None]) -> Callable[..., None]:
     @functools.wraps(command)
     def run(*args: Any, **kwargs: Any) -> None:
         try:
-            command(*args, **kwargs)
+            with _prints_on_stderr():
+                command(*args, **kwargs)
         except RLightningError as error:
             typer.echo(f"error: {_in_words(error)}", err=True)
             raise typer.Exit(2 if isinstance(error, ConfigError) else 1) from None
+        except TimeoutError as error:  # Of a group: clients that didn't come.
+            typer.echo(f"error: {error}", err=True)
+            raise typer.Exit(1) from None
         except KeyboardInterrupt:
             raise typer.Exit(INTERRUPTED) from None
 

@@ -30,6 +30,7 @@ from rlightning_aio.cli.terminal import (
     err,
     interruptible,
     print_json,
+    print_result,
 )
 from rlightning_aio.config import load_config
 
@@ -202,7 +203,7 @@ def _report(config: Path, search: _Search, *, interrupted: bool, as_json: bool) 
             f"A step takes {duration(search.step_us)} in the env: {counted(num_cores(), 'core')} "
             f"that only step make {count(search.limit)} steps/s."
         )
-    typer.echo(_as_yaml(config, best))
+    print_result(_as_yaml(config, best))
 
 
 def _as_yaml(config: Path, best: Contender) -> str:

@@ -79,7 +79,8 @@ def make_keys(directory: str | os.PathLike[str], names: Sequence[str]) -> list[P
         The directories that belong on the clients' machines, in the order of `names`.
 
     Raises:
-        ConfigError: a name can't be a file's, or has keys already; nothing was written.
+        ConfigError: a name can't be a file's, or has keys already, and nothing was written; or
+            the directory can't be written into.
     """
     top = Path(directory)
     for name in names:
@@ -90,6 +91,17 @@ def make_keys(directory: str | os.PathLike[str], names: Sequence[str]) -> list[P
             )
         if (top / name).exists():
             raise ConfigError(f"{top / name} exists; remove it to make new keys for {name!r}")
+    try:
+        _write_keys(top, names)
+    except OSError as error:
+        raise ConfigError(
+            f"no keys can be written into {top}: {error.strerror}: {error.filename}; name a "
+            "directory that is yours"
+        ) from error
+    return [top / name for name in names]
+
+
+def _write_keys(top: Path, names: Sequence[str]) -> None:
     allowed = top / _SERVER / _ALLOWED
     allowed.mkdir(parents=True, exist_ok=True)
     server = top / _SERVER / (_SERVER + _SECRET_SUFFIX)
@@ -101,7 +113,6 @@ def make_keys(directory: str | os.PathLike[str], names: Sequence[str]) -> list[P
         keys = _write_pair(top / name, _CLIENT)
         (top / name / (_SERVER + _PUBLIC_SUFFIX)).write_text(_render(KeyPair(server_keys.public)))
         (allowed / (name + _PUBLIC_SUFFIX)).write_text(_render(KeyPair(keys.public)))
-    return [top / name for name in names]
 
 
 def _write_pair(directory: Path, name: str) -> KeyPair:
