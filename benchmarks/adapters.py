@@ -1,9 +1,9 @@
 """HalfCheetah-v5, 32 envs, through the interfaces of Gymnasium and Stable-Baselines3.
 
 How far ahead is each of ours of the class whose place it takes, and what does it cost beside the
-bare group? Over callables, which make separate envs, and by the task's name, which has each worker
-step its envs together. Infos are part of both interfaces, so they are made in every step; the bare
-group makes them when somebody reads them, and nobody does.
+bare group? Over callables, which make separate envs, and by the task's name, which has each worker,
+and the trainer's process, step its share together. Infos are part of both interfaces, so they are
+made in every step; the bare group makes them when somebody reads them, and nobody does.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ QUESTION = Question(
         OursSync(BARE, WORK),
         OursMadeVector(MADE_VECTOR, WORK),
         OursMadeSb3(MADE_SB3, WORK),
-        OursSync(BARE_TOGETHER, replace(WORK, together=WORK.num_envs // CORES)),
+        OursSync(BARE_TOGETHER, replace(WORK, together=WORK.num_envs // CORES, placement="split")),
         GymnasiumAsync(GYMNASIUM, WORK),
         StableBaselines3(SUBPROC, WORK),
     ],

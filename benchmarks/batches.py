@@ -1,7 +1,8 @@
 """Many simulations to a worker, stepped with one call: ahead of EnvPool, near the ceiling?
 
 The ceiling is one such loop on each core, at once, without a trainer. The limit is a bare Python
-loop on each core. EnvPool steps the same tasks written in C++.
+loop on each core. EnvPool steps the same tasks written in C++. Where all are stepped and awaited,
+the trainer's process has one share (`placement: split`), unless it says *workers alone*.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ def against(subject: Contender, reference: Contender, bound: float) -> None:
 for (task, count), (pool, half_of_pool, ceiling, limit) in FIGURES.items():
     name = f"{task.removesuffix('-v5')} x {count}"
     plain = Work(task, count, backend="mujoco")
-    work = replace(plain, together=count // CORES)
+    work = replace(plain, together=count // CORES, placement="split")
     ours = OursSync(f"rlightning_aio, {name}", work)
     if pool:
         against(ours, EnvPool(f"EnvPool, {name}", plain), pool)
@@ -65,11 +66,15 @@ for (task, count), (pool, half_of_pool, ceiling, limit) in FIGURES.items():
         against(ours, Limit(f"the limit, {name}", plain), limit)
 
 cheetahs = Work("HalfCheetah-v5", 32, backend="mujoco")
+together = replace(cheetahs, together=32 // CORES)
+contenders.append(OursSync("rlightning_aio, workers alone, HalfCheetah x 32", together))
+contenders.append(OursSync("rlightning_aio, workers alone, 32 single HalfCheetahs", cheetahs))
+cheetahs = replace(cheetahs, placement="split")
 single = OursSync("rlightning_aio, 32 single HalfCheetahs", cheetahs)
 against(single, GymnasiumAsync("Gymnasium AsyncVectorEnv, 32 HalfCheetahs", cheetahs), 4.0)
 against(single, Limit("the limit, single HalfCheetahs", cheetahs), 0.75)
 
-carts = Work("CartPole-v1", 1024, together=1024 // CORES)
+carts = Work("CartPole-v1", 1024, together=1024 // CORES, placement="split")
 against(
     OursSync("rlightning_aio, CartPole x 1,024", carts),
     VectorEntryPoint("Gymnasium's vector_entry_point, CartPole x 1,024", carts),

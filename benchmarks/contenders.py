@@ -119,7 +119,7 @@ class Stepped(Contender):
 def group_config(work: Work, envs_per_process: int | str) -> dict[str, Any]:
     """One config entry for all envs of `work`."""
     workers: dict[str, Any] = {}
-    if work.placement == "process":
+    if work.placement != "inline":
         # One worker on each core is best kept there.
         workers = {
             "envs_per_process": envs_per_process,

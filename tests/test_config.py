@@ -333,7 +333,7 @@ def test_an_overridden_field_is_checked_like_any_other(write: Write) -> None:
         ("max_episode_steps", 0, "should be greater than or equal to 1, got 0"),
         ("step_timeout", -1, "should be greater than 0, got -1"),
         ("start_timeout", math.nan, "should be greater than 0, got nan"),
-        ("placement", "inlin", "should be 'process', 'inline' or 'ray', got 'inlin'"),
+        ("placement", "inlin", "should be 'process', 'inline', 'split' or 'ray', got 'inlin'"),
         ("on_worker_death", "ignore", "should be 'restart', 'raise' or 'resume', got 'ignore'"),
         ("envs_per_process", "many", "should be a valid integer or 'auto', got 'many'"),
         ("envs_per_process", 0, "should be greater than or equal to 1 or 'auto', got 0"),
@@ -419,8 +419,12 @@ SERVER = {"name": "robots", "backend": "env_server"}
 
 @pytest.mark.parametrize(
     ("entry", "refuses"),
-    [(INLINE, PLACEMENTS["inline"].refuses), (SERVER, placement_of("env_server", "").refuses)],
-    ids=["inline", "env_server"],
+    [
+        (INLINE, PLACEMENTS["inline"].refuses),
+        (HOPPER | {"placement": "split"}, PLACEMENTS["split"].refuses),
+        (SERVER, placement_of("env_server", "").refuses),
+    ],
+    ids=["inline", "split", "env_server"],
 )
 def test_what_has_no_meaning_where_the_envs_live_is_refused(
     entry: dict[str, Any], refuses: Mapping[str, str]

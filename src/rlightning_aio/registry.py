@@ -140,6 +140,7 @@ class Placement:
             something that would not happen. (`num_cpus` is no promise of ours anywhere but
             with Ray, nor `num_gpus` in this process, and both are found in configs for any place.)
         local: its workers use this machine's cores and see this process's modules.
+        own_share: this process takes the last share of the envs, as if it were a worker.
         extra: the extra of this package that it needs; empty for none.
     """
 
@@ -147,12 +148,14 @@ class Placement:
     spreads: bool
     refuses: Mapping[str, str] = field(default_factory=dict[str, str])
     local: bool = True
+    own_share: bool = False
     extra: str = ""
 
 
 _THIS_PROCESS = "the envs live in this process, which is as it is"
 _NO_WORKER = "there is no worker that could die or be replaced"
 _NO_LIMIT = "nothing can end what an env does in this process"
+_OWN_SHARE = "this process, which is as it is, has a share of the envs"
 _CLIENTS_OWN = "its envs live with its clients, which start them as they like"
 _NOT_RAYS = "it is for Ray actors (placement: ray)"
 
@@ -178,6 +181,19 @@ PLACEMENTS: dict[str, Placement] = {
             "cpu_affinity": _THIS_PROCESS,
             "ray_options": _NOT_RAYS,
         },
+    ),
+    "split": Placement(
+        "rlightning_aio.hosts.process:ProcessHost",
+        spreads=True,
+        refuses={
+            "step_timeout": _NO_LIMIT,
+            "reset_timeout": _NO_LIMIT,
+            "start_timeout": _NO_LIMIT,
+            "interpreter": _OWN_SHARE,
+            "env_vars": _OWN_SHARE,
+            "ray_options": _NOT_RAYS,
+        },
+        own_share=True,
     ),
     "ray": Placement(
         "rlightning_aio.hosts.ray_host:RayHost",

@@ -16,13 +16,13 @@ from gymnasium.vector import AutoresetMode
 
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.envs.gymnasium import spec_of
-from rlightning_aio.envs.of_spec import BatchOf, OneOf
+from rlightning_aio.envs.of_spec import OneOf
 from rlightning_aio.envs.sub_envs import adapted
 from rlightning_aio.errors import ConfigError, EnvRaised
 from rlightning_aio.sync import EnvGroup, build_env_group
 from rlightning_aio.types import PolicyResponse
 from rlightning_aio.vector.leftovers import drop_outstanding
-from rlightning_aio.vector.making import imports_of, laid_out, steps_together
+from rlightning_aio.vector.making import steps_together, together
 from rlightning_aio.vector.rows import rows_of
 
 if TYPE_CHECKING:
@@ -49,8 +49,9 @@ def make_vec_env(
     """Monitored envs of one task; see `stable_baselines3.common.env_util.make_vec_env`.
 
     Envs of a MuJoCo task that `rlightning_aio.envs.mujoco_batch` knows are stepped together, as
-    many in each worker, inside a `VecMonitor`. Those of any other are separate, each in a
-    `Monitor`, as are those that are to have a wrapper, or a file, each.
+    many in each worker and in this process (``placement: split``), inside a `VecMonitor`. Those
+    of any other are separate, each in a `Monitor`, as are those that are to have a wrapper, or a
+    file, each.
 
     Args:
         env_id: a registered name, or what makes an env.
@@ -63,10 +64,9 @@ def make_vec_env(
     fields, kwargs = vec_env_kwargs or {}, {"render_mode": "rgb_array", **(env_kwargs or {})}
     single = any(more.get(name) for name in _OF_SINGLE_ENVS)
     if isinstance(env_id, str) and not single and steps_together(spec := spec_of(env_id), kwargs):
-        count, fields = laid_out(n_envs, {**imports_of(spec), **fields})
         one = OneOf(spec, {"disable_env_checker": True, **kwargs})
-        batch = BatchOf(one, n_envs // count, AutoresetMode.SAME_STEP)
-        made = VecEnv([batch if count < n_envs else one] * count, **fields)
+        makers, fields = together(one, n_envs, AutoresetMode.SAME_STEP, fields)
+        made = VecEnv(makers, **fields)
         made.seed(seed)
         return import_module("stable_baselines3.common.vec_env").VecMonitor(made)
     make: Any = import_module("stable_baselines3.common.env_util").make_vec_env

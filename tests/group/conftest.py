@@ -78,13 +78,14 @@ class Place:
 
 INLINE = Place("inline", {"placement": "inline"})
 INLINE_SYNC = Place("inline", {"placement": "inline"}, synchronous=True)
-ONE_SYNC = Place("one worker", {"envs_per_process": 100}, synchronous=True)
 SEVERAL = Place("several workers", {"envs_per_process": 2})
+SPLIT_SYNC = Place("split", {"placement": "split", "envs_per_process": 2}, synchronous=True)
+"""Two envs in each worker, and the last two in this process."""
 RAY = Place("ray", {"placement": "ray", "envs_per_process": 2, "num_cpus": 0})
 RAY_SYNC = Place("ray", {"placement": "ray", "envs_per_process": 100, "num_cpus": 0}, True)
 # Ray takes an environment and some minutes of its own: `make test-ray`.
 ON_RAY = "RLIGHTNING_AIO_ON_RAY" in os.environ
-PLACES = [RAY, RAY_SYNC] if ON_RAY else [INLINE, INLINE_SYNC, ONE_SYNC, SEVERAL]
+PLACES = [RAY, RAY_SYNC] if ON_RAY else [INLINE, INLINE_SYNC, SPLIT_SYNC, SEVERAL]
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
-from rlightning_aio.config import EnvConfig, check_installed, parse_configs
+from rlightning_aio.config import EnvConfig, check_installed, moved, parse_configs
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.group.core import Core
 from rlightning_aio.group.devices import dealt_out
@@ -277,6 +277,11 @@ def _orders(plan: Plan, servers: Sequence[EnvConfig], cores: Sequence[int]) -> l
         for (config, fns), num_hosts in zip(local, nums_hosts, strict=True)
         for share in _shares(fns, num_hosts)
     ]
+    # This process is as good as one worker, whatever the number of entries.
+    for k, (config, share) in list(enumerate(shares))[::-1]:
+        if _place(config).own_share:
+            shares[k] = moved(config, "inline"), share
+            break
     num_processes = sum(_has_worker_here(config) for config, _ in shares)
     surroundings = _surroundings([config for config, _ in shares])
     orders = [

@@ -10,6 +10,7 @@ from gymnasium.vector import AutoresetMode
 from rlightning_aio.envs.gymnasium import spec_of
 from rlightning_aio.envs.mujoco_tasks import is_batched
 from rlightning_aio.envs.of_spec import BatchOf, OneOf, VectorOf
+from rlightning_aio.registry import PLACEMENTS
 from rlightning_aio.sharing import num_batches, num_cores
 from rlightning_aio.vector.env import VectorEnv, per_worker
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     import gymnasium as gym
     from gymnasium.envs.registration import EnvSpec
 
-__all__ = ["imports_of", "laid_out", "make_vec", "steps_together", "vector_entry_point"]
+__all__ = ["make_vec", "steps_together", "together", "vector_entry_point"]
 
 Mode = Literal["async", "vector_entry_point"]
 
@@ -38,10 +39,10 @@ def make_vec(
         id: a registered name, ``module:name``, or a spec.
         num_envs: how many.
         vectorization_mode: None has the envs of a task that `mujoco_batch` knows stepped
-            together, with the same results, as many in each worker, and those of any other
-            separately. ``async``: separately, whatever the task. ``vector_entry_point``: each
-            worker has the task's own vector environment, whose seeds and infos may differ from
-            separate envs'.
+            together, with the same results, as many in each worker and in this process
+            (``placement: split``), and those of any other separately. ``async``: separately,
+            whatever the task. ``vector_entry_point``: each worker has the task's own vector
+            environment, whose seeds and infos may differ from separate envs'.
         vector_kwargs: further arguments of `VectorEnv`.
         wrappers: put around each env, the first innermost; envs with any are separate.
         kwargs: of `gymnasium.make`, or of the task's vector environment. Gymnasium's checker,
@@ -59,7 +60,7 @@ def make_vec(
         if spec.vector_entry_point is None or wrappers:
             reason = "takes no wrappers of single envs" if wrappers else "has no such entry point"
             raise ValueError(f"{spec.id} {reason}; leave vectorization_mode out")
-        count, given = laid_out(num_envs, given)
+        count, given = _laid_out(num_envs, given)
         makers = [VectorOf(spec, num_envs // count, kwargs)] * count
     elif vectorization_mode not in (None, "async"):
         raise ValueError(
@@ -68,10 +69,8 @@ def make_vec(
         )
     elif vectorization_mode is None and not wrappers and steps_together(spec, kwargs):
         mode = AutoresetMode(given.get("autoreset_mode", AutoresetMode.NEXT_STEP))
-        count, given = laid_out(num_envs, given)
-        if count < num_envs:
-            makers = [BatchOf(one, num_envs // count, mode)] * count
-    env = VectorEnv(makers, **{**imports_of(spec), **given})
+        makers, given = together(one, num_envs, mode, given)
+    env = VectorEnv(makers, **{**_imports_of(spec), **given})
     env.spec = copy.deepcopy(spec)
     env.spec.kwargs.update(kwargs)
     return env
@@ -105,7 +104,27 @@ def steps_together(spec: EnvSpec, kwargs: Mapping[str, Any]) -> bool:
     return is_batched(spec) and kwargs.get("disable_env_checker", True) and not single
 
 
-def laid_out(num_envs: int, arguments: dict[str, Any]) -> tuple[int, dict[str, Any]]:
+def together(
+    one: OneOf, num_envs: int, mode: AutoresetMode, arguments: dict[str, Any]
+) -> tuple[list[Callable[[], Any]], dict[str, Any]]:
+    """What makes envs of a task that are stepped together, and where they live.
+
+    Whoever steps them waits for all, and their simulator is one that does not crash: so one
+    share lives in this process, unless an argument asks for what only workers can do.
+
+    Args:
+        one: makes one of them.
+        num_envs: in all.
+        mode: what each does after its episode's end.
+        arguments: as of `_laid_out`.
+    """
+    count, given = _laid_out(num_envs, {**_imports_of(one.spec), **arguments})
+    if not given.keys() & {"placement", *PLACEMENTS["split"].refuses}:
+        given["placement"] = "split"
+    return [one if count == num_envs else BatchOf(one, num_envs // count, mode)] * count, given
+
+
+def _laid_out(num_envs: int, arguments: dict[str, Any]) -> tuple[int, dict[str, Any]]:
     """In how many batches envs are laid over workers, and how an entry says that.
 
     Args:
@@ -129,7 +148,7 @@ def laid_out(num_envs: int, arguments: dict[str, Any]) -> tuple[int, dict[str, A
     return count, {**rest, "envs_per_process": -(-count // workers)}
 
 
-def imports_of(spec: EnvSpec) -> dict[str, Any]:
+def _imports_of(spec: EnvSpec) -> dict[str, Any]:
     """What an entry of the task has to say of it."""
     # Known before the first env is made, it need not tell every time that its assets are old.
     is_mujoco = str(spec.entry_point).startswith("gymnasium.envs.mujoco")
