@@ -411,6 +411,7 @@ VALUES: dict[str, Any] = {
     "env_vars": {"A": "1"},
     "cpu_affinity": True,
     "ray_options": {"max_restarts": 0},
+    "video": {"folder": "films"},
 }
 """A value for each field that some place for envs refuses."""
 INLINE = HOPPER | {"placement": "inline"}

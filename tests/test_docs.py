@@ -14,6 +14,7 @@ import pytest
 from run_python import output_of
 
 from rlightning_aio import EnvGroup, build_env_group
+from rlightning_aio.config import VideoConfig
 from rlightning_aio.hosts.listener import ServerSettings
 
 DOCS = Path(__file__).parent.parent / "docs"
@@ -30,6 +31,7 @@ def test_every_argument_and_setting_has_its_row() -> None:
     building = inspect.signature(build_env_group).parameters.keys() - {"env_cfgs"}
     assert table_rows("collecting.md") == collecting | building
     assert table_rows("remote.md") - {"state"} == set(ServerSettings.model_fields)
+    assert set(VideoConfig.model_fields) <= table_rows("evaluating.md")
 
 
 def blocks(language: str, page: str) -> list[str]:

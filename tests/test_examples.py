@@ -35,7 +35,8 @@ def test_every_program_runs(tmp_path: Path) -> None:
     text = (ROOT / "docs" / "backends.md").read_text()
     backends.write_text(text.partition("\n## callable")[2].partition("\n## ")[0])
     pages = [
-        ROOT / "docs" / f"{name}.md" for name in ("collecting", "gymnasium", "remote", "state")
+        ROOT / "docs" / f"{name}.md"
+        for name in ("collecting", "evaluating", "gymnasium", "remote", "state")
     ]
     for page in (ROOT / "README.md", *pages, backends):
         blocks = [block for block in blocks_of_python(page) if "import torch" not in block]

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
         PolicyResponse,
         default_env_preprocess_fn,
     )
+    from rlightning_aio.video import record_video
 
 __version__ = "0.1.0"
 
@@ -67,6 +68,7 @@ _HOMES = {
         "PolicyResponse",
         "default_env_preprocess_fn",
     ),
+    "video": ("record_video",),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 
@@ -98,6 +100,7 @@ __all__ = [
     "build_env_group",
     "default_env_preprocess_fn",
     "load_config",
+    "record_video",
     "run",
 ]
 

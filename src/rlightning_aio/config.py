@@ -37,13 +37,54 @@ from rlightning_aio.sharing import num_batches, num_cores
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
-__all__ = ["EnvConfig", "check_installed", "load_config", "moved", "parse_configs"]
+__all__ = [
+    "MADE_BY_GYMNASIUM",
+    "EnvConfig",
+    "VideoConfig",
+    "check_installed",
+    "load_config",
+    "moved",
+    "parse_configs",
+]
 
 _TOP_LEVEL = ("envs", "env", "imports")
 _CALLABLE = "callable"
 """Name of the backend whose envs come from a callable."""
+MADE_BY_GYMNASIUM = ("gymnasium", "mujoco", "ale")
+"""Backends whose `env_kwargs` go to `gymnasium.make`."""
 _TYPO = 0.8
 """So much does a misspelt name resemble the right one; other sections of a file do less."""
+
+
+class VideoConfig(BaseModel):
+    """Which episodes of an entry's envs are filmed, and where the files go."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    folder: str = Field(min_length=1)
+    """Gets ``<env id>-episode-<n>.mp4``; n counts the episodes of the env from 0, or from the
+    last film that is there. It is made if it isn't there."""
+    envs: tuple[Annotated[int, Field(ge=0)], ...] = Field(default=(0,), strict=False)
+    """Which envs of the entry, from 0. Each has a worker of its own, so that those that aren't
+    filmed wait for no frame, unless `EnvConfig.envs_per_process` says how many share one."""
+    sub_env: int = Field(default=0, ge=0)
+    """Which of an env's sub-environments."""
+    every: int = Field(default=1, ge=1)
+    """Film episodes 0, every, 2 * every, …"""
+    episodes: tuple[Annotated[int, Field(ge=0)], ...] | None = Field(default=None, strict=False)
+    """Film these alone."""
+
+    @field_validator("folder")
+    @classmethod
+    def _find_from_anywhere(cls, folder: str) -> str:
+        # Where "~" is nobody's, it is a name as any other.
+        return os.path.abspath(os.path.expanduser(folder))  # noqa: PTH100, PTH111
+
+    def wants(self, episode: int) -> bool:
+        """Whether the episode of that number is to be filmed."""
+        if self.episodes is not None:
+            return episode in self.episodes
+        return episode % self.every == 0
 
 
 class EnvConfig(BaseModel):
@@ -108,6 +149,8 @@ class EnvConfig(BaseModel):
     ray_options: dict[str, Any] = Field(default_factory=dict)
     """Options of a Ray actor beside `num_cpus` and `num_gpus`, as its ``.options()`` takes them,
     and ``address``, the cluster's (``placement: ray`` only)."""
+    video: VideoConfig | None = None
+    """Episodes that are filmed where the envs live; see `record_video`."""
 
     @model_validator(mode="before")
     @classmethod
@@ -556,10 +599,25 @@ def _check_snapshot_every(config: EnvConfig) -> str | None:
     return None
 
 
+def _check_video(config: EnvConfig) -> str | None:
+    video = config.video
+    if video is None:
+        return None
+    if above := [k for k in video.envs if k >= config.num_workers]:
+        return f"there is no env {above[0]} among num_workers: {config.num_workers}, from 0"
+    if 1 < config.num_envs <= video.sub_env:
+        return f"there is no sub-environment {video.sub_env} of num_envs: {config.num_envs}, from 0"
+    mode = config.env_kwargs.get("render_mode")
+    if config.backend in MADE_BY_GYMNASIUM and mode != "rgb_array":
+        return f"needs env_kwargs: {{render_mode: rgb_array}}, got {mode!r}"
+    return None
+
+
 _COMPARED_WITH = {
     "task": ("make_env",),
     "make_env": ("num_workers",),
     "snapshot_every": ("on_worker_death",),
+    "video": ("num_workers", "num_envs", "env_kwargs"),
 }
 """Fields without which nothing can be said of others."""
 _CHECKS: dict[str, Callable[[EnvConfig], str | None]] = {
@@ -569,6 +627,7 @@ _CHECKS: dict[str, Callable[[EnvConfig], str | None]] = {
     "num_envs": _check_num_envs,
     "interpreter": _check_interpreter,
     "snapshot_every": _check_snapshot_every,
+    "video": _check_video,
 }
 
 

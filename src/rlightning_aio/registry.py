@@ -229,6 +229,7 @@ _PLACED_BY_BACKEND: dict[str, Placement] = {
             "a truncated result, and it may come back",
             "max_restarts": "it has no workers; a client that is gone may come back",
             "snapshot_every": "it has no workers; a client that is gone begins anew",
+            "video": _CLIENTS_OWN,
         },
     ),
 }

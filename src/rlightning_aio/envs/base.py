@@ -237,6 +237,14 @@ class BaseEnv(abc.ABC):
         """One frame, as the simulator renders it."""
         return self.env.render()
 
+    def render_one(self, sub_env: int) -> Any:
+        """One frame of a sub-environment; of an env without such, its own.
+
+        By default what `render` has for it, which renders all of them.
+        """
+        frames = self.render()
+        return frames if self.num_envs == 1 else frames[sub_env]
+
     def offload(self) -> None:
         """Free device memory until `reload`; envs that hold none need not support it."""
         raise NotImplementedError(f"backend {self.config.backend!r} has no offload()")

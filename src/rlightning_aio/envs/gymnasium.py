@@ -8,7 +8,7 @@ import warnings
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from rlightning_aio.envs.base import (
     BareReset,
@@ -106,6 +106,15 @@ class GymnasiumEnv(BaseEnv):
     def is_wrapped(self, wrapper_class: type[Any]) -> bool:
         """Whether `wrapper_class` is among the env's wrappers."""
         return any(isinstance(wrapper, wrapper_class) for wrapper in wrappers_of(self.env))
+
+    def render_one(self, sub_env: int) -> Any:
+        if not self._is_vector:
+            return self.env.render()
+        inner: Any = self.env.unwrapped
+        if isinstance(inner, SyncVectorEnv):
+            return inner.envs[sub_env].render()
+        own = getattr(inner, "render_one", None)  # A `MujocoBatch`'s.
+        return self.env.render()[sub_env] if own is None else own(sub_env)
 
     def close(self) -> None:
         self.env.close()

@@ -6,6 +6,7 @@ Rule: everything that can be known to be wrong without starting a process is sai
 from __future__ import annotations
 
 import inspect
+import itertools
 import os
 import warnings
 from collections import Counter, deque
@@ -26,6 +27,7 @@ from rlightning_aio.group.resumption import Resumption
 from rlightning_aio.group.single import SingleEnvCore, StepsAtOnce
 from rlightning_aio.group.slab_layout import SlabLayout
 from rlightning_aio.group.supervisor import Supervisor
+from rlightning_aio.group.videos import check_videos, filmed_alone
 from rlightning_aio.hosts.arena import Arena, map_shared
 from rlightning_aio.hosts.base import Wiring
 from rlightning_aio.hosts.messages import StartOrder
@@ -72,6 +74,7 @@ def plan_group(
     """
     configs = parse_configs(env_cfgs)
     check_installed(configs)
+    check_videos(configs)
     fns = _preprocess_fns(configs, preprocess_fn)
     for config, own in zip(configs, fns, strict=True):
         host_class(config)
@@ -275,7 +278,7 @@ def _orders(plan: Plan, servers: Sequence[EnvConfig], cores: Sequence[int]) -> l
     shares = [
         (config, share)
         for (config, fns), num_hosts in zip(local, nums_hosts, strict=True)
-        for share in _shares(fns, num_hosts)
+        for share in _shares(config, fns, num_hosts)
     ]
     # This process is as good as one worker, whatever the number of entries.
     for k, (config, share) in list(enumerate(shares))[::-1]:
@@ -359,9 +362,14 @@ def _nums_hosts(configs: Sequence[EnvConfig], num_cores: int) -> list[int]:
 
 
 def _shares(
-    fns: Sequence[PreprocessFn | None], num_hosts: int
+    config: EnvConfig, fns: Sequence[PreprocessFn | None], num_hosts: int
 ) -> list[list[tuple[int, PreprocessFn | None]]]:
-    """Which envs of an entry live together: as evenly as can be, neighbours together."""
+    """Which envs of an entry live together: as evenly as can be, neighbours together, but for
+    those that are filmed.
+    """
     count = len(fns)
     envs = list(enumerate(fns))
-    return [envs[count * k // num_hosts : count * (k + 1) // num_hosts] for k in range(num_hosts)]
+    bounds = {count * k // num_hosts for k in range(num_hosts + 1)}
+    if _place(config).spreads:
+        bounds |= {k + side for k in filmed_alone(config) for side in (0, 1)}
+    return [envs[first:end] for first, end in itertools.pairwise(sorted(bounds))]

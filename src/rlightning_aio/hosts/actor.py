@@ -231,7 +231,7 @@ class EnvActor:
         errors: list[tuple[int, ErrorText]] = []
         for index, runner in enumerate(self._runners):
             try:
-                runner.env.close()
+                runner.close()
             except BaseException as error:
                 errors.append((index, ErrorText.of(error)))
         self._runners.clear()

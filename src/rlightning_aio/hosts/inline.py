@@ -146,7 +146,7 @@ class InlineHost:
         errors: list[tuple[int, ErrorText]] = []
         for index, runner in enumerate(self._runners):
             try:
-                runner.env.close()
+                runner.close()
             except BaseException as error:
                 errors.append((index, ErrorText.of(error)))
         self.release()

@@ -155,6 +155,10 @@ class EnvRunner:
             return self._restore(*arguments)
         return self._step_with(*arguments)
 
+    def close(self) -> None:
+        """Close the env."""
+        self.env.close()
+
     # -- standings ----------------------------------------------------------------
 
     def standing(self) -> bytes:

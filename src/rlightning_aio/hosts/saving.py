@@ -26,16 +26,12 @@ __all__ = ["SavingRunner"]
 
 
 class SavingRunner(EnvRunner):
-    """See the module.
+    """See the module. Its env's config says how many steps come between two standings at most."""
 
-    Args:
-        env: as of `EnvRunner`; inline: likewise.
-        every: so many steps come between two standings at most.
-    """
-
-    def __init__(self, env: BaseEnv, every: int, *, inline: bool = False) -> None:
+    def __init__(self, env: BaseEnv, *, inline: bool = False) -> None:
         super().__init__(env, inline=inline)
-        self._every = every
+        assert env.config.snapshot_every is not None
+        self._every = env.config.snapshot_every
         self._since = 0
 
     def attach(self, slab: Slab, row: int, announce: Callable[[InfoSchema], int]) -> None:

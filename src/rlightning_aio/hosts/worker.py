@@ -271,7 +271,7 @@ class Worker:
         for index, runner in enumerate(self._runners):
             self._begin_with(index)
             try:
-                runner.env.close()
+                runner.close()
             except BaseException as error:
                 errors.append((index, ErrorText.of(error)))
         self._runners.clear()

@@ -1,0 +1,214 @@
+"""`RecordingRunner`: an env whose episodes are filmed where it lives.
+
+It renders after each result and hands the frame to an encoder beside it (`VideoFile`), so no
+frame travels. An episode's film begins with what its reset shows, and ends with what its last
+step shows; where an env begins the next episode within that step, with the one before.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from rlightning_aio.envs.tensors import as_numpy
+from rlightning_aio.hosts.runner import EnvRunner
+from rlightning_aio.hosts.saving import SavingRunner
+from rlightning_aio.hosts.video_file import VideoFile, find_ffmpeg
+from rlightning_aio.protocol.entries import Operation
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from rlightning_aio.config import VideoConfig
+    from rlightning_aio.envs.base import BaseEnv
+    from rlightning_aio.hosts.messages import OutOfBand
+    from rlightning_aio.hosts.runner import Execute
+    from rlightning_aio.protocol.info import InfoSchema
+    from rlightning_aio.protocol.slab import Slab
+
+__all__ = ["RecordingRunner", "RecordingSavingRunner"]
+
+_DEFAULT_FPS: Final = 30.0
+
+
+class RecordingRunner(EnvRunner):
+    """See the module. Its env's config has a ``video``.
+
+    Raises:
+        ImportError: ffmpeg isn't installed where the env lives.
+        ValueError: the env renders nothing, or can't be filmed.
+    """
+
+    def __init__(self, env: BaseEnv, *, inline: bool = False) -> None:
+        super().__init__(env, inline=inline)
+        assert env.config.video is not None
+        find_ffmpeg()
+        _check_renders(env)
+        self._camera = _Camera(env, env.config.video)
+
+    def attach(self, slab: Slab, row: int, announce: Callable[[InfoSchema], int]) -> None:
+        super().attach(slab, row, announce)
+        self._camera.watch(slab, row, self.meta.autoreset, self.meta.max_episode_steps)
+        self.step = self._filmed(self.step)
+        self._own_reset = self._filmed(self._own_reset)
+        # Its halves would not come by here.
+        self.begin_step = None
+
+    def execute(self, op: int, arguments: Any) -> Any:
+        outcome = super().execute(op, arguments)
+        if op in (Operation.STEP, Operation.RESET):
+            self._camera.see()
+        return outcome
+
+    def _filmed(self, execute: Execute) -> Execute:
+        def execute_and_film() -> OutOfBand | None:
+            outcome = execute()
+            self._camera.see()
+            return outcome
+
+        return execute_and_film
+
+    def close(self) -> None:
+        try:
+            self._camera.close()
+        finally:
+            super().close()
+
+
+class RecordingSavingRunner(RecordingRunner, SavingRunner):
+    """One that gives its standing away as well."""
+
+
+class _Camera:
+    """Films the episodes of one env, or of one of its sub-environments."""
+
+    def __init__(self, env: BaseEnv, config: VideoConfig) -> None:
+        self._env, self._config = env, config
+        self._name = env.env_id
+        if env.num_envs > 1:
+            self._name += f"-sub-{config.sub_env}"
+        self._fps = _fps(env)
+        self._file: VideoFile | None = None
+        self._number = _last_number(Path(config.folder), self._name)
+        self._off = False
+
+    def watch(self, slab: Slab, row: int, autoreset: str, limit: int | None) -> None:
+        """Learn from a row what has happened."""
+        agents = len(slab.layout.agents) or 1
+        columns = (slab.is_reset, slab.over, slab.episode_length)
+        self._is_reset, self._over, self._length = (
+            column[row, ...].reshape(agents, -1)[:, self._config.sub_env] for column in columns
+        )
+        self._begins_at_once = autoreset == "same_step"
+        self._limit = limit
+
+    def see(self) -> None:
+        """A result lies in the row."""
+        if self._off:
+            return
+        if self._is_reset.all():
+            self._begin()
+        elif self._file is not None or self._begins_at_once:
+            self._go_on()
+
+    def _begin(self) -> None:
+        """Begin the next episode with what is to be seen now."""
+        self._finish()
+        self._number += 1
+        if self._config.wants(self._number):
+            self._write()
+
+    def _go_on(self) -> None:
+        over = bool(self._over.all())
+        if over and self._begins_at_once:
+            self._begin()
+            return
+        if self._file is not None:
+            self._write()
+            if over or (self._limit is not None and self._length.max() >= self._limit):
+                self._finish()
+
+    def _write(self) -> None:
+        frame = self._frame()
+        try:
+            if self._file is None:
+                path = Path(self._config.folder) / f"{self._name}-episode-{self._number}.mp4"
+                self._file = VideoFile(path, frame, self._fps)
+            else:
+                self._file.write(frame)
+        except OSError as error:
+            self._stop(error)
+
+    def _finish(self) -> None:
+        file, self._file = self._file, None
+        if file is not None:
+            try:
+                file.finish()
+            except OSError as error:
+                self._stop(error)
+
+    def _stop(self, error: OSError) -> None:
+        """A disk that is full ends the film, not the training."""
+        self._off, self._file = True, None
+        sys.stderr.write(f"env {self._env.env_id!r} is filmed no more: {error}\n")
+
+    def _frame(self) -> NDArray[np.uint8]:
+        frame = as_numpy(self._env.render_one(self._config.sub_env))
+        array = np.asarray(frame)
+        if array.ndim == 4 and len(array) == 1:  # ManiSkill's, of one sub-environment.
+            array = array[0]
+        if array.ndim != 3 or array.shape[2] != 3 or array.dtype != np.uint8:
+            shown = type(frame).__name__ if array.ndim != 3 else f"{array.dtype}{array.shape}"
+            raise ValueError(
+                f"env {self._env.env_id!r} can't be filmed: render() gives {shown}, not a uint8 "
+                "array [height, width, 3]; a simulator of Gymnasium's does with "
+                "env_kwargs: {render_mode: rgb_array}"
+            )
+        return array
+
+    def close(self) -> None:
+        """The episode that is under way stays without its end."""
+        file, self._file = self._file, None
+        if file is not None:
+            file.abandon()
+
+
+def _check_renders(env: BaseEnv) -> None:
+    mode = getattr(env.env, "render_mode", "rgb_array")
+    if mode != "rgb_array":
+        raise ValueError(
+            f"env {env.env_id!r} can't be filmed: its render_mode is {mode!r}; make it with "
+            "render_mode 'rgb_array', which goes into the entry's env_kwargs"
+        )
+    assert env.config.video is not None
+    if env.config.video.sub_env >= env.num_envs:
+        raise ValueError(
+            f"env {env.env_id!r} has no sub-environment {env.config.video.sub_env} that could be "
+            f"filmed: it has {env.num_envs}, from 0"
+        )
+    if env.config.num_envs > env.num_envs:
+        raise ValueError(
+            f"env {env.env_id!r} can't be filmed: it gives results of some sub-environments at a "
+            "time"
+        )
+
+
+def _fps(env: BaseEnv) -> float:
+    metadata: Any = getattr(env.env, "metadata", None) or {}
+    return float(metadata.get("render_fps") or _DEFAULT_FPS)
+
+
+def _last_number(folder: Path, name: str) -> int:
+    """The highest number of an episode whose film is there; -1 if none is.
+
+    So a replaced worker, and a run that is resumed, go on counting.
+    """
+    pattern = re.compile(rf"{re.escape(name)}-episode-(\d+)\.mp4")
+    found = (pattern.fullmatch(path.name) for path in folder.glob("*.mp4"))
+    return max((int(match[1]) for match in found if match), default=-1)

@@ -1,0 +1,256 @@
+"""Films of episodes: which there are, what is on them, and what becomes of one without an end."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+import rlightning_aio as rl
+from rlightning_aio import sync
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+STEP = 8
+"""How much brighter a frame is than the one before."""
+
+
+class Brighter(gym.Env[Any, Any]):
+    """Its frames get brighter with each step; an episode has three."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012  # Gymnasium's.
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
+    action_space = gym.spaces.Discrete(10)
+    length = 3
+    size = (32, 48)
+
+    def __init__(self, render_mode: str | None = "rgb_array", start: int = 0) -> None:
+        self.render_mode, self._start, self._steps = render_mode, start, 0
+        self.pid = os.getpid()
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        self._steps = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        if action == 9:
+            os.kill(os.getpid(), signal.SIGKILL)
+        self._steps += 1
+        return np.zeros(1, np.float32), 1.0, self._steps == self.length, False, {}
+
+    def render(self) -> Any:
+        return np.full((*self.size, 3), self._start + STEP * self._steps, np.uint8)
+
+
+class Odd(Brighter):
+    """Frames of a size that most players don't take."""
+
+    size = (31, 47)
+
+
+class Endless(Brighter):
+    """No episode ends by itself."""
+
+    length = 10**9
+
+
+def ffmpeg(path: Path, *to: str) -> subprocess.CompletedProcess[bytes]:
+    program = imageio_ffmpeg.get_ffmpeg_exe()
+    return subprocess.run([program, "-i", str(path), *to], capture_output=True, check=False)
+
+
+def brightness(path: Path) -> list[int]:
+    """Of each frame, in steps."""
+    done = ffmpeg(path, "-vf", "scale=1:1:flags=area", "-pix_fmt", "gray", "-f", "rawvideo", "-")
+    assert done.returncode == 0, done.stderr
+    return [round(byte / STEP) for byte in done.stdout]
+
+
+def films(folder: Path) -> dict[str, list[int]]:
+    return {path.name: brightness(path) for path in sorted(folder.iterdir())}
+
+
+def entry(make_env: Callable[[], Any], **fields: Any) -> dict[str, Any]:
+    return {"name": "env", "make_env": make_env, "placement": "inline", **fields}
+
+
+def play(group: sync.EnvGroup, num_steps: int, action: Any = 0) -> None:
+    """Reset and step all envs, resetting those whose episode is over."""
+    batch, _ = group.reset()
+    with group.auto_reset(100):
+        for _ in range(num_steps):
+            batch, _ = group.step(batch.respond(action=[action] * len(batch)))
+
+
+def test_each_episode_is_a_film_of_all_that_was_seen(tmp_path: Path) -> None:
+    """From the frame of the reset to that of the last step; in worker processes, too."""
+    config = entry(Brighter, num_workers=3, placement="process")
+    config = rl.record_video(config, tmp_path, ["env-0", "env-2"])
+    with sync.build_env_group(config) as group:
+        play(group, 7)
+    whole = [0, 1, 2, 3]
+    assert films(tmp_path) == {f"env-{k}-episode-{n}.mp4": whole for k in (0, 2) for n in range(2)}
+
+
+def test_an_episode_without_an_end_is_marked_as_such(tmp_path: Path) -> None:
+    """What there is when the group closes can be played."""
+    with sync.build_env_group(rl.record_video(entry(Brighter), tmp_path)) as group:
+        play(group, 5)
+    assert films(tmp_path) == {
+        "env-0-episode-0.mp4": [0, 1, 2, 3],
+        "env-0-episode-1.partial.mp4": [0, 1],
+    }
+
+
+def test_a_step_limit_ends_a_film(tmp_path: Path) -> None:
+    """Also one that only the group knows, by the reset that follows."""
+    with sync.build_env_group(rl.record_video(entry(Endless), tmp_path)) as group:
+        batch, _ = group.reset()
+        with group.auto_reset(2):
+            for _ in range(3):
+                batch, _ = group.step(batch.respond(action=[0]))
+    assert films(tmp_path)["env-0-episode-0.mp4"] == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("chosen", "numbers"), [({"every": 2}, [0, 2]), ({"episodes": [1, 3]}, [1, 3])]
+)
+def test_episodes_are_chosen(tmp_path: Path, chosen: dict[str, Any], numbers: list[int]) -> None:
+    """Every so manyth, or those that are named."""
+    with sync.build_env_group(rl.record_video(entry(Brighter), tmp_path, **chosen)) as group:
+        play(group, 4 * 4 - 1)
+    assert list(films(tmp_path)) == [f"env-0-episode-{n}.mp4" for n in numbers]
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_one_of_several_sub_environments_is_filmed(tmp_path: Path, mode: AutoresetMode) -> None:
+    """Its episodes alone, wherever the next one begins."""
+
+    def make() -> Any:
+        return SyncVectorEnv([lambda: Brighter(start=100), Brighter], autoreset_mode=mode)
+
+    config = rl.record_video(entry(make), tmp_path, sub_env=1)
+    with sync.build_env_group(config) as group:
+        batch, _ = group.reset()
+        for _ in range(8):
+            batch, _ = group.step(batch.respond(action=np.zeros((1, 2), np.int64)))
+    seen = films(tmp_path)
+    last = [0, 1, 2] if mode == AutoresetMode.SAME_STEP else [0, 1, 2, 3]
+    assert seen["env-0-sub-1-episode-0.mp4"] == seen["env-0-sub-1-episode-1.mp4"] == last
+
+
+def test_frames_of_any_size_and_envs_of_ones_own(tmp_path: Path) -> None:
+    """An odd width or height gets a border."""
+    with sync.build_env_group(rl.record_video(entry(Odd), tmp_path)) as group:
+        play(group, 3)
+    (path,) = tmp_path.iterdir()
+    said = ffmpeg(path).stderr.decode()
+    assert " 48x32" in said
+    assert " 10 fps" in said
+
+
+def test_a_replaced_worker_goes_on_filming(tmp_path: Path) -> None:
+    """The film of the episode that was lost is marked, until the next one takes its number."""
+    config = entry(Brighter, placement="process")
+    with sync.build_env_group(rl.record_video(config, tmp_path)) as group:
+        play(group, 5)
+        batch, _ = group.step(rl.BatchedData(["env-0"], [rl.PolicyResponse("env-0", 9)]))
+        assert batch.restarted.all()
+        for _ in range(3):
+            batch, _ = group.step(batch.respond(action=[0]))
+    assert films(tmp_path) == {
+        "env-0-episode-0.mp4": [0, 1, 2, 3],
+        "env-0-episode-1.mp4": [0, 1, 2, 3],
+    }
+
+
+def test_a_folder_of_films_gets_more(tmp_path: Path) -> None:
+    """No film is overwritten by another run."""
+    for _ in range(2):
+        with sync.build_env_group(rl.record_video(entry(Brighter), tmp_path)) as group:
+            play(group, 3)
+    assert list(films(tmp_path)) == ["env-0-episode-0.mp4", "env-0-episode-1.mp4"]
+
+
+def test_a_filmed_env_has_a_worker_of_its_own(tmp_path: Path) -> None:
+    """So no other env waits for its frames, however many share the other workers."""
+    config = rl.record_video(
+        entry(Brighter, num_workers=6, placement="process"), tmp_path, ["env-2"]
+    )
+    with sync.build_env_group(config) as group:
+        pids = [group[env_id].get_attr("pid") for env_id in group.env_ids]
+    assert pids.count(pids[2]) == 1
+    assert len(set(pids)) < len(pids)
+
+
+# -- errors -----------------------------------------------------------------------------
+
+
+def test_a_folder_that_cannot_be_written_is_told_before_anything_starts(tmp_path: Path) -> None:
+    """By the entry and the field."""
+    (tmp_path / "file").touch()
+    config = rl.record_video(entry(Brighter), tmp_path / "file" / "films")
+    with pytest.raises(rl.ConfigError, match=r"entry 'env', video.folder: .*file/films"):
+        sync.build_env_group(config)
+
+
+def test_a_missing_package_is_told_before_anything_starts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the command that installs it."""
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(rl.ConfigError, match=r"pip install 'rlightning-aio\[video\]'"):
+        sync.build_env_group(rl.record_video(entry(Brighter), tmp_path))
+
+
+def test_an_unknown_env_is_told(tmp_path: Path) -> None:
+    """With the nearest one."""
+    with pytest.raises(rl.ConfigError, match="did you mean 'env-0'"):
+        rl.record_video(entry(Brighter), tmp_path, ["env_0"])
+
+
+@pytest.mark.parametrize(
+    ("video", "words"),
+    [
+        ({"envs": [2]}, "no env 2 among num_workers: 1"),
+        ({"sub_env": 4}, "no sub-environment 4 of num_envs: 3"),
+        ({}, "render_mode: rgb_array"),
+        ({"folder": ""}, "video.folder: String should have at least 1 character"),
+        ({"every": 0}, "video.every: should be greater than or equal to 1"),
+    ],
+)
+def test_a_config_that_cannot_be_filmed_is_refused(video: dict[str, Any], words: str) -> None:
+    """By the field, when it is read."""
+    fields = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1", "num_envs": 3}
+    with pytest.raises(rl.ConfigError, match=words):
+        sync.build_env_group({**fields, "video": {"folder": "films", **video}})
+
+
+def test_an_env_that_renders_nothing_is_told_at_its_start(tmp_path: Path) -> None:
+    """It can't be known before, as its maker is the user's."""
+    config = rl.record_video(entry(lambda: Brighter(None)), tmp_path)
+    with pytest.raises(
+        rl.StartFailed, match="env 'env-0' can't be filmed: its render_mode is None"
+    ):
+        sync.build_env_group(config).init()
+
+
+def test_a_film_that_cannot_be_written_ends_no_training(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Here its folder goes away meanwhile; it is said once."""
+    folder = tmp_path / "films"
+    with sync.build_env_group(rl.record_video(entry(Brighter), folder)) as group:
+        folder.rmdir()
+        play(group, 9)
+    assert capfd.readouterr().err.count("env 'env-0' is filmed no more") == 1
