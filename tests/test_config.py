@@ -378,6 +378,14 @@ def test_backends_of_single_envs_take_several_workers_instead() -> None:
     assert said in problems_of(arm)
 
 
+def test_more_results_than_envs_are_not_waited_for() -> None:
+    """Such a number is a mistake, and named; clients of a server are as many as come."""
+    said = problems_of({**CARTPOLE, "num_workers": 4, "min_results": 5})
+    assert "envs.0 ('cartpole'), min_results: is 5, and num_workers: 4" in said
+    parse_configs({**CARTPOLE, "num_workers": 4, "min_results": 4})
+    parse_configs({"name": "robots", "backend": "env_server", "min_results": 9})
+
+
 @pytest.mark.parametrize("missing", ["name", "backend", "task"])
 def test_a_missing_field_is_named(missing: str) -> None:
     """The three fields without a default are required."""

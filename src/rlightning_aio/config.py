@@ -123,6 +123,9 @@ class EnvConfig(BaseModel):
     """Where the envs live: worker processes, this process (``inline``), or Ray actors."""
     envs_per_process: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
     """Envs that share a worker."""
+    min_results: int | None = Field(default=None, ge=1)
+    """Results of this entry for which `collect_async` waits where it is not told how many; those of
+    all entries are summed up."""
     step_timeout: float | None = Field(default=None, gt=0)
     """Seconds that one step may take before the env counts as hung."""
     reset_timeout: float | None = Field(default=None, gt=0)
@@ -586,6 +589,14 @@ def _check_interpreter(config: EnvConfig) -> str | None:
     return f"{path!r} {reason}"
 
 
+def _check_min_results(config: EnvConfig) -> str | None:
+    if config.min_results is None or config.backend == "env_server":
+        return None
+    if config.min_results <= config.num_workers:
+        return None
+    return f"is {config.min_results}, and num_workers: {config.num_workers} makes as many results"
+
+
 def _check_snapshot_every(config: EnvConfig) -> str | None:
     if "snapshot_every" in placement_of(config.backend, config.placement).refuses:
         return None
@@ -616,6 +627,7 @@ def _check_video(config: EnvConfig) -> str | None:
 _COMPARED_WITH = {
     "task": ("make_env",),
     "make_env": ("num_workers",),
+    "min_results": ("num_workers",),
     "snapshot_every": ("on_worker_death",),
     "video": ("num_workers", "num_envs", "env_kwargs"),
 }
@@ -626,6 +638,7 @@ _CHECKS: dict[str, Callable[[EnvConfig], str | None]] = {
     "make_env": _check_make_env,
     "num_envs": _check_num_envs,
     "interpreter": _check_interpreter,
+    "min_results": _check_min_results,
     "snapshot_every": _check_snapshot_every,
     "video": _check_video,
 }

@@ -65,7 +65,7 @@ def test_a_marked_result_marks_nothing_but_itself(start: Start) -> None:
     config = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1", "num_workers": 2}
     group = start({**config, "envs_per_process": 2})
     pushes = BatchedData(["pole-0", "pole-1"], [PolicyResponse(f"pole-{k}", k) for k in range(2)])
-    kill(group.group._core.supervisor.hosts[0].pid)
+    kill(group.group.get_workers()[0]["pid"])
     marks = []
     for _ in range(4):
         batch, _ = group.step(pushes)
@@ -73,6 +73,8 @@ def test_a_marked_result_marks_nothing_but_itself(start: Start) -> None:
         told = [info.get("episode") for info in batch.info()]
         assert told == [None, None]
     assert marks == [(True, True, True)] + 3 * [(False, False, False)]
+    (worker,) = group.group.get_workers()
+    assert (worker["state"], worker["restarts"]) == ("up", 1)
 
 
 @on_one_driver

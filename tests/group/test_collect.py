@@ -7,6 +7,7 @@ and both drivers have their say.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import threading
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -122,6 +123,47 @@ def test_a_minimum_is_waited_for_and_a_maximum_kept(sync_group: Any, gates: list
         assert len(batch) == len(flags) == size
         came += batch.ids()
     assert came == ["gated-3", "gated-1", "gated-0"]
+
+
+def test_without_a_minimum_the_configs_holds(tmp_path: Path) -> None:
+    """Those of the entries asked for are summed up; a maximum below lowers it."""
+    envs = {"backend": "gymnasium", "task": "CartPole-v1", "placement": "inline"}
+    entries = [
+        {**envs, "name": "a", "num_workers": 3, "min_results": 2},
+        {**envs, "name": "b", "num_workers": 3, "min_results": 3},
+        {**envs, "name": "c"},
+    ]
+    with rlightning_aio.sync.build_env_group(entries) as group:
+        batch, _ = group.reset(seed=0)
+        steps = batch.respond(action=[0] * 7)
+        for options, count in (
+            ({}, 5),
+            ({"max_results": 1}, 1),
+            ({"min_results": 4}, 4),
+            ({"entries": ["a"]}, 2),
+            ({"entries": ["c"]}, 1),
+        ):
+            group.step_async(steps)
+            assert len(group.collect_async(**options)[0]) == count, options
+            with contextlib.suppress(NothingPending):
+                group.collect_async(wait_all=True)
+
+
+def test_it_is_told_what_each_worker_is_doing(sync_group: Any, gates: list[Gate]) -> None:
+    """Which env it steps, and whose results are outstanding, the oldest first."""
+    (worker,) = sync_group.get_workers()
+    assert (worker["entry"], worker["env_ids"], worker["state"]) == ("gated", IDS, "up")
+    assert (worker["owed"], worker["owed_seconds"]) == ([], 0.0)
+    sync_group.step_async(responses(2))
+    sync_group.step_async(responses(0, 1))
+    with gates[2].held():
+        (worker,) = sync_group.get_workers()
+        assert worker["owed"] == ["gated-2", "gated-0", "gated-1"]
+        assert worker["owed_seconds"] > 0
+    assert sync_group.collect_async()[0].ids() == ["gated-2"]
+    assert sync_group.get_workers()[0]["owed"] == ["gated-0", "gated-1"]
+    with opened(*gates[:2]):
+        assert len(sync_group.collect_async(wait_all=True)[0]) == 2
 
 
 def test_results_of_some_entries_are_taken_alone(tmp_path: Path) -> None:

@@ -144,6 +144,12 @@ class Core:
         """See `EnvGroup.close`."""
         return self.supervisor.close(now)
 
+    def describe_workers(self, now_ns: int) -> list[dict[str, Any]]:
+        """See `EnvGroup.get_workers`."""
+        if self.supervisor.open:
+            self._poll()  # Results that lie there are owed no more.
+        return self.supervisor.describe(now_ns)
+
     # -- requests ---------------------------------------------------------------------
 
     def step_async(self, batch: BatchedData, now: float) -> None:

@@ -64,6 +64,7 @@ class EnvTable:
         self._slot_of = {env_id: slot for slot, env_id in enumerate(env_ids)}
         entry_names = list(dict.fromkeys(config.name for config in self.configs))
         number = {name: k for k, name in enumerate(entry_names)}
+        self._min_results = {config.name: config.min_results or 0 for config in self.configs}
         self.names = EnvNames(
             [*env_ids, *[""] * (size - len(env_ids))],
             shared_ids,
@@ -185,6 +186,12 @@ class EnvTable:
                 known = ", ".join(entry_names)
                 raise UnknownEnv(f"no entry of this group is called {name!r}; they are {known}")
         return np.isin(self.names.entries, [entry_names.index(name) for name in names])
+
+    def usual_min_results(self, names: Sequence[str] | None) -> int:
+        """Results for which a collect of some entries waits, or of all, if nobody says another."""
+        wanted = self._min_results
+        known = wanted.values() if names is None else (wanted.get(name, 0) for name in names)
+        return max(1, sum(known))
 
     def describe(self, slot: int) -> str:
         """How an error message names the env."""

@@ -281,7 +281,7 @@ class Facade:
         self,
         timeout: float | None,
         wait_all: bool,
-        min_results: int,
+        min_results: int | None,
         max_results: int | None,
         deadline: float | None,
         entries: Sequence[str] | None,
@@ -289,6 +289,9 @@ class Facade:
     ) -> Procedure[tuple[BatchedData, list[bool]]]:
         _check_seconds("timeout", timeout)
         _check_seconds("deadline", deadline)
+        if min_results is None:
+            usual = self._core.envs.usual_min_results(entries)
+            min_results = usual if max_results is None else max(1, min(usual, max_results))
         if min_results < 1:
             raise ValueError(f"min_results must be at least 1, not {min_results!r}")
         if max_results is not None and max_results < 1:
@@ -377,6 +380,24 @@ class Facade:
         if reset:
             stats.reset_envs()
         return found
+
+    def get_workers(self) -> list[dict[str, Any]]:
+        """What each place where envs live is doing now: each worker, this process, each env_server.
+
+        It waits for nothing, and may be asked while another task waits for results, or for `init`.
+
+        Keys: ``entry``; ``env_ids`` (of a server, those of clients that have joined); ``pid`` (of
+        a process on this machine, else None); ``state`` (``"new"`` before `init`, ``"starting"``,
+        ``"up"``, ``"down"`` where a replacement is due, ``"failed"``, ``"closed"``);
+        ``owed`` (ids of the envs whose results are outstanding, the oldest first, which is the
+        order in which a worker executes them) and ``owed_seconds``, for how long that of the
+        first is; ``restarts`` (how often it was replaced).
+
+        Raises:
+            RLightningError: the group is another thread's now, or another loop's.
+        """
+        self._driver.check_caller()
+        return self._core.describe_workers(time.monotonic_ns())
 
     def print_timing_summary(self) -> None:
         """Print the figures of `get_stats` as a table."""

@@ -43,7 +43,7 @@ class HostRecord:
 
     Attributes:
         start_by: when it must be up; late: it wasn't, and is being killed.
-        restart_at: when a dead one is started again.
+        restart_at: when a dead one is started again; restarts: how often one was.
         held: what was asked of it since it died, entries and arguments, until a replacement is
             up; None while none is needed.
         deaths: by slot, of workers that died while they executed that env, since the env
@@ -65,6 +65,7 @@ class HostRecord:
     start_by: float | None = None
     late: bool = False
     restart_at: float | None = None
+    restarts: int = 0
     held: list[tuple[NDArray[np.int64], Sequence[Any] | None]] | None = None
     deaths: dict[int | None, int] = field(default_factory=dict[int | None, int])
     culprit: int | None = None

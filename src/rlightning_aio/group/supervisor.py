@@ -32,6 +32,7 @@ from rlightning_aio.group.hint import hint
 from rlightning_aio.group.host_record import HostRecord, Stage
 from rlightning_aio.group.slab_layout import check_actions
 from rlightning_aio.group.wait import Procedure, Wait, earliest
+from rlightning_aio.group.workers import describe
 from rlightning_aio.hosts.base import Membership
 from rlightning_aio.hosts.messages import (
     Attached,
@@ -393,6 +394,10 @@ class Supervisor:
             return str(error)
         return None
 
+    def describe(self, now_ns: int) -> list[dict[str, Any]]:
+        """See `EnvGroup.get_workers`."""
+        return [describe(record, self._envs, self._requests, now_ns) for record in self._records]
+
     def give_hint(self, latency_us: Mapping[str, Mapping[str, Any]]) -> None:
         """Log, at INFO, what the measured times say of the group's settings."""
         workers = Counter(
@@ -546,6 +551,7 @@ class Supervisor:
 
     def _restart(self, record: HostRecord, now: float) -> None:
         record.restart_at = None
+        record.restarts += 1
         try:
             self._launch(record, now)
         except OSError as error:

@@ -259,7 +259,7 @@ class EnvGroup(Facade):
         self,
         timeout: float | None = None,
         wait_all: bool = False,
-        min_results: int = 1,
+        min_results: int | None = None,
         max_results: int | None = None,
         deadline: float | None = None,
         entries: Sequence[str] | None = None,
@@ -273,7 +273,8 @@ class EnvGroup(Facade):
             timeout: seconds of a further window, opened when the first result is ready, in
                 which more results join.
             wait_all: wait for all that are pending; `timeout` is ignored then, with a warning.
-            min_results: don't return before that many are ready (or all that are pending).
+            min_results: don't return before that many are ready (or all that are pending). None
+                is what the config entries' ``min_results`` sum up to, or 1.
             max_results: leave what is above to the next call, first come first served.
             deadline: seconds in all, from now.
             entries: take results of these config entries only; the others' stay.
