@@ -9,6 +9,7 @@ import inspect
 import os
 import select
 import signal
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -91,6 +92,13 @@ def kill(pid: int) -> None:
         assert select.select([descriptor], [], [], HANG)[0], "it lives"
     finally:
         os.close(descriptor)
+
+
+def stop(pid: int) -> None:
+    """Stop a process; returns when it has stopped: on another core it goes on for a moment."""
+    os.kill(pid, signal.SIGSTOP)
+    while Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "T":
+        os.sched_yield()
 
 
 class Tokens:

@@ -8,7 +8,7 @@ import signal
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
-from faults.driven import Driven, Tokens, kill, marked, pid_of, two_workers
+from faults.driven import Driven, Tokens, kill, marked, pid_of, stop, two_workers
 from faults.test_shutdown import read_until, trainer
 from patience import HANG
 
@@ -40,7 +40,7 @@ def test_worker_that_is_stopped_for_a_while_loses_nothing(start: Start) -> None:
     pid = pid_of(group, "faulty-0")
     for _ in range(20):
         group.step_async(tokens.steps(["faulty-0"]))
-        os.kill(pid, signal.SIGSTOP)
+        stop(pid)
         group.step_async(tokens.steps(["faulty-1", "faulty-2", "faulty-3"]))
         found: list[str] = []
         while not {"faulty-2", "faulty-3"} <= set(found):
@@ -60,7 +60,7 @@ def test_megabytes_for_a_stopped_worker_do_not_block_the_trainer(start: Start) -
     """They wait until it reads; meanwhile the other worker is asked and answers."""
     group, tokens = start(two_workers(), preprocess_fn=unpacked), Tokens()
     pid = pid_of(group, "faulty-0")
-    os.kill(pid, signal.SIGSTOP)
+    stop(pid)
     group.step_async(loaded(tokens.steps(["faulty-0", "faulty-1"])))
     for _ in range(10):
         group.step_async(loaded(tokens.steps(["faulty-2", "faulty-3"])))
@@ -77,7 +77,7 @@ def test_megabytes_for_a_worker_that_dies_go_with_it(start: Start) -> None:
     """Its replacement is not handed the rest of what the dead one was being sent."""
     group, tokens = start(two_workers(), preprocess_fn=unpacked), Tokens()
     pid = pid_of(group, "faulty-0")
-    os.kill(pid, signal.SIGSTOP)
+    stop(pid)
     group.step_async(loaded(tokens.steps(["faulty-0", "faulty-1"])))
     kill(pid)
     batch, _ = group.collect_async(wait_all=True)

@@ -9,7 +9,16 @@ import time
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import pytest
-from faults.driven import Driven, Tokens, entry, fork_server_of, marked, pid_of, two_workers
+from faults.driven import (
+    Driven,
+    Tokens,
+    entry,
+    fork_server_of,
+    marked,
+    pid_of,
+    stop,
+    two_workers,
+)
 from faults.drivers import kinds_on_both_drivers, on_one_driver
 from patience import HANG
 
@@ -107,7 +116,7 @@ def test_reset_that_hangs_after_a_step_without_limit_is_found(start: Start) -> N
 def test_worker_that_is_stopped_before_it_is_asked_is_found(start: Start) -> None:
     """It executes nothing, so nothing takes too long; yet its env has been asked and is late."""
     group, tokens = start(two_workers(step_timeout=LIMIT)), Tokens()
-    os.kill(pid_of(group, "faulty-0"), signal.SIGSTOP)
+    stop(pid_of(group, "faulty-0"))
     batch, _ = group.step(tokens.steps(group.group.env_ids))
     assert [marked(ret) for ret in batch.values()] == [True, True, False, False]
 
@@ -118,8 +127,8 @@ def test_hang_is_ended_though_the_fork_server_has_hung_as_well(
     """It would kill the worker, and can't; so it goes with all of its workers."""
     monkeypatch.setattr(supervisor, "_OBEY_SECONDS", LIMIT)
     group, tokens = start(two_workers(step_timeout=LIMIT)), Tokens()
-    os.kill(pid_of(group, "faulty-0"), signal.SIGSTOP)
-    os.kill(fork_server_of(group.group)._process.pid, signal.SIGSTOP)
+    stop(pid_of(group, "faulty-0"))
+    stop(fork_server_of(group.group)._process.pid)
     batch, _ = group.step(tokens.steps(group.group.env_ids))
     assert [marked(ret) for ret in batch.values()] == [True, True, False, False]
     assert batch["faulty-0"].info["worker_restarted"] == "hung in a step and was killed"
@@ -222,7 +231,7 @@ def test_after_a_missed_deadline_the_next_results_are_right(start: Start) -> Non
     pid = pid_of(group, "faulty-0")
     waits: list[dict[str, Any]] = [{}, {"wait_all": True}, {"timeout": 5}, {"min_results": 2}]
     for waiting in waits:
-        os.kill(pid, signal.SIGSTOP)
+        stop(pid)
         group.step_async(tokens.steps(["faulty-0", "faulty-1"]))
         for _ in range(3):
             with pytest.raises(TimeoutError, match="nothing is lost"):
@@ -246,7 +255,7 @@ async def test_cancelled_step_leaves_its_results_to_collect() -> None:
     async with rlightning_aio.build_env_group(two_workers()) as group:
         batch, _ = await group.reset()
         pid = int(batch["faulty-0"].observation[1])
-        os.kill(pid, signal.SIGSTOP)
+        stop(pid)
         stepping = asyncio.ensure_future(group.step(tokens.steps(group.env_ids)))
         with pytest.raises(TimeoutError):
             await asyncio.wait_for(stepping, 0.05)
@@ -264,7 +273,7 @@ async def test_cancelled_call_answers_nobody_else() -> None:
     async with rlightning_aio.build_env_group(two_workers()) as group:
         batch, _ = await group.reset()
         pid = int(batch["faulty-0"].observation[1])
-        os.kill(pid, signal.SIGSTOP)
+        stop(pid)
         with pytest.raises(TimeoutError):
             await asyncio.wait_for(group["faulty-0"].call("returns", os.getpid), 0.05)
         os.kill(pid, signal.SIGCONT)
@@ -281,7 +290,7 @@ async def test_cancelled_collect_loses_nothing() -> None:
     async with rlightning_aio.build_env_group(two_workers()) as group:
         batch, _ = await group.reset()
         pid = int(batch["faulty-0"].observation[1])
-        os.kill(pid, signal.SIGSTOP)
+        stop(pid)
         group.step_async(tokens.steps(group.env_ids))
         for _ in range(3):
             with pytest.raises(TimeoutError):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import pytest
-from faults.driven import Driven, Tokens, entry, two_workers
+from faults.driven import Driven, Tokens, entry, stop, two_workers
 from faults.drivers import on_one_driver
 
 import rlightning_aio
@@ -201,7 +201,7 @@ async def test_second_collector_is_refused_and_the_first_goes_on() -> None:
         # Workers that are stopped keep the first collector waiting.
         pids = [host.pid for host in group._core.supervisor.hosts]
         for pid in pids:
-            os.kill(pid, signal.SIGSTOP)
+            stop(pid)
         try:
             group.step_async(tokens.steps(group.env_ids))
             first = asyncio.ensure_future(group.collect_async(wait_all=True))

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import pytest
-from faults.driven import Driven, Tokens, fork_server_of, kill, pid_of, two_workers
+from faults.driven import Driven, Tokens, fork_server_of, kill, pid_of, stop, two_workers
 from patience import HANG
 
 import rlightning_aio
@@ -436,8 +436,8 @@ def test_stopped_fork_server_does_not_hold_up_close(start: Start) -> None:
     """Who would kill the workers can't; so it is killed, and the kernel kills them."""
     group = start(two_workers())
     server = fork_server_of(group.group)
-    os.kill(pid_of(group, "faulty-0"), signal.SIGSTOP)
-    os.kill(server._process.pid, signal.SIGSTOP)
+    stop(pid_of(group, "faulty-0"))
+    stop(server._process.pid)
     with watched(processes_of(group.group)) as ended:
         group.close()
         ended()

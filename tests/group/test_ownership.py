@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 import uvloop
+from faults.driven import stop
 from patience import HANG
 
 import rlightning_aio
@@ -92,7 +93,7 @@ def test_a_loop_that_is_not_closed_may_be_used_again(
         batch, _ = own.run(group.collect_async(wait_all=True))
         assert batch.reward.tolist() == [4.0] * 3
         worker = group._core.supervisor.hosts[0]
-        os.kill(worker.pid, signal.SIGSTOP)
+        stop(worker.pid)
         group.step_async(batch.respond(action=np.array([[0, 4.0]] * 3)))
 
         async def begin() -> asyncio.Task[Any]:
@@ -139,7 +140,7 @@ def test_a_synchronous_group_is_one_thread_s_at_a_time() -> None:
     with sync.build_env_group(PROBE) as group:
         batch, _ = group.reset()
         worker = group._core.supervisor.hosts[0].pid
-        os.kill(worker, signal.SIGSTOP)
+        stop(worker)
         group.step_async(batch.respond(action=np.array([[0, 4.0]] * 3)))
         found: list[Any] = []
         waiter = threading.Thread(target=lambda: found.append(group.collect_async(wait_all=True)))

@@ -181,12 +181,11 @@ def test_a_client_is_told_when_its_key_is_not_on_the_list(tmp_path: Path) -> Non
 def refused(address: str, keys: Path) -> str:
     """What a client is told that dials in with `keys` and isn't let in."""
     host, _, port = address.removeprefix("tcp://").rpartition(":")
-    with (
-        RemoteEnvClient(CountingEnv(), host, int(port), keys=keys, name="again") as client,
-        pytest.raises(TimeoutError) as caught,
-    ):
-        client.connect(timeout=1.5)
-    return str(caught.value)
+    with RemoteEnvClient(CountingEnv(), host, int(port), keys=keys, name="again") as client:
+        while client.state in {"not connected", "asking to be let in"}:  # No trouble so far.
+            with pytest.raises(TimeoutError):
+                client.connect(timeout=0.5)
+        return client.state
 
 
 def test_a_key_that_is_overwritten_in_place_gets_in_no_more(
@@ -370,8 +369,9 @@ def test_a_client_survives_a_server_that_talks_nonsense() -> None:
         env = CountingEnv()
         with RemoteEnvClient(env, "127.0.0.1", port, name="arm") as client:
             while client._session.malformed <= 20:
-                with pytest.raises(TimeoutError, match="asking to be let in"):
+                with pytest.raises(TimeoutError):
                     client.connect(timeout=0.5)
+            assert "asking to be let in" in client.state
         done.set()
         thread.join()
     assert env.closed
