@@ -14,7 +14,7 @@ RLLIB := .venv-rllib
 PIP_INSTALL = $(@D)/bin/python -m pip install --quiet --disable-pip-version-check
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-ray test-simulators test-gpu check format bench clean
+.PHONY: help run test test-ray test-simulators test-gpu test-pythons check format docs dist bench clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 24
@@ -49,6 +49,11 @@ test-gpu: $(SIMULATORS)/installed $(ISAAC)/installed ## the tests of simulators 
 	$(ISAAC)/bin/python -m pytest -m gpu -rs tests/envs/test_gpu.py
 	$(SIMULATORS)/bin/python -m pytest -m gpu -rs tests/envs/test_gpu.py tests/envs/test_maniskill.py
 
+# The wheel and the sdist, each as the only thing in an environment of each Python that is found.
+# MuJoCo and the like come anew, so this takes some minutes.
+test-pythons: $(VENV)/installed-release ## wheel and sdist in empty environments of Python 3.11, 3.12 and 3.13
+	$(PY) -m pytest -m pythons -rs tests/test_wheel.py
+
 check: $(VENV)/installed-check ## the static checks: ruff, pyright, import-linter
 	$(VENV)/bin/ruff check
 	$(VENV)/bin/ruff format --check
@@ -59,11 +64,20 @@ format: $(VENV)/installed-check ## lay the code out as `make check` wants it
 	$(VENV)/bin/ruff check --fix
 	$(VENV)/bin/ruff format
 
+# Material tells whoever builds of its successor; the site doesn't need to know.
+docs: export NO_MKDOCS_2_WARNING := 1
+docs: $(VENV)/installed-docs ## the documentation site, into site/; warnings are errors
+	$(VENV)/bin/mkdocs build
+
+dist: $(VENV)/installed-release ## the wheel and the sdist, into dist/
+	rm -rf dist
+	$(PY) -m build
+
 bench: $(VENV)/installed-bench ## every benchmark, peers included (their packages are large)
 	$(PY) benchmarks/run_all.py
 
 clean: ## remove the virtual environments and every cache
-	rm -rf $(VENV) $(SIMULATORS) $(ISAAC) $(RLLIB) build dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) $(SIMULATORS) $(ISAAC) $(RLLIB) build dist site .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 	find src tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
 
 %/bin/python:
@@ -78,12 +92,14 @@ $(VENV)/installed: extras :=
 $(VENV)/installed-test: extras := [test]
 $(VENV)/installed-check: extras := [test,check]
 $(VENV)/installed-bench: extras := [bench]
+$(VENV)/installed-docs: extras := [docs]
 $(VENV)/installed-ray: extras := [test,ray]
-$(SIMULATORS)/installed: extras := [test,ale,envpool,examples,maniskill,pettingzoo,piper,sb3,torchrl]
-$(VENV)/installed $(VENV)/installed-test $(VENV)/installed-check $(VENV)/installed-bench $(VENV)/installed-ray: | $(PY)
+$(VENV)/installed-release: extras := [test,release]
+$(SIMULATORS)/installed: extras := [test,ale,envpool,examples,maniskill,notebook,pettingzoo,piper,sb3,torchrl]
+STAMPS := $(VENV)/installed $(addprefix $(VENV)/installed-,test check docs bench ray release)
+$(STAMPS): | $(PY)
 $(SIMULATORS)/installed: | $(SIMULATORS)/bin/python
-$(VENV)/installed $(VENV)/installed-test $(VENV)/installed-check $(VENV)/installed-bench \
-    $(VENV)/installed-ray $(SIMULATORS)/installed: pyproject.toml constraints.txt
+$(STAMPS) $(SIMULATORS)/installed: pyproject.toml constraints.txt
 	$(PIP_INSTALL) --constraint constraints.txt --editable '.$(extras)'
 	@touch $@
 

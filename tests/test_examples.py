@@ -1,6 +1,7 @@
 """Each program in ``examples/``, in the README and in the documents runs as it stands.
 
-Those that train, and so need torch, are run by examples/test_programs.py.
+Pages come under it by themselves. Those that train, and so need torch, are run by
+examples/test_programs.py.
 """
 
 from __future__ import annotations
@@ -11,11 +12,23 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from patience import HANG
 
 ROOT = Path(__file__).parent.parent
+DOCS = ROOT / "docs"
 PROGRAMS = Path(__file__).with_name("programs.py")
 LOOPS = ("async_loop", "sync_loop")
+# Run by tests of their own: they need other packages, or are no whole programs.
+ELSEWHERE = {
+    "command-line": "cli/test_documentation.py",
+    "envpool": "test_docs.py",
+    "rlightning": "test_docs.py",
+    "rllib": "vector/test_pages.py",
+    "scaling": "on_ray/test_pages.py",
+    "stable_baselines3": "vector/test_pages.py",
+    "torchrl": "vector/test_pages.py",
+}
 
 
 def blocks_of_python(page: Path) -> list[str]:
@@ -26,22 +39,19 @@ def by_program(written: str) -> dict[str, str]:
     return dict(part.split("\n", 1) for part in written.split("\0")[1:])
 
 
-def test_every_program_runs(tmp_path: Path) -> None:
+PAGES = sorted(page for page in DOCS.rglob("*.md") if page.stem not in ELSEWHERE)
+
+
+@pytest.mark.parametrize("pages", [[ROOT / "README.md"], PAGES[::2], PAGES[1::2]], ids=len)
+def test_every_program_runs(pages: list[Path], tmp_path: Path) -> None:
     """It ends well, without a warning; the examples print something, and complain of nothing."""
-    examples = [ROOT / "examples" / f"{name}.py" for name in LOOPS]
+    examples = [ROOT / "examples" / f"{name}.py" for name in LOOPS if len(pages) == 1]
     programs = list(examples)
-    # Those of docs/command-line.md and of the rest of docs/backends.md are no whole programs.
-    backends = tmp_path / "callable.md"
-    text = (ROOT / "docs" / "backends.md").read_text()
-    backends.write_text(text.partition("\n## callable")[2].partition("\n## ")[0])
-    pages = [
-        ROOT / "docs" / f"{name}.md"
-        for name in ("collecting", "evaluating", "gymnasium", "remote", "state")
-    ]
-    for page in (ROOT / "README.md", *pages, backends):
-        blocks = [block for block in blocks_of_python(page) if "import torch" not in block]
-        assert blocks
-        for number, block in enumerate(blocks):
+    (tmp_path / "configs").symlink_to(ROOT / "configs")
+    for page in pages:
+        for number, block in enumerate(blocks_of_python(page)):
+            if "import torch" in block:
+                continue
             program = tmp_path / f"{page.stem}_{number}.py"
             program.write_text(block)
             programs.append(program)
@@ -49,7 +59,7 @@ def test_every_program_runs(tmp_path: Path) -> None:
     environment = {name: v for name, v in os.environ.items() if name != "PYTHONASYNCIODEBUG"}
     done = subprocess.run(
         [sys.executable, "-W", "error", PROGRAMS, *programs],
-        cwd=ROOT,
+        cwd=tmp_path,
         env=environment,
         capture_output=True,
         text=True,
@@ -62,6 +72,13 @@ def test_every_program_runs(tmp_path: Path) -> None:
     for example in map(str, examples):
         assert printed[example]
         assert complained[example] == ""
+
+
+def test_pages_that_are_left_out_are_run_elsewhere() -> None:
+    """Each is there, has a program, and is named by the test that is said to run it."""
+    for page, test in ELSEWHERE.items():
+        assert blocks_of_python(DOCS / f"{page}.md")
+        assert page in (ROOT / "tests" / test).read_text()
 
 
 def test_the_two_loops_are_short() -> None:

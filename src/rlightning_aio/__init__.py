@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     )
     from rlightning_aio.video import record_video
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _HOMES = {
     "batch": ("BatchedData",),

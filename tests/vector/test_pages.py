@@ -1,4 +1,4 @@
-"""The programs of docs/torchrl.md and docs/rllib.md run as they stand."""
+"""The programs of the pages on libraries that `make test` does not install run as they stand."""
 
 from __future__ import annotations
 
@@ -14,7 +14,12 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 @pytest.mark.simulators
 @pytest.mark.parametrize(
-    ("page", "needed"), [("torchrl", ["torchrl"]), ("rllib", ["ray", "tree", "torch"])]
+    ("page", "needed"),
+    [
+        ("torchrl", ["torchrl"]),
+        ("rllib", ["ray", "tree", "torch"]),
+        ("stable_baselines3", ["stable_baselines3"]),
+    ],
 )
 def test_program_runs(page: str, needed: list[str], tmp_path: Path) -> None:
     """To its end, and prints what it says."""

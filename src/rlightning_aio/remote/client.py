@@ -75,7 +75,8 @@ class RemoteEnvClient:
 
     Args:
         env: newly built; the client owns it from now on, initialises it and closes it.
-        hostname, port: of the server.
+        hostname: of the server.
+        port: of the server.
         keys: directory of the client's keys, see ``rlightning-aio keygen``; None connects
             without, which a server with keys refuses.
         name: unique at the server; by default this machine's name and the process id.

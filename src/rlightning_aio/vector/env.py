@@ -44,9 +44,11 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         env_fns: one callable for each env, or for as many vector environments, each of as many
             sub-environments, whose `autoreset_mode` is this one's. They run in the workers, and
             only there; lambdas and functions of ``__main__`` will do.
-        shared_memory, context, daemon: accepted, and without meaning here.
+        shared_memory: accepted, and without meaning here.
         copy: observations are the caller's own. False spares a copy: who writes to them writes
             to what a later masked reset shows of envs that it doesn't reset.
+        context: accepted, and without meaning here.
+        daemon: accepted, and without meaning here.
         worker: must be None; there is no worker function to replace.
         observation_mode: ``same``, ``different`` (equal shapes and dtypes), or a pair of the
             batched and the single observation space.

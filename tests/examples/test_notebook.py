@@ -1,0 +1,42 @@
+"""The notebook runs from its first cell to its last, in a kernel of its own."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from run_python import output_of
+
+NOTEBOOK = Path(__file__).parents[2] / "examples" / "notebook.ipynb"
+
+EXECUTE = """
+import sys
+import nbformat
+from nbclient import NotebookClient
+
+notebook = nbformat.read(sys.argv[1], as_version=4)
+NotebookClient(notebook, timeout=300, kernel_name="python3").execute()
+nbformat.write(notebook, "executed.ipynb")
+"""
+
+
+def test_it_is_kept_without_outputs() -> None:
+    """What it shows is made by whoever opens it."""
+    for cell in json.loads(NOTEBOOK.read_text())["cells"]:
+        assert not cell.get("outputs")
+        assert cell.get("execution_count") is None
+
+
+@pytest.mark.simulators
+def test_it_runs(tmp_path: Path) -> None:
+    """It shows two figures, and counts steps and episodes."""
+    for needed in ("ipykernel", "matplotlib", "nbclient", "pygame"):
+        pytest.importorskip(needed)
+    output_of("-c", EXECUTE, NOTEBOOK, folder=tmp_path, asyncio_debug=False)
+    cells = json.loads((tmp_path / "executed.ipynb").read_text())["cells"]
+    shown = [output.get("data", {}) for cell in cells for output in cell.get("outputs", [])]
+    assert sum("image/png" in data for data in shown) == 2
+    texts = ["".join(data.get("text/plain", "")) for data in shown]
+    (counts,) = [json.loads(f"[{text[1:-1]}]") for text in texts if text.startswith("(")]
+    assert min(counts) > 0
