@@ -17,7 +17,7 @@ PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md"), ROOT / "benchmarks" / "
 PACKAGE = ROOT / "src" / "rlightning_aio"
 # Rooms of the code. What users need of them, the package itself or another module offers.
 INTERNAL = {"batch", "cli", "config", "envs", "group", "hosts", "protocol", "registry", "sharing"}
-INTERNAL |= {"types", "__init__"}
+INTERNAL |= {"types", "video", "__init__"}
 
 
 def named(page: Path) -> str:
