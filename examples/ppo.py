@@ -154,8 +154,10 @@ def learn(
 
 def train(args: Args) -> Run:
     torch.manual_seed(args.seed)
+    # While it waits for all, this process steps a share of them itself.
     entry = {
         "name": "env", "backend": args.backend, "task": args.task, "num_workers": args.num_envs,
+        "placement": "split",
     }  # fmt: skip
     run = Run(args.total_steps, args.folder, args.resume)
     with build_env_group(entry) as group:
