@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import sys
 
 import pytest
@@ -9,6 +10,8 @@ import uvloop
 
 # libuv keeps a pipe for signals from its first loop to the end of the process.
 uvloop.new_event_loop().close()
+# And multiprocessing the memory that Gymnasium's AsyncVectorEnv shares with its processes.
+multiprocessing.RawArray("b", 1)
 
 
 @pytest.fixture(autouse=True)

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import csv
 import importlib.util
 import json
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
 import pytest
+from cli import stub_policies
 from cli.command import CARTPOLE, invoke, invoke_json, run, start, write_config
 from patience import HANG
 
 from rlightning_aio import EnvConfig, load_config
-from rlightning_aio.cli import bench, measuring, tune
+from rlightning_aio.cli import bench, measuring, settings, tune
 from rlightning_aio.config import moved
 
 if TYPE_CHECKING:
@@ -25,7 +27,7 @@ QUICK = ["--seconds", 0.01, "--rounds", 2]
 @pytest.fixture(autouse=True)
 def two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     """The settings tried depend on the machine."""
-    monkeypatch.setattr(measuring, "num_cores", lambda: 2)
+    monkeypatch.setattr(settings, "num_cores", lambda: 2)
 
 
 def settings_of(contenders: list[dict[str, Any]]) -> list[tuple[str, int]]:
@@ -46,6 +48,10 @@ def test_bench_compares_places_and_rules(tmp_path: Path) -> None:
     assert [c["min_results"] for c in contenders] == rules * 4
     assert all(len(c["rounds"]) == 2 and min(c["rounds"]) > 0 for c in contenders)
     assert all(c["latency_us"]["p50"] <= c["latency_us"]["p99"] for c in contenders)
+    assert all(c["start_seconds"] > 0 and c["reset_seconds"] > 0 for c in contenders)
+    assert all(c["cores"] >= 0 and c["memory_bytes"] >= 0 for c in contenders)
+    assert document["versions"]["gymnasium"]
+    assert (document["interrupted"], document["cores"] > 0) == (False, True)
 
 
 def test_a_measurement_has_a_step_however_slow_the_machine_is(
@@ -104,7 +110,8 @@ def test_an_interrupted_bench_prints_what_it_has(tmp_path: Path) -> None:
     assert child.returncode == 130
     assert "Traceback" not in stderr
     if stdout:
-        assert json.loads(stdout)["contenders"]
+        document = json.loads(stdout)
+        assert (document["interrupted"], bool(document["contenders"])) == (True, True)
 
 
 def test_a_plot_without_matplotlib_is_refused_before_anything_is_measured(
@@ -134,7 +141,7 @@ def test_the_plot_is_an_image(tmp_path: Path) -> None:
 def test_what_tune_prints_of_inline_envs_loads(tmp_path: Path) -> None:
     """It leaves out what has no meaning there, defaults included."""
     entry = EnvConfig(name="a", backend="gymnasium", task="CartPole-v1", step_timeout=3.0)
-    setting = measuring.Setting((moved(entry, "inline"),))
+    setting = settings.Setting((moved(entry, "inline"),), "inline")
     best = SimpleNamespace(setting=setting, steps_per_second=1.0, rule=measuring.Rule("step", None))
     path = tmp_path / "tuned.yaml"
     path.write_text(tune._as_yaml(path, cast("Any", best)))
@@ -150,10 +157,11 @@ def test_tune_prints_a_config_that_loads(tmp_path: Path) -> None:
     tuned = tmp_path / "tuned.yaml"
     tuned.write_text(done.stdout)
     (entry,), (asked_for,) = load_config(tuned), load_config(config)
-    chosen = {"placement", "envs_per_process"}
+    chosen = {"placement", "envs_per_process", "min_results"}
     assert entry.model_dump(exclude=chosen) == asked_for.model_dump(exclude=chosen)
     assert entry.placement == "inline" or isinstance(entry.envs_per_process, int)
-    assert "collect_async(min_results=" in done.stdout
+    assert entry.min_results is not None
+    assert f"collect_async(min_results={entry.min_results})" in done.stdout
     assert "Where the envs live" in done.stderr
 
 
@@ -183,6 +191,14 @@ def entry(**fields: Any) -> EnvConfig:
     return EnvConfig(**{"name": "a", "backend": "gymnasium", "task": "CartPole-v1", **fields})
 
 
+def found(*entries: EnvConfig) -> list[tuple[str, int, list[tuple[int, int]]]]:
+    """The settings tried: where, in how many workers, and how many envs of how many each."""
+    return [
+        (s.placement, s.workers, [(c.num_workers, c.num_envs) for c in s.configs])
+        for s in settings.possible_settings(entries)
+    ]
+
+
 @pytest.mark.parametrize(
     ("fields", "workers"),
     [
@@ -196,8 +212,106 @@ def entry(**fields: Any) -> EnvConfig:
         ({"num_workers": 2, "interpreter": "/usr/bin/python3"}, [1, 2]),
     ],
 )
-def test_the_settings_that_are_tried(fields: dict[str, Any], workers: list[int]) -> None:
+def test_the_numbers_of_workers_that_are_tried(fields: dict[str, Any], workers: list[int]) -> None:
     """From one worker to one for each env, within reason, and this process where it may be."""
-    settings = measuring.possible_settings([entry(**fields)])
-    assert [setting.workers for setting in settings] == workers
-    assert sum(setting.inline for setting in settings) == workers.count(0)
+    sizes = [(fields["num_workers"], 1)]
+    tried = [(where, count) for where, count, own in found(entry(**fields)) if own == sizes]
+    assert [count for where, count in tried if where != "split"] == workers
+    assert [where for where, count in tried if count == 0] == ["inline"] * workers.count(0)
+
+
+def test_simulations_that_can_share_an_env_are_tried_that_way() -> None:
+    """CartPole-v1 has a vector entry point: whether that, and where, is best is found out, too."""
+    tried = found(entry(num_workers=8))
+    eight, four, one = [(8, 1)], [(2, 4)], [(1, 8)]
+    assert {"inline", "split"} == {where for where, _, own in tried if own == eight} - {"process"}
+    assert ("inline", 0, one) in tried
+    assert ("process", 1, one) in tried
+    assert ("process", 2, four) in tried
+    assert ("split", 1, four) in tried
+    # However they are configured, and beside entries that can't be had like that.
+    assert found(entry(num_envs=8))[:1] == [("process", 1, one)]
+    assert ("process", 2, four) in found(entry(num_envs=8))
+    other = entry(name="b", backend="callable", task="module:make", num_workers=3)
+    assert ("inline", 0, [(1, 8), (3, 1)]) in found(entry(num_workers=8), other)
+
+
+def test_what_tune_prints_is_complete(tmp_path: Path) -> None:
+    """Sub-environments, and the results to wait for, dealt out over the entries."""
+    entries = tuple(
+        EnvConfig(name=name, backend="gymnasium", task="CartPole-v1", num_workers=n, num_envs=2)
+        for name, n in (("a", 1), ("b", 2), ("c", 4))
+    )
+    setting = settings._in_workers(entries, 2)
+    rule = measuring.Rule("any", 5)
+    best = measuring.Contender(setting, rule, [measuring.Round(100.0, (1.0, 2.0), 1.0)])
+    path = tmp_path / "tuned.yaml"
+    path.write_text(tune._as_yaml(path, best))
+    loaded = load_config(path)
+    assert [(c.num_workers, c.num_envs) for c in loaded] == [(1, 2), (2, 2), (4, 2)]
+    assert sum(c.min_results or 0 for c in loaded) == 5
+
+
+def test_baselines_stand_in_the_same_table(tmp_path: Path) -> None:
+    """A plain loop and Gymnasium's two vector envs step what it can make; CSV has all figures."""
+    config = write_config(tmp_path, {**CARTPOLE, "num_workers": 2, "max_episode_steps": 5})
+    # What Gymnasium shares with its processes is kept for the rest of this one.
+    done = run("bench", config, "--seconds", 0.005, "--rounds", 1, "--format", "csv")
+    assert done.returncode == 0, done.stderr
+    rows = list(csv.DictReader(done.stdout.splitlines()))
+    assert [row["place"] for row in rows[-3:]] == ["bare loop", "SyncVectorEnv", "AsyncVectorEnv"]
+    assert all(float(row["steps_per_second"]) > 0 for row in rows)
+
+
+def test_a_policy_and_a_seed_are_used(tmp_path: Path) -> None:
+    """Every place steps with the policy's actions; what takes no batch is left out."""
+    config = write_config(tmp_path, {**STUB, "num_workers": 1})
+    stub_policies.furthest_seen.clear()
+    words = ("--policy", "cli.stub_policies:furthest", "--seed", 3, "--rounds", 1)
+    done = invoke("bench", config, *words, "--seconds", 0.005, "--format", "markdown")
+    assert done.exit_code == 0, done.stderr
+    head, line, *rows = done.stdout.splitlines()
+    assert head.startswith("| envs in | results | steps/s |")
+    assert set(line) <= set("|-: ")
+    assert not [row for row in rows if "VectorEnv" in row]
+    assert stub_policies.furthest_seen
+
+
+def test_what_was_saved_is_compared_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Exit code 3 where all rounds are slower than all that were saved, and only there."""
+    monkeypatch.chdir(tmp_path)
+    config = write_config(tmp_path, {**STUB, "num_workers": 1})
+    words = ("bench", config, "--seconds", 0.005, "--rounds", 1)
+    missing = invoke(*words, "--compare", "before")
+    assert (missing.exit_code, missing.stdout) == (2, "")
+    assert invoke(*words, "--save", "before").exit_code == 0
+    saved = tmp_path / ".rlightning-aio" / "bench" / "before.json"
+    document = json.loads(saved.read_text())
+    for factor, code in ((1e-6, 0), (1e6, 3)):
+        changed = json.loads(json.dumps(document))
+        for contender in changed["contenders"]:
+            contender["rounds"] = [rate * factor for rate in contender["rounds"]]
+        saved.write_text(json.dumps(changed | {"cpu": "another"}))
+        done = invoke(*words, "--compare", "before", "--json")
+        assert done.exit_code == code, done.stderr
+        comparison = json.loads(done.stdout)["comparison"]
+        assert comparison["slower"] == (len(document["contenders"]) if code else 0)
+        assert comparison["differences"][0].startswith("cpu was another")
+
+
+def test_a_plot_that_can_not_be_written_is_found_before_anything_is_measured(
+    tmp_path: Path,
+) -> None:
+    """A folder that isn't there, a folder in its place, and a kind that is none."""
+    config = write_config(tmp_path, STUB)
+    (tmp_path / "taken.png").mkdir()
+    for name, why in (
+        ("no/plot.png", "No such file"),
+        ("taken.png", "Is a directory"),
+        ("plot.txt", "should end in"),
+    ):
+        done = invoke("bench", config, "--plot", tmp_path / name)
+        assert done.exit_code == 2
+        assert why in done.stderr
+        assert "starting" not in done.stderr
+    assert not (tmp_path / "plot.png").exists()

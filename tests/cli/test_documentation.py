@@ -32,8 +32,8 @@ LINES = [
 
 SHORT = {
     "rollout": ["--steps", "500", "envs.0.num_workers=8"],
-    "bench": ["--seconds", "0.05", "envs.0.num_workers=2"],
-    "tune": ["envs.0.num_workers=2"],
+    "bench": ["--seconds", "0.005", "--rounds", "1", "envs.0.num_workers=2"],
+    "tune": ["--seconds", "0.005", "--rounds", "1", "envs.0.num_workers=2"],
 }
 
 

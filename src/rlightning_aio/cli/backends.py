@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 from rich.text import Text
 
-from rlightning_aio.cli.terminal import named_columns, out, print_json
+from rlightning_aio.cli.terminal import named_columns, out, print_json, print_table
 from rlightning_aio.registry import BACKENDS, ENTRY_POINT_GROUP
 
 __all__ = ["backends"]
@@ -52,7 +52,7 @@ def backends(
             Text(row.version or "not installed", "" if row.version else "dim"),
             Text(row.install, "dim" if row.version else ""),
         )
-    out().print(table)
+    print_table(out(), table)
 
 
 def _built_in() -> list[_Row]:

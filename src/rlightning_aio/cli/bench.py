@@ -3,47 +3,73 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
-import importlib.util
+from dataclasses import dataclass, field
+from enum import StrEnum
 from pathlib import Path  # noqa: TC003 (Typer reads annotations)
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import typer
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
 import rlightning_aio
-from rlightning_aio.cli.measuring import (
-    Contender,
-    Limits,
-    Rule,
-    Setting,
-    num_cores,
-    opened,
-    possible_settings,
-    take_turns,
-)
+from rlightning_aio.cli.baselines import Baseline, baselines_of, opened_baseline
+from rlightning_aio.cli.comparing import Comparison, check_name, compared, save
+from rlightning_aio.cli.contender_table import as_csv, as_markdown, print_contenders
+from rlightning_aio.cli.measuring import Contender, Limits, Rule, opened, take_turns
+from rlightning_aio.cli.plots import check_plot, draw_contenders
+from rlightning_aio.cli.policies import Policy, load_policy
+from rlightning_aio.cli.settings import Setting, possible_settings
+from rlightning_aio.cli.surroundings import surroundings
 from rlightning_aio.cli.terminal import (
     INTERRUPTED,
     count,
     counted,
-    duration,
     err,
     interruptible,
-    named_columns,
     out,
     print_json,
+    print_result,
 )
 from rlightning_aio.config import load_config
-from rlightning_aio.errors import ConfigError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rich.console import Console
+    from rlightning_aio.cli.measuring import Measurable, Place
 
-    from rlightning_aio.config import EnvConfig
+__all__ = ["Watch", "bench"]
 
-__all__ = ["Watch", "bench", "print_contenders"]
+REGRESSION = 3
+"""Exit code where something has become slower than what was saved."""
+
+
+class Format(StrEnum):
+    """How the table is printed."""
+
+    TABLE = "table"
+    CSV = "csv"
+    MARKDOWN = "markdown"
+
+
+@dataclass
+class _Bench:
+    """What is measured, and how."""
+
+    settings: list[Setting]
+    baselines: list[Baseline]
+    rounds: int
+    limits: Limits
+    policy: Policy | None
+    seed: int
+    contenders: list[Contender] = field(default_factory=list[Contender])
+
+    def __post_init__(self) -> None:
+        self.contenders = [
+            Contender(setting, rule)
+            for setting in self.settings
+            for rule in _rules(setting.num_envs)
+        ]
+        self.contenders += [Contender(baseline, Rule("step", None)) for baseline in self.baselines]
 
 
 def bench(
@@ -58,85 +84,141 @@ def bench(
         int | None,
         typer.Option(min=1, help="End a measurement after so many.", show_default="no limit"),
     ] = None,
+    policy: Annotated[
+        str | None,
+        typer.Option(metavar="MODULE:CALLABLE", help="Takes a batch, returns actions."),
+    ] = None,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Of the envs' first reset and the random actions.")
+    ] = 0,
+    save_as: Annotated[
+        str | None,
+        typer.Option("--save", metavar="NAME", help="Keep the figures, to compare with later."),
+    ] = None,
+    compare: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Compare with what was saved; exit code 3 if slower."),
+    ] = None,
     plot: Annotated[
         Path | None, typer.Option(help="Also draw the table (PNG, SVG or PDF; needs matplotlib).")
     ] = None,
+    table_format: Annotated[Format, typer.Option("--format", help="Of the table.")] = Format.TABLE,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print one JSON document in place of the table.")
     ] = False,
 ) -> None:
     """Measure how fast a config's envs go, and how to make them go faster.
 
-    The envs live in this process, or in one worker, or in several; results are taken with a
-    synchronous step of all envs, or asynchronously as soon as one, half or all of them are
-    ready. All combinations take turns, and figures are medians over the rounds. Latency is
-    the time from an action's sending to its result in hand. Actions are random.
+    The envs live in this process, or in one worker, or in several, or in both; results are taken
+    with a synchronous step of all envs, or asynchronously as soon as one, half or all of them
+    are ready. Simulations that can share an env (num_envs) are tried that way, too. Beside
+    them stand a plain loop and Gymnasium's vector envs, where these can make the envs. All take
+    turns, and figures are medians over the rounds. Latency is the time from an action's sending
+    to its result in hand. Actions are random, unless --policy names where they come from.
 
     For example:
 
         rlightning-aio bench configs/halfcheetah.yaml
         rlightning-aio bench configs/cartpole.yaml envs.0.num_workers=256 --rounds 9
         rlightning-aio bench configs/hopper.yaml --plot hopper.png --json > hopper.json
+        rlightning-aio bench configs/hopper.yaml --save before
+        rlightning-aio bench configs/hopper.yaml --compare before
     """
     configs = load_config(config, overrides or ())
-    if plot is not None and importlib.util.find_spec("matplotlib") is None:
-        raise ConfigError("--plot needs matplotlib: pip install matplotlib")
-    settings = possible_settings(configs)
-    contenders = [Contender(setting, rule) for setting in settings for rule in _rules(configs)]
-    limits = Limits(steps or 2**62, seconds)
+    if plot is not None:
+        check_plot(plot)
+    for name in (save_as, compare):
+        check_name(name, must_exist=name is compare)
+    order = _Bench(
+        possible_settings(configs),
+        # A policy takes a group's batches, which these have none of.
+        [] if policy else baselines_of(configs),
+        rounds,
+        Limits(steps or 2**62, seconds),
+        load_policy(policy) if policy else None,
+        seed,
+    )
+    interrupted = False
+    comparison: Comparison | None = None
     try:
         with (
-            Watch(settings, rounds * len(contenders)) as watch,
+            Watch(len(order.settings), rounds * len(order.contenders)) as watch,
             interruptible(),
-            contextlib.closing(_measure(settings, contenders, rounds, limits, watch)) as measuring,
+            contextlib.closing(_measure(order, watch)) as measuring,
         ):
             rlightning_aio.run(measuring)
     except KeyboardInterrupt:
+        interrupted = True
         raise typer.Exit(INTERRUPTED) from None
     finally:
-        if any(contender.rounds for contender in contenders):
-            _report(str(config), contenders, plot, as_json=as_json)
+        if any(contender.rounds for contender in order.contenders):
+            document = {
+                "config": str(config),
+                "interrupted": interrupted,
+                **surroundings(configs),
+                "contenders": [contender.as_json() for contender in order.contenders],
+            }
+            comparison = None if compare is None else compared(compare, document)
+            _report(document, order.contenders, comparison, table_format, as_json=as_json)
+            if plot is not None:
+                draw_contenders(str(config), order.contenders, plot)
+            if save_as is not None and not interrupted:
+                save(save_as, document)
+    if comparison is not None and comparison.slower:
+        raise typer.Exit(REGRESSION)
 
 
-def _rules(configs: Sequence[EnvConfig]) -> list[Rule]:
-    num_envs = sum(config.num_workers for config in configs)
+def _rules(num_envs: int) -> list[Rule]:
     half = max(1, num_envs // 2)
     named = {1: "async, first ready", half: "async, half", num_envs: "async, all"}
     return [Rule("step", None), *(Rule(words, least) for least, words in sorted(named.items()))]
 
 
-async def _measure(
-    settings: Sequence[Setting],
-    contenders: Sequence[Contender],
-    rounds: int,
-    limits: Limits,
-    watch: Watch,
-) -> None:
-    async with opened(settings) as stands:
-        watch.say(f"measuring {counted(len(contenders), 'contender')}, {counted(rounds, 'round')}")
-        await take_turns(stands, contenders, rounds, limits, watch.measured)
+async def _measure(order: _Bench, watch: Watch) -> None:
+    with contextlib.ExitStack() as stack:
+        # Before the groups: Gymnasium forks this process as it is.
+        plain: dict[Place, Measurable | str] = {}
+        for baseline in order.baselines:
+            try:
+                plain[baseline] = stack.enter_context(opened_baseline(baseline, order.seed))
+            except Exception as error:  # noqa: BLE001  # It is the simulator's code.
+                plain[baseline] = f"{type(error).__name__}: {error}".partition("\n")[0]
+        async with opened(order.settings, order.policy, order.seed) as stands:
+            watch.say(
+                f"measuring {counted(len(order.contenders), 'contender')}, "
+                f"{counted(order.rounds, 'round')}"
+            )
+            await take_turns(
+                plain | stands, order.contenders, order.rounds, order.limits, watch.measured
+            )
 
 
 class Watch:
-    """The live line on stderr; on anything but a terminal, plain lines."""
+    """The live line on stderr; on anything but a terminal, plain lines.
 
-    def __init__(self, settings: Sequence[Setting], measurements: int) -> None:
+    Args:
+        groups: that are started first.
+        measurements: that follow.
+    """
+
+    def __init__(self, groups: int, measurements: int) -> None:
         self._console = err()
         self._progress = Progress(
             SpinnerColumn(),
-            BarColumn(bar_width=28),
+            BarColumn(bar_width=16),
+            TimeRemainingColumn(compact=True),
             TextColumn("{task.description}"),
             console=self._console,
             auto_refresh=False,
             transient=True,
         )
         self._task = self._progress.add_task("", total=measurements)
-        self._settings = settings
+        self._groups = groups
 
     def __enter__(self) -> Self:
         if self._console.is_terminal:
             self._progress.start()
-        self.say(f"starting {counted(len(self._settings), 'group')}")
+        self.say(f"starting {counted(self._groups, 'group')}")
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -158,67 +240,23 @@ class Watch:
 
 
 def _report(
-    config: str, contenders: Sequence[Contender], plot: Path | None, *, as_json: bool
+    document: dict[str, Any],
+    contenders: Sequence[Contender],
+    comparison: Comparison | None,
+    table_format: Format,
+    *,
+    as_json: bool,
 ) -> None:
     if as_json:
-        print_json(
-            {
-                "config": config,
-                "cores": num_cores(),
-                "contenders": [contender.as_json() for contender in contenders],
-            }
-        )
+        told = {} if comparison is None else {"comparison": comparison.as_json()}
+        print_json(document | told)
+        return
+    if table_format is Format.CSV:
+        print_result(as_csv(contenders))
+    elif table_format is Format.MARKDOWN:
+        print_result(as_markdown(contenders))
     else:
-        print_contenders(out(), config, contenders)
-    if plot is not None:
-        _draw(config, contenders, plot)
-
-
-def print_contenders(console: Console, title: str, contenders: Sequence[Contender]) -> None:
-    """The table of what was measured, the fastest in bold."""
-    fastest = max(contenders, key=lambda contender: contender.steps_per_second)
-    table = named_columns(
-        f"{title}: {counted(num_cores(), 'core')}, "
-        f"medians of {counted(len(fastest.rounds), 'round')}",
-        "envs in", "results", "steps/s", "slowest", "fastest", "latency p50", "p99",
-    )  # fmt: skip
-    table.columns[1].justify = "left"
-    for contender in contenders:
-        table.add_row(*_row(contender), style="bold" if contender is fastest else None)
-    console.print(table)
-    failures = {c.setting.words: c.failure for c in contenders if c.failure}
-    for words, failure in failures.items():
-        console.print(f"{words}: {failure}", markup=False)
-
-
-def _row(contender: Contender) -> list[str]:
-    names = [contender.setting.words, contender.rule.words]
-    if not contender.rounds:
-        return [*names, *["-"] * 5]
-    rates = (contender.steps_per_second, *contender.spread)
-    return [*names, *map(count, rates), *map(duration, contender.latency_us)]
-
-
-def _draw(config: str, contenders: Sequence[Contender], path: Path) -> None:
-    """Bars of steps per second, one group of bars for each setting."""
-    # An extra that only this needs, without types that say anything.
-    importlib.import_module("matplotlib").use("Agg")
-    plt: Any = importlib.import_module("matplotlib.pyplot")
-    rules = list(dict.fromkeys(contender.rule.words for contender in contenders))
-    settings = list(dict.fromkeys(contender.setting.words for contender in contenders))
-    figure, axes = plt.subplots(figsize=(8, 1.2 + 0.22 * len(contenders)), layout="constrained")
-    height = 0.8 / len(rules)
-    for index, rule in enumerate(rules):
-        own = [contender for contender in contenders if contender.rule.words == rule]
-        axes.barh(
-            [settings.index(c.setting.words) + index * height for c in own],
-            [c.steps_per_second for c in own],
-            height,
-            label=rule,
-        )
-    axes.set_yticks([k + 0.4 - height / 2 for k in range(len(settings))], settings)
-    axes.invert_yaxis()
-    axes.set(xlabel="env steps per second", title=f"{config}, {counted(num_cores(), 'core')}")
-    figure.legend(loc="outside lower center", ncols=len(rules))
-    figure.savefig(path, dpi=150)
-    plt.close(figure)
+        title = ("Interrupted: " if document["interrupted"] else "") + document["config"]
+        print_contenders(out(), title, contenders)
+    if comparison is not None:
+        comparison.print(out() if table_format is Format.TABLE else err())

@@ -2,7 +2,7 @@
 
 Rule: what is compared is measured in turns (A B C A B C …) with all groups open, and told
 as medians over the rounds, so that a machine that is busy for a while slows all of them.
-A group that waits for its turn sleeps. Actions are random, and finished episodes are reset.
+A group that waits for its turn sleeps. Finished episodes are reset.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ import asyncio
 import contextlib
 import os
 import time
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from statistics import median
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -21,119 +21,32 @@ import rlightning_aio
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.batch.data import parts_of
 from rlightning_aio.cli.collecting import Roster, resetting, respond_to_all, responder
+from rlightning_aio.cli.processes import cpu_seconds, memory_bytes
 from rlightning_aio.cli.rollout_statistics import RolloutStatistics
-from rlightning_aio.cli.terminal import counted
-from rlightning_aio.config import moved
-from rlightning_aio.errors import ConfigError, RLightningError
-from rlightning_aio.registry import BACKENDS
+from rlightning_aio.errors import RLightningError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Callable, Sequence
 
     from numpy.typing import NDArray
 
-    from rlightning_aio.config import EnvConfig
+    from rlightning_aio.cli.policies import Policy
+    from rlightning_aio.cli.settings import Setting
     from rlightning_aio.group.aio import EnvGroup
 
 __all__ = [
     "Contender",
+    "Costs",
     "Limits",
+    "Measurable",
+    "Place",
     "Round",
     "Rule",
-    "Setting",
     "Stand",
-    "num_cores",
+    "as_round",
     "opened",
-    "possible_settings",
     "take_turns",
 ]
-
-_MANY_WORKERS: Final = 32
-"""More are not tried: starting them takes longer than it teaches."""
-
-
-def num_cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0))
-
-
-@dataclass(frozen=True, eq=False)
-class Setting:
-    """Where the envs live. One is itself alone: fields of a config need not be hashable.
-
-    Attributes:
-        configs: the entries with their placement and envs_per_process.
-    """
-
-    configs: tuple[EnvConfig, ...]
-
-    @property
-    def inline(self) -> bool:
-        """Whether they live in this process."""
-        return all(config.placement == "inline" for config in self.configs)
-
-    @property
-    def workers(self) -> int:
-        """Worker processes in all."""
-        return 0 if self.inline else sum(_num_workers(config) for config in self.configs)
-
-    @property
-    def words(self) -> str:
-        """How tables call it."""
-        if self.inline:
-            return "inline"
-        return counted(self.workers, "worker")
-
-    def as_json(self) -> dict[str, Any]:
-        """The fields that make it."""
-        return {
-            "placement": "inline" if self.inline else "process",
-            "workers": self.workers,
-            "envs_per_process": (
-                {} if self.inline else {c.name: c.envs_per_process for c in self.configs}
-            ),
-        }
-
-
-def _num_workers(config: EnvConfig) -> int:
-    assert isinstance(config.envs_per_process, int)
-    return -(-config.num_workers // config.envs_per_process)
-
-
-def possible_settings(configs: Sequence[EnvConfig]) -> list[Setting]:
-    """The settings worth trying: this process, and several numbers of workers for each entry.
-
-    Raises:
-        ConfigError: an entry's envs don't live where the command could choose.
-    """
-    for config in configs:
-        if config.backend == "env_server" or config.placement == "ray":
-            raise ConfigError(
-                f"entry {config.name!r}: its envs live elsewhere, so there is nothing to choose; "
-                "use rollout to measure it as it is"
-            )
-    settings: dict[int, Setting] = {}
-    for count in _worker_counts(configs):
-        setting = Setting(tuple(_with_workers(config, count) for config in configs))
-        settings.setdefault(setting.workers, setting)
-    if not any(config.interpreter or config.env_vars for config in configs):
-        settings[0] = Setting(tuple(moved(config, "inline") for config in configs))
-    return list(settings.values())
-
-
-def _worker_counts(configs: Sequence[EnvConfig]) -> list[int]:
-    most, cores = max(config.num_workers for config in configs), num_cores()
-    counts = {1, cores // 2, cores, 2 * cores, min(most, _MANY_WORKERS)}
-    return sorted(count for count in counts if 1 <= count <= most)
-
-
-def _with_workers(config: EnvConfig, count: int) -> EnvConfig:
-    backend = BACKENDS.get(config.backend)
-    if backend is not None and not backend.cpu_bound:
-        # A simulator with a device or threads of its own shares no process.
-        count = config.num_workers
-    per_process = -(-config.num_workers // count) if count < config.num_workers else 1
-    return config.model_copy(update={"placement": "process", "envs_per_process": per_process})
 
 
 @dataclass(frozen=True)
@@ -167,19 +80,59 @@ class Round:
 
     Attributes:
         latency_us: from an action's sending to its result in hand, p50 and p99.
+        cores: that were kept busy, by this process and the workers.
     """
 
     steps_per_second: float
     latency_us: tuple[float, float]
+    cores: float
+
+
+@dataclass(frozen=True)
+class Costs:
+    """What envs cost beside their steps.
+
+    Attributes:
+        start_seconds: until all of them were built; reset_seconds: their first reset.
+        memory_bytes: of their processes; in this process, by how much it has grown.
+    """
+
+    start_seconds: float
+    reset_seconds: float
+    memory_bytes: int
+
+
+class Place(Protocol):
+    """Where envs can live, and be stepped."""
+
+    @property
+    def words(self) -> str:
+        """How tables call it."""
+        ...
+
+    def as_json(self) -> dict[str, Any]:
+        """What makes it."""
+        ...
+
+
+class Measurable(Protocol):
+    """Envs that wait to be measured."""
+
+    costs: Costs
+
+    async def measure(self, rule: Rule, limits: Limits) -> Round:
+        """One measurement, of full length after a few steps that warm the caches."""
+        ...
 
 
 @dataclass
 class Contender:
-    """A setting under a rule, and what was measured of it."""
+    """A place under a rule, and what was measured of it."""
 
-    setting: Setting
+    setting: Place
     rule: Rule
     rounds: list[Round] = field(default_factory=list[Round])
+    costs: Costs | None = None
     failure: str | None = None
 
     @property
@@ -188,10 +141,10 @@ class Contender:
         return median(r.steps_per_second for r in self.rounds) if self.rounds else 0.0
 
     @property
-    def spread(self) -> tuple[float, float]:
-        """Slowest and fastest round."""
+    def spread(self) -> float:
+        """Half of what lies between the slowest and the fastest round, as a share of the median."""
         rates = [r.steps_per_second for r in self.rounds]
-        return min(rates), max(rates)
+        return (max(rates) - min(rates)) / 2 / self.steps_per_second
 
     @property
     def latency_us(self) -> tuple[float, float]:
@@ -201,9 +154,15 @@ class Contender:
             median(r.latency_us[1] for r in self.rounds),
         )
 
+    @property
+    def cores(self) -> float:
+        """Median over the rounds of the cores that were busy."""
+        return median(r.cores for r in self.rounds)
+
     def as_json(self) -> dict[str, Any]:
         """All that is known of it."""
         document: dict[str, Any] = {
+            "place": self.setting.words,
             **self.setting.as_json(),
             "rule": self.rule.words,
             "min_results": self.rule.min_results,
@@ -214,9 +173,11 @@ class Contender:
             p50, p99 = self.latency_us
             document |= {
                 "steps_per_second": self.steps_per_second,
+                "spread": self.spread,
                 "latency_us": {"p50": p50, "p99": p99},
+                "cores": self.cores,
             }
-        return document
+        return document | ({} if self.costs is None else asdict(self.costs))
 
 
 class Stand:
@@ -224,15 +185,26 @@ class Stand:
 
     Args:
         group: initialised, inside `resetting`.
-        everyone: a batch of all its envs, to which random actions respond again and again.
+        everyone: a batch of all its envs, to which actions respond again and again.
+        costs: of the group.
+        policy: where actions come from; None for random ones, of that seed.
     """
 
     def __init__(
-        self, group: EnvGroup, setting: Setting, roster: Roster, everyone: BatchedData
+        self,
+        group: EnvGroup,
+        setting: Setting,
+        roster: Roster,
+        everyone: BatchedData,
+        costs: Costs,
+        policy: Policy | None,
+        seed: int,
     ) -> None:
+        self.costs = costs
         self._group = group
-        self._respond = responder(group, roster, None, 0)
+        self._respond = responder(group, roster, policy, seed)
         self._everyone = everyone
+        self._pids = _processes(group)
         self._sent_at = np.zeros(len(everyone))
         self.statistics = RolloutStatistics(setting.configs)
         self.statistics.begin(roster)
@@ -243,9 +215,15 @@ class Stand:
         await one_round(rule.min_results or 0, Limits(limits.steps, limits.seconds / 10))
         return await one_round(rule.min_results or 0, limits)
 
+    def _as_round(
+        self, steps: int, seconds: float, busy: float, latencies: NDArray[np.float64]
+    ) -> Round:
+        return as_round(steps, seconds, cpu_seconds(self._pids) - busy, latencies)
+
     async def _step(self, ignored: int, limits: Limits) -> Round:
         del ignored
         latencies: list[float] = []
+        busy = cpu_seconds(self._pids)
         first, began = self.statistics.steps, time.monotonic()
         now = began
         while limits.not_reached(self.statistics.steps - first, now - began):
@@ -255,11 +233,13 @@ class Stand:
             now = time.monotonic()
             latencies.append(now - sent_at)
             self.statistics.add(batch)
-        return _as_round(self.statistics.steps - first, now - began, np.array(latencies))
+        steps = self.statistics.steps - first
+        return self._as_round(steps, now - began, busy, np.array(latencies))
 
     async def _collect(self, min_results: int, limits: Limits) -> Round:
         latencies: list[NDArray[np.float64]] = []
         group, sent_at = self._group, self._sent_at
+        busy = cpu_seconds(self._pids)
         first, began = self.statistics.steps, time.monotonic()
         now = began
         sent_at[:] = now
@@ -272,15 +252,26 @@ class Stand:
                 latencies.append(now - sent_at[part.slots])
                 sent_at[part.slots] = now
             await respond_to_all(group, self._respond, batch)
-        steps = self.statistics.steps - first
+        done = self._as_round(
+            self.statistics.steps - first, now - began, busy, np.concatenate(latencies)
+        )
         batch, _ = await group.collect_async(wait_all=True)
         self.statistics.add(batch)
-        return _as_round(steps, now - began, np.concatenate(latencies))
+        return done
 
 
-def _as_round(steps: int, seconds: float, latencies: NDArray[np.float64]) -> Round:
+def _processes(group: EnvGroup) -> list[int]:
+    """Of the trainer, and of the group's workers."""
+    pids = [worker["pid"] for worker in group.get_workers()]
+    return [os.getpid(), *(pid for pid in pids if pid is not None)]
+
+
+def as_round(
+    steps: int, seconds: float, cpu_seconds: float, latencies: NDArray[np.float64]
+) -> Round:
+    """What so many steps in so many seconds come to; latencies are in seconds."""
     p50, p99 = np.percentile(latencies, [50, 99]) * 1e6
-    return Round(steps / seconds, (float(p50), float(p99)))
+    return Round(steps / seconds, (float(p50), float(p99)), cpu_seconds / seconds)
 
 
 def _joined(responses: list[BatchedData]) -> BatchedData:
@@ -291,38 +282,49 @@ def _joined(responses: list[BatchedData]) -> BatchedData:
     return BatchedData([value.env_id for value in values], values)
 
 
-async def _open(stack: contextlib.AsyncExitStack, setting: Setting) -> Stand:
+async def _open(
+    stack: contextlib.AsyncExitStack, setting: Setting, policy: Policy | None, seed: int
+) -> Stand:
+    before = memory_bytes([os.getpid()])
+    began = time.monotonic()
     group = rlightning_aio.build_env_group(list(setting.configs), mixed_actions=True)
     await stack.enter_async_context(group)
     roster = Roster(group, await group.init())
-    everyone, _ = await group.reset(seed=0)
+    started = time.monotonic()
+    everyone, _ = await group.reset(seed=seed)
+    reset = time.monotonic()
+    grown = max(0, memory_bytes([os.getpid()]) - before)
+    workers = memory_bytes(_processes(group)[1:])
+    costs = Costs(started - began, reset - started, workers or grown)
     stack.enter_context(resetting(group, setting.configs))
-    return Stand(group, setting, roster, everyone)
+    return Stand(group, setting, roster, everyone, costs, policy, seed)
 
 
 @contextlib.asynccontextmanager
-async def opened(settings: Sequence[Setting]) -> AsyncGenerator[dict[Setting, Stand | str]]:
+async def opened(
+    settings: Sequence[Setting], policy: Policy | None = None, seed: int = 0
+) -> AsyncGenerator[dict[Place, Measurable | str]]:
     """Groups for all settings, open at once; a message for each that could not start.
 
     Raises:
         RLightningError: none could.
     """
     async with contextlib.AsyncExitStack() as stack:
-        stands: dict[Setting, Stand | str] = {}
+        stands: dict[Place, Measurable | str] = {}
         error: RLightningError | None = None
         for setting in settings:
             try:
-                stands[setting] = await _open(stack, setting)
+                stands[setting] = await _open(stack, setting, policy, seed)
             except RLightningError as failure:
                 error = failure
                 stands[setting] = str(failure).partition("\n")[0]
-        if error is not None and not any(isinstance(s, Stand) for s in stands.values()):
+        if error is not None and all(isinstance(stand, str) for stand in stands.values()):
             raise error
         yield stands
 
 
 async def take_turns(
-    stands: dict[Setting, Stand | str],
+    stands: dict[Place, Measurable | str],
     contenders: Sequence[Contender],
     rounds: int,
     limits: Limits,
@@ -332,9 +334,10 @@ async def take_turns(
     for _ in range(rounds):
         for contender in contenders:
             stand = stands[contender.setting]
-            if isinstance(stand, Stand):
-                contender.rounds.append(await stand.measure(contender.rule, limits))
-            else:
+            if isinstance(stand, str):
                 contender.failure = stand
+            else:
+                contender.costs = stand.costs
+                contender.rounds.append(await stand.measure(contender.rule, limits))
             tell(contender)
             await asyncio.sleep(0)  # Ctrl-C gets its turn.

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["Policy", "PolicyRaised", "RandomPolicy", "Responder", "load_policy"]
+__all__ = ["Policy", "PolicyRaised", "RandomPolicy", "Responder", "load_policy", "sampler_of"]
 
 Policy: TypeAlias = Callable[[BatchedData], Any]
 Sampler: TypeAlias = Callable[[int], Any]
@@ -157,7 +157,7 @@ class RandomPolicy:
             raise ConfigError(f"env {env_id!r} reports no action space; give a --policy")
         sampler = next((sampler for known, sampler in self._kinds if known == space), None)
         if sampler is None:
-            sampler = _sampler(space, self._rng)
+            sampler = sampler_of(space, self._rng)
             self._kinds.append((space, sampler))
         self._samplers[env_id] = sampler
         # Others' infos are left alone: they may hold what can't be unpickled here.
@@ -166,7 +166,7 @@ class RandomPolicy:
         return sampler
 
 
-def _sampler(space: gym.Space[Any], rng: np.random.Generator) -> Sampler:
+def sampler_of(space: gym.Space[Any], rng: np.random.Generator) -> Sampler:
     """A function that makes n actions of `space`, as columns."""
     columns = _columns(space, rng)
     if columns is not None:

@@ -186,3 +186,14 @@ def _mean(stats: Sequence[Mapping[str, Any]], key: str, episodes: int) -> float 
     if not episodes:
         return None
     return float(sum(s[key] * s["episodes"] for s in stats if s["episodes"]) / episodes)
+
+
+@dataclass(frozen=True)
+class Course:
+    """How a rollout of one entry went."""
+
+    name: str
+    rate_seconds: list[float]
+    rates: list[float]
+    episode_steps: list[int]
+    returns: list[float]

@@ -16,12 +16,13 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
 from rich.console import Console
+from rich.measure import Measurement
 from rich.table import Table
 
 from rlightning_aio.errors import ConfigError, EnvFault, RemoteTraceback, RLightningError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator
+    from collections.abc import Callable, Generator, Sequence
 
 __all__ = [
     "INTERRUPTED",
@@ -36,11 +37,14 @@ __all__ = [
     "out",
     "print_json",
     "print_result",
+    "print_table",
 ]
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
 
+_NATURAL = 10_000
+"""Columns in which any table has room."""
 _WIDE = 160
 """Columns of a table that goes to a file: what reads it wraps lines itself."""
 
@@ -141,9 +145,30 @@ def named_columns(title: str, *names: str) -> Table:
     table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False)
     for position, name in enumerate(names):
         table.add_column(
-            name, justify="right" if position else "left", no_wrap=True, vertical="bottom"
+            name, justify="right" if position else "left", overflow="fold", vertical="bottom"
         )
     return table
+
+
+def print_table(console: Console, table: Table, expendable: Sequence[str] = ()) -> None:
+    """Print `table`; where it is too wide for the console, without some of its columns.
+
+    Args:
+        console: where it goes.
+        table: of `named_columns`.
+        expendable: names of columns, those first that are missed least.
+    """
+    wide = console.options.update(max_width=_NATURAL, width=_NATURAL)
+    left_out: list[str] = []
+    for name in expendable:
+        if Measurement.get(console, wide, table).maximum <= console.width:
+            break
+        table.columns = [column for column in table.columns if column.header != name]
+        left_out.append(name.replace("\n", " ").strip())
+    console.print(table)
+    if left_out:
+        words = f"(too narrow for {', '.join(left_out)}; --json has all)"
+        console.print(words, style="dim", markup=False)
 
 
 def count(value: float) -> str:

@@ -11,17 +11,10 @@ import typer
 import yaml
 
 import rlightning_aio
-from rlightning_aio.cli.bench import Watch, print_contenders
-from rlightning_aio.cli.measuring import (
-    Contender,
-    Limits,
-    Rule,
-    Setting,
-    num_cores,
-    opened,
-    possible_settings,
-    take_turns,
-)
+from rlightning_aio.cli.bench import Watch
+from rlightning_aio.cli.contender_table import print_contenders
+from rlightning_aio.cli.measuring import Contender, Limits, Rule, Stand, opened, take_turns
+from rlightning_aio.cli.settings import Setting, possible_settings
 from rlightning_aio.cli.terminal import (
     INTERRUPTED,
     count,
@@ -33,11 +26,12 @@ from rlightning_aio.cli.terminal import (
     print_result,
 )
 from rlightning_aio.config import load_config
+from rlightning_aio.sharing import num_cores
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rlightning_aio.cli.measuring import Stand
+    from rlightning_aio.cli.measuring import Measurable, Place
     from rlightning_aio.config import EnvConfig
 
 __all__ = ["tune"]
@@ -106,7 +100,8 @@ def tune(
 ) -> None:
     """Find where a config's envs should live, and how many results to wait for.
 
-    It measures a step of the envs alone, tries this process and several numbers of workers,
+    It measures a step of the envs alone, tries this process, several numbers of workers and both
+    together, with the simulations in envs of their own or in fewer that hold several (num_envs),
     then several `min_results` with the fastest two of them, all in alternating rounds. The
     config with the best setting is printed as YAML on stdout, the table of what was tried on
     stderr. Of settings that are equally fast, the one with the lowest latency is best. Actions
@@ -124,7 +119,7 @@ def tune(
     interrupted = False
     try:
         with (
-            Watch(settings, measurements) as watch,
+            Watch(len(settings), measurements) as watch,
             interruptible(),
             contextlib.closing(_search(search, settings, watch)) as searching,
         ):
@@ -140,8 +135,9 @@ def tune(
 async def _search(search: _Search, settings: Sequence[Setting], watch: Watch) -> None:
     async with opened(settings) as stands:
         await _measure_env(search, settings, stands)
-        half = max(1, search.num_envs // 2)
-        search.places = [Contender(setting, _waiting_for(half)) for setting in settings]
+        search.places = [
+            Contender(setting, _waiting_for(max(1, setting.num_envs // 2))) for setting in settings
+        ]
         watch.say(f"trying {counted(len(settings), 'setting')}, {counted(search.rounds, 'round')}")
         await take_turns(stands, search.places, search.rounds, search.limits, watch.measured)
         ranked = sorted(search.places, key=lambda contender: -contender.steps_per_second)
@@ -149,7 +145,7 @@ async def _search(search: _Search, settings: Sequence[Setting], watch: Watch) ->
             Contender(contender.setting, _waiting_for(least))
             for contender in ranked[:_FINALISTS]
             if contender.rounds
-            for least in _least(search.num_envs)
+            for least in _least(_setting(contender).num_envs)
         ]
         watch.say(
             f"trying {len(search.finals)} times min_results, {counted(search.rounds, 'round')}"
@@ -158,15 +154,20 @@ async def _search(search: _Search, settings: Sequence[Setting], watch: Watch) ->
 
 
 async def _measure_env(
-    search: _Search, settings: Sequence[Setting], stands: dict[Setting, Stand | str]
+    search: _Search, settings: Sequence[Setting], stands: dict[Place, Measurable | str]
 ) -> None:
     """Step with one worker alone, where nothing disturbs it."""
     for setting in settings:
         stand = stands[setting]
-        if not isinstance(stand, str):
+        if isinstance(stand, Stand):
             await stand.measure(Rule("step", None), search.limits)
             search.step_us = stand.statistics.mean_step_us()
             return
+
+
+def _setting(contender: Contender) -> Setting:
+    assert isinstance(contender.setting, Setting)
+    return contender.setting
 
 
 def _waiting_for(least: int) -> Rule:
@@ -203,10 +204,12 @@ def _report(config: Path, search: _Search, *, interrupted: bool, as_json: bool) 
             f"A step takes {duration(search.step_us)} in the env: {counted(num_cores(), 'core')} "
             f"that only step make {count(search.limit)} steps/s."
         )
-    print_result(_as_yaml(config, best))
+    print_result(_as_yaml(config, best, interrupted=interrupted))
 
 
-def _as_yaml(config: Path, best: Contender) -> str:
+def _as_yaml(config: Path, best: Contender, *, interrupted: bool = False) -> str:
+    setting = _setting(best)
+    wanted = _dealt_out(best.rule.min_results or 1, [c.num_workers for c in setting.configs])
     entries: list[dict[str, Any]] = [
         {
             # What was given; a default may be a robot's, or mean nothing where the envs live.
@@ -214,13 +217,28 @@ def _as_yaml(config: Path, best: Contender) -> str:
                 mode="json", exclude_defaults=True, include=set(entry.model_fields_set)
             ),
             "placement": entry.placement,
-            **({} if best.setting.inline else {"envs_per_process": entry.envs_per_process}),
+            **({} if entry.placement == "inline" else {"envs_per_process": entry.envs_per_process}),
+            **({"min_results": least} if least else {}),
         }
-        for entry in best.setting.configs
+        for entry, least in zip(setting.configs, wanted, strict=True)
     ]
     text = yaml.safe_dump({"envs": entries}, sort_keys=False, allow_unicode=True)
-    return (
-        f"# {config}, tuned on {counted(num_cores(), 'core')}:\n"
-        f"# {count(best.steps_per_second)} steps/s with "
-        f"collect_async(min_results={best.rule.min_results}).\n{text}"
-    ).rstrip()
+    least, rate = best.rule.min_results, count(best.steps_per_second)
+    lines = [
+        f"{config}, tuned on {counted(num_cores(), 'core')}:",
+        f"{rate} steps/s with collect_async(min_results={least}), the default with this config.",
+    ]
+    if interrupted:
+        lines.insert(0, "Interrupted: not everything was tried.")
+    if any(entry.num_envs > 1 for entry in setting.configs):
+        lines.append("With num_envs, a result is that of so many sub-environments at once.")
+    return ("".join(f"# {line}\n" for line in lines) + text).rstrip()
+
+
+def _dealt_out(wanted: int, sizes: Sequence[int]) -> list[int]:
+    """`wanted` results over entries of so many envs, by their shares; the sum is `wanted`."""
+    total, parts, before = sum(sizes), list[int](), 0
+    for size in sizes:
+        parts.append(wanted * (before + size) // total - wanted * before // total)
+        before += size
+    return parts

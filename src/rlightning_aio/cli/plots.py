@@ -1,0 +1,101 @@
+"""Pictures of what commands have measured; matplotlib is an extra that only they need."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from typing import TYPE_CHECKING, Any, Final
+
+from rlightning_aio.cli.terminal import counted
+from rlightning_aio.errors import ConfigError
+from rlightning_aio.sharing import num_cores
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from rlightning_aio.cli.measuring import Contender
+    from rlightning_aio.cli.rollout_statistics import Course
+
+__all__ = ["check_plot", "draw_contenders", "draw_rollout"]
+
+_KINDS: Final = (".png", ".svg", ".pdf")
+
+
+def check_plot(path: Path) -> None:
+    """Find out, before anything is measured, whether a picture can be written.
+
+    Raises:
+        ConfigError: it can't, and why.
+    """
+    if path.suffix.lower() not in _KINDS:
+        raise ConfigError(f"--plot {path}: should end in {', '.join(_KINDS[:-1])} or {_KINDS[-1]}")
+    is_new = not path.exists()
+    try:
+        path.open("ab").close()
+    except OSError as error:
+        raise ConfigError(f"--plot {path}: can't be written: {error.strerror}") from error
+    if is_new:
+        path.unlink()
+    if importlib.util.find_spec("matplotlib") is None:
+        raise ConfigError("--plot needs matplotlib: pip install matplotlib")
+
+
+def _pyplot() -> Any:
+    importlib.import_module("matplotlib").use("Agg")
+    return importlib.import_module("matplotlib.pyplot")
+
+
+def _save(plt: Any, figure: Any, path: Path) -> None:
+    try:
+        figure.savefig(path, dpi=150)
+    except OSError as error:
+        raise ConfigError(f"--plot {path}: can't be written: {error}") from error
+    finally:
+        plt.close(figure)
+
+
+def draw_contenders(config: str, contenders: Sequence[Contender], path: Path) -> None:
+    """Bars of steps per second, one group of bars for each place, with the rounds' spread.
+
+    Raises:
+        ConfigError: the picture can't be written.
+    """
+    plt = _pyplot()
+    measured = [contender for contender in contenders if contender.rounds]
+    rules = list(dict.fromkeys(contender.rule.words for contender in measured))
+    places = list(dict.fromkeys(contender.setting.words for contender in measured))
+    figure, axes = plt.subplots(figsize=(8, 1.4 + 0.22 * len(measured)), layout="constrained")
+    height = 0.8 / len(rules)
+    for index, rule in enumerate(rules):
+        own = [contender for contender in measured if contender.rule.words == rule]
+        axes.barh(
+            [places.index(c.setting.words) + index * height for c in own],
+            [c.steps_per_second for c in own],
+            height,
+            xerr=[c.spread * c.steps_per_second for c in own],
+            label=rule,
+        )
+    axes.set_yticks([k + 0.4 - height / 2 for k in range(len(places))], places)
+    axes.invert_yaxis()
+    axes.set(xlabel="env steps per second", title=f"{config}, {counted(num_cores(), 'core')}")
+    figure.legend(loc="outside lower center", ncols=len(rules))
+    _save(plt, figure, path)
+
+
+def draw_rollout(config: str, courses: Sequence[Course], path: Path) -> None:
+    """Steps per second over time, and returns of episodes over steps, by entry.
+
+    Raises:
+        ConfigError: the picture can't be written.
+    """
+    plt = _pyplot()
+    figure, (rates, returns) = plt.subplots(2, figsize=(8, 6), layout="constrained")
+    for course in courses:
+        rates.plot(course.rate_seconds, course.rates, label=course.name)
+        returns.plot(course.episode_steps, course.returns, ".", ms=3, label=course.name)
+    rates.set(xlabel="seconds", ylabel="env steps per second", ylim=(0, None), title=config)
+    returns.set(xlabel="env steps of the entry", ylabel="return of an episode")
+    for axes in (rates, returns):
+        axes.legend(loc="upper left")
+    _save(plt, figure, path)

@@ -1,0 +1,56 @@
+"""What processes of this machine use, as the kernel counts it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+__all__ = ["cpu_model", "cpu_seconds", "memory_bytes"]
+
+_TICKS: Final = os.sysconf("SC_CLK_TCK")
+_USER_TICKS: Final = 11
+"""Where the time in user mode stands behind a process's name; that in the kernel follows."""
+
+
+def cpu_seconds(pids: Sequence[int]) -> float:
+    """Time that the processes have spent on cores until now; 0 of one that is gone."""
+    return sum(map(_cpu_seconds, pids))
+
+
+def _cpu_seconds(pid: int) -> float:
+    if pid == os.getpid():
+        used = os.times()
+        return used.user + used.system
+    text = _read(f"/proc/{pid}/stat").rpartition(")")[2].split()
+    return sum(map(int, text[_USER_TICKS : _USER_TICKS + 2])) / _TICKS
+
+
+def memory_bytes(pids: Sequence[int]) -> int:
+    """Memory of the processes; of what several share, each has its part. 0 of one that is gone."""
+    return sum(map(_memory_bytes, pids))
+
+
+def _memory_bytes(pid: int) -> int:
+    for line in _read(f"/proc/{pid}/smaps_rollup").splitlines():
+        if line.startswith("Pss:"):
+            return int(line.split()[1]) * 1024
+    return 0
+
+
+def cpu_model() -> str:
+    """What this machine's processor calls itself; empty where it doesn't."""
+    for line in _read("/proc/cpuinfo").splitlines():
+        if line.startswith("model name"):
+            return line.partition(":")[2].strip()
+    return ""
+
+
+def _read(path: str) -> str:
+    try:
+        return Path(path).read_text(errors="replace")
+    except OSError:
+        return ""
