@@ -20,6 +20,7 @@ from torch.distributions import Categorical
 from training_run import arguments
 
 import rlightning_aio as rl
+from rlightning_aio.evaluation import Evaluation, evaluate
 
 
 @dataclass
@@ -31,8 +32,8 @@ class Args:
     seed: int = 1_000
 
 
-async def evaluate(args: Args) -> list[float]:
-    """The returns of all episodes."""
+async def evaluation(args: Args) -> Evaluation:
+    """All episodes."""
     saved = torch.load(Path(args.folder) / "checkpoint.pt", weights_only=True)
     trained = saved["args"]
     task = trained["task"] if args.task == "as trained" else args.task
@@ -56,25 +57,12 @@ async def evaluate(args: Args) -> list[float]:
                 return policy.probs.argmax(-1).numpy()
             return policy.mean.numpy().clip(actions.low, actions.high)
 
-        returns: list[float] = []
-        sums, left = np.zeros(args.num_envs), np.full(args.num_envs, args.episodes)
-        batch, _ = await group.reset(seed=args.seed)
         with group.auto_reset():
-            group.step_async(batch.respond(action=act(batch)))
-            while left.any():
-                batch, _ = await group.collect_async()
-                sums[batch.index] += batch.reward
-                over = batch.index[batch.done]
-                returns += sums[over].tolist()
-                sums[over] = 0.0
-                left[over] -= 1
-                going = batch.take(np.flatnonzero(left[batch.index]))
-                if len(going):
-                    group.step_async(going.respond(action=act(going)))
-    return returns
+            return await evaluate(group, act, args.episodes, seed=args.seed)
 
 
 if __name__ == "__main__":
-    found = np.array(rl.run(evaluate(arguments(Args))))
-    error = found.std(ddof=1) / np.sqrt(len(found))
-    print(f"{len(found)} episodes: return {found.mean():.1f} +- {1.96 * error:.1f} (95 %)")
+    found = rl.run(evaluation(arguments(Args)))
+    reward = found.total_reward
+    either_side = reward.high - reward.mean
+    print(f"{reward.count} episodes: return {reward.mean:.1f} +- {either_side:.1f} (95 %)")

@@ -1,0 +1,280 @@
+"""`evaluate`: equally many episodes of each env, and honest figures of them."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+import rlightning_aio as rl
+from rlightning_aio import sync
+from rlightning_aio.evaluation import Episode, Evaluation, evaluate
+from rlightning_aio.evaluation.estimates import mean_estimate, wilson_estimate
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+SHORT, LONG = 2, 8
+
+
+class Scripted(gym.Env[Any, Any]):
+    """Succeeds soon or fails late, as ``succeeds`` says of the seed of the episode.
+
+    Its reward is 1 in each step; with action 1 its process ends.
+    """
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, succeeds: Callable[[int], bool], key: str = "success") -> None:
+        self._succeeds, self._key = succeeds, key
+        self._seed = self._steps = 0
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        if seed is not None:
+            self._seed = seed
+        self._steps = 0
+        return np.array([self._seed], np.float64), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        if action == 1:
+            os._exit(3)
+        self._steps += 1
+        success = self._succeeds(self._seed)
+        over = self._steps == (SHORT if success else LONG)
+        observation = np.array([self._seed], np.float64)
+        return observation, 1.0, over, False, {self._key: success and over}
+
+
+def group_of(*makers: Callable[[], Any], **fields: Any) -> sync.EnvGroup:
+    fields = {"placement": "inline", **fields}
+    entry = {"name": "env", "make_env": list(makers), "num_workers": len(makers), **fields}
+    return sync.build_env_group(entry)
+
+
+def nothing(batch: rl.BatchedData) -> Any:
+    return np.zeros(batch.is_reset.shape, np.int64)
+
+
+def scripted(succeeds: Callable[[int], bool], **kwargs: Any) -> Callable[[], Scripted]:
+    return lambda: Scripted(succeeds, **kwargs)
+
+
+def evaluated(group: sync.EnvGroup, episodes: int, **kwargs: Any) -> Evaluation:
+    with group, group.auto_reset(1000):
+        return evaluate(group, kwargs.pop("policy", nothing), episodes, **kwargs)
+
+
+def first_come(group: sync.EnvGroup, total: int) -> list[bool]:
+    """Whether each of the episodes succeeded that end first."""
+    found: list[bool] = []
+    with group, group.auto_reset(1000):
+        batch, _ = group.reset()
+        while len(found) < total:
+            batch, _ = group.step(batch.respond(action=nothing(batch)))
+            found += batch.info("success", False)[batch.done].tolist()
+    return found[:total]
+
+
+HALF_SUCCEED = [scripted(lambda _: True)] * 2 + [scripted(lambda _: False)] * 2
+
+
+def test_a_fixed_number_of_each_is_unbiased_where_first_come_is_not() -> None:
+    """Half of the envs succeed, in 2 + 1 calls; the others fail in 8 + 1. Of those that end
+    first three in four succeed.
+    """
+    assert np.mean(first_come(group_of(*HALF_SUCCEED), 24)) == 0.75
+    found = evaluated(group_of(*HALF_SUCCEED), 6)
+    assert found.success is not None
+    assert (found.success.mean, found.success.count) == (0.5, 24)
+    assert found.length is not None
+    assert found.length.mean == (SHORT + LONG) / 2
+
+
+def test_the_first_episodes_are_unbiased_where_first_come_is_not() -> None:
+    """Of episodes alike in all envs three in ten succeed; of the first three to end all do."""
+    envs = [scripted(lambda seed: seed % 10 < 3)] * 10
+    with (group := group_of(*envs)), group.auto_reset(1000):
+        batch, _ = group.reset(seed=0)
+        while not batch.done.any():
+            batch, _ = group.step(batch.respond(action=nothing(batch)))
+        assert batch.info("success")[batch.done].tolist() == [True] * 3
+    found = evaluated(group_of(*envs), 4, seed=0)
+    assert found.success is not None
+    assert (found.success.mean, found.success.count) == (0.3, 40)
+
+
+def by_number(episodes: Sequence[Episode]) -> list[Episode]:
+    return sorted(episodes, key=lambda one: (one.env_id, one.sub_env, one.number))
+
+
+def test_episodes_are_told_of() -> None:
+    """Each with its env and number, what it gave, and what its last info says of it."""
+    told: list[Episode] = []
+    group = group_of(scripted(lambda seed: seed % 2 == 0, key="is_success"))
+    found = evaluated(group, 2, seed=4, on_episode=told.append)
+    assert found.episodes == told
+    assert told == [
+        Episode("env-0", 0, 0, float(SHORT), SHORT, True),
+        Episode("env-0", 0, 1, float(LONG), LONG, False),
+    ]
+
+
+@pytest.mark.parametrize("mode", [None, AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_episode_n_has_a_seed_of_its_own(mode: AutoresetMode | None) -> None:
+    """``seed + n * N + k``, with N sub-environments in the group, whoever ends first; where
+    sub-environments reset themselves, that of their first.
+    """
+    seen: set[int] = set()
+
+    def notes(batch: rl.BatchedData) -> Any:
+        seen.update(np.ravel(batch.observation).astype(int).tolist())
+        return nothing(batch)
+
+    make = scripted(lambda seed: seed % 2 == 0)
+    own = make if mode is None else lambda: SyncVectorEnv([make] * 2, autoreset_mode=mode)
+    found = evaluated(group_of(own, own), 3, seed=10, policy=notes)
+    width = 1 if mode is None else 2
+    rounds = 3 if mode is None else 1
+    assert seen == set(range(10, 10 + rounds * 2 * width))
+    counts = {(one.env_id, one.sub_env): 0 for one in found.episodes}
+    assert len(counts) == 2 * width
+    for one in found.episodes:
+        key = one.env_id, one.sub_env
+        assert one.number == counts[key]
+        counts[key] += 1
+        success = one.success
+        assert one.length == one.total_reward == (SHORT if success else LONG)
+    assert set(counts.values()) == {3}
+
+
+def test_an_evaluation_that_goes_on_is_one_that_was_not_interrupted() -> None:
+    """Finished episodes aren't played again, and all come out as if nothing had been."""
+    envs = [scripted(lambda seed: seed % 3 == 0)] * 3
+    whole = evaluated(group_of(*envs), 4, seed=5)
+    kept: list[Episode] = []
+
+    def interrupts(episode: Episode) -> None:
+        kept.append(episode)
+        if len(kept) == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        evaluated(group_of(*envs), 4, seed=5, on_episode=interrupts)
+    added: list[Episode] = []
+    rest = evaluated(group_of(*envs), 4, seed=5, played=kept, on_episode=added.append)
+    assert len(added) == 12 - 5
+    assert by_number(rest.episodes) == by_number(whole.episodes)
+
+
+def test_an_episode_that_is_lost_with_its_worker_is_begun_anew() -> None:
+    """With its seed, so the figures are those of an evaluation in which none died."""
+    calls = 0
+
+    def dies_once(batch: rl.BatchedData) -> Any:
+        nonlocal calls
+        calls += 1
+        return np.full(len(batch), calls == 4)
+
+    env = scripted(lambda seed: seed % 2 == 0)
+    group = group_of(env, placement="process")
+    found = evaluated(group, 3, seed=0, policy=dies_once)
+    assert found.lost == 1
+    assert [one.length for one in found.episodes] == [SHORT, LONG, SHORT]
+
+
+def test_an_env_whose_worker_always_ends_is_told() -> None:
+    """It would never have its episodes."""
+    group = group_of(scripted(lambda _: True), placement="process", max_restarts=10)
+    with pytest.raises(rl.RLightningError, match=r"'env-0' has lost .* 3 times in a row"):
+        evaluated(group, 1, policy=lambda batch: np.ones(len(batch), np.int64))
+
+
+def test_entries_may_differ() -> None:
+    """In what they show, and in how many sub-environments theirs have; a policy may answer with
+    several batches.
+    """
+    pair = {
+        "name": "pair", "placement": "inline",
+        "make_env": lambda: SyncVectorEnv([scripted(lambda _: True)] * 2),
+    }  # fmt: skip
+    single = {"name": "single", "placement": "inline", "make_env": scripted(lambda _: False)}
+
+    def by_entry(batch: rl.BatchedData) -> list[rl.BatchedData]:
+        return [part.respond(action=nothing(part)) for part in batch.by_name().values()]
+
+    found = evaluated(sync.build_env_group([pair, single]), 2, policy=by_entry)
+    assert [len(found.of_envs([id_]).episodes) for id_ in ("pair-0", "single-0")] == [4, 2]
+
+
+async def test_it_is_awaited_over_an_asynchronous_group() -> None:
+    """So may its policy be."""
+
+    async def policy(batch: rl.BatchedData) -> Any:
+        return nothing(batch)
+
+    entry = {"name": "env", "make_env": scripted(lambda _: True), "placement": "inline"}
+    async with rl.build_env_group(entry) as group:
+        with group.auto_reset(1000):
+            found = await evaluate(group, policy, 2)
+    assert len(found.episodes) == 2
+
+
+# -- errors -----------------------------------------------------------------------------
+
+
+def test_it_needs_a_context_and_envs_of_its_own() -> None:
+    """Nothing is sent before that is known."""
+    with group_of(scripted(lambda _: True)) as group:
+        with pytest.raises(RuntimeError, match=r"evaluate inside `with group.auto_reset\(\):`"):
+            evaluate(group, nothing, 1)
+        with group.auto_reset(9):
+            with pytest.raises(ValueError, match="episodes must be at least 1, not 0"):
+                evaluate(group, nothing, 0)
+            other = Episode("other-0", 0, 0, 1.0, 1, None)
+            with pytest.raises(ValueError, match=r"'other-0'.* was played by no env of this group"):
+                evaluate(group, nothing, 1, played=[other])
+
+
+# -- figures ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("successes", "count", "low", "high"),
+    [
+        (0, 10, 0.0, 0.2775),
+        (10, 10, 0.7225, 1.0),
+        (8, 10, 0.4902, 0.9433),
+        (81, 263, 0.2553, 0.3662),
+    ],
+)
+def test_wilson_interval(successes: int, count: int, low: float, high: float) -> None:
+    """Worked out by hand with z = 1.96: (p + z²/2n ± z √(p(1-p)/n + z²/4n²)) / (1 + z²/n); the
+    last is Newcombe's example (Statistics in Medicine 17, 1998).
+    """
+    found = wilson_estimate(successes, count)
+    assert found is not None
+    assert (found.low, found.high) == pytest.approx((low, high), abs=5e-5)
+
+
+def test_interval_of_a_mean() -> None:
+    """Of 1, 2, 3, 4: 2.5 ± 3.182 · 1.29099 / 2; wider tables have 2.0860 at 20 degrees."""
+    found = mean_estimate([1.0, 2.0, 3.0, 4.0])
+    assert found is not None
+    assert (found.mean, found.low, found.high) == pytest.approx((2.5, 0.44603, 4.55397), abs=1e-4)
+    wide = mean_estimate([float(k) for k in range(21)])
+    assert wide is not None
+    assert wide.high == pytest.approx(10 + 2.08596 * np.sqrt(38.5 / 21), abs=1e-3)
+
+
+def test_what_nothing_is_known_of() -> None:
+    """No episode has no figures; one has a mean alone."""
+    empty = Evaluation()
+    assert empty.total_reward is empty.length is empty.success is None
+    one = mean_estimate([3.0])
+    assert one is not None
+    assert (one.mean, one.low, one.high) == (3.0, None, None)
