@@ -17,6 +17,7 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 
+import picture
 from harness import machine_text, say, tables
 
 HERE = Path(__file__).resolve().parent
@@ -70,6 +71,7 @@ def main() -> int:
     for name in known:
         text = with_table(text, name)
     README.write_text(text)
+    picture.PICTURE.write_text(picture.drawn(RESULTS))
     if failed:
         say(f"failed: {', '.join(failed)}")
     return 1 if failed else 0

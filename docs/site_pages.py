@@ -63,6 +63,11 @@ def on_page_markdown(markdown: str, page: Page, files: Files, **_: object) -> st
     return LINK.sub(turned, markdown)
 
 
+def on_page_content(html: str, **_: object) -> str:
+    """Leave out what docstrings have before a block of code, as Sphinx does."""
+    return html.replace("<p>::</p>", "").replace("::</p>", ":</p>")
+
+
 def checkout_path(uri: str, link: str) -> str:
     """The path, from the checkout's root, of what a page of the site links to."""
     homes = {page: path for path, page in PAGES.items()}

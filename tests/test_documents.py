@@ -73,8 +73,9 @@ def test_every_configuration_loads(tmp_path: Path) -> None:
 
 
 def test_lists_are_lists_on_the_site() -> None:
-    """They follow an empty line: elsewhere than on GitHub, they would go on with the paragraph."""
+    """By Markdown's older rules: after an empty line, and with code indented by four blanks."""
     for page in PAGES:
+        assert not re.search(r"^ {1,3}```", page.read_text(), re.MULTILINE), named(page)
         before = ""
         for line in prose(page).splitlines():
             if re.match(r"(-|\d+\.) ", line):
@@ -152,8 +153,21 @@ def test_one_version_is_told() -> None:
     )
 
 
+def make_targets() -> set[str]:
+    return set(re.findall(r"^([a-z-]+):.*## ", (ROOT / "Makefile").read_text(), re.MULTILINE))
+
+
+def test_workflows_run_what_a_contributor_types() -> None:
+    """Each `make` in them has a target."""
+    workflows = list((ROOT / ".github" / "workflows").glob("*.yml"))
+    used = re.findall(r"run: make ([a-z-]+)", "\n".join(file.read_text() for file in workflows))
+    assert set(used) >= {"check", "test", "docs", "test-pythons"}
+    assert set(used) <= make_targets()
+
+
 def test_every_make_target_is_described() -> None:
     """Those that `make help` lists are in CONTRIBUTING.md."""
-    targets = re.findall(r"^([a-z-]+):.*## ", (ROOT / "Makefile").read_text(), re.MULTILINE)
     text = (ROOT / "CONTRIBUTING.md").read_text()
-    assert [t for t in targets if t != "help" and f"`make {t}`" not in text] == []
+    assert {
+        target for target in make_targets() - {"help"} if f"`make {target}`" not in text
+    } == set()

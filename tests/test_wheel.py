@@ -1,7 +1,9 @@
-"""What people install is the wheel: each of the changes of one line works with nothing else."""
+"""What people install is the wheel or the sdist: each works with nothing else."""
 
 from __future__ import annotations
 
+import os
+import shutil
 import subprocess
 import sys
 import sysconfig
@@ -55,15 +57,64 @@ def run(*command: str | Path, folder: Path) -> str:
     return done.stdout
 
 
+PIP = ("-m", "pip", "--quiet", "--disable-pip-version-check")
+
+
+def found_python(version: str) -> Path | None:
+    """On the path, or among pyenv's."""
+    pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
+    on_path = shutil.which(f"python{version}")
+    candidates = [Path(on_path)] if on_path else []
+    for python in [*candidates, *sorted(pyenv.glob(f"{version}.*/bin/python"))]:
+        # What pyenv puts on the path may stand for a version that isn't chosen.
+        told = subprocess.run([python, "--version"], capture_output=True, text=True, check=False)
+        if told.returncode == 0 and told.stdout.startswith(f"Python {version}."):
+            return python
+    return None
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The sdist, and the wheel that is built from it, as they would be published."""
+    folder = tmp_path_factory.mktemp("dist")
+    run(sys.executable, "-m", "build", "--outdir", folder, ROOT, folder=folder)
+    (sdist,), (wheel,) = folder.glob("*.tar.gz"), folder.glob("*.whl")
+    return {"wheel": wheel, "sdist": sdist}
+
+
+@pytest.mark.pythons
+@pytest.mark.timeout(1200)  # Pip fetches some 300 MB for each.
+@pytest.mark.parametrize("version", ["3.11", "3.12", "3.13"])
+def test_both_work_under_each_python(version: str, built: dict[str, Path], tmp_path: Path) -> None:
+    """In an environment in which nothing else was installed; so does the command."""
+    base = found_python(version)
+    if base is None:
+        pytest.skip(f"no Python {version} here")
+    run(base, "-m", "venv", "empty", folder=tmp_path)
+    folder = tmp_path / "empty" / "bin"
+    program = tmp_path / "program.py"
+    program.write_text(PROGRAM)
+    install = (folder / "python", *PIP, "install", "--constraint", ROOT / "constraints.txt")
+    for package in (built["wheel"], built["sdist"]):
+        run(*install, "--force-reinstall", "--no-deps", package, folder=tmp_path)
+        run(*install, package, folder=tmp_path)
+        run(folder / "python", *PIP, "check", folder=tmp_path)
+        assert run(folder / "python", program, folder=tmp_path).split() == [
+            "gymnasium",
+            "factories",
+        ]
+    steps = ("rollout", ROOT / "configs" / "cartpole.yaml", "--steps", "500", "--json")
+    assert '"steps"' in run(folder / "rlightning-aio", *steps, folder=tmp_path)
+
+
 @pytest.mark.simulators
 def test_it_works_in_an_empty_environment(tmp_path: Path) -> None:
     """Installed with what it asks for; Stable-Baselines3 is lent, as it is large."""
-    pip = ("-m", "pip", "--quiet", "--disable-pip-version-check")
-    run(sys.executable, *pip, "wheel", "--no-deps", "--wheel-dir", ".", ROOT, folder=tmp_path)
+    run(sys.executable, *PIP, "wheel", "--no-deps", "--wheel-dir", ".", ROOT, folder=tmp_path)
     run(sys.executable, "-m", "venv", "empty", folder=tmp_path)
     python = tmp_path / "empty" / "bin" / "python"
     (wheel,) = tmp_path.glob("*.whl")
-    run(python, *pip, "install", "--constraint", ROOT / "constraints.txt", wheel, folder=tmp_path)
+    run(python, *PIP, "install", "--constraint", ROOT / "constraints.txt", wheel, folder=tmp_path)
     program = tmp_path / "program.py"
     program.write_text(PROGRAM)
     assert run(python, program, folder=tmp_path).split() == ["gymnasium", "factories"]

@@ -193,6 +193,13 @@ def test_every_script_has_its_place_in_the_readme(monkeypatch: pytest.MonkeyPatc
     assert sorted(set(marked) - {"end"}) == sorted((*run_all.SCRIPTS, *run_all.LONG))
 
 
+def test_the_picture_shows_the_kept_results(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who renews results by hand runs benchmarks/picture.py."""
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    picture = importlib.import_module("picture")
+    assert picture.PICTURE.read_text() == picture.drawn(picture.RESULTS)
+
+
 def test_a_renewed_table_stands_between_its_marks(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
