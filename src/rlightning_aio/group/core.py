@@ -345,7 +345,7 @@ class Core:
             self._collecting = False
             self._stop_waiting()
         slots = self.requests.take(most, among)
-        return self._hand_out(np.sort(slots) if ordered else slots, synchronous=False)
+        return self.hand_out(np.sort(slots) if ordered else slots, synchronous=False)
 
     def _raise_fault(self, among: NDArray[np.bool_] | None) -> None:
         """Raise the oldest error for the collector, if there is one of these slots."""
@@ -354,7 +354,7 @@ class Core:
                 self.requests.faults.remove(fault)
                 raise fault
 
-    def _hand_out(self, slots: NDArray[np.intp], *, synchronous: bool) -> tuple[BatchedData, Flags]:
+    def hand_out(self, slots: NDArray[np.intp], *, synchronous: bool) -> tuple[BatchedData, Flags]:
         """The results of `slots`, all ready. They stay so until the batch is complete: where
         memory runs out on the way, the next collect hands them out.
         """
@@ -439,13 +439,13 @@ class Core:
     def _settled(self, ticket: Ticket, slots: NDArray[np.intp]) -> tuple[BatchedData, Flags]:
         """The results of a call, in its order; its faults, with the results, as an error."""
         if not ticket.faults:
-            return self._hand_out(slots, synchronous=True)
+            return self.hand_out(slots, synchronous=True)
         done = self.requests.ready(slots)
         fault = ticket.faults[0]
         fault.others = tuple(ticket.faults[1:])
         if len(done):
             try:
-                fault.results = self._hand_out(done, synchronous=True)[0]
+                fault.results = self.hand_out(done, synchronous=True)[0]
             except BaseException:
                 self.requests.faults.extend(ticket.faults)
                 raise

@@ -11,11 +11,14 @@ from typing import TYPE_CHECKING, Any, Protocol, Self
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import BadAction, RLightningError
 from rlightning_aio.group.build import Plan, assemble
+from rlightning_aio.group.trace import NO_SPAN, Trace
 from rlightning_aio.hosts.base import Watcher
 from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
+    from contextlib import AbstractContextManager
+    from pathlib import Path
     from types import TracebackType
 
     import gymnasium as gym
@@ -151,6 +154,7 @@ class Facade:
         supervisor = self._core.supervisor
         self._finalizer = weakref.finalize(self, supervisor.abandon)
         self._disowned = False
+        self._traces: list[Trace] = []
         _groups.add(self)
 
     _shares_thread = False
@@ -408,6 +412,29 @@ class Facade:
         for kind, figures in stats["latency_us"].items():
             print(f"{figures['p50']:12.1f} µs {kind} (median), {figures['p99']:.1f} µs (p99)")
 
+    def trace(self, path: str | Path) -> Trace:
+        """Record a timeline of this group into a file that https://ui.perfetto.dev opens.
+
+        ``with group.trace("run.json"):`` (or ``async with``) records what happens within; so do
+        `Trace.start` and `Trace.stop`. It shows when each env stepped and was reset, what its
+        worker and the trainer waited for, which request led to which result, and restarts, hangs
+        and step limits: docs/timeline.md. `span` adds what else the trainer does.
+
+        Args:
+            path: of the file, in Chrome's trace event format (JSON). It is written when the
+                recording ends, also by an error, Ctrl-C or `close`, and replaces what was there.
+
+        Raises:
+            OSError: the file can't be written there.
+        """
+        return Trace(self._core, path, self._traces, by_task=self._shares_thread)
+
+    def span(self, name: str) -> AbstractContextManager[Any]:
+        """Mark, with ``with group.span("learner"):``, what the trainer does as a slice of the
+        timeline. It may stay in the program: while nothing is recorded, nothing happens.
+        """
+        return self._traces[0].span(name) if self._traces else NO_SPAN
+
     def _disown(self) -> None:
         """Leave it to the process that has forked this one: let go of all that they share."""
         self._disowned = True
@@ -418,6 +445,8 @@ class Facade:
         if not self._core.supervisor.closed:
             return  # It was refused.
         self._finalizer.detach()
+        for trace in list(self._traces):
+            trace.stop()
         close_errors = self._core.supervisor.close_errors
         errors = list(close_errors)
         close_errors.clear()  # Told once, however often it is closed.

@@ -61,5 +61,5 @@ class SingleEnvCore(Core):
         self._results.keep(0, out_of_band or {})
         self.requests.answer_at_once(0)
         self.drain()  # An info may have come in a new form.
-        results, flags = self._hand_out(slots, synchronous=True)
+        results, flags = self.hand_out(slots, synchronous=True)
         return results, flags if self.auto.active else None

@@ -16,7 +16,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Final, Literal, TypeAlias
 
 import numpy as np
 
@@ -61,7 +61,7 @@ if TYPE_CHECKING:
     from rlightning_aio.hosts.arena import Arena
     from rlightning_aio.hosts.base import Host, Shared
 
-__all__ = ["GivenUp", "Lifecycle", "Replaced", "Supervisor"]
+__all__ = ["Fate", "GivenUp", "Lifecycle", "Replaced", "Supervisor"]
 
 _CLOSE_SECONDS: Final = 1.5
 """How long envs may take to close before their worker is killed."""
@@ -87,6 +87,8 @@ _log = logging.getLogger("rlightning_aio")
 
 Lifecycle: TypeAlias = Built | NotBuilt | Attached | Closed
 """Completions that concern nobody but the supervisor."""
+Fate: TypeAlias = Literal["hung", "died", "given up", "up"]
+"""What may befall a host after its first start."""
 ErrorFor: TypeAlias = Callable[["NDArray[np.intp]"], WorkerDied]
 """Makes the error for some of the slots that owed a reply."""
 
@@ -135,6 +137,8 @@ class Supervisor:
         close_errors: of envs' `close`, with their ids.
         resources: what hosts share, see `base.Wiring`.
         open, closed: the group can be asked; it is over.
+        tell_of: called with what has befallen a host, its number, the slot of the env that hangs
+            (or -1), and the cause in words.
     """
 
     def __init__(
@@ -157,6 +161,7 @@ class Supervisor:
         self.metas: list[EnvMeta] = []
         self.close_errors: list[tuple[str, ErrorText]] = []
         self.resources: dict[object, Shared] = {}
+        self.tell_of: Callable[[Fate, int, int, str], None] = _told_to_nobody
         self._envs = envs
         self._requests = requests
         self._layout = layout
@@ -303,6 +308,8 @@ class Supervisor:
         record.start_by = None
         # Until now it had nothing to do.
         record.idle = ()
+        if self.open:
+            self.tell_of("up", record.host.host_id, -1, "")
         held, record.held = record.held, None
         for entries, arguments in held or ():
             record.host.submit(entries, arguments)
@@ -485,6 +492,7 @@ class Supervisor:
         if expiry is None or self._now < expiry:
             return
         record.hung_slot = slot_of(entry) if entry else self._first_owed(record)
+        self.tell_of("hung", record.host.host_id, record.hung_slot, "")
         self._kill(record, dump=True)
 
     def _kill(self, record: HostRecord, *, dump: bool) -> None:
@@ -526,6 +534,7 @@ class Supervisor:
         self._resumption.settle(record.slots)
         was_up = record.stage is Stage.UP
         error_for, cause, is_last = self._judge(record, death, owed)
+        self.tell_of("given up" if is_last else "died", told.host_id, -1, cause)
         if is_last:
             self._requests.lose_host(told.host_id)
             self._give_up(record, partial(error_for, owed))
@@ -677,6 +686,9 @@ class Supervisor:
             warnings.warn(
                 "an EnvGroup was not closed; its envs were killed", ResourceWarning, stacklevel=1
             )
+
+
+def _told_to_nobody(what: Fate, host_id: int, slot: int, cause: str) -> None: ...
 
 
 def _pause(deaths: int) -> float:

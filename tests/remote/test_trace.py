@@ -1,0 +1,40 @@
+"""What a timeline shows of clients."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from patience import HANG
+from remote.counting import ClientThread, CountingEnv
+from timelines import Seen
+
+from rlightning_aio import sync
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def test_clients_have_tracks_by_their_names(tmp_path: Path) -> None:
+    """With what they were asked; a place that nobody has taken has none."""
+    kwargs = {"min_clients": 2, "connect_timeout": HANG, "heartbeat": 5.0}
+    entry = {"name": "robots", "backend": "env_server", "env_kwargs": kwargs}
+    with sync.build_env_group(entry) as group:
+        address = group["robots-0"].address
+        threads = [ClientThread(address, name, CountingEnv()) for name in ("left", "right")]
+        with group.trace(tmp_path / "run.json"):
+            batch, _ = group.reset()
+            for _ in range(5):
+                group.step_async(batch.respond(action=np.zeros((2, 2), np.float32)))
+                batch, _ = group.collect_async(wait_all=True, deadline=HANG)
+        group.close()
+        for thread in threads:
+            thread.join()
+    seen = Seen(tmp_path / "run.json")
+    tracks = [track for process, track in seen.tracks if process == "env_server robots-0"]
+    assert tracks[0] == "all clients"
+    assert sorted(tracks[1:]) == ["robots-0/left", "robots-0/right"]
+    for track in tracks[1:]:
+        names = [one.name for one in seen.of(track)]
+        assert names == ["joined", *["step"] * 5]
+    assert seen.flows == 10
