@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 __all__ = ["NO_SPAN", "Trace"]
 
-_Owner: TypeAlias = "asyncio.Task[Any] | threading.Thread"
+_Owner: TypeAlias = "asyncio.Task[Any] | int"
 
 NO_SPAN: Final = contextlib.nullcontext()
 """What `EnvGroup.span` returns while nothing is recorded."""
@@ -66,6 +66,7 @@ _PROCEDURES: Final = {
     "restore": ("restore", 0),
 }
 _clock: Final = time.monotonic_ns
+_current_task: Final = asyncio.current_task
 
 
 class Trace:
@@ -81,7 +82,7 @@ class Trace:
         self._path = Path(path)
         _check_writable(self._path)
         self._running = running
-        self._owner = _task_or_thread if by_task else threading.current_thread
+        self._owner = _task_or_thread if by_task else threading.get_ident
         self._pid = 0
 
     # -- life -------------------------------------------------------------------------
@@ -175,7 +176,7 @@ class Trace:
                 call(*args)
             finally:
                 # As requests have it: what is sent is sent within this.
-                add(number, lane, int(args[place] * 1e9), _clock())
+                add((number, lane, int(args[place] * 1e9), _clock()))
 
         return covered
 
@@ -189,7 +190,7 @@ class Trace:
             try:
                 return (yield from procedure(*args, **options))
             finally:
-                add(number, lane, int(args[place] * 1e9), _clock())
+                add((number, lane, int(args[place] * 1e9), _clock()))
 
         return covered
 
@@ -198,6 +199,7 @@ class Trace:
     ) -> Callable[..., tuple[BatchedData, Flags]]:
         records, lane_of, requests = self._records, self._lanes.current, self._core.requests
         entry_of, sent_of, number = requests.entry, requests.sent_ns, records.name("hand out")
+        add = records.add_results
 
         def covered(slots: NDArray[np.intp], *, synchronous: bool) -> tuple[BatchedData, Flags]:
             lane, began = lane_of(), _clock()
@@ -205,11 +207,14 @@ class Trace:
             entries, sent = entry_of[slots], sent_of[slots]
             batch, flags = hand_out(slots, synchronous=synchronous)
             for part in parts_of(batch):
-                own = ... if part.positions is None else part.positions
-                records.add_results(entries[own], sent[own], part.times, began, lane)
+                own = part.positions
+                if own is None:
+                    add(entries, sent, part.times, began, lane)
+                else:
+                    add(entries[own], sent[own], part.times, began, lane)
                 if part.limit_reached is not None or part.restarted is not None:
                     self._note_flags(part)
-            records.add_span(number, lane, began, _clock())
+            records.add_span((number, lane, began, _clock()))
             return batch, flags
 
         return covered
@@ -294,7 +299,7 @@ class _Span:
         self._began = _clock()
 
     def __exit__(self, *error: object) -> None:
-        self._records.add_span(self._number, self._lane, self._began, _clock())
+        self._records.add_span((self._number, self._lane, self._began, _clock()))
 
 
 class _Lanes:
@@ -309,6 +314,8 @@ class _Lanes:
     def __init__(self, owner: Callable[[], _Owner]) -> None:
         self._owner = owner
         self._lane_of: dict[_Owner, int] = {}
+        # As an owner of a lane, a thread is its number; here it is itself.
+        self._at_work: dict[_Owner, asyncio.Task[Any] | threading.Thread] = {}
         self.names: list[str] = []
 
     def current(self) -> int:
@@ -318,26 +325,28 @@ class _Lanes:
         return self._take(owner) if lane is None else lane
 
     def _take(self, owner: _Owner) -> int:
-        over = next((one for one in list(self._lane_of) if _is_over(one)), None)
+        at_work = threading.current_thread() if isinstance(owner, int) else owner
+        over = next((one for one, who in self._at_work.items() if _is_over(who)), None)
         if over is not None:
+            del self._at_work[over]
             lane = self._lane_of.pop(over)
         else:
             lane = len(self.names)
-            name = owner.get_name() if isinstance(owner, asyncio.Task) else owner.name
+            name = at_work.get_name() if isinstance(at_work, asyncio.Task) else at_work.name
             self.names.append(name if lane else "trainer")
-        self._lane_of[owner] = lane
+        self._lane_of[owner], self._at_work[owner] = lane, at_work
         return lane
 
 
 def _task_or_thread() -> _Owner:
     try:
-        return asyncio.current_task() or threading.current_thread()
+        return _current_task() or threading.get_ident()
     except RuntimeError:  # No loop runs in this thread.
-        return threading.current_thread()
+        return threading.get_ident()
 
 
-def _is_over(owner: _Owner) -> bool:
-    return owner.done() if isinstance(owner, asyncio.Task) else not owner.is_alive()
+def _is_over(who: asyncio.Task[Any] | threading.Thread) -> bool:
+    return who.done() if isinstance(who, asyncio.Task) else not who.is_alive()
 
 
 def _check_writable(path: Path) -> None:

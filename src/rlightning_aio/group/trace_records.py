@@ -1,30 +1,30 @@
 """`Records`: what a timeline is made of, in bounded memory.
 
-Numbers only, written into arrays that are there already: a result costs 32 bytes and so does a
-span. Of a long run the newest are kept, `KEPT` of each kind.
+Numbers only: a result takes 48 bytes, and a span of the trainer some 170. Of a long run the newest
+are kept, `KEPT` of each kind.
 """
 
 from __future__ import annotations
 
-from array import array
 from collections import deque
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import NDArray
 
 __all__ = ["KEPT", "Mark", "Records", "Results", "Span"]
 
-_CHUNK: Final = 1 << 14
-_NUM_CHUNKS: Final = 16
-KEPT: Final = _CHUNK * _NUM_CHUNKS
+KEPT: Final = 1 << 18
 """How many results are kept, and how many spans: the newest."""
 _MARKS: Final = 10_000
-_SPAN_FIELDS: Final = 4
+_BATCHES_APART: Final = 512
+_RESULTS_APART: Final = KEPT // 16
+"""So many are joined at a time: each batch alone would take more memory for its arrays' headers
+than for what is in them."""
+
+_Batch: TypeAlias = "tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], int, int]"
 
 
 class Span(NamedTuple):
@@ -74,62 +74,29 @@ class Results(NamedTuple):
         return Results(*(column[which] for column in self))
 
 
-class _Chunk:
-    """Room for some results, and for each batch of them what all have in common."""
-
-    def __init__(self, size: int) -> None:
-        self.entries = np.empty(size, np.int64)
-        self.sent = np.empty(size, np.int64)
-        self.times = np.empty((size, 2), np.int64)
-        self.size = size
-        self.used = 0
-        # Of each batch: where it ends, when it was handed out, and in which lane.
-        self.batches = array("q")
-
-    def results(self) -> Results:
-        ends, taken, lanes = np.array(self.batches, np.int64).reshape(-1, 3).T
-        counts = np.diff(ends, prepend=0)
-        n = self.used
-        times = self.times[:n].T
-        each = (np.repeat(taken, counts), np.repeat(lanes, counts))
-        return Results(self.entries[:n], self.sent[:n], times[0], times[1], *each)
-
-
 class Records:
     """See the module.
 
     Attributes:
+        add_span: keeps a span as a tuple: the number of its name, its lane, its two times.
         marks: the newest.
     """
 
     def __init__(self) -> None:
-        self._chunks: deque[_Chunk] = deque(maxlen=_NUM_CHUNKS)
-        self._chunk = self._next_chunk(_CHUNK)
-        self._spans: deque[array[int]] = deque([array("q")], maxlen=_NUM_CHUNKS)
         self._names: dict[str, int] = {}
+        self._spans: deque[tuple[int, int, int, int]] = deque(maxlen=KEPT)
+        self.add_span = self._spans.append
         self.marks: deque[Mark] = deque(maxlen=_MARKS)
-        # Until then something may be missing.
-        self._complete_since = 0
-
-    def _next_chunk(self, size: int) -> _Chunk:
-        if len(self._chunks) == _NUM_CHUNKS:
-            self._complete_since = max(self._complete_since, self._chunks[0].batches[-2])
-        chunk = _Chunk(size)
-        self._chunks.append(chunk)
-        return chunk
+        # Batches as they came, and those before joined to fewer and longer arrays.
+        self._batches: list[_Batch] = []
+        self._results: deque[Results] = deque()
+        self._num_apart = self._num_joined = 0
+        # When the last result that was dropped had been handed out.
+        self._dropped_until = 0
 
     def name(self, name: str) -> int:
         """The number that stands for a span's name."""
         return self._names.setdefault(name, len(self._names))
-
-    def add_span(self, name: int, lane: int, began: int, ended: int) -> None:
-        """Keep what was done from `began` until `ended`."""
-        spans = self._spans[-1]
-        spans.extend((name, lane, began, ended))
-        if len(spans) >= _CHUNK * _SPAN_FIELDS:
-            if len(self._spans) == _NUM_CHUNKS:
-                self._complete_since = max(self._complete_since, self._spans[0][-1])
-            self._spans.append(array("q"))
 
     def add_results(
         self,
@@ -139,36 +106,52 @@ class Records:
         taken: int,
         lane: int,
     ) -> None:
-        """Keep results that were handed out together; `times` are those of `ResultColumns`."""
-        chunk = self._chunk
-        begin, count = chunk.used, len(entries)
-        end = begin + count
-        if end > chunk.size:
-            chunk = self._chunk = self._next_chunk(max(count, _CHUNK))
-            begin, end = 0, count
-        chunk.entries[begin:end] = entries
-        chunk.sent[begin:end] = sent
-        chunk.times[begin:end] = times
-        chunk.used = end
-        chunk.batches.extend((end, taken, lane))
+        """Keep results that were handed out together; the arrays are nobody else's to change.
+
+        `times` are those of `ResultColumns`.
+        """
+        self._batches.append((entries, sent, times, taken, lane))
+        self._num_apart += len(entries)
+        if len(self._batches) == _BATCHES_APART or self._num_apart >= _RESULTS_APART:
+            self._join()
+
+    def _join(self) -> None:
+        entries, sent, times, taken, lanes = zip(*self._batches, strict=True)
+        self._batches.clear()
+        self._num_apart = 0
+        counts = [len(part) for part in entries]
+        done, busy = np.concatenate(times).T
+        found = Results(
+            np.concatenate(entries),
+            np.concatenate(sent),
+            done,
+            busy,
+            np.repeat(taken, counts),
+            np.repeat(lanes, counts),
+        )
+        self._results.append(found)
+        self._num_joined += len(found.entries)
+        while self._num_joined > KEPT and len(self._results) > 1:
+            dropped = self._results.popleft()
+            self._num_joined -= len(dropped.entries)
+            self._dropped_until = int(dropped.taken.max(initial=self._dropped_until))
 
     @property
     def complete_since(self) -> int:
-        """All that began after this is kept."""
-        return self._complete_since
+        """All that came after this is kept."""
+        full = len(self._spans) == KEPT
+        return max(self._dropped_until, self._spans[0][-1] if full else 0)
 
     def results(self) -> Results:
         """All results that are kept."""
-        parts = [chunk.results() for chunk in self._chunks]
-        return Results(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+        if self._batches:
+            self._join()
+        nothing = np.empty(0, np.int64)
+        if not self._results:
+            return Results(*[nothing] * len(Results._fields))
+        return Results(*(np.concatenate(parts) for parts in zip(*self._results, strict=True)))
 
     def spans(self) -> list[Span]:
         """All spans that are kept, in the order in which they ended."""
         names = list(self._names)
-        found: list[Span] = []
-        for chunk in self._spans:
-            rows: Sequence[Sequence[int]] = (
-                np.array(chunk, np.int64).reshape(-1, _SPAN_FIELDS).tolist()
-            )
-            found += [Span(names[name], *rest) for name, *rest in rows]
-        return found
+        return [Span(names[name], *rest) for name, *rest in self._spans]
