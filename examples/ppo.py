@@ -10,6 +10,7 @@ cut short for one that has ended; ppo_async.py does better.
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -32,6 +33,7 @@ class Args:
     total_steps: int = 1_000_000
     folder: str = "runs/ppo"
     resume: bool = False
+    trace: str = ""  # The file of a timeline; none.
     save_every: int = 50
     num_envs: int = 16
     num_steps: int = 128
@@ -185,7 +187,7 @@ def train(args: Args) -> Run:
             }
 
         block = (args.num_steps, args.num_envs)
-        with run:
+        with run, group.trace(args.trace) if args.trace else nullcontext():
             if run.saved:
                 batch, _ = group.restore(run.saved["envs"])
                 observation, sums = run.saved["observation"], run.saved["sums"].numpy().copy()
@@ -221,7 +223,7 @@ def train(args: Args) -> Run:
                         first, _ = group.reset(env_ids=[group.env_ids[k] for k in over])
                         shown[over] = normalizer.observed(over, first.observation)
                     observation = torch.from_numpy(shown)
-                with run.learning():
+                with run.learning(), group.span("learner"):
                     optimizer.param_groups[0]["lr"] = args.learning_rate * run.remaining
                     with torch.no_grad():
                         last = agent.value(observation)

@@ -11,6 +11,7 @@ that go on in the next rollout are bootstrapped, each from its own next observat
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -140,10 +141,11 @@ async def train(args: Args | CartPole) -> Run:
             min_batch=args.min_batch,
             seed=args.seed + run.steps,
         )
-        with group.auto_reset(), run:
+        trace = group.trace(args.trace) if args.trace else nullcontext()
+        with group.auto_reset(), run, trace:
             while run.goes_on():
                 rollout = await collector.collect()
-                with run.learning():
+                with run.learning(), group.span("learner"):
                     rate = args.learning_rate * run.remaining
                     figures = learner.learn(learner.columns(rollout), rate)
                     player.take(learner.agent)

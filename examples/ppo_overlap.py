@@ -11,6 +11,7 @@ action had when it was chosen, which PPO clips, is what makes up for that.
 from __future__ import annotations
 
 import asyncio
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,7 +49,8 @@ async def train(args: Args | CartPole) -> Run:
             min_batch=args.min_batch,
             seed=args.seed + run.steps,
         )
-        with group.auto_reset(), run:
+        trace = group.trace(args.trace) if args.trace else nullcontext()
+        with group.auto_reset(), run, trace:
             rollout = await collector.collect()
             while run.goes_on():
                 columns = learner.columns(rollout)
@@ -61,7 +63,7 @@ async def train(args: Args | CartPole) -> Run:
                 async with asyncio.TaskGroup() as both:
                     # Arrays of a rollout are its own until the next one but one.
                     collecting = both.create_task(collector.collect())
-                    with run.learning():
+                    with run.learning(), group.span("learner"):
                         figures = await asyncio.to_thread(learner.learn, columns, rate)
                     player.take(learner.agent)
                     collector.policy_version += 1

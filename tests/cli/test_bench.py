@@ -12,6 +12,7 @@ import pytest
 from cli import stub_policies
 from cli.command import CARTPOLE, invoke, invoke_json, run, start, write_config
 from patience import HANG
+from timelines import Seen
 
 from rlightning_aio import EnvConfig, load_config
 from rlightning_aio.cli import bench, measuring, settings, tune
@@ -315,3 +316,11 @@ def test_a_plot_that_can_not_be_written_is_found_before_anything_is_measured(
         assert why in done.stderr
         assert "starting" not in done.stderr
     assert not (tmp_path / "plot.png").exists()
+
+
+def test_bench_traces_the_fastest(tmp_path: Path) -> None:
+    """One file, of one measurement more; the figures are as many as without."""
+    config = write_config(tmp_path, {**STUB, "num_workers": 1})
+    document = invoke_json("bench", config, *QUICK, "--trace", tmp_path / "run.json")
+    assert all(len(c["rounds"]) == 2 for c in document["contenders"])
+    assert Seen(tmp_path / "run.json").called("step")

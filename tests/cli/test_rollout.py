@@ -10,6 +10,7 @@ import pytest
 from cli import stub_policies
 from cli.command import CARTPOLE, TESTS, invoke, invoke_json, run, write_config
 from cli.stub_envs import Stub
+from timelines import Seen
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -181,3 +182,16 @@ def test_the_version_is_told() -> None:
     import rlightning_aio
 
     assert invoke("--version").stdout == f"{rlightning_aio.__version__}\n"
+
+
+def test_trace_writes_a_timeline(tmp_path: Path) -> None:
+    """With the policy's part; a place where it can't be is told before any env is started."""
+    config = write_config(tmp_path, {**CARTPOLE, "num_workers": 2, "placement": "inline"})
+    trace = tmp_path / "run.json"
+    document = invoke_json("rollout", config, "--steps", 50, "--trace", trace)
+    seen = Seen(trace)
+    assert len(seen.called("policy")) == len(seen.called("collect_async")) + 1
+    assert len(seen.called("step")) >= document["steps"]
+    done = invoke("rollout", config, "--trace", tmp_path / "missing" / "run.json")
+    assert done.exit_code == 2
+    assert "there is no folder" in done.stderr

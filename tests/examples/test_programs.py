@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 from run_python import output_of
+from timelines import Seen
 
 torch = pytest.importorskip("torch")
 pytestmark = pytest.mark.simulators
@@ -36,7 +37,11 @@ def test_example_trains_and_resumes(name: str, tmp_path: Path) -> None:
     """Its curve grows by a row for each update, and a second run goes on where it ended."""
     program = EXAMPLES / f"{name}.py"
     given = [*SHORT[name].split(), "--folder", str(tmp_path), "--total-steps"]
-    assert "'steps': " in output_of("-W", "error", program, *given, "256", asyncio_debug=False)
+    traced = ["--trace", str(tmp_path / "run.json")] if name.startswith("ppo") else []
+    assert "'steps': " in output_of(
+        "-W", "error", program, *given, "256", *traced, asyncio_debug=False
+    )
+    assert not traced or Seen(tmp_path / "run.json").called("learner")
     first = curve(tmp_path)
     assert int(first[-1]["steps"]) >= 256
     output_of(program, *given, "512", "--resume", asyncio_debug=False)

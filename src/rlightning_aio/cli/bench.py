@@ -13,9 +13,10 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRe
 
 import rlightning_aio
 from rlightning_aio.cli.baselines import Baseline, baselines_of, opened_baseline
+from rlightning_aio.cli.collecting import check_trace
 from rlightning_aio.cli.comparing import Comparison, check_name, compared, save
 from rlightning_aio.cli.contender_table import as_csv, as_markdown, print_contenders
-from rlightning_aio.cli.measuring import Contender, Limits, Rule, opened, take_turns
+from rlightning_aio.cli.measuring import Contender, Limits, Rule, Stand, opened, take_turns
 from rlightning_aio.cli.plots import check_plot, draw_contenders
 from rlightning_aio.cli.policies import Policy, load_policy
 from rlightning_aio.cli.settings import Setting, possible_settings
@@ -33,7 +34,7 @@ from rlightning_aio.cli.terminal import (
 from rlightning_aio.config import load_config
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from rlightning_aio.cli.measuring import Measurable, Place
 
@@ -61,6 +62,7 @@ class _Bench:
     limits: Limits
     policy: Policy | None
     seed: int
+    trace: Path | None
     contenders: list[Contender] = field(default_factory=list[Contender])
 
     def __post_init__(self) -> None:
@@ -103,6 +105,14 @@ def bench(
         Path | None, typer.Option(help="Also draw the table (PNG, SVG or PDF; needs matplotlib).")
     ] = None,
     table_format: Annotated[Format, typer.Option("--format", help="Of the table.")] = Format.TABLE,
+    trace: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Step the fastest group once more and write a timeline of it for "
+            "https://ui.perfetto.dev.",
+        ),
+    ] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print one JSON document in place of the table.")
     ] = False,
@@ -127,6 +137,7 @@ def bench(
     configs = load_config(config, overrides or ())
     if plot is not None:
         check_plot(plot)
+    check_trace(trace)
     for name in (save_as, compare):
         check_name(name, must_exist=name is compare)
     order = _Bench(
@@ -137,6 +148,7 @@ def bench(
         Limits(steps or 2**62, seconds),
         load_policy(policy) if policy else None,
         seed,
+        trace,
     )
     interrupted = False
     comparison: Comparison | None = None
@@ -191,6 +203,20 @@ async def _measure(order: _Bench, watch: Watch) -> None:
             await take_turns(
                 plain | stands, order.contenders, order.rounds, order.limits, watch.measured
             )
+            if order.trace is not None:
+                await _trace_fastest(order, stands, order.trace)
+
+
+async def _trace_fastest(
+    order: _Bench, stands: Mapping[Place, Measurable | str], path: Path
+) -> None:
+    """Measure the fastest of the groups once more, with its timeline recorded."""
+    for contender in sorted(order.contenders, key=lambda c: c.steps_per_second, reverse=True):
+        stand = stands.get(contender.setting)
+        if isinstance(stand, Stand):
+            with stand.group.trace(path):
+                await stand.measure(contender.rule, order.limits)
+            return
 
 
 class Watch:

@@ -7,11 +7,15 @@ import warnings
 from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio.cli.policies import Policy, RandomPolicy, Responder
+from rlightning_aio.errors import ConfigError
 from rlightning_aio.group.aio import ServerHandle
+from rlightning_aio.group.trace import check_writable
 from rlightning_aio.types import EnvMeta
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Sequence
+    from contextlib import AbstractAsyncContextManager
+    from pathlib import Path
 
     import gymnasium as gym
 
@@ -19,7 +23,7 @@ if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.group.aio import EnvGroup
 
-__all__ = ["Roster", "resetting", "respond_to_all", "responder"]
+__all__ = ["Roster", "check_trace", "resetting", "respond_to_all", "responder", "traced"]
 
 _NO_LIMIT: Final = 2**62
 
@@ -64,8 +68,28 @@ def _differ(spaces: Sequence[gym.Space[Any] | None]) -> bool:
 
 async def respond_to_all(group: EnvGroup, respond: Responder, batch: BatchedData) -> None:
     """Have every env of `batch` go on."""
-    for response in await respond(batch):
+    with group.span("policy"):
+        responses = await respond(batch)
+    for response in responses:
         group.step_async(response)
+
+
+def check_trace(path: Path | None) -> None:
+    """Find out, before anything is started, whether a timeline can be written.
+
+    Raises:
+        ConfigError: it can't, and why.
+    """
+    if path is not None:
+        try:
+            check_writable(path)
+        except OSError as error:
+            raise ConfigError(f"--trace: {error}") from error
+
+
+def traced(group: EnvGroup, path: Path | None) -> AbstractAsyncContextManager[object]:
+    """Records a timeline of `group` into a file, if one is named."""
+    return contextlib.nullcontext() if path is None else group.trace(path)
 
 
 @contextlib.contextmanager

@@ -201,7 +201,7 @@ class Stand:
         seed: int,
     ) -> None:
         self.costs = costs
-        self._group = group
+        self.group = group
         self._respond = responder(group, roster, policy, seed)
         self._everyone = everyone
         self._pids = _processes(group)
@@ -229,7 +229,7 @@ class Stand:
         while limits.not_reached(self.statistics.steps - first, now - began):
             responses = _joined(await self._respond(self._everyone))
             sent_at = time.monotonic()
-            batch, _ = await self._group.step(responses)
+            batch, _ = await self.group.step(responses)
             now = time.monotonic()
             latencies.append(now - sent_at)
             self.statistics.add(batch)
@@ -238,7 +238,7 @@ class Stand:
 
     async def _collect(self, min_results: int, limits: Limits) -> Round:
         latencies: list[NDArray[np.float64]] = []
-        group, sent_at = self._group, self._sent_at
+        group, sent_at = self.group, self._sent_at
         busy = cpu_seconds(self._pids)
         first, began = self.statistics.steps, time.monotonic()
         now = began

@@ -13,7 +13,14 @@ import typer
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn
 
 import rlightning_aio
-from rlightning_aio.cli.collecting import Roster, resetting, respond_to_all, responder
+from rlightning_aio.cli.collecting import (
+    Roster,
+    check_trace,
+    resetting,
+    respond_to_all,
+    responder,
+    traced,
+)
 from rlightning_aio.cli.policies import Policy, load_policy
 from rlightning_aio.cli.rollout_statistics import EntryFigures, RolloutStatistics
 from rlightning_aio.cli.terminal import (
@@ -48,6 +55,7 @@ class _Order:
     min_results: int
     seed: int | None
     policy: Policy | None
+    trace: Path | None
 
 
 def rollout(
@@ -70,6 +78,10 @@ def rollout(
             min=1, help="Results to wait for in each collect.", show_default="half of the envs"
         ),
     ] = None,
+    trace: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write a timeline for https://ui.perfetto.dev."),
+    ] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print one JSON document in place of the table.")
     ] = False,
@@ -87,6 +99,7 @@ def rollout(
         rlightning-aio rollout configs/cartpole.yaml envs.0.num_workers=128 --seed 0
         rlightning-aio rollout configs/hopper.yaml --policy my_policies:greedy
         rlightning-aio rollout configs/multi_task.yaml --json > rollout.json
+        rlightning-aio rollout configs/halfcheetah.yaml --trace run.json
     """
     configs = load_config(config, overrides or ())
     num_envs = sum(entry.num_workers for entry in configs)
@@ -95,7 +108,9 @@ def rollout(
         min_results=min_results or max(1, num_envs // 2),
         seed=seed,
         policy=load_policy(policy) if policy else None,
+        trace=trace,
     )
+    check_trace(trace)
     statistics = RolloutStatistics(configs)
     group = rlightning_aio.build_env_group(configs, mixed_actions=True)
     interrupted = False
@@ -122,7 +137,7 @@ async def _collect(
     statistics: RolloutStatistics,
     display: _Display,
 ) -> None:
-    async with group:
+    async with group, traced(group, order.trace):
         roster = Roster(group, await group.init())
         for server in roster.servers:
             display.say(f"{server.env_id} listens at {server.address}")

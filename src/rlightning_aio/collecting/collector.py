@@ -318,7 +318,8 @@ class Collector(Generic[G, R]):
         """Call the policy for `part`, and send what it says."""
         version = self.policy_version
         began = time.monotonic_ns()
-        answer = yield lambda: part.kind.policy(part.batch)
+        with self._group.span("policy"):
+            answer = yield lambda: part.kind.policy(part.batch)
         self._clock.note_policy(time.monotonic_ns() - began)
         responses, columns = part.kind.columns_of(part, answer)
         self._group.step_async(responses)

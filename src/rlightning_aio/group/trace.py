@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from rlightning_aio.group.wait import Procedure
     from rlightning_aio.hosts.base import Host
 
-__all__ = ["NO_SPAN", "Trace"]
+__all__ = ["NO_SPAN", "Trace", "check_writable"]
 
 _Owner: TypeAlias = "asyncio.Task[Any] | int"
 
@@ -80,7 +80,7 @@ class Trace:
     def __init__(self, core: Core, path: str | Path, running: list[Trace], *, by_task: bool):
         self._core = core
         self._path = Path(path)
-        _check_writable(self._path)
+        check_writable(self._path)
         self._running = running
         self._owner = _task_or_thread if by_task else threading.get_ident
         self._pid = 0
@@ -349,7 +349,7 @@ def _is_over(who: asyncio.Task[Any] | threading.Thread) -> bool:
     return who.done() if isinstance(who, asyncio.Task) else not who.is_alive()
 
 
-def _check_writable(path: Path) -> None:
+def check_writable(path: Path) -> None:
     """Raises OSError, saying why `path` can't be written, if that can be known."""
     folder = path.parent
     if not folder.is_dir():
