@@ -79,7 +79,7 @@ def test_lists_are_lists_on_the_site() -> None:
         before = ""
         for line in prose(page).splitlines():
             if re.match(r"(-|\d+\.) ", line):
-                assert not before or re.match(r" |-|\d+\.", before), f"{named(page)}: {line}"
+                assert not before or re.match(r" {2,3}\S|-|\d+\.", before), f"{named(page)}: {line}"
             before = line
 
 

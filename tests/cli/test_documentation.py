@@ -1,4 +1,4 @@
-"""What ``docs/command-line.md`` and the README say can be typed."""
+"""What ``docs/command-line.md``, other pages and the README say can be typed."""
 
 from __future__ import annotations
 
@@ -14,20 +14,22 @@ if TYPE_CHECKING:
 
 ROOT = TESTS.parent
 PAGE = (ROOT / "docs" / "command-line.md").read_text()
-README = (ROOT / "README.md").read_text()
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def blocks(language: str, page: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
 
 
-LINES = [
+COMMANDS = [
     line.partition(" > ")[0]
-    for page in (PAGE, README)
-    for block in blocks("sh", page)
+    for page in PAGES
+    for block in blocks("sh", page.read_text())
     for line in block.splitlines()
-    if line.startswith("rlightning-aio")
 ]
+LINES = sorted({line for line in COMMANDS if line.startswith("rlightning-aio")})
+# Run by test_readme.py and test_docs.py.
+ELSEWHERE = ("make ", "python -m rlightning_aio.legacy ")
 
 
 SHORT = {
@@ -48,6 +50,12 @@ def test_every_command_runs(line: str, tmp_path: Path, monkeypatch: pytest.Monke
     short = SHORT.get(shlex.split(line)[1], [])
     done = invoke(*shlex.split(line)[1:], *short)
     assert done.exit_code == 0, done.stderr
+
+
+def test_no_command_is_left_out() -> None:
+    """What a reader can't type as it stands is in a block of `console`."""
+    others = [line for line in COMMANDS if line not in LINES and line.strip()]
+    assert [line for line in others if not line.startswith(ELSEWHERE)] == []
 
 
 @pytest.mark.parametrize("command", re.findall(r"^## (\w+)$", PAGE, re.MULTILINE))
