@@ -43,6 +43,7 @@ class Walk(gym.Env[Any, Any]):
         return self.observation(), self.at, over, self.steps >= 30, {"steps": self.steps}
 
 
+NUM_DEATHS = int(os.environ.get("RLIGHTNING_AIO_DEATHS", "4"))
 ENTRY: dict[str, Any] = {
     "name": "e",
     "make_env": Walk,
@@ -106,13 +107,14 @@ def with_deaths(start: Start, num_episodes: int, num_deaths: int) -> Episodes:
 
 
 @on_one_driver
+@pytest.mark.timeout(300 + NUM_DEATHS)
 def test_episodes_go_on_after_deaths_with_the_returns_that_they_would_have_had(
     start: Start,
 ) -> None:
     """And no more steps are lost at once than the entry says. ``RLIGHTNING_AIO_DEATHS`` says how
     many deaths there are.
     """
-    disturbed = with_deaths(start, 5, int(os.environ.get("RLIGHTNING_AIO_DEATHS", "4")))
+    disturbed = with_deaths(start, 5, NUM_DEATHS)
     undisturbed = Episodes(start({**ENTRY, "on_worker_death": "restart", "snapshot_every": None}))
     undisturbed.run(max(map(len, disturbed.ended.values())))
     assert any(disturbed.lost)
