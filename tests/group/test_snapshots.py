@@ -344,6 +344,44 @@ def test_all_are_put_back_or_none() -> None:
         assert not batch.is_reset.any()
 
 
+class Lost(Fragile):
+    """Can't even go back."""
+
+    def load_state(self, state: int) -> None:
+        if self.fails:
+            raise OSError("the disk is gone")
+        self.count = state
+
+
+def test_one_that_can_not_even_go_back_begins_anew() -> None:
+    """It alone."""
+    entry = {"name": "e", "make_env": Lost, "num_workers": 2, "placement": "inline"}
+    with sync.build_env_group(entry) as group:
+        batch, _ = group.reset()
+        snapshot = group.snapshot()
+        batch, _ = group.step(batch.respond(action=[0, 1]))
+        with pytest.raises(EnvRaised, match=r"env 'e-1'.*restore.*the disk is gone"):
+            group.restore(snapshot)
+        batch, _ = group.step(batch.respond(action=[0, 0]))
+        assert batch.observation.tolist() == [[2], [0]]
+        assert batch.restarted.tolist() == [False, True]
+        assert batch.info()[1]["worker_restarted"] == "could not be put back"
+
+
+def test_an_env_that_has_yet_to_make_its_parts_says_so() -> None:
+    """It holds nothing of a library whose version it would tell, which is no difference."""
+    with (
+        sync.build_env_group(entry_of("of its own", placement="inline")) as one,
+        sync.build_env_group(entry_of("of its own", placement="inline")) as other,
+    ):
+        batch, _ = one.reset(seed=0)
+        with pytest.raises(EnvRaised, match=r"own_space is a Box.*has not been reset yet"):
+            other.restore(one.snapshot())
+        other.reset()
+        shown, _ = other.restore(one.snapshot())
+        np.testing.assert_equal(shown.observation, batch.observation)
+
+
 class Hidden(Fragile):
     """Holds what nobody can pickle."""
 

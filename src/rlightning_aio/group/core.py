@@ -672,8 +672,10 @@ class Core:
             back = [(before[k], False) for k in kept]
             try:
                 yield from self._send_standings(now, slots[kept], back)
-            except EnvFault:
-                self._recovery.lose(slots[kept].tolist(), "could not be put back")
+            except EnvFault as again:
+                lost = {one.env_id for one in (again, *again.others)}
+                left = [slot for slot in slots[kept].tolist() if self.envs.env_ids[slot] in lost]
+                self._recovery.lose(left, "could not be put back")
             fault.add_note("nothing was restored: the other envs are where they were before")
             raise
         except BaseException:
