@@ -139,6 +139,17 @@ def test_the_plot_is_an_image(tmp_path: Path) -> None:
     assert path.read_bytes().startswith(b"\x89PNG")
 
 
+def test_the_plot_of_a_rollout_is_an_image(tmp_path: Path) -> None:
+    """Rates and returns of each entry."""
+    if importlib.util.find_spec("matplotlib") is None:
+        pytest.skip("matplotlib is not installed")
+    path = tmp_path / "plot.svg"
+    config = write_config(tmp_path, CARTPOLE, {**CARTPOLE, "name": "other"})
+    done = run("rollout", config, "--steps", 500, "--plot", path)
+    assert done.returncode == 0, done.stderr
+    assert b"<svg" in path.read_bytes()
+
+
 def test_what_tune_prints_of_inline_envs_loads(tmp_path: Path) -> None:
     """It leaves out what has no meaning there, defaults included."""
     entry = EnvConfig(name="a", backend="gymnasium", task="CartPole-v1", step_timeout=3.0)

@@ -49,6 +49,27 @@ def test_json_is_all_that_stdout_holds(tmp_path: Path) -> None:
     assert "collecting 500 steps" in done.stderr
 
 
+def test_a_rollout_may_be_bounded_in_time(tmp_path: Path) -> None:
+    """It ends then, whoever is still awaited; a number of steps beside it ends it earlier."""
+    config = write_config(tmp_path, {**STUB, "num_workers": 2})
+    document = invoke_json("rollout", config, "--seconds", 0.05, "--min-results", 1)
+    assert document["steps"] > 0
+    assert document["interrupted"] is False
+    assert invoke_json("rollout", config, "--seconds", 1000, "--steps", 10)["steps"] == 10
+    kwargs = {"pid_file": str(tmp_path / "pid"), "where": "step"}
+    stuck = {"name": "stuck", "backend": "stuck", "task": "any", "env_kwargs": kwargs}
+    with pytest.warns(UserWarning, match="did not close in time"):
+        document = invoke_json("rollout", write_config(tmp_path, stuck), "--seconds", 0.05)
+    assert document["steps"] <= 2
+    assert document["seconds"] >= 0.05
+
+
+def test_the_configs_number_of_results_is_waited_for(tmp_path: Path) -> None:
+    """As `tune` writes it."""
+    config = write_config(tmp_path, {**STUB, "num_workers": 6, "min_results": 5})
+    assert invoke_json("rollout", config, "--steps", 100)["batch_size"]["max"] >= 5
+
+
 def test_overrides_change_the_configuration(tmp_path: Path) -> None:
     """What follows the file is applied to it."""
     config = write_config(tmp_path, {**STUB, "num_workers": 2})

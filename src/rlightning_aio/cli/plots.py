@@ -11,7 +11,7 @@ from rlightning_aio.errors import ConfigError
 from rlightning_aio.sharing import num_cores
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
     from pathlib import Path
 
     from rlightning_aio.cli.measuring import Contender
@@ -74,6 +74,7 @@ def draw_contenders(config: str, contenders: Sequence[Contender], path: Path) ->
             [c.steps_per_second for c in own],
             height,
             xerr=[c.spread * c.steps_per_second for c in own],
+            ecolor="gray",
             label=rule,
         )
     axes.set_yticks([k + 0.4 - height / 2 for k in range(len(places))], places)
@@ -81,6 +82,11 @@ def draw_contenders(config: str, contenders: Sequence[Contender], path: Path) ->
     axes.set(xlabel="env steps per second", title=f"{config}, {counted(num_cores(), 'core')}")
     figure.legend(loc="outside lower center", ncols=len(rules))
     _save(plt, figure, path)
+
+
+def _axes_of(points: Iterable[tuple[float, float]]) -> tuple[list[float], list[float]]:
+    listed = list(points)
+    return [x for x, _ in listed], [y for _, y in listed]
 
 
 def draw_rollout(config: str, courses: Sequence[Course], path: Path) -> None:
@@ -92,9 +98,10 @@ def draw_rollout(config: str, courses: Sequence[Course], path: Path) -> None:
     plt = _pyplot()
     figure, (rates, returns) = plt.subplots(2, figsize=(8, 6), layout="constrained")
     for course in courses:
-        rates.plot(course.rate_seconds, course.rates, label=course.name)
-        returns.plot(course.episode_steps, course.returns, ".", ms=3, label=course.name)
-    rates.set(xlabel="seconds", ylabel="env steps per second", ylim=(0, None), title=config)
+        rates.plot(*_axes_of(course.rates), label=course.name)
+        returns.plot(*_axes_of(course.returns), ".", ms=3, label=course.name)
+    rates.set(xlabel="seconds", ylabel="env steps per second", title=config)
+    rates.set(xlim=(0, None), ylim=(0, None))
     returns.set(xlabel="env steps of the entry", ylabel="return of an episode")
     for axes in (rates, returns):
         axes.legend(loc="upper left")

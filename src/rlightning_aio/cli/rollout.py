@@ -7,10 +7,9 @@ import contextlib
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path  # noqa: TC003 (Typer reads annotations)
-from typing import TYPE_CHECKING, Annotated, Final, Self
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn
 
 import rlightning_aio
 from rlightning_aio.cli.collecting import (
@@ -21,19 +20,20 @@ from rlightning_aio.cli.collecting import (
     responder,
     traced,
 )
+from rlightning_aio.cli.live import Display
+from rlightning_aio.cli.plots import check_plot, draw_rollout
 from rlightning_aio.cli.policies import Policy, load_policy
 from rlightning_aio.cli.rollout_statistics import EntryFigures, RolloutStatistics
 from rlightning_aio.cli.terminal import (
     INTERRUPTED,
     count,
-    counted,
     duration,
-    err,
     interruptible,
     named_columns,
     number,
     out,
     print_json,
+    print_table,
 )
 from rlightning_aio.config import EnvConfig, load_config
 
@@ -44,18 +44,29 @@ if TYPE_CHECKING:
 
 __all__ = ["rollout"]
 
-_REFRESH_SECONDS: Final = 0.2
+_ENDLESS = 2**62
+_STEPS = 10_000
+"""Collected where nothing else is said."""
 
 
 @dataclass(frozen=True)
 class _Order:
     """What to collect, and how."""
 
-    steps: int
+    steps: int | None
+    seconds: float | None
     min_results: int
     seed: int | None
     policy: Policy | None
     trace: Path | None
+
+    def left(self, statistics: RolloutStatistics) -> tuple[int, float | None] | None:
+        """Steps and seconds that are left to collect; None at the end."""
+        steps = _ENDLESS if self.steps is None else self.steps - statistics.steps
+        seconds = self.seconds
+        if seconds is not None:
+            seconds -= statistics.elapsed(time.monotonic())
+        return None if steps <= 0 or (seconds is not None and seconds <= 0) else (steps, seconds)
 
 
 def rollout(
@@ -64,7 +75,13 @@ def rollout(
         list[str] | None,
         typer.Argument(help="Dotted overrides, such as envs.0.num_workers=8", show_default=False),
     ] = None,
-    steps: Annotated[int, typer.Option(min=1, help="Env steps to collect.")] = 10_000,
+    steps: Annotated[
+        int | None,
+        typer.Option(min=1, help="Env steps to collect.", show_default="10000, or for --seconds"),
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.001, help="Collect for so long.", show_default="no limit")
+    ] = None,
     policy: Annotated[
         str | None,
         typer.Option(metavar="MODULE:CALLABLE", help="Takes a batch, returns actions."),
@@ -75,8 +92,17 @@ def rollout(
     min_results: Annotated[
         int | None,
         typer.Option(
-            min=1, help="Results to wait for in each collect.", show_default="half of the envs"
+            min=1,
+            help="Results to wait for in each collect.",
+            show_default="the config's, or half of the envs",
         ),
+    ] = None,
+    live: Annotated[
+        bool, typer.Option("--live", help="On a terminal, show each worker while it runs.")
+    ] = False,
+    plot: Annotated[
+        Path | None,
+        typer.Option(help="Draw rates and returns (PNG, SVG or PDF; needs matplotlib)."),
     ] = None,
     trace: Annotated[
         Path | None,
@@ -98,25 +124,30 @@ def rollout(
         rlightning-aio rollout configs/halfcheetah.yaml --steps 100000
         rlightning-aio rollout configs/cartpole.yaml envs.0.num_workers=128 --seed 0
         rlightning-aio rollout configs/hopper.yaml --policy my_policies:greedy
+        rlightning-aio rollout configs/halfcheetah.yaml --seconds 60 --live
         rlightning-aio rollout configs/multi_task.yaml --json > rollout.json
         rlightning-aio rollout configs/halfcheetah.yaml --trace run.json
     """
     configs = load_config(config, overrides or ())
+    if plot is not None:
+        check_plot(plot)
     num_envs = sum(entry.num_workers for entry in configs)
+    configured = sum(entry.min_results or 0 for entry in configs)
     order = _Order(
-        steps=steps,
-        min_results=min_results or max(1, num_envs // 2),
+        steps=_STEPS if steps is None and seconds is None else steps,
+        seconds=seconds,
+        min_results=min_results or configured or max(1, num_envs // 2),
         seed=seed,
         policy=load_policy(policy) if policy else None,
         trace=trace,
     )
     check_trace(trace)
-    statistics = RolloutStatistics(configs)
+    statistics = RolloutStatistics(configs, keep_course=plot is not None)
     group = rlightning_aio.build_env_group(configs, mixed_actions=True)
     interrupted = False
     try:
         with (
-            _Display(group, statistics, steps) as display,
+            Display(group, statistics, order.steps, seconds, workers=live) as display,
             interruptible(),
             contextlib.closing(_collect(group, configs, order, statistics, display)) as collecting,
         ):
@@ -128,6 +159,8 @@ def rollout(
         # Also after an error: what was collected until then is worth knowing.
         if interrupted or statistics.steps:
             _report(config, group, statistics, interrupted=interrupted, as_json=as_json)
+            if plot is not None:
+                draw_rollout(str(config), statistics.courses(), plot)
 
 
 async def _collect(
@@ -135,12 +168,13 @@ async def _collect(
     configs: Sequence[EnvConfig],
     order: _Order,
     statistics: RolloutStatistics,
-    display: _Display,
+    display: Display,
 ) -> None:
-    async with group, traced(group, order.trace):
+    async with display.ticking(), group, traced(group, order.trace):
         roster = Roster(group, await group.init())
         for server in roster.servers:
             display.say(f"{server.env_id} listens at {server.address}")
+        display.resetting()
         batch, _ = await group.reset(seed=order.seed)
         respond = responder(group, roster, order.policy, order.seed)
         sub_envs = max(config.num_envs for config in configs)
@@ -148,90 +182,23 @@ async def _collect(
         statistics.begin(roster)
         with resetting(group, configs):
             await respond_to_all(group, respond, batch)
-            while (left := order.steps - statistics.steps) > 0:
-                most = -(-left // sub_envs)
-                batch, _ = await group.collect_async(
-                    min_results=min(order.min_results, most), max_results=most
-                )
+            while (left := order.left(statistics)) is not None:
+                most, seconds = -(-left[0] // sub_envs), left[1]
+                try:
+                    batch, _ = await group.collect_async(
+                        min_results=min(order.min_results, most),
+                        max_results=most,
+                        deadline=seconds,
+                    )
+                except TimeoutError:
+                    statistics.end(time.monotonic())  # The time is over; it was waited till then.
+                    break
                 statistics.add(batch)
                 await respond_to_all(group, respond, batch)
                 if display.due():
                     display.show()
                     # Where results never keep us waiting, nothing else would let Ctrl-C in.
                     await asyncio.sleep(0)
-
-
-class _Display:
-    """The live line on stderr; on anything but a terminal, plain lines at the start."""
-
-    def __init__(self, group: EnvGroup, statistics: RolloutStatistics, steps: int) -> None:
-        self._group = group
-        self._statistics = statistics
-        self._steps = steps
-        self._console = err()
-        self._progress = Progress(
-            SpinnerColumn(),
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=16),
-            TextColumn("{task.fields[figures]}"),
-            console=self._console,
-            auto_refresh=False,
-            transient=True,
-        )
-        self._starting = f"starting {counted(len(group), 'env')}"
-        self._task: TaskID = self._progress.add_task(self._starting, total=steps, figures="")
-        self._next_at = 0.0
-        self._last = (0.0, 0)
-
-    def __enter__(self) -> Self:
-        if self._console.is_terminal:
-            self._progress.start()
-            self._progress.refresh()
-        else:
-            self._console.print(self._starting)
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        if self._console.is_terminal:
-            self._progress.stop()
-
-    def ready(self) -> None:
-        """All envs have had their first reset."""
-        if self._console.is_terminal:
-            self._progress.update(self._task, description="")
-        else:
-            self._console.print(f"collecting {counted(self._steps, 'step')}")
-
-    def say(self, words: str) -> None:
-        """Add a line that stays."""
-        self._console.print(words, soft_wrap=True)
-
-    def due(self) -> bool:
-        """Whether it is time to show something new."""
-        return time.monotonic() >= self._next_at
-
-    def show(self) -> None:
-        """Draw the figures as they are now."""
-        now = time.monotonic()
-        self._next_at = now + _REFRESH_SECONDS
-        if not self._console.is_terminal:
-            return
-        then, steps = self._last
-        self._last = now, self._statistics.steps
-        rate = (self._statistics.steps - steps) / (now - then)
-        entries = self._statistics.by_entry(self._group.get_env_stats())
-        self._progress.update(
-            self._task, completed=self._statistics.steps, figures=_figures(entries, rate)
-        )
-        self._progress.refresh()
-
-
-def _figures(entries: Sequence[EntryFigures], rate: float) -> str:
-    steps = sum(entry.steps for entry in entries)
-    episodes = sum(entry.episodes for entry in entries)
-    total = sum((entry.mean_return or 0.0) * entry.episodes for entry in entries)
-    mean = number(total / episodes if episodes else None)
-    return f"{count(steps)} steps  {count(rate)} steps/s  {count(episodes)} episodes  return {mean}"
 
 
 def _report(
@@ -265,6 +232,9 @@ def _report(
     _print_table(title, entries, stats["latency_us"])
 
 
+_EXPENDABLE = ("\np99", "envs", "mean\nlength", "steps", "episodes", "step\np50")
+
+
 def _print_table(
     title: str, entries: Sequence[EntryFigures], latency: dict[str, dict[str, float]]
 ) -> None:
@@ -287,7 +257,7 @@ def _print_table(
             duration(step.get("p99")),
         )
     console = out()
-    console.print(table)
+    print_table(console, table, _EXPENDABLE)
     if latency:
         shares = (("step", "in the env"), ("wait", "before it"), ("transfer", "after it"))
         console.print(

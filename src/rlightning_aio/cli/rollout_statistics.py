@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections import Counter, deque
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -22,13 +22,17 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio.batch import BatchedData
-    from rlightning_aio.batch.columns import EnvNames
+    from rlightning_aio.batch.columns import EnvNames, ResultColumns
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.types import EnvMeta
 
-__all__ = ["EntryFigures", "RolloutStatistics"]
+__all__ = ["Course", "EntryFigures", "RolloutStatistics"]
 
 _NOTHING: Final = np.empty(0, np.int64)
+_RECENT_BATCHES: Final = 64
+_COURSE_SECONDS: Final = 0.25
+_COURSE_EPISODES: Final = 50_000
+"""As many as a picture has room for; of more, the last."""
 _LATENCY_BATCHES: Final = 4096
 """Batches whose step times are kept for the percentiles."""
 
@@ -56,10 +60,13 @@ class RolloutStatistics:
 
     Args:
         configs: of the group, in order.
+        keep_course: keep what `courses` tells.
     """
 
-    def __init__(self, configs: Sequence[EnvConfig]) -> None:
+    def __init__(self, configs: Sequence[EnvConfig], *, keep_course: bool = False) -> None:
         self._configs = configs
+        self._courses = {config.name: Course(config.name) for config in configs}
+        self._keep_course = keep_course
         self._entries = {
             f"{config.name}-{index}": config.name
             for config in configs
@@ -87,6 +94,38 @@ class RolloutStatistics:
         """Over the whole time."""
         return self.steps / self.seconds if self.seconds else 0.0
 
+    def end(self, now: float) -> None:
+        """Nothing has come until now, nor will."""
+        self._ended = now
+
+    def elapsed(self, now: float) -> float:
+        """Seconds since the first step was sent; 0 before."""
+        return now - self._began if self._began else 0.0
+
+    def idle(self, now: float) -> float:
+        """Seconds since the last result came, or since the first step was sent."""
+        return now - self._ended if self._began else 0.0
+
+    def steps_of(self, env_ids: Sequence[str]) -> int:
+        """Steps of these envs."""
+        return sum(self._counts[env_id] for env_id in env_ids)
+
+    def recent_step_us(self) -> dict[str, float]:
+        """Time in an env's own step, mean over the last batches, by env."""
+        sums, numbers = Counter[str](), Counter[str]()
+        for times in list(self._step_times)[-_RECENT_BATCHES:]:
+            env_ids = times.names.ids(times.slots)
+            for env_id, busy_ns in zip(env_ids, times.busy_ns.tolist(), strict=True):
+                sums[env_id] += busy_ns
+                numbers[env_id] += 1
+        return {env_id: total / numbers[env_id] / 1e3 for env_id, total in sums.items()}
+
+    def courses(self) -> list[Course]:
+        """How each entry went, if that was kept."""
+        for course in self._courses.values():
+            course.end(self.seconds)
+        return list(self._courses.values())
+
     def begin(self, meta_of: Callable[[str], EnvMeta]) -> None:
         """The first steps are about to be sent.
 
@@ -108,6 +147,23 @@ class RolloutStatistics:
                     self._meet(env_id)
             self.steps += int(stepped.sum())
             self._step_times.append(_StepTimes(part.names, part.slots, part.busy_ns))
+            if self._keep_course:
+                self._note_course(part, stepped)
+
+    def _note_course(self, part: ResultColumns, stepped: NDArray[np.bool_]) -> None:
+        """What `courses` tells of results of envs of one kind."""
+        rows = len(part)
+        names = np.array(part.names.names(part.slots))
+        ended = np.zeros((rows, 1), np.bool_)
+        if part.episode_return is not None and part.episode_length is not None:
+            ended = (part.done & (part.episode_length > 0)).reshape(rows, -1)
+        for name in dict.fromkeys(names.tolist()):
+            mine = names == name
+            course = self._courses[name]
+            course.add(int(stepped[mine].sum()), self.seconds)
+            if part.episode_return is not None and ended[mine].any():
+                returns = part.episode_return.reshape(rows, -1)[mine][ended[mine]]
+                course.returns += [(course.steps, value) for value in returns.tolist()]
 
     def _meet(self, env_id: str) -> None:
         """Take note of an env that is met for the first time."""
@@ -188,12 +244,33 @@ def _mean(stats: Sequence[Mapping[str, Any]], key: str, episodes: int) -> float 
     return float(sum(s[key] * s["episodes"] for s in stats if s["episodes"]) / episodes)
 
 
-@dataclass(frozen=True)
+@dataclass
 class Course:
-    """How a rollout of one entry went."""
+    """How a rollout of one entry went.
+
+    Attributes:
+        steps: until now.
+        rates: seconds since the start, and steps per second of the moment before.
+        returns: of episodes, each with the entry's steps at its end.
+    """
 
     name: str
-    rate_seconds: list[float]
-    rates: list[float]
-    episode_steps: list[int]
-    returns: list[float]
+    steps: int = 0
+    rates: list[tuple[float, float]] = field(default_factory=list[tuple[float, float]])
+    returns: deque[tuple[int, float]] = field(
+        default_factory=lambda: deque[tuple[int, float]](maxlen=_COURSE_EPISODES)
+    )
+    _since: tuple[float, int] = (0.0, 0)
+
+    def add(self, steps: int, seconds: float) -> None:
+        """So many steps have come, so long after the start."""
+        self.steps += steps
+        if seconds - self._since[0] >= _COURSE_SECONDS:
+            self.end(seconds)
+
+    def end(self, seconds: float) -> None:
+        """Close the present moment."""
+        then, before = self._since
+        if seconds > then:
+            self.rates.append((seconds, (self.steps - before) / (seconds - then)))
+            self._since = seconds, self.steps

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 import typer
 from rich.console import Console
 from rich.measure import Measurement
-from rich.table import Table
+from rich.table import Column, Table
 
 from rlightning_aio.errors import ConfigError, EnvFault, RemoteTraceback, RLightningError
 
@@ -30,6 +30,7 @@ __all__ = [
     "counted",
     "duration",
     "err",
+    "fitted",
     "guarded",
     "interruptible",
     "named_columns",
@@ -142,7 +143,7 @@ def _in_words(error: RLightningError) -> str:
 
 def named_columns(title: str, *names: str) -> Table:
     """An empty table: the first column is text, all others are figures."""
-    table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False)
+    table = _empty(title)
     for position, name in enumerate(names):
         table.add_column(
             name, justify="right" if position else "left", overflow="fold", vertical="bottom"
@@ -150,8 +151,14 @@ def named_columns(title: str, *names: str) -> Table:
     return table
 
 
-def print_table(console: Console, table: Table, expendable: Sequence[str] = ()) -> None:
-    """Print `table`; where it is too wide for the console, without some of its columns.
+def _empty(title: Any, *columns: Column) -> Table:
+    return Table(
+        *columns, title=title, title_justify="left", title_style="bold", box=None, pad_edge=False
+    )
+
+
+def fitted(console: Console, table: Table, expendable: Sequence[str]) -> tuple[Table, list[str]]:
+    """`table` without as many columns as it takes to fit the console, and what they are called.
 
     Args:
         console: where it goes.
@@ -163,8 +170,16 @@ def print_table(console: Console, table: Table, expendable: Sequence[str] = ()) 
     for name in expendable:
         if Measurement.get(console, wide, table).maximum <= console.width:
             break
-        table.columns = [column for column in table.columns if column.header != name]
+        rows = table.rows
+        table = _empty(table.title, *(c for c in table.columns if c.header != name))
+        table.rows = rows
         left_out.append(name.replace("\n", " ").strip())
+    return table, left_out
+
+
+def print_table(console: Console, table: Table, expendable: Sequence[str] = ()) -> None:
+    """Print `table`, without some of its `expendable` columns where it is too wide."""
+    table, left_out = fitted(console, table, expendable)
     console.print(table)
     if left_out:
         words = f"(too narrow for {', '.join(left_out)}; --json has all)"

@@ -1,0 +1,286 @@
+"""What `rollout` shows on a terminal while it runs: how far it is, how fast, and whom it waits for.
+
+Rule: a rate is of the last moments, and where nothing comes there is none: then it says who is
+waited for, and since when. On anything but a terminal there are plain lines at the start alone.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from collections import deque
+from typing import TYPE_CHECKING, Any, Final, Self
+
+from rich.console import Group
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.spinner import Spinner
+from rich.table import Table
+from rich.text import Text
+
+from rlightning_aio.cli.processes import memory_bytes
+from rlightning_aio.cli.terminal import count, counted, duration, err, fitted, named_columns, number
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator, Sequence
+
+    from rich.console import RenderableType
+
+    from rlightning_aio.cli.rollout_statistics import RolloutStatistics
+    from rlightning_aio.group.aio import EnvGroup
+
+__all__ = ["Display"]
+
+_REFRESH_SECONDS: Final = 0.2
+_PATIENCE_SECONDS: Final = 1.0
+"""So long nothing may come before it is said that it is waited for."""
+_RATE_SECONDS: Final = 3.0
+_BAR: Final = 16
+_NAMED: Final = 3
+_FEWEST_ROWS: Final = 4
+_EXPENDABLE: Final = ("entry", "envs", "memory", "step", "restarts")
+
+
+class Display:
+    """The live line on stderr, and below it, where `workers` are wanted, one for each of them.
+
+    Args:
+        group: not yet initialised.
+        statistics: of what is collected.
+        steps, seconds: after which it ends; None where it doesn't.
+    """
+
+    def __init__(
+        self,
+        group: EnvGroup,
+        statistics: RolloutStatistics,
+        steps: int | None,
+        seconds: float | None,
+        *,
+        workers: bool,
+    ) -> None:
+        self._group = group
+        self._statistics = statistics
+        self._steps = steps
+        self._seconds = seconds
+        self._console = err()
+        self._workers = _WorkerTable(group, statistics) if workers else None
+        self._spinner = Spinner("dots")
+        self._live = Live(console=self._console, auto_refresh=False, transient=True)
+        self._doing = f"starting {counted(len(group), 'env')}"
+        self._since = time.monotonic()
+        self._next_at = 0.0
+        self._recent: deque[tuple[float, int]] = deque()
+
+    def __enter__(self) -> Self:
+        if self._console.is_terminal:
+            self._live.start()
+        else:
+            self._console.print(self._doing)
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        if self._console.is_terminal:
+            self._live.stop()
+
+    @contextlib.asynccontextmanager
+    async def ticking(self) -> AsyncGenerator[None]:
+        """Meanwhile, it is drawn anew whatever is waited for."""
+        if not self._console.is_terminal:
+            yield
+            return
+        ticker = asyncio.create_task(self._tick())
+        try:
+            yield
+        finally:
+            ticker.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await ticker
+
+    async def _tick(self) -> None:
+        while True:
+            self.show()
+            await asyncio.sleep(_REFRESH_SECONDS)
+
+    def resetting(self) -> None:
+        """All envs are there, and begin their first episodes."""
+        self._doing, self._since = "first reset", time.monotonic()
+
+    def ready(self) -> None:
+        """All envs have had their first reset."""
+        self._doing = ""
+        if not self._console.is_terminal:
+            words = [] if self._steps is None else [counted(self._steps, "step")]
+            words += [] if self._seconds is None else [f"for {self._seconds:g} s"]
+            self._console.print(f"collecting {' '.join(words)}")
+
+    def say(self, words: str) -> None:
+        """Add a line that stays."""
+        self._console.print(words, soft_wrap=True)
+
+    def due(self) -> bool:
+        """Whether it is time to show something new."""
+        return time.monotonic() >= self._next_at
+
+    def show(self) -> None:
+        """Draw everything as it is now."""
+        now = time.monotonic()
+        self._next_at = now + _REFRESH_SECONDS
+        if not self._console.is_terminal:
+            return
+        self._recent.append((now, self._statistics.steps))
+        while self._recent[0][0] < now - _RATE_SECONDS:
+            self._recent.popleft()
+        self._live.update(self._drawn(now), refresh=True)
+
+    def _drawn(self, now: float) -> RenderableType:
+        grid = Table.grid(padding=(0, 1))
+        cells: list[RenderableType] = [self._spinner]
+        room = self._console.width - 2
+        if not self._doing:
+            done = self._share_done(now)
+            cells.append(ProgressBar(total=1.0, completed=done, width=_BAR))
+            room -= _BAR + 1
+        cells.append(Text(_fitting(self._parts(now), room), no_wrap=True))
+        grid.add_row(*cells)
+        if self._workers is None:
+            return grid
+        rows = max(_FEWEST_ROWS, self._console.height - 6)
+        table, _ = fitted(self._console, self._workers.drawn(now, rows), _EXPENDABLE)
+        return Group(grid, table)
+
+    def _share_done(self, now: float) -> float:
+        shares = [0.0]
+        if self._steps is not None:
+            shares.append(self._statistics.steps / self._steps)
+        if self._seconds is not None:
+            shares.append(self._statistics.elapsed(now) / self._seconds)
+        return min(1.0, max(shares))
+
+    def _parts(self, now: float) -> list[str]:
+        """What there is to say, the most important first."""
+        if self._doing:
+            waited = now - self._since
+            return [self._doing, *self._awaited(waited)]
+        idle = self._statistics.idle(now)
+        steps = f"{count(self._statistics.steps)} steps"
+        if idle > _PATIENCE_SECONDS:
+            return [*(self._awaited(idle) or [f"waiting {idle:.0f} s"]), steps]
+        rate = self._rate()
+        stats = self._group.get_env_stats(by_entry=True).values()
+        episodes = sum(own["episodes"] for own in stats)
+        total = sum((own["mean_return"] or 0.0) * own["episodes"] for own in stats)
+        return [
+            f"{count(rate)} steps/s",
+            *self._time_left(now, rate),
+            steps,
+            f"return {number(total / episodes if episodes else None)}",
+            f"{count(episodes)} episodes",
+        ]
+
+    def _rate(self) -> float:
+        (then, steps), (now, more) = self._recent[0], self._recent[-1]
+        return (more - steps) / (now - then) if now > then else 0.0
+
+    def _time_left(self, now: float, rate: float) -> list[str]:
+        left: list[float] = []
+        if self._steps is not None and rate:
+            left.append((self._steps - self._statistics.steps) / rate)
+        if self._seconds is not None:
+            left.append(self._seconds - self._statistics.elapsed(now))
+        if not left:
+            return []
+        seconds = max(0, round(min(left)))
+        hours, minutes = divmod(seconds // 60, 60)
+        return [f"{hours}:{minutes:02}:{seconds % 60:02} left" if hours else
+                f"{minutes}:{seconds % 60:02} left"]  # fmt: skip
+
+    def _awaited(self, waited: float) -> list[str]:
+        """For whom it waits, and since when."""
+        if waited <= _PATIENCE_SECONDS:
+            return []
+        workers = self._group.get_workers()
+        names = [
+            name
+            for worker in sorted(workers, key=lambda worker: -worker["owed_seconds"])
+            for name in (worker["owed"] if worker["state"] == "up" else worker["env_ids"])
+        ]
+        empty = [worker["entry"] for worker in workers if not worker["env_ids"]]
+        who = _listed(names) or (f"clients of {_listed(empty)}" if empty else "")
+        return [f"waiting {waited:.0f} s{' for ' if who else ''}{who}"]
+
+
+class _WorkerTable:
+    """A line for each worker: who it is, what it does, how fast."""
+
+    def __init__(self, group: EnvGroup, statistics: RolloutStatistics) -> None:
+        self._group = group
+        self._statistics = statistics
+        self._before: dict[int, tuple[float, int]] = {}
+        self._rates: dict[int, float] = {}
+
+    def drawn(self, now: float, rows: int) -> Table:
+        """As it is now, of so many workers."""
+        table = named_columns(
+            "", "worker", "entry", "envs", "steps/s", "step", "memory", "restarts", "state"
+        )
+        table.title = None
+        table.columns[1].justify = table.columns[-1].justify = "left"
+        workers = self._group.get_workers()
+        times = self._statistics.recent_step_us()
+        for number_, worker in enumerate(workers[:rows]):
+            table.add_row(*self._row(number_, worker, times, now))
+        if len(workers) > rows:
+            table.add_row(f"and {len(workers) - rows} more")
+        return table
+
+    def _row(
+        self, number_: int, worker: dict[str, Any], times: dict[str, float], now: float
+    ) -> Sequence[str]:
+        ids = worker["env_ids"]
+        own = [times[env_id] for env_id in ids if env_id in times]
+        pid = worker["pid"]
+        return (
+            "here" if pid is None else str(pid),
+            worker["entry"],
+            count(len(ids)),
+            count(self._rate(number_, self._statistics.steps_of(ids), now)),
+            duration(sum(own) / len(own) if own else None),
+            "-" if pid is None else f"{memory_bytes([pid]) / 2**20:,.0f} MiB",
+            count(worker["restarts"]),
+            _state(worker),
+        )
+
+    def _rate(self, number_: int, steps: int, now: float) -> float:
+        then, before = self._before.setdefault(number_, (now, steps))
+        if now - then >= 1.0:
+            self._rates[number_] = (steps - before) / (now - then)
+            self._before[number_] = (now, steps)
+        return self._rates.get(number_, 0.0)
+
+
+def _state(worker: dict[str, Any]) -> str:
+    if worker["state"] != "up":
+        return worker["state"]
+    if not worker["owed"]:
+        return "waits for actions"
+    if worker["owed_seconds"] < _PATIENCE_SECONDS:
+        return "steps"
+    return f"{worker['owed'][0]} for {worker['owed_seconds']:.0f} s"
+
+
+def _listed(names: Sequence[str]) -> str:
+    shown = [name for name in names if name][:_NAMED]
+    more = len(names) - len(shown)
+    return ", ".join(shown) + (f" and {more} more" if more > 0 and shown else "")
+
+
+def _fitting(parts: Sequence[str], room: int) -> str:
+    """As many of `parts` as have room, from the first."""
+    text = parts[0]
+    for part in parts[1:]:
+        if len(text) + 2 + len(part) > room:
+            break
+        text += "  " + part
+    return text

@@ -1,0 +1,99 @@
+"""What a person sees on a terminal: whom a rollout waits for, and tables that cut nothing."""
+
+from __future__ import annotations
+
+import re
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+from rich.console import Console
+
+from rlightning_aio.cli import live
+from rlightning_aio.cli.contender_table import print_contenders
+from rlightning_aio.cli.live import Display
+from rlightning_aio.cli.measuring import Contender, Costs, Round, Rule
+from rlightning_aio.cli.settings import possible_settings
+from rlightning_aio.config import EnvConfig
+
+
+def worker(entry: str, owed: list[str], **fields: Any) -> dict[str, Any]:
+    known = {"entry": entry, "env_ids": owed, "owed": owed, "owed_seconds": 5.0, "state": "up"}
+    return {**known, "pid": None, "restarts": 0, **fields}
+
+
+def display(workers: list[dict[str, Any]], *, idle: float, steps: int = 400) -> Display:
+    """Of a rollout of 1,000 steps that is 10 seconds old, with a rate of 50 steps/s lately."""
+    group = SimpleNamespace(
+        get_workers=lambda: workers,
+        get_env_stats=lambda by_entry: {"a": {"episodes": 4, "mean_return": 2.5}},
+    )
+    statistics = SimpleNamespace(
+        steps=steps,
+        idle=lambda now: idle,
+        elapsed=lambda now: 10.0,
+        recent_step_us=lambda: {"a-0": 20.0},
+        steps_of=len,
+    )
+    shown = Display.__new__(Display)
+    shown._group, shown._statistics = cast("Any", group), cast("Any", statistics)
+    shown._steps, shown._seconds, shown._doing, shown._since = 1000, None, "", 0.0
+    shown._recent = cast("Any", [(0.0, 300), (2.0, 400)])
+    return shown
+
+
+def test_while_results_come_it_tells_how_fast_and_until_when() -> None:
+    """The most important first; what has no room is left out as a whole."""
+    parts = display([], idle=0.1)._parts(10.0)
+    assert parts == ["50 steps/s", "0:12 left", "400 steps", "return 2.50", "4 episodes"]
+    assert live._fitting(parts, 32) == "50 steps/s  0:12 left  400 steps"
+
+
+def test_while_nothing_comes_it_tells_whom_it_waits_for_and_since_when() -> None:
+    """The longest first, in place of a rate that is none any more."""
+    ids = [f"a-{k}" for k in range(5)]
+    workers = [worker("a", ids[1:], owed_seconds=3.0), worker("a", ids[:1], owed_seconds=9.0)]
+    parts = display(workers, idle=8.4)._parts(10.0)
+    assert parts == ["waiting 8 s for a-0, a-1, a-2 and 2 more", "400 steps"]
+    parts = display([worker("robots", [])], idle=3.0)._parts(10.0)
+    assert parts[0] == "waiting 3 s for clients of robots"
+
+
+def test_while_envs_start_it_tells_which_are_not_there() -> None:
+    """Those of workers that are up are waited for no more."""
+    starting = display([worker("a", ["a-0"], state="starting")], idle=0.0)
+    starting._doing, starting._since = "starting 2 envs", 6.0
+    assert starting._parts(10.0) == ["starting 2 envs", "waiting 4 s for a-0"]
+
+
+def test_each_worker_has_its_line() -> None:
+    """What it does, and for how long; a restart is counted."""
+    workers = [worker("a", ["a-0"], restarts=2), worker("b", ["b-0"], state="down")]
+    shown = display(workers, idle=0.0)
+    table = live._WorkerTable(shown._group, shown._statistics).drawn(10.0, rows=8)
+    console = Console(width=100)
+    with console.capture() as capture:
+        console.print(table)
+    lines = [re.split(r"  +", line.strip()) for line in capture.get().splitlines()]
+    assert lines[1] == ["here", "a", "1", "0", "20 µs", "-", "2", "a-0 for 5 s"]
+    assert lines[2][-2:] == ["0", "down"]
+
+
+@pytest.mark.parametrize("width", [60, 80, 120, 160])
+def test_narrow_terminals_get_fewer_columns_and_no_cut_figures(width: int) -> None:
+    """What matters most stays, whole; what was left out is named."""
+    entry = EnvConfig(name="a", backend="gymnasium", task="CartPole-v1", num_workers=8)
+    contenders = [
+        Contender(setting, Rule("async, first ready", 1), [Round(1234567.0, (123456.0, 2e6), 9.5)])
+        for setting in possible_settings([entry])
+    ]
+    for contender in contenders:
+        contender.costs = Costs(12.0, 3.0, 2**33)
+    console = Console(width=width)
+    with console.capture() as capture:
+        print_contenders(console, "a title", contenders)
+    text = capture.get()
+    assert max(map(len, text.splitlines())) <= width
+    assert text.count("1,234,567") == len(contenders)
+    assert "…" not in text
+    assert ("too narrow for" in text) == (width < 120)
