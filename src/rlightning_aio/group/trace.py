@@ -24,7 +24,7 @@ from rlightning_aio.batch.data import parts_of
 from rlightning_aio.group.requests import State
 from rlightning_aio.group.trace_file import HostTrack, Timeline, events
 from rlightning_aio.group.trace_records import Mark, Records
-from rlightning_aio.hosts.base import Killable
+from rlightning_aio.hosts.base import Killable, Membership
 from rlightning_aio.protocol.entries import Operation
 
 if TYPE_CHECKING:
@@ -72,9 +72,9 @@ _current_task: Final = asyncio.current_task
 class Trace:
     """What `EnvGroup.trace` returns: it records from `start` to `stop`, or within a ``with``.
 
-    The newest 262,144 results are kept, and as many spans of the trainer; what that takes is 17 MB
-    at most, however long it runs. The file is written by `stop`, under another name until it is
-    whole, so there is never half of one; that takes some 5 s for a full record, about 100 MB.
+    The newest 262,144 results are kept, and as many spans of the trainer, which takes some 60 MB of
+    memory at most, however long it runs. The file is written by `stop`, under another name until it
+    is whole, so there is never half of one; some 100 MB in some seconds, if the record is full.
     """
 
     def __init__(self, core: Core, path: str | Path, running: list[Trace], *, by_task: bool):
@@ -276,12 +276,12 @@ class Trace:
 
     def _track(self, host: Host) -> HostTrack:
         envs, first = self._core.envs, host.first_slot
-        config = envs.configs[first]
         names = envs.env_ids[first : first + host.num_envs]
-        if config.backend == "env_server":
-            return HostTrack(f"env_server {config.name}-0", "all clients", first, names)
-        where = {"process": "worker", "inline": "inline"}.get(config.placement, config.placement)
-        return HostTrack(f"{where} {host.host_id} ({config.name})", "worker", first, names)
+        if isinstance(host, Membership):
+            return HostTrack(f"env_server {host.server_id}", "all clients", first, names)
+        where = "worker" if isinstance(host, Killable) else "inline"
+        name = f"{where} {host.host_id} ({envs.configs[first].name})"
+        return HostTrack(name, "worker", first, names)
 
 
 class _Span:
