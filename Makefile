@@ -14,7 +14,7 @@ RLLIB := .venv-rllib
 PIP_INSTALL = $(@D)/bin/python -m pip install --quiet --disable-pip-version-check
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-ray test-simulators test-gpu test-pythons check format docs dist bench clean
+.PHONY: help run test test-ray environments test-simulators test-gpu test-pythons check format docs dist bench clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 24
@@ -32,13 +32,16 @@ test-ray: $(VENV)/installed-ray ## the tests of `placement: ray`, on clusters of
 	$(PY) -m pytest -m ray tests/on_ray
 	RLIGHTNING_AIO_ON_RAY=1 $(PY) -m pytest tests/group
 
+# What `make test-simulators` installs; `make -j3 environments` installs the three at once.
+environments: $(SIMULATORS)/installed $(ISAAC)/installed $(RLLIB)/installed
+
 # Kernels that Isaac Lab compiled once are found again, by workers and tests alike.
 test-simulators: export WARP_CACHE_PATH := $(CURDIR)/$(ISAAC)/warp-cache
 test-simulators: export ISAAC_PYTHON := $(CURDIR)/$(ISAAC)/bin/python
-test-simulators: $(SIMULATORS)/installed $(ISAAC)/installed $(RLLIB)/installed ## the tests of every backend, on the real simulators (7 GB of packages)
+test-simulators: environments ## the tests of every backend, on the real simulators (7 GB of packages)
 	tests/simulators/install_debian.sh
 	$(ISAAC)/bin/python -m pytest -m simulators -rs tests/envs/test_isaac.py
-	$(SIMULATORS)/bin/python -m pytest -m simulators -rs tests/benchmarks tests/envs tests/examples tests/vector tests/test_docs.py tests/test_wheel.py
+	$(SIMULATORS)/bin/python -m pytest --numprocesses 3 --dist worksteal -m simulators -rs tests/benchmarks tests/envs tests/examples tests/vector tests/test_docs.py tests/test_wheel.py
 	$(RLLIB)/bin/python -m pytest -m simulators -rs tests/vector/test_pages.py
 
 # With -rs, each test that is skipped says what it lacks.
@@ -73,7 +76,7 @@ dist: $(VENV)/installed-release ## the wheel and the sdist, into dist/
 	rm -rf dist
 	$(PY) -m build
 
-bench: $(VENV)/installed-bench ## every benchmark, peers included (their packages are large)
+bench: $(VENV)/installed-bench $(VENV)/installed-pufferlib ## every benchmark, peers included (their packages are large)
 	$(PY) benchmarks/run_all.py
 
 clean: ## remove the virtual environments and every cache
@@ -101,6 +104,12 @@ $(STAMPS): | $(PY)
 $(SIMULATORS)/installed: | $(SIMULATORS)/bin/python
 $(STAMPS) $(SIMULATORS)/installed: pyproject.toml constraints.txt
 	$(PIP_INSTALL) --constraint constraints.txt --editable '.$(extras)'
+	@touch $@
+
+# It pins versions that nobody else does, of which its vector environments need none. Where it
+# can't be installed, it is left out of the comparison.
+$(VENV)/installed-pufferlib: constraints.txt | $(VENV)/installed-bench
+	-$(PIP_INSTALL) --constraint constraints.txt --no-deps pufferlib-core
 	@touch $@
 
 $(RLLIB)/installed: pyproject.toml constraints.txt | $(RLLIB)/bin/python

@@ -26,6 +26,13 @@ MODES = [
     pytest.param(AutoresetMode.DISABLED, id="Disabled"),
 ]
 
+# Python keeps shared memory of its own for the next, which would count as left behind. TorchRL, once
+# imported, has processes begin with importing everything anew.
+PEER: dict[str, dict[str, Any]] = {
+    "async": {"shared_memory": False, "context": "fork"},
+    "sync": {},
+}
+
 
 @pytest.fixture(scope="module", autouse=True)
 def tracker_of_multiprocessing() -> None:
@@ -139,9 +146,7 @@ def compare_together(task: str, mode: AutoresetMode, count: int, peer: str, limi
     kwargs, arguments = {"max_episode_steps": limit}, {"autoreset_mode": mode}
     ours = make_vec(task, 4, vector_kwargs={**arguments, "max_concurrency": 2}, **kwargs)
     assert len(ours.group.env_ids) == 2
-    if peer == "async":
-        arguments["shared_memory"] = False
-    theirs: Any = gym.make_vec(task, 4, peer, arguments, **kwargs)
+    theirs: Any = gym.make_vec(task, 4, peer, {**arguments, **PEER[peer]}, **kwargs)
     compare(ours, theirs, task, count, [functools.partial(gym.make, task, **kwargs)] * 4)
 
 
@@ -172,8 +177,7 @@ def test_beside_gymnasiums_processes(task: str, mode: AutoresetMode) -> None:
     if task.startswith("ALE/"):
         pytest.importorskip("ale_py")
     ours = VectorEnv(makers, autoreset_mode=mode)
-    # Python keeps the shared memory of its own for the next, which would count as left behind.
-    theirs = AsyncVectorEnv(makers, shared_memory=False, autoreset_mode=mode)
+    theirs = AsyncVectorEnv(makers, autoreset_mode=mode, **PEER["async"])
     compare(ours, theirs, task, 1000)
 
 
