@@ -189,7 +189,10 @@ def test_the_console_script_is_this_command() -> None:
     assert project["scripts"] == {"rlightning-aio": "rlightning_aio.cli:main"}
 
 
-@pytest.mark.parametrize("command", [[], ["rollout"], ["bench"], ["tune"], ["backends"]])
+@pytest.mark.parametrize(
+    "command",
+    [[], *([name] for name in ("rollout", "bench", "tune", "check", "backends", "tasks"))],
+)
 def test_help_teaches_by_example(command: list[str]) -> None:
     """Each help text has command lines to copy."""
     done = invoke(*command, "--help")

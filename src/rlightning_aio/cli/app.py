@@ -11,8 +11,10 @@ import typer
 import rlightning_aio
 from rlightning_aio.cli.backends import backends
 from rlightning_aio.cli.bench import bench
+from rlightning_aio.cli.check import check
 from rlightning_aio.cli.remote import client, keygen
 from rlightning_aio.cli.rollout import rollout
+from rlightning_aio.cli.tasks import tasks
 from rlightning_aio.cli.terminal import guarded
 from rlightning_aio.cli.tune import tune
 
@@ -47,6 +49,7 @@ def prepare(
     Start here:
 
         rlightning-aio backends
+        rlightning-aio check configs/cartpole.yaml
         rlightning-aio rollout configs/cartpole.yaml
     """
     del version  # Its callback has done the work.
@@ -56,5 +59,5 @@ def prepare(
         sys.path.append(here)
 
 
-for command in (rollout, bench, tune, backends, client, keygen):
+for command in (rollout, bench, tune, check, backends, tasks, client, keygen):
     app.command()(guarded(command))

@@ -1,0 +1,133 @@
+"""``rlightning-aio check``: whether a config's envs can be built and stepped, and their spaces."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import asdict, dataclass
+from pathlib import Path  # noqa: TC003 (Typer reads annotations)
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+import rlightning_aio
+from rlightning_aio.cli.collecting import Roster, resetting, respond_to_all, responder
+from rlightning_aio.cli.terminal import (
+    INTERRUPTED,
+    counted,
+    interruptible,
+    out,
+    print_json,
+)
+from rlightning_aio.config import check_installed, load_config
+from rlightning_aio.registry import ENVS
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rlightning_aio.config import EnvConfig
+
+__all__ = ["check"]
+
+_STEPS: Final = 3
+
+
+@dataclass
+class _Finding:
+    """What was found out of an entry; None where its env was not started.
+
+    Attributes:
+        skipped: why it was not.
+    """
+
+    name: str
+    backend: str
+    task: str
+    num_workers: int
+    num_envs: int
+    observation_space: str | None = None
+    action_space: str | None = None
+    max_episode_steps: int | None = None
+    skipped: str | None = None
+
+
+def check(
+    config: Annotated[Path, typer.Argument(help="YAML file with envs:", show_default=False)],
+    overrides: Annotated[
+        list[str] | None,
+        typer.Argument(help="Dotted overrides, such as envs.0.num_workers=8", show_default=False),
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON document in place of the text.")
+    ] = False,
+) -> None:
+    """Check a config: build one env of each entry, step it a few times, print its spaces.
+
+    What is wrong with the file is told first, before anything is started. Robots are not
+    started, and neither are env_servers, whose envs live elsewhere.
+
+    For example:
+
+        rlightning-aio check configs/cartpole.yaml
+        rlightning-aio check configs/halfcheetah.yaml envs.0.task=Ant-v5
+    """
+    configs = load_config(config, overrides or ())
+    check_installed(configs)
+    findings: list[_Finding] = []
+    try:
+        with interruptible(), contextlib.closing(_look(configs, findings)) as looking:
+            rlightning_aio.run(looking)
+    except KeyboardInterrupt:
+        raise typer.Exit(INTERRUPTED) from None
+    if as_json:
+        print_json({"config": str(config), "entries": [asdict(found) for found in findings]})
+        return
+    for found in findings:
+        for line in _lines(found):
+            out().print(line, soft_wrap=True, markup=False)
+
+
+async def _look(configs: Sequence[EnvConfig], findings: list[_Finding]) -> None:
+    for config in configs:
+        found = _Finding(
+            config.name, config.backend, config.task, config.num_workers, config.num_envs
+        )
+        if config.backend == "env_server":
+            found.skipped = "its envs live with its clients"
+        elif ENVS.is_hardware(config.backend):
+            found.skipped = "it would move"
+        else:
+            await _try(config, found)
+        findings.append(found)
+
+
+async def _try(config: EnvConfig, found: _Finding) -> None:
+    """Build one env of the entry, and step it."""
+    one = [config.model_copy(update={"num_workers": 1, "min_results": None})]
+    async with rlightning_aio.build_env_group(one) as group:
+        (meta,) = group.metas
+        found.observation_space = str(meta.observation_space)
+        found.action_space = str(meta.action_space)
+        found.num_envs = meta.num_envs
+        found.max_episode_steps = config.max_episode_steps or meta.max_episode_steps
+        respond = responder(group, Roster(group, [meta]), None, 0)
+        batch, _ = await group.reset(seed=0)
+        with resetting(group, one):
+            for _ in range(_STEPS):
+                await respond_to_all(group, respond, batch)
+                batch, _ = await group.collect_async()
+
+
+def _lines(found: _Finding) -> list[str]:
+    each = "" if found.num_envs == 1 else f", {found.num_envs} sub-environments in each"
+    head = f"{found.name}: {counted(found.num_workers, 'env')}{each} ({found.backend}"
+    head += f", {found.task})" if found.task else ")"
+    if found.skipped is not None:
+        return [head, f"  not started: {found.skipped}"]
+    limit = found.max_episode_steps
+    return [
+        head,
+        f"  observation  {found.observation_space}",
+        f"  action       {found.action_space}",
+        f"  step limit   {limit or 'none'}",
+        f"  reset and stepped {_STEPS} times",
+    ]

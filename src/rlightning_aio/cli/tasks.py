@@ -1,0 +1,99 @@
+"""``rlightning-aio tasks``: what a config entry's ``task`` may say, by backend."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import gymnasium as gym
+import typer
+
+from rlightning_aio.cli.terminal import print_json, print_result
+from rlightning_aio.errors import ConfigError
+from rlightning_aio.registry import BACKENDS, ENVS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+__all__ = ["tasks"]
+
+
+def _entry_point(spec: Any) -> str:
+    return str(spec.entry_point or spec.vector_entry_point)
+
+
+def _of_gymnasium() -> Iterable[str]:
+    return [name for name, spec in gym.registry.items() if "envs.mujoco" not in _entry_point(spec)]
+
+
+def _of_mujoco() -> Iterable[str]:
+    return [name for name, spec in gym.registry.items() if "envs.mujoco" in _entry_point(spec)]
+
+
+def _of_ale() -> Iterable[str]:
+    importlib.import_module("ale_py")
+    return [name for name in gym.registry if name.startswith("ALE/")]
+
+
+def _of_pettingzoo() -> Iterable[str]:
+    return importlib.import_module("pettingzoo").parallel_registry
+
+
+def _of_envpool() -> Iterable[str]:
+    return importlib.import_module("envpool").list_all_envs()
+
+
+def _of_maniskill() -> Iterable[str]:
+    importlib.import_module("mani_skill.envs")
+    return importlib.import_module("mani_skill.utils.registration").REGISTERED_ENVS
+
+
+_LISTS: Final[dict[str, Callable[[], Iterable[str]]]] = {
+    "gymnasium": _of_gymnasium,
+    "mujoco": _of_mujoco,
+    "ale": _of_ale,
+    "pettingzoo": _of_pettingzoo,
+    "envpool": _of_envpool,
+    "maniskill": _of_maniskill,
+}
+
+
+def _backends() -> list[str]:
+    """For the shell's completion."""
+    return list(_LISTS)
+
+
+def tasks(
+    backend: Annotated[
+        str,
+        typer.Argument(
+            help="As an entry's `backend`.", show_default=False, autocompletion=_backends
+        ),
+    ],
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON document in place of the names.")
+    ] = False,
+) -> None:
+    """List the tasks that a backend's simulator offers here, one a line.
+
+    For example:
+
+        rlightning-aio tasks mujoco
+        rlightning-aio tasks gymnasium | grep Cart
+    """
+    if backend not in _LISTS:
+        known = ", ".join(_LISTS)
+        if not ENVS.knows(backend):
+            raise ConfigError(ENVS.unknown(backend))
+        raise ConfigError(
+            f"backend {backend!r} has no list of tasks: docs/backends.md says what its `task` is; "
+            f"there are lists of {known}"
+        )
+    known_backend = BACKENDS[backend]
+    if known_backend.installed_version() is None:
+        raise ConfigError(f"backend {backend!r} is not installed: {known_backend.install_command}")
+    names = sorted(_LISTS[backend]())
+    if as_json:
+        print_json(names)
+    else:
+        print_result("\n".join(names))
