@@ -43,7 +43,7 @@ from rlightning_aio.group.results import Results
 from rlightning_aio.group.seeds import checked_seed, seeds_for
 from rlightning_aio.group.snapshots import EnvSnapshot, check_same, identity_of, pack, unpack
 from rlightning_aio.group.stats import Stats
-from rlightning_aio.group.wait import Procedure, Wait, earliest
+from rlightning_aio.group.wait import TURN, Procedure, Wait, earliest
 from rlightning_aio.protocol.entries import Operation
 from rlightning_aio.protocol.slab import AS_RESTORED, TRUNCATED
 from rlightning_aio.registry import ENVS
@@ -266,23 +266,18 @@ class Core:
         try:
             # The other calls that wait must be woken as early as they asked for.
             poller, first = self.poller, min(self._wanted)
-            if poller.execute(wanted, until) or poller.spin(first):
-                return (yield from self._look())
-            came, look_again = poller.arm(first, now)
+            if poller.execute(wanted, until):
+                return (yield from self._check_liveness((yield Wait(0.0))))
+            came, look_again = poller.spin(first), None
+            if not came:
+                came, look_again = poller.arm(first, now)
             if came:
-                return (yield from self._look())
+                return (yield from self._check_liveness((yield TURN)))
             now = yield Wait(earliest(until, look_again, self.supervisor.next_check()))
             poller.slept()
         finally:
             self._wanted.remove(wanted)
         self._check(now)
-        return now
-
-    def _look(self) -> Procedure[float]:
-        """Let other calls that wait have their turn, without blocking."""
-        now = yield Wait(0.0)
-        if self.supervisor.is_overdue(now):
-            self._check(now)
         return now
 
     def _stop_waiting(self) -> None:

@@ -137,7 +137,7 @@ class Driver(Watcher, Protocol):
 
 def check_process(pid: int) -> None:
     """Raises `RLightningError` in a child that process `pid` has forked."""
-    if os.getpid() != pid:
+    if _this_process[0] != pid:
         raise RLightningError(
             f"this group belongs to process {pid}, which has forked this one; only it can use and "
             "close the group; build another one here"
@@ -456,8 +456,13 @@ class Facade:
 _groups: weakref.WeakSet[Facade] = weakref.WeakSet()
 
 
+# Every call asks for it, and asking the system takes as long as all the rest of its checks.
+_this_process = [os.getpid()]
+
+
 def _disown_all() -> None:
     """Leave all groups to the process that has forked this one."""
+    _this_process[0] = os.getpid()
     for group in list(_groups):
         group._disown()  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]  # Nobody else's.
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 from rlightning_aio.errors import RLightningError
 from rlightning_aio.group.build import PreprocessFn, plan_group
 from rlightning_aio.group.facade import Facade, ServerView, check_process, only_result, steps_of
+from rlightning_aio.group.wait import TURN
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -115,8 +116,9 @@ class SyncDriver:
             wait = procedure.send(None)  # pyright: ignore[reportArgumentType]
             while True:
                 try:
-                    self._block(wait.until)
-                    self.drain()
+                    if wait is not TURN:  # One procedure runs at a time.
+                        self._block(wait.until)
+                        self.drain()
                 except BaseException as error:
                     # Thrown, not closed: closing down takes waiting, too.
                     wait = procedure.throw(error)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from dataclasses import dataclass
-from typing import TypeAlias, TypeVar
+from typing import Final, TypeAlias, TypeVar
 
-__all__ = ["Procedure", "Wait", "earliest"]
+__all__ = ["TURN", "Procedure", "Wait", "earliest"]
 
 T = TypeVar("T")
 
@@ -20,6 +20,11 @@ class Wait:
 
     until: float | None = None
 
+
+TURN: Final = Wait(0.0)
+"""Let others who wait have their turn, as what is waited for has come. Where nobody else can
+wait, there is nothing to do.
+"""
 
 Procedure: TypeAlias = Generator[Wait, float, T]
 """Yields what it waits for, is sent the time, returns its result.
