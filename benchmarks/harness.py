@@ -379,9 +379,10 @@ def modules_of(contenders: Iterable[Contender]) -> set[str]:
 def machine_facts(modules: Iterable[str]) -> dict[str, Any]:
     """What the figures depend on beside the code; `modules` are those that take part."""
     versions: dict[str, str] = {}
+    distributions = importlib.metadata.packages_distributions()
     for name in (*ALWAYS_USED, *sorted(set(modules) - set(ALWAYS_USED))):
         try:
-            versions[name] = importlib.metadata.version(name)
+            versions[name] = importlib.metadata.version(distributions.get(name, [name])[0])
         except importlib.metadata.PackageNotFoundError:
             continue  # Not installed, or a module beside this one.
     return {

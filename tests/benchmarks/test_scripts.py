@@ -36,7 +36,7 @@ ASKED = {
     "memory": ["rlightning_aio"],
     "pong": ["rlightning_aio"],
     "tracing": ["async half, CartPole"],
-    "peers": ["Gymnasium", "SB3", "Tianshou", "EnvPool, 16 of 32"],
+    "peers": ["Gymnasium", "SB3", "Tianshou", "EnvPool, 16 of 32", "TorchRL", "PufferLib"],
 }
 # Here the work itself gives the length.
 WITHOUT_SECONDS = ("start", "memory")
@@ -117,6 +117,11 @@ def test_script_measures_each_of_its_contenders(
         ("stable_baselines3", "SB3 SubprocVecEnv"),
         ("tianshou", "Tianshou ShmemVectorEnv"),
         ("envpool", "EnvPool, 16 of 32"),
+        ("torchrl", "TorchRL ParallelEnv"),
+        ("torchrl", "TorchRL AsyncEnvPool, all"),
+        ("torchrl", "TorchRL AsyncEnvPool, 16 of 32"),
+        ("pufferlib", "PufferLib, synchronous"),
+        ("pufferlib", "PufferLib, 16 of 32"),
     ],
 )
 def test_peer_steps(module: str, peer: str, report_of: ReportOf) -> None:

@@ -26,8 +26,8 @@ MODES = [
     pytest.param(AutoresetMode.DISABLED, id="Disabled"),
 ]
 
-# Python keeps shared memory of its own for the next, which would count as left behind. TorchRL, once
-# imported, has processes begin with importing everything anew.
+# Python keeps shared memory of its own for the next, which would count as left behind. TorchRL,
+# once imported, has processes begin with importing everything anew.
 PEER: dict[str, dict[str, Any]] = {
     "async": {"shared_memory": False, "context": "fork"},
     "sync": {},
