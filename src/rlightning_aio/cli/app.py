@@ -12,6 +12,7 @@ import rlightning_aio
 from rlightning_aio.cli.backends import backends
 from rlightning_aio.cli.bench import bench
 from rlightning_aio.cli.check import check
+from rlightning_aio.cli.evaluating import evaluation
 from rlightning_aio.cli.remote import client, keygen
 from rlightning_aio.cli.rollout import rollout
 from rlightning_aio.cli.tasks import tasks
@@ -61,3 +62,5 @@ def prepare(
 
 for command in (rollout, bench, tune, check, backends, tasks, client, keygen):
     app.command()(guarded(command))
+# Named after what Python has a function of that name for.
+app.command("eval")(guarded(evaluation))

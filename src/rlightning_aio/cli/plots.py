@@ -16,8 +16,9 @@ if TYPE_CHECKING:
 
     from rlightning_aio.cli.measuring import Contender
     from rlightning_aio.cli.rollout_statistics import Course
+    from rlightning_aio.evaluation import Estimate, Evaluation
 
-__all__ = ["check_plot", "draw_contenders", "draw_rollout"]
+__all__ = ["check_plot", "draw_contenders", "draw_evaluation", "draw_rollout"]
 
 _KINDS: Final = (".png", ".svg", ".pdf")
 
@@ -106,3 +107,38 @@ def draw_rollout(config: str, courses: Sequence[Course], path: Path) -> None:
     for axes in (rates, returns):
         axes.legend(loc="upper left")
     _save(plt, figure, path)
+
+
+def draw_evaluation(config: str, by_entry: Sequence[tuple[str, Evaluation]], path: Path) -> None:
+    """Each episode's return, the means and, where episodes are judged, the success rates with their
+    95 % intervals, by entry.
+
+    Raises:
+        ConfigError: the picture can't be written.
+    """
+    plt = _pyplot()
+    judged = any(found.success is not None for _, found in by_entry)
+    figure, axes = plt.subplots(
+        1, 1 + judged, squeeze=False, figsize=(9, 1.6 + 0.6 * len(by_entry)), layout="constrained"
+    )
+    returns, *rates = axes[0]
+    for place, (_, found) in enumerate(by_entry):
+        values = [episode.total_reward for episode in found.episodes]
+        returns.plot(values, [place] * len(values), "|", alpha=0.4, ms=12)
+        _draw_estimate(returns, found.total_reward, place)
+        for axis in rates:
+            _draw_estimate(axis, found.success, place)
+    returns.set(xlabel="return of an episode; mean, 95 %", title=config)
+    for axis in rates:
+        axis.set(xlabel="success rate, 95 %", xlim=(-0.02, 1.02))
+    for axis in axes[0]:
+        axis.set_yticks(range(len(by_entry)), [name for name, _ in by_entry])
+        axis.set_ylim(len(by_entry) - 0.5, -0.5)
+    _save(plt, figure, path)
+
+
+def _draw_estimate(axes: Any, one: Estimate | None, place: int) -> None:
+    if one is not None:
+        low, high = (one.mean if end is None else end for end in (one.low, one.high))
+        ends = [[one.mean - low], [high - one.mean]]
+        axes.errorbar(one.mean, place, xerr=ends, fmt="o", capsize=4, color="black")

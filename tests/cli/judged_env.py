@@ -1,0 +1,61 @@
+"""An env that judges its episodes, and can be filmed."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import SyncVectorEnv
+
+
+class Judged(gym.Env[Any, Any]):
+    """Succeeds where the seed of the episode is even; an episode has three steps."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+    render_mode = "rgb_array"
+
+    def __init__(self) -> None:
+        self.seed = self.steps = 0
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        self.seed, self.steps = self.seed if seed is None else seed, 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.steps += 1
+        success = self.seed % 2 == 0
+        return np.zeros(1, np.float32), 1.0, self.steps == 3, False, {"success": success}
+
+    def render(self) -> Any:
+        return np.full((16, 16, 3), 50 * self.steps, np.uint8)
+
+
+class Waiting(Judged):
+    """Goes no further than the first step of the second episode; another one than the first
+    doesn't even begin.
+    """
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        if (self.seed == 2 and self.steps == 1) or self.seed % 2:
+            if self.seed == 2:
+                sys.stderr.write("waits\n")
+                sys.stderr.flush()
+            threading.Event().wait()
+        return super().step(action)
+
+
+def make() -> Judged:
+    return Judged()
+
+
+def wait() -> Waiting:
+    return Waiting()
+
+
+def poles() -> SyncVectorEnv:
+    """Three CartPoles, each as if it were alone."""
+    return SyncVectorEnv([lambda: gym.make("CartPole-v1")] * 3)
