@@ -41,7 +41,7 @@ test-simulators: export ISAAC_PYTHON := $(CURDIR)/$(ISAAC)/bin/python
 test-simulators: environments ## the tests of every backend, on the real simulators (7 GB of packages)
 	tests/simulators/install_debian.sh
 	$(ISAAC)/bin/python -m pytest -m simulators -rs tests/envs/test_isaac.py
-	$(SIMULATORS)/bin/python -m pytest --numprocesses 3 --dist worksteal -m simulators -rs tests/benchmarks tests/envs tests/examples tests/vector tests/test_docs.py tests/test_wheel.py
+	$(SIMULATORS)/bin/python -m pytest --numprocesses 3 --dist worksteal -m simulators -rs tests/benchmarks tests/cli tests/envs tests/examples tests/vector tests/test_docs.py tests/test_wheel.py
 	$(RLLIB)/bin/python -m pytest -m simulators -rs tests/vector/test_pages.py
 
 # With -rs, each test that is skipped says what it lacks.

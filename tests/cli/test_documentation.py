@@ -35,6 +35,7 @@ ELSEWHERE = ("make ", "python -m rlightning_aio.legacy ")
 SHORT = {
     "rollout": ["--steps", "500", "envs.0.num_workers=8"],
     "bench": ["--seconds", "0.005", "--rounds", "1", "envs.0.num_workers=2"],
+    "eval": ["envs.0.num_workers=2"],
     "tune": ["--seconds", "0.005", "--rounds", "1", "envs.0.num_workers=2"],
 }
 

@@ -183,6 +183,17 @@ def test_random_actions_suit_entries_with_different_spaces(tmp_path: Path) -> No
     assert all(entry["steps"] > 50 for entry in document["entries"])
 
 
+def test_it_is_filmed(tmp_path: Path) -> None:
+    """The first env of each entry, in a worker of its own; what had no end is marked."""
+    judged = {"name": "judged", "task": "cli.judged_env:make", "num_workers": 2}
+    films = tmp_path / "films"
+    config = write_config(tmp_path, judged)
+    done = run("rollout", config, "--steps", 40, "--video", films, "--video-every", 2)
+    assert done.returncode == 0, done.stderr
+    assert {path.name.partition("-episode-")[0] for path in films.iterdir()} == {"judged-0"}
+    assert (films / "judged-0-episode-2.mp4").exists()
+
+
 def test_the_console_script_is_this_command() -> None:
     """What is installed as rlightning-aio is `cli.main`."""
     project = tomllib.loads((TESTS.parent / "pyproject.toml").read_text())["project"]

@@ -13,7 +13,7 @@ import typer
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
 import rlightning_aio
-from rlightning_aio.cli.collecting import Roster, resetting, responder
+from rlightning_aio.cli.collecting import Roster, check_trace, resetting, responder, traced
 from rlightning_aio.cli.evaluation_file import EvaluationFile, subject
 from rlightning_aio.cli.films import Video, VideoEnvs, VideoEvery, filmed
 from rlightning_aio.cli.plots import check_plot, draw_evaluation
@@ -58,6 +58,7 @@ class _Order:
     seed: int | None
     policy: Policy | None
     played: Sequence[Episode]
+    trace: Path | None
 
 
 def evaluation(
@@ -93,6 +94,10 @@ def evaluation(
     video: Video = None,
     video_env: VideoEnvs = None,
     video_every: VideoEvery = None,
+    trace: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write a timeline for https://ui.perfetto.dev."),
+    ] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print one JSON document in place of the table.")
     ] = False,
@@ -114,6 +119,7 @@ def evaluation(
     _check_envs(config, configs)
     if plot is not None:
         check_plot(plot)
+    check_trace(trace)
     chosen, named = _policy(policy, algo)
     about = subject(configs, named, seed)
     configs = filmed(configs, video, video_env, video_every)
@@ -121,7 +127,7 @@ def evaluation(
         kept = None if resume is None else stack.enter_context(EvaluationFile(resume, about))
         group = rlightning_aio.build_env_group(configs, mixed_actions=True)
         played = _within([] if kept is None else kept.played, episodes)
-        order = _Order(configs, episodes, seed, chosen, played)
+        order = _Order(configs, episodes, seed, chosen, played, trace)
         watch = stack.enter_context(_Watch(group, order, kept))
         interrupted = stopped = False
         try:
@@ -173,7 +179,7 @@ def _within(played: Sequence[Episode], episodes: int) -> list[Episode]:
 
 
 async def _evaluate(group: EnvGroup, order: _Order, watch: _Watch) -> None:
-    async with group:
+    async with group, traced(group, order.trace):
         metas = await group.init()
         if isinstance(order.policy, SB3Policy):
             order.policy.check(metas)
@@ -184,7 +190,7 @@ async def _evaluate(group: EnvGroup, order: _Order, watch: _Watch) -> None:
         with resetting(group, order.configs):
             watch.found = await evaluate(
                 group,
-                watch.seeing(respond),
+                watch.seeing(group, respond),
                 order.episodes,
                 seed=order.seed,
                 min_batch=max(1, len(group) // 2),
@@ -249,7 +255,7 @@ class _Watch:
         if self._kept is not None:
             self._kept.add(episode)
 
-    def seeing(self, respond: Responder) -> Callable[[BatchedData], Any]:
+    def seeing(self, group: EnvGroup, respond: Responder) -> Callable[[BatchedData], Any]:
         """`respond`, with the live line drawn now and then."""
 
         async def answer(batch: BatchedData) -> list[BatchedData]:
@@ -258,7 +264,8 @@ class _Watch:
                 self._show()
                 # Where results never keep us waiting, nothing else would let Ctrl-C in.
                 await asyncio.sleep(0)
-            return await respond(batch)
+            with group.span("policy"):
+                return await respond(batch)
 
         return answer
 

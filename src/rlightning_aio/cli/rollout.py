@@ -20,6 +20,7 @@ from rlightning_aio.cli.collecting import (
     responder,
     traced,
 )
+from rlightning_aio.cli.films import Video, VideoEnvs, VideoEvery, filmed
 from rlightning_aio.cli.live import Display
 from rlightning_aio.cli.plots import check_plot, draw_rollout
 from rlightning_aio.cli.policies import Policy, load_policy
@@ -104,6 +105,9 @@ def rollout(
         Path | None,
         typer.Option(help="Draw rates and returns (PNG, SVG or PDF; needs matplotlib)."),
     ] = None,
+    video: Video = None,
+    video_env: VideoEnvs = None,
+    video_every: VideoEvery = None,
     trace: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Write a timeline for https://ui.perfetto.dev."),
@@ -127,8 +131,9 @@ def rollout(
         rlightning-aio rollout configs/halfcheetah.yaml --seconds 60 --live
         rlightning-aio rollout configs/multi_task.yaml --json > rollout.json
         rlightning-aio rollout configs/halfcheetah.yaml --trace run.json
+        rlightning-aio rollout configs/cartpole.yaml --video films --video-every 10
     """
-    configs = load_config(config, overrides or ())
+    configs = filmed(load_config(config, overrides or ()), video, video_env, video_every)
     if plot is not None:
         check_plot(plot)
     num_envs = sum(entry.num_workers for entry in configs)
