@@ -7,8 +7,9 @@ file properly when its input ends, so what there is can be played.
 
 from __future__ import annotations
 
+import os
 import subprocess
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 __all__ = ["VideoFile", "find_ffmpeg"]
+
+_NICE: Final = 10
+"""Who steps comes before who encodes."""
 
 
 def find_ffmpeg() -> str:
@@ -63,13 +67,15 @@ class VideoFile:
                 *("-r", str(fps), "-i", "-", "-an"),
                 # What most players take: chroma by the half, so sizes must be even.
                 *("-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"),
-                *("-c:v", "libx264", "-preset", "veryfast", str(self._partial)),
+                # By itself it would take all cores, which others step on.
+                *("-c:v", "libx264", "-preset", "veryfast", "-threads", "1", str(self._partial)),
             ],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             start_new_session=True,
         )
+        os.setpriority(os.PRIO_PROCESS, self._ffmpeg.pid, _NICE)
         self.write(frame)
 
     def write(self, frame: NDArray[np.uint8]) -> None:
