@@ -68,10 +68,11 @@ def _write_column(action: Any, slab: Slab, slots: NDArray[np.intp], envs: EnvTab
     """Write the actions of a whole batch with one copy for each array."""
     rows = slice(None) if slots is envs.all else slots
     for leaf, target in slab.action_columns:
-        source = _as_array(_column_at(action, leaf))
+        source = _as_array(_column_at(action, leaf) if leaf.path else action)
         if source.shape != (len(slots), *leaf.shape) or not _castable(source, leaf):
             raise BadAction(_misfit(f"the batch's action{leaf.name}", source, leaf, len(slots)))
-        _refuse_unfit(source, leaf, slab, slots, envs)
+        if (unfit := _unfit(source, leaf, slab)) is not None:
+            raise _unfit_error(unfit, source, leaf, slots, envs)
         target[rows] = source
 
 
@@ -99,22 +100,25 @@ def _write_one_by_one(
                     who = envs.describe(int(slots[k]))
                     raise BadAction(_misfit(f"action{leaf.name} for {who}", source, leaf))
             stacked = np.array(sources)
-            _refuse_unfit(stacked, leaf, slab, slots[positions], envs)
+            if (unfit := _unfit(stacked, leaf, slab)) is not None:
+                raise _unfit_error(unfit, stacked, leaf, slots[positions], envs)
             target[rows] = stacked
 
 
-def _refuse_unfit(
-    source: NDArray[Any], leaf: Leaf, slab: Slab, slots: NDArray[np.intp], envs: EnvTable
-) -> None:
-    """Raises `BadAction` if any number of the actions of `slots` has no meaning in its space."""
-    unfit = _unfit(source, leaf, slab)
-    if unfit is not None:
-        row = int(unfit.reshape(len(slots), -1).any(axis=1).argmax())
-        number = source[row][unfit[row]].flat[0]
-        raise BadAction(
-            f"action{leaf.name} for {envs.describe(int(slots[row]))} holds {number}, which doesn't "
-            f"fit the action space, of dtype {leaf.dtype}; nothing was sent"
-        )
+def _unfit_error(
+    unfit: NDArray[np.bool_],
+    source: NDArray[Any],
+    leaf: Leaf,
+    slots: NDArray[np.intp],
+    envs: EnvTable,
+) -> BadAction:
+    """Names the first of the actions of `slots` that is `unfit` somewhere."""
+    row = int(unfit.reshape(len(slots), -1).any(axis=1).argmax())
+    number = source[row][unfit[row]].flat[0]
+    return BadAction(
+        f"action{leaf.name} for {envs.describe(int(slots[row]))} holds {number}, which doesn't "
+        f"fit the action space, of dtype {leaf.dtype}; nothing was sent"
+    )
 
 
 def _unfit(source: NDArray[Any], leaf: Leaf, slab: Slab) -> NDArray[np.bool_] | None:

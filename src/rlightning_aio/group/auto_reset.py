@@ -180,7 +180,9 @@ class AutoReset:
             slots: of all results.
             flagged: those parts in which any flag is set.
         """
-        shown = [slot for part in flagged for slot in self._note_flags(part)]
+        shown: list[int] = []
+        for part in flagged:
+            shown += self._note_flags(part)
         if self._limits is None:
             return None
         self._margin -= 1

@@ -218,9 +218,11 @@ class Core:
         What they would be asked was meant for the episode that they have lost. Of one that is
         back, the first result of the new episode, which waits to be collected, is the answer.
         """
+        names, is_current = self.envs.names, names_of(batch) is self.envs.names
+        if is_current and not self.requests.num_ready:
+            return batch, slots
         gone = self.requests.joined(slots)
-        names = self.envs.names
-        if names_of(batch) is not names:
+        if not is_current:
             pairs = zip(batch.env_ids(), names.ids(slots), strict=True)
             gone |= np.array([then != now for then, now in pairs], np.bool_)
         if not gone.any():
@@ -312,7 +314,8 @@ class Core:
             now = yield from self._check_liveness(now)
             while True:
                 self._poll()
-                self._raise_fault(among)
+                if self.requests.faults:
+                    self._raise_fault(among)
                 ready, total = self.requests.pending(among)
                 if not total and not self.supervisor.has_members:
                     whose = "" if entries is None else f" of entries {', '.join(entries)}"

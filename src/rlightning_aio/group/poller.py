@@ -126,14 +126,20 @@ class Poller:
         those of clients, which may be processes of this machine, too.
         """
         in_flight = self._requests.in_flight
-        at_work = sum([1 for host_id in self._workers if in_flight[host_id]])
-        at_work += sum([in_flight[host_id] for host_id in self._env_servers])
+        at_work = 0
+        for host_id in self._workers:
+            if in_flight[host_id]:
+                at_work += 1
+        servers: list[Membership] = []
+        for host_id, server in self._env_servers.items():
+            if in_flight[host_id]:
+                at_work += in_flight[host_id]
+                servers.append(server)
         self._spun = 0 < at_work < self.num_cores
         if not self._spun:
             return False
         self._bell.disarm()
         unread = self._bell.unread
-        servers = [server for host_id, server in self._env_servers.items() if in_flight[host_id]]
         if not servers:
             return self._spinner.spin(lambda: unread() >= wanted)
         return self._spinner.spin(

@@ -28,7 +28,7 @@ from rlightning_aio.protocol.entries import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
@@ -271,24 +271,27 @@ class Requests:
         entries += which  # RESET == STEP + 1
         self.entry[slots] = entries
 
-    def by_host(self, slots: NDArray[np.intp]) -> Iterator[tuple[int, slice]]:
+    def by_host(self, slots: NDArray[np.intp]) -> list[tuple[int, slice]]:
         """Each host with its part of submitted `slots`: in flight from now on.
 
         One part for each run of slots of one host.
         """
-        if not len(slots):
-            return
+        count = len(slots)
+        if not count:
+            return []
         hosts = self._host_of[slots]
-        if hosts[0] == hosts[-1] and len(self.in_flight) == 1:
-            self.in_flight[0] += len(slots)
-            yield 0, slice(None)
-            return
+        first = hosts.item(0)
+        if count == 1 or (first == hosts.item(-1) and not np.count_nonzero(hosts != first)):
+            self.in_flight[first] += count
+            return [(first, slice(None))]
+        parts: list[tuple[int, slice]] = []
         start = 0
-        for end in (*((hosts[1:] != hosts[:-1]).nonzero()[0] + 1).tolist(), len(slots)):
-            host_id = int(hosts[start])
+        for end in (*((hosts[1:] != hosts[:-1]).nonzero()[0] + 1).tolist(), count):
+            host_id = hosts.item(start)
             self.in_flight[host_id] += end - start
-            yield host_id, slice(start, end)
+            parts.append((host_id, slice(start, end)))
             start = end
+        return parts
 
     def step_answered_at_once(self, slot: int, now: float) -> None:
         """Number a step that was executed without being submitted."""
@@ -321,8 +324,9 @@ class Requests:
         Args:
             reports: a host, and the entries of what it has done; in the order of arrival.
         """
-        parts = [entries for _, entries in reports]
-        entries = parts[0] if len(parts) == 1 else np.concatenate(parts)
+        entries = reports[0][1]
+        if len(reports) > 1:
+            entries = np.concatenate([entries for _, entries in reports])
         slots = (entries >> _OP_BITS) & _SLOT_MASK
         current = self.entry[slots] == entries
         if np.count_nonzero(current) < len(slots):
@@ -444,7 +448,8 @@ class Requests:
                 slots = slots[: most - count]
             taken.append(slots)
             count += len(slots)
-        self._ready.extendleft(slots for slots in reversed(left) if len(slots))
+        if left:
+            self._ready.extendleft(slots for slots in reversed(left) if len(slots))
         self.num_ready -= count
         return taken[0] if len(taken) == 1 else np.concatenate(taken)
 

@@ -117,8 +117,8 @@ class Stats:
         sent_ns = self._requests.sent_ns
         self._batches += 1
         for part in parts:
-            slots, resets = part.slots, part.is_reset
-            num_envs = resets.shape[1] if resets.ndim > 1 else 1
+            slots, shape = part.slots, part.reward.shape
+            has_sub_envs = len(shape) > (2 if part.agents else 1)
             any_flagged = part.episode_return is not None
             self._samples.append(
                 _Sample(
@@ -127,8 +127,8 @@ class Stats:
                     slots,
                     sent_ns[slots],
                     part.times,
-                    num_envs,
-                    resets.copy() if any_flagged else None,
+                    shape[-1] if has_sub_envs else 1,
+                    part.is_reset.copy() if any_flagged else None,
                     synchronous,
                 )
             )

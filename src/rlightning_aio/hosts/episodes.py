@@ -73,8 +73,12 @@ class EpisodeSums:
             Which of them have reset themselves in this step; None if none has.
         """
         if ended is None and not self._any_over:
-            self.returns[which] += reward
-            self.lengths[which] += 1
+            if which is ...:
+                np.add(self.returns, reward, out=self.returns)
+                np.add(self.lengths, 1, out=self.lengths)
+            else:
+                self.returns[which] += reward
+                self.lengths[which] += 1
             return None
         return self._step_around_ends(reward, ended, which)
 

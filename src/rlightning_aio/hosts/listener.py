@@ -43,6 +43,8 @@ _MESSAGES_A_PUMP: Final = 1000
 _UNSENT_A_CLIENT: Final = 100
 _UNREAD_A_CLIENT: Final = 100
 _LINGER_MS: Final = 200
+_SECONDS_BETWEEN_LOOKS: Final = 0.01
+"""At those who come and go, while clients have something to say; else whenever there is time."""
 _LOOKS_IN_A_ROW: Final = 50
 _LOOKS_A_SECOND: Final = 50
 """At those who come and go: where there are more, they wait and are looked at together."""
@@ -150,6 +152,7 @@ class Listener:
         self._gate = Gate(settings.keys, self._allowance)
         self._looks = Allowance(_LOOKS_IN_A_ROW, _LOOKS_A_SECOND)
         self._look_at: float | None = None
+        self._looked_at = 0.0
         self._is_deaf = False
         self._is_skipping = False
         self._address: str | None = None
@@ -246,12 +249,17 @@ class Listener:
         if self._has_more:
             self._has_more = False
             os.eventfd_read(self._more)
-        self._look(now)
+        # Asking is what makes ZMQ's descriptor unreadable again.
+        has_message = is_readable(self._router)
+        if not has_message or now >= self._looked_at + _SECONDS_BETWEEN_LOOKS:
+            # It shows what there is to see until then by its own descriptors.
+            self._looked_at = now
+            self._look(now)
         for _ in range(_MESSAGES_A_PUMP):
-            # Asking is what makes ZMQ's descriptor unreadable again.
-            if not is_readable(self._router):
+            if not has_message:
                 break
             self._receive(now)
+            has_message = is_readable(self._router)
         else:
             self._call_back()
         self._sessions.tick(now)

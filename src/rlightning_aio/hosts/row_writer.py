@@ -109,8 +109,10 @@ class RowWriter:
         self._reward[...] = reward
         self._terminated[...] = terminated
         self._truncated[...] = truncated
-        ended = self._terminated | self._truncated
-        ended = ended if ended.any() else None
+        ended = None
+        if terminated is not False or truncated is not False:
+            ended = self._terminated | self._truncated
+            ended = ended if ended.any() else None
         if self._turns:
             which = np.asarray(info["env_id"])
             reset = self._sums.step(self._reward, ended, which)

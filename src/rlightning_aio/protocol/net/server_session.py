@@ -269,9 +269,7 @@ class ServerSessions:
             What it led to.
         """
         try:
-            # The trainer may have its own arithmetic raise; a client's numbers must not.
-            with np.errstate(all="ignore"):
-                return self._receive(route, user, parts, now)
+            return self._receive(route, user, parts, now)
         except WireError as error:
             self._complain(str(error), now)
             return Heard.MALFORMED
@@ -329,7 +327,9 @@ class ServerSessions:
         refusal = self._objection(hello, size, user, now)
         if refusal is None:
             try:
-                self._welcome(self._open(hello, route, user, now))
+                # The trainer may have its own arithmetic raise; a client's bounds must not.
+                with np.errstate(all="ignore"):
+                    self._welcome(self._open(hello, route, user, now))
             except _NoRoom as error:
                 refusal = ("full", str(error), True)
             except WireError as error:

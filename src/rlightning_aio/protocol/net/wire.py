@@ -70,7 +70,8 @@ STALE_REQUEST: Final = "StaleRequest"
 """What a client calls a request that is older than one it has executed."""
 
 DTYPES: Final[Mapping[str, np.dtype[Any]]] = {
-    name: np.dtype(name).newbyteorder("<")
+    # By its name: made otherwise it equals that of other arrays, and is not the same.
+    name: np.dtype(np.dtype(name).newbyteorder("<").str)
     for name in (
         "bool", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64",
         "float16", "float32", "float64",
