@@ -79,11 +79,6 @@ class _Place:
 
     def write(self, result: RemoteResult) -> OutOfBand | None:
         """Put a result into the row; what of it is out of band."""
-        # The trainer may have its own arithmetic raise; a client's numbers must not.
-        with np.errstate(all="ignore"):
-            return self._write(result)
-
-    def _write(self, result: RemoteResult) -> OutOfBand | None:
         writer = self._writer
         ends = writer.checked_ends(result.reward, result.terminated, result.truncated)
         if result.is_reset or result.is_loss:
@@ -97,6 +92,11 @@ class _Place:
         # Statistics go by this machine's clock, and what the result says by its client's.
         self._sent_ns[self._row] = result.sent_ns or time.time_ns()
         return writer.write_data(result.observation, result.info, result.extra)
+
+    def write_first(self, result: RemoteResult) -> OutOfBand | None:
+        """The same for a first result, once the trainer takes it in."""
+        with np.errstate(all="ignore"):
+            return self.write(result)
 
 
 class EnvServerHost:
@@ -219,6 +219,14 @@ class EnvServerHost:
     def submit(self, entries: NDArray[np.int64], arguments: Sequence[Any] | None = None) -> None:
         """See `base.Host.submit`."""
         now = time.monotonic()
+        try:
+            self._submit(entries, arguments, now)
+        finally:
+            self._listener.flush(now)
+
+    def _submit(
+        self, entries: NDArray[np.int64], arguments: Sequence[Any] | None, now: float
+    ) -> None:
         for position, entry in enumerate(cast("list[int]", entries.tolist())):
             index = slot_of(entry) - self.first_slot
             place = self._places[index]
@@ -275,8 +283,15 @@ class EnvServerHost:
     def tick(self, now: float) -> None:
         """See `base.Membership.tick`."""
         self._listener.pump(now)
+        results = self._listener.take()
+        if results:
+            # The trainer may have its own arithmetic raise; a client's numbers must not.
+            with np.errstate(all="ignore"):
+                self._take_in(results)
+
+    def _take_in(self, results: list[RemoteResult]) -> None:
         done: list[int] = []
-        for result in self._listener.take():
+        for result in results:
             if result.number is None:
                 self._join(result)
                 continue
@@ -305,7 +320,7 @@ class EnvServerHost:
             return
         slab = self._slab if known is None else None
         traits = self._listener.traits(name)
-        write = partial(self._places[index].write, result)
+        write = partial(self._places[index].write_first, result)
         self._tell(Joined(self.host_id, index, meta, traits, slab, write))
 
 

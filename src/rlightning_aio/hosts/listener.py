@@ -305,8 +305,13 @@ class Listener:
         self._is_skipping = frame.more
         self._allowance.spend(dropped * DROPPED_FRAME, now)
 
+    def flush(self, now: float) -> None:
+        """Send what was asked for, and see to it that nothing is left that wakes nobody."""
+        self._flush(now)
+        if self._sessions.has_results:
+            self._call_back()
+
     def _flush(self, now: float) -> None:
-        """Send what is due, and see to it that nothing is left that wakes nobody."""
         outbox = self._sessions.outbox
         if not outbox:
             return
@@ -346,10 +351,8 @@ class Listener:
     def submit(
         self, client: str, number: int, action: Any, extras: Mapping[str, Any], now: float
     ) -> bool:
-        """Ask a client to step; see `ServerSessions.submit`."""
-        will_answer = self._sessions.submit(client, number, action, extras, now)
-        self._submitted(now)
-        return will_answer
+        """Ask a client to step, with the next `flush`; see `ServerSessions.submit`."""
+        return self._sessions.submit(client, number, action, extras, now)
 
     def submit_reset(
         self,
@@ -359,15 +362,8 @@ class Listener:
         options: dict[str, Any] | None,
         now: float,
     ) -> bool:
-        """Ask a client to reset; see `ServerSessions.submit_reset`."""
-        will_answer = self._sessions.submit_reset(client, number, seed, options, now)
-        self._submitted(now)
-        return will_answer
-
-    def _submitted(self, now: float) -> None:
-        self._flush(now)
-        if self._sessions.has_results:
-            self._call_back()
+        """Ask a client to reset, with the next `flush`; see `ServerSessions.submit_reset`."""
+        return self._sessions.submit_reset(client, number, seed, options, now)
 
     def take(self) -> list[RemoteResult]:
         """All results that are ready, oldest first; each is handed out once."""
