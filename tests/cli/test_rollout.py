@@ -188,7 +188,8 @@ def test_it_is_filmed(tmp_path: Path) -> None:
     judged = {"name": "judged", "task": "cli.judged_env:make", "num_workers": 2}
     films = tmp_path / "films"
     config = write_config(tmp_path, judged)
-    done = run("rollout", config, "--steps", 40, "--video", films, "--video-every", 2)
+    both = ("--min-results", 2)  # Else the other one may take all the steps.
+    done = run("rollout", config, "--steps", 40, *both, "--video", films, "--video-every", 2)
     assert done.returncode == 0, done.stderr
     assert {path.name.partition("-episode-")[0] for path in films.iterdir()} == {"judged-0"}
     assert (films / "judged-0-episode-2.mp4").exists()
