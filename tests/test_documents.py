@@ -15,7 +15,7 @@ ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
 PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md"), ROOT / "benchmarks" / "README.md"])
 PACKAGE = ROOT / "src" / "rlightning_aio"
-# Rooms of the code. What users need of them, the package itself or another module offers.
+# Internal packages. The package itself or another module offers what users need from them.
 INTERNAL = {"batch", "cli", "config", "envs", "group", "hosts", "protocol", "registry", "sharing"}
 INTERNAL |= {"types", "video", "__init__"}
 
