@@ -39,13 +39,16 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def prepare(
     version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print it.")
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version."
+        ),
     ] = False,
 ) -> None:
     """Many reinforcement-learning environments in worker processes, used as one.
 
-    A config is a YAML file with one entry for each kind of env; `key=value` arguments
-    after it override it (envs.0.num_workers=8).
+    A config is a YAML file with one entry for each kind of env. `key=value` arguments
+    after it override its fields (envs.0.num_workers=8).
 
     Start here:
 

@@ -25,14 +25,14 @@ class _Row:
 
 def backends(
     as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON document in place of the table.")
+        bool, typer.Option("--json", help="Print one JSON document instead of the table.")
     ] = False,
 ) -> None:
-    """List every backend: whether its simulator is installed here, and how to install it.
+    """List all backends: whether the simulator is installed here, and how to install it.
 
     Backends of other packages (entry points of the group rlightning_aio.envs) are listed
-    after the built-in ones. Simulators that exclude each other live in environments of
-    their own; run this command there, and name that Python in an entry's `interpreter`.
+    after the built-in ones. Simulators that exclude each other need separate virtual
+    environments; run this command there, and name that Python in an entry's `interpreter`.
 
     For example:
 

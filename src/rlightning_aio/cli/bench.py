@@ -80,31 +80,35 @@ def bench(
         list[str] | None,
         typer.Argument(help="Dotted overrides, such as envs.0.num_workers=8", show_default=False),
     ] = None,
-    rounds: Annotated[int, typer.Option(min=1, help="Turns of each contender.")] = 5,
-    seconds: Annotated[float, typer.Option(min=0.001, help="Length of one measurement.")] = 0.5,
+    rounds: Annotated[int, typer.Option(min=1, help="Number of turns for each contender.")] = 5,
+    seconds: Annotated[
+        float, typer.Option(min=0.001, help="Length of one measurement, in seconds.")
+    ] = 0.5,
     steps: Annotated[
         int | None,
-        typer.Option(min=1, help="End a measurement after so many.", show_default="no limit"),
+        typer.Option(
+            min=1, help="End a measurement after this many steps.", show_default="no limit"
+        ),
     ] = None,
     policy: Annotated[
         str | None,
         typer.Option(metavar="MODULE:CALLABLE", help="Takes a batch, returns actions."),
     ] = None,
     seed: Annotated[
-        int, typer.Option(min=0, help="Of the envs' first reset and the random actions.")
+        int, typer.Option(min=0, help="Seed of the first reset and random actions.")
     ] = 0,
     save_as: Annotated[
         str | None,
-        typer.Option("--save", metavar="NAME", help="Keep the figures, to compare with later."),
+        typer.Option("--save", metavar="NAME", help="Save the figures to compare with later."),
     ] = None,
     compare: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="Compare with what was saved; exit code 3 if slower."),
+        typer.Option(metavar="NAME", help="Compare with saved figures; exit code 3 if slower."),
     ] = None,
     plot: Annotated[
-        Path | None, typer.Option(help="Also draw the table (PNG, SVG or PDF; needs matplotlib).")
+        Path | None, typer.Option(help="Also draw the figures (PNG, SVG or PDF; needs matplotlib).")
     ] = None,
-    table_format: Annotated[Format, typer.Option("--format", help="Of the table.")] = Format.TABLE,
+    table_format: Annotated[Format, typer.Option("--format", help="Table format.")] = Format.TABLE,
     trace: Annotated[
         Path | None,
         typer.Option(
@@ -114,17 +118,17 @@ def bench(
         ),
     ] = None,
     as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON document in place of the table.")
+        bool, typer.Option("--json", help="Print one JSON document instead of the table.")
     ] = False,
 ) -> None:
-    """Measure how fast a config's envs go, and how to make them go faster.
+    """Measure how fast a config's envs run, and how to make them run faster.
 
-    The envs live in this process, or in one worker, or in several, or in both; results are taken
-    with a synchronous step of all envs, or asynchronously as soon as one, half or all of them
-    are ready. Simulations that can share an env (num_envs) are tried that way, too. Beside
-    them stand a plain loop and Gymnasium's vector envs, where these can make the envs. All take
-    turns, and figures are medians over the rounds. Latency is the time from an action's sending
-    to its result in hand. Actions are random, unless --policy names where they come from.
+    The envs live in this process, in one worker, in several, or in both. Results come from
+    a synchronous step of all envs, or asynchronously as soon as one, half or all of them
+    are ready. Simulations that can share an env (num_envs) are also tried that way. A plain
+    loop and Gymnasium's vector envs are measured as well, if these can make the envs. All take
+    turns, and figures are medians over the rounds. Latency is the time from sending an action
+    to receiving its result. Actions are random, unless --policy names a policy.
 
     For example:
 

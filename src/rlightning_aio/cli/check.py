@@ -57,12 +57,12 @@ def check(
         typer.Argument(help="Dotted overrides, such as envs.0.num_workers=8", show_default=False),
     ] = None,
     as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON document in place of the text.")
+        bool, typer.Option("--json", help="Print one JSON document instead of the text.")
     ] = False,
 ) -> None:
     """Check a config: build one env of each entry, step it a few times, print its spaces.
 
-    What is wrong with the file is told first, before anything is started. Robots are not
+    Errors in the file are reported first, before anything is started. Robots are not
     started, and neither are env_servers, whose envs live elsewhere.
 
     For example:

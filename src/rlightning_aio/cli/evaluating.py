@@ -71,25 +71,25 @@ def evaluation(
         str,
         typer.Option(
             metavar="MODULE:CALLABLE|FILE.zip|random",
-            help="Takes a batch, returns actions; or a model that Stable-Baselines3 has saved.",
+            help="Takes a batch, returns actions; or a model saved by Stable-Baselines3.",
         ),
     ] = _RANDOM,
     algo: Annotated[
         str | None,
         typer.Option(
-            help="Of the model in FILE.zip, such as PPO.", show_default="what the file tells"
+            help="Algorithm of the model in FILE.zip, such as PPO.", show_default="from the file"
         ),
     ] = None,
-    episodes: Annotated[int, typer.Option(min=1, help="Episodes of each env.")] = 10,
+    episodes: Annotated[int, typer.Option(min=1, help="Episodes for each env.")] = 10,
     seed: Annotated[
-        int | None, typer.Option(min=0, help="Of the episodes, each of which has its own.")
+        int | None, typer.Option(min=0, help="Base seed; each episode has its own seed.")
     ] = None,
     resume: Annotated[
         Path | None,
-        typer.Option(help="Keep finished episodes in this file, and don't play those in it again."),
+        typer.Option(help="Save finished episodes to this file, and skip those already in it."),
     ] = None,
     plot: Annotated[
-        Path | None, typer.Option(help="Also draw it (PNG, SVG or PDF; needs matplotlib).")
+        Path | None, typer.Option(help="Also draw the results (PNG, SVG or PDF; needs matplotlib).")
     ] = None,
     video: Video = None,
     video_env: VideoEnvs = None,
@@ -99,15 +99,15 @@ def evaluation(
         typer.Option(metavar="FILE", help="Write a timeline for https://ui.perfetto.dev."),
     ] = None,
     as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON document in place of the table.")
+        bool, typer.Option("--json", help="Print one JSON document instead of the table.")
     ] = False,
 ) -> None:
-    """Play a fixed number of episodes of each env, and print what they say of a policy.
+    """Evaluate a policy: play a fixed number of episodes for each env and print statistics.
 
-    Means and success rates have 95 % intervals. Those episodes that end first would be no fair
-    sample: envs that end soon would have more of them. Success is what the last info of an
-    episode says under success or is_success. Ctrl-C ends it early and prints what there is,
-    which is no fair sample either; with --resume the same command goes on from there.
+    Means and success rates have 95 % intervals. The episodes that end first would not be a fair
+    sample, because envs with short episodes would have more of them. Success is the value of
+    success or is_success in the last info of an episode. Ctrl-C ends early and prints the results
+    so far, which are not a fair sample either. With --resume the same command continues from there.
 
     For example:
 

@@ -20,7 +20,9 @@ __all__ = ["Video", "VideoEnvs", "VideoEvery", "filmed"]
 Video: TypeAlias = Annotated[
     Path | None,
     typer.Option(
-        "--video", metavar="FOLDER", help="Film episodes into it (MP4; needs imageio-ffmpeg)."
+        "--video",
+        metavar="FOLDER",
+        help="Film episodes to this folder (MP4; needs imageio-ffmpeg).",
     ),
 ]
 VideoEnvs: TypeAlias = Annotated[
@@ -34,7 +36,7 @@ VideoEnvs: TypeAlias = Annotated[
 ]
 VideoEvery: TypeAlias = Annotated[
     int | None,
-    typer.Option("--video-every", min=1, help="Film every so manyth episode.", show_default="1"),
+    typer.Option("--video-every", min=1, help="Film every n-th episode.", show_default="1"),
 ]
 
 

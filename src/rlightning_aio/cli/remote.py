@@ -56,21 +56,21 @@ def client(
     ],
     keys: Annotated[
         Path | None,
-        typer.Option(help="This client's directory of `keygen`.", show_default="no keys"),
+        typer.Option(help="This client's directory, made by `keygen`.", show_default="no keys"),
     ] = None,
     name: Annotated[
         str | None,
-        typer.Option(help="Unique at the server.", show_default="host name and process id"),
+        typer.Option(help="Name, unique at the server.", show_default="host name and process id"),
     ] = None,
     as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON document in place of the last line.")
+        bool, typer.Option("--json", help="Print one JSON document instead of the last line.")
     ] = False,
 ) -> None:
     """Lend an env of this machine to the env_server of a trainer elsewhere.
 
-    Builds the first env of the config's entry, here in this process, and serves it until it
-    is finished or Ctrl-C is pressed. A server that is not there, or goes away, is dialled
-    again with growing pauses; each time it lets the env in, the env is reset.
+    The command builds the first env of the config's entry in this process, and serves it until
+    the env is finished or you press Ctrl-C. If the server is not there, or goes away, the client
+    dials again with growing pauses. Each time the server lets the env in, the env is reset.
 
     For example:
 
@@ -204,15 +204,15 @@ def _report(served: RemoteEnvClient, *, interrupted: bool, as_json: bool) -> Non
 
 
 def keygen(
-    directory: Annotated[Path, typer.Argument(help="Made if missing.", show_default=False)],
-    names: Annotated[list[str], typer.Argument(help="Of the clients.", show_default=False)],
+    directory: Annotated[Path, typer.Argument(help="Created if missing.", show_default=False)],
+    names: Annotated[list[str], typer.Argument(help="Names of the clients.", show_default=False)],
     as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON document in place of the advice.")
+        bool, typer.Option("--json", help="Print one JSON document instead of the advice.")
     ] = False,
 ) -> None:
-    """Make the CURVE keys of an env_server and of clients that it lets in.
+    """Make the CURVE keys of an env_server and of the clients that it lets in.
 
-    The server's keys are made the first time and kept from then on, so clients can be added
+    The server's keys are made the first time and then kept, so you can add clients
     later. Each client gets a directory of its own, which holds a secret: copy it to that
     client's machine over a channel that you trust. Deleting server/clients/NAME.key shuts
     a client out.

@@ -81,14 +81,15 @@ def rollout(
         typer.Option(min=1, help="Env steps to collect.", show_default="10000, or for --seconds"),
     ] = None,
     seconds: Annotated[
-        float | None, typer.Option(min=0.001, help="Collect for so long.", show_default="no limit")
+        float | None,
+        typer.Option(min=0.001, help="Seconds to collect for.", show_default="no limit"),
     ] = None,
     policy: Annotated[
         str | None,
         typer.Option(metavar="MODULE:CALLABLE", help="Takes a batch, returns actions."),
     ] = None,
     seed: Annotated[
-        int | None, typer.Option(min=0, help="Of the envs' first reset and the random actions.")
+        int | None, typer.Option(min=0, help="Seed of the first reset and random actions.")
     ] = None,
     min_results: Annotated[
         int | None,
@@ -113,15 +114,15 @@ def rollout(
         typer.Option(metavar="FILE", help="Write a timeline for https://ui.perfetto.dev."),
     ] = None,
     as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON document in place of the table.")
+        bool, typer.Option("--json", help="Print one JSON document instead of the table.")
     ] = False,
 ) -> None:
-    """Collect steps from a config's envs and print a table of what came.
+    """Collect steps from a config's envs and print a table of the results.
 
-    Actions are sampled at random from the envs' action spaces, or made by the callable that
-    --policy names. It gets a BatchedData (one for each entry, where their spaces differ) and
+    Actions are sampled at random from the envs' action spaces, or come from the callable that
+    --policy names. It gets a BatchedData (one for each entry, if their spaces differ) and
     returns actions, one row for each result, or a batch made with its respond() method.
-    Ctrl-C ends the collecting early and prints the table of what there is.
+    Ctrl-C ends the collection early and prints the table so far.
 
     For example:
 

@@ -67,14 +67,16 @@ def tasks(
     backend: Annotated[
         str,
         typer.Argument(
-            help="As an entry's `backend`.", show_default=False, autocompletion=_backends
+            help="A backend, as in an entry's `backend`.",
+            show_default=False,
+            autocompletion=_backends,
         ),
     ],
     as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON document in place of the names.")
+        bool, typer.Option("--json", help="Print one JSON document instead of the names.")
     ] = False,
 ) -> None:
-    """List the tasks that a backend's simulator offers here, one a line.
+    """List the tasks of a backend's simulator, as installed here, one per line.
 
     For example:
 

@@ -92,20 +92,22 @@ def tune(
         list[str] | None,
         typer.Argument(help="Dotted overrides, such as envs.0.num_workers=8", show_default=False),
     ] = None,
-    rounds: Annotated[int, typer.Option(min=1, help="Turns of each setting.")] = 5,
-    seconds: Annotated[float, typer.Option(min=0.001, help="Length of one measurement.")] = 0.5,
+    rounds: Annotated[int, typer.Option(min=1, help="Number of turns for each setting.")] = 5,
+    seconds: Annotated[
+        float, typer.Option(min=0.001, help="Length of one measurement, in seconds.")
+    ] = 0.5,
     as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON document in place of the YAML.")
+        bool, typer.Option("--json", help="Print one JSON document instead of the YAML.")
     ] = False,
 ) -> None:
     """Find where a config's envs should live, and how many results to wait for.
 
-    It measures a step of the envs alone, tries this process, several numbers of workers and both
-    together, with the simulations in envs of their own or in fewer that hold several (num_envs),
-    then several `min_results` with the fastest two of them, all in alternating rounds. The
-    config with the best setting is printed as YAML on stdout, the table of what was tried on
-    stderr. Of settings that are equally fast, the one with the lowest latency is best. Actions
-    are random: a policy that takes long shifts the balance towards a smaller min_results.
+    It first measures a step of the envs alone. Then it tries this process, several numbers of
+    workers and both together, with one simulation in each env or several (num_envs), and then
+    several `min_results` with the two fastest of these, all in alternating rounds. It prints the
+    config with the best setting as YAML on stdout, and the table of all settings on stderr.
+    Among equally fast settings, the one with the lowest latency is best. Actions
+    are random: a slow policy shifts the balance towards a smaller min_results.
 
     For example:
 
