@@ -236,7 +236,9 @@ def test_it_needs_a_context_and_envs_of_its_own() -> None:
             with pytest.raises(ValueError, match="episodes must be at least 1, not 0"):
                 evaluate(group, nothing, 0)
             other = Episode("other-0", 0, 0, 1.0, 1, None)
-            with pytest.raises(ValueError, match=r"'other-0'.* was played by no env of this group"):
+            with pytest.raises(
+                ValueError, match=r"'other-0'.* was not played by an env of this group"
+            ):
                 evaluate(group, nothing, 1, played=[other])
 
 

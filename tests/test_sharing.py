@@ -42,5 +42,5 @@ def test_an_entry_is_laid_over_the_cores_where_it_asks_for_it() -> None:
     assert laid_out(placement="inline") == laid_out(backend="envpool") == (1, total)
     assert laid_out(num_envs=1) == (1, 1)
     for fields in ({"backend": "pettingzoo"}, {"backend": "callable"}):
-        with pytest.raises(ValueError, match="and these have none; give a number"):
+        with pytest.raises(ValueError, match="and these envs have none; give a number"):
             laid_out(**fields)

@@ -253,4 +253,4 @@ def test_a_film_that_cannot_be_written_ends_no_training(
     with sync.build_env_group(rl.record_video(entry(Brighter), folder)) as group:
         folder.rmdir()
         play(group, 9)
-    assert capfd.readouterr().err.count("env 'env-0' is filmed no more") == 1
+    assert capfd.readouterr().err.count("env 'env-0' is no longer filmed") == 1

@@ -178,7 +178,7 @@ class EnvConfig(BaseModel):
     def _know_how_many(cls, num_workers: Any) -> Any:
         if num_workers == "auto":
             raise ValueError(
-                "'auto' lays the sub-environments that num_envs says over the cores, and these "
+                "'auto' spreads the sub-environments of num_envs over the cores, and these envs "
                 "have none; give a number"
             )
         return num_workers
@@ -556,7 +556,7 @@ def _check_task(config: EnvConfig) -> str | None:
     if config.make_env is not None and config.backend == _CALLABLE:
         return f"make_env makes the envs; leave out {config.task!r}" if config.task else None
     if config.backend == _CALLABLE and not all(config.task.partition(":")):
-        return f"should read like module:function (or give make_env), got {config.task!r}"
+        return f"should look like module:function (or give make_env), got {config.task!r}"
     return None if config.task or config.backend == "env_server" else "is required"
 
 
@@ -604,7 +604,7 @@ def _check_snapshot_every(config: EnvConfig) -> str | None:
     if resumes and ENVS.is_hardware(config.backend):
         return f"on_worker_death: resume can't put back what backend {config.backend!r} moves"
     if resumes and config.snapshot_every is None:
-        return "is required with on_worker_death: resume; so many steps are lost at most"
+        return "is required with on_worker_death: resume; it is the most steps that can be lost"
     if config.snapshot_every is not None and not resumes:
         return "has no meaning without on_worker_death: resume"
     return None
@@ -804,7 +804,7 @@ def _apply(document: Any, override: str) -> str | None:
     key, equals, text = override.partition("=")
     top, dot, below = key.partition(".")
     if not equals or not (top in _TOP_LEVEL or (OmegaConf.is_dict(document) and top in document)):
-        return "should read like envs.0.num_workers=8"
+        return "should look like envs.0.num_workers=8"
     if top in ("env", "envs"):
         # Either word reaches the entries, whichever the file uses.
         top = "env" if "env" in document and "envs" not in document else "envs"

@@ -152,10 +152,10 @@ class Placement:
     extra: str = ""
 
 
-_THIS_PROCESS = "the envs live in this process, which is as it is"
+_THIS_PROCESS = "the envs live in this process, which is already running"
 _NO_WORKER = "there is no worker that could die or be replaced"
 _NO_LIMIT = "nothing can end what an env does in this process"
-_OWN_SHARE = "this process, which is as it is, has a share of the envs"
+_OWN_SHARE = "this process, which is already running, has a share of the envs"
 _CLIENTS_OWN = "its envs live with its clients, which start them as they like"
 _NOT_RAYS = "it is for Ray actors (placement: ray)"
 
@@ -201,7 +201,7 @@ PLACEMENTS: dict[str, Placement] = {
         refuses={
             "interpreter": "Ray starts the actors; ray_options.runtime_env may name another "
             "Python or other packages",
-            "cpu_affinity": "Ray deals out the cores of its nodes",
+            "cpu_affinity": "Ray assigns the cores of its nodes",
         },
         local=False,
         extra="ray",

@@ -117,8 +117,8 @@ class VecEnv(_Base):
             for k, spaces in enumerate(self._rows.spaces):
                 if spaces is not first and spaces != first:
                     raise ConfigError(
-                        f"the spaces of env {k} are not those of env 0; Stable-Baselines3 batches "
-                        "what is alike"
+                        f"the spaces of env {k} are not those of env 0; Stable-Baselines3 needs "
+                        "equal spaces"
                     )
             # Results of all envs, in order, which actions can answer.
             self._answerable = BatchedData(self.group.env_ids, [None] * len(metas))

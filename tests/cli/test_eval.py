@@ -128,7 +128,7 @@ def test_what_is_wrong_is_told_before_anything_starts(tmp_path: Path) -> None:
     )
     assert "can't be written" in refused(config, "--resume", tmp_path / "absent" / "file")
     (tmp_path / "zip.zip").write_text("nothing")
-    assert "name it by --algo" in refused(config, "--policy", tmp_path / "zip.zip")
+    assert "name it with --algo" in refused(config, "--policy", tmp_path / "zip.zip")
     server = write_config(tmp_path, {"name": "robots", "backend": "env_server"})
     assert "'robots'), backend: clients of an env_server come and go" in refused(server)
 
@@ -142,7 +142,7 @@ def test_a_file_of_another_evaluation_is_left_as_it_is(tmp_path: Path) -> None:
     assert file.read_bytes() == before
     for text in ("notes", "notes\nmore notes\n", "[1]\n", "{}\n"):
         file.write_text(text)
-        assert "is no file that eval has written" in refused(config, "--resume", file)
+        assert "is not a file that eval has written" in refused(config, "--resume", file)
         assert file.read_text() == text
 
 

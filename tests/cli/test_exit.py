@@ -99,7 +99,7 @@ def test_a_wrong_option_is_code_2(tmp_path: Path, words: list[str]) -> None:
 @pytest.mark.parametrize(
     ("policy", "message"),
     [
-        ("nonsense", "should read like my_policies:greedy"),
+        ("nonsense", "should look like my_policies:greedy"),
         ("no_such_module:f", "No module named 'no_such_module'"),
         ("cli.stub_policies:nothing", "has no 'nothing'"),
         ("cli.stub_policies:not_callable", "is a int, not a callable"),

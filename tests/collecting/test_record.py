@@ -165,5 +165,5 @@ def test_errors_are_raised_in_their_turn() -> None:
 def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "notes"
     path.write_text("shopping list")
-    with pytest.raises(ValueError, match="notes holds no record"):
+    with pytest.raises(ValueError, match="notes is not a record"):
         Record.load(path)

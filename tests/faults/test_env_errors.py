@@ -302,7 +302,7 @@ MISFITS: dict[str, tuple[dict[str, Any], str]] = {
 
 @on_one_driver
 def test_observation_that_does_not_fit_its_space_is_named_with_both_shapes(start: Start) -> None:
-    """Expected and found, shape and dtype; the env can be used on, the others notice nothing."""
+    """Expected and found, shape and dtype; the env is still usable, the others notice nothing."""
     group, tokens = start(two_workers()), Tokens()
     for instead, message in MISFITS.values():
         group.call("faulty-1", "answer_with", **instead)

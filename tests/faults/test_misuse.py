@@ -113,7 +113,7 @@ def test_unknown_and_doubled_ids_are_named(start: Start) -> None:
     group, tokens = start(two_workers()), Tokens()
     for ids, error, message in (
         (["faulty-0", "faulty-9"], UnknownEnv, "'faulty-9'; its envs are faulty-0, faulty-1"),
-        (["faulty-0", "faulty-1", "faulty-0"], EnvBusy, "'faulty-0' comes twice"),
+        (["faulty-0", "faulty-1", "faulty-0"], EnvBusy, "'faulty-0' appears twice"),
     ):
         chosen = responses(ids, np.zeros((len(ids), 2)))
         with pytest.raises(error, match=message):

@@ -175,7 +175,7 @@ def test_an_env_is_reset_once_in_one_call(new_group: NewGroup) -> None:
     """Naming an env twice is refused as a whole, as in a batch of steps."""
     group = new_group(2)
     ids = ["fake-1", "fake-0", "fake-1"]
-    with pytest.raises(EnvBusy, match="'fake-1' comes twice"):
+    with pytest.raises(EnvBusy, match="'fake-1' appears twice"):
         group.begin(group.core.reset(group.now, None, None, ids)).result()
     assert not group.hosts[0].waiting
 

@@ -107,7 +107,7 @@ def test_what_the_machine_lacks_is_refused_before_anything_starts(
         r"\(0, 1\), by CUDA_VISIBLE_DEVICES=0,1",
     ):
         sync.build_env_group({**entry, "num_gpus": 1, "envs_per_process": 1})
-    with pytest.raises(ConfigError, match=r"whole devices or a part of one, not 1\.5"):
+    with pytest.raises(ConfigError, match=r"whole devices or a fraction of one, not 1\.5"):
         sync.build_env_group({**entry, "num_gpus": 1.5})
 
 

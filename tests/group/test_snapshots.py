@@ -288,7 +288,7 @@ def test_what_does_not_match_in_number_is_refused() -> None:
             group.snapshot()
         batch, _ = group.reset(seed=0)
         snapshot = group.snapshot()
-        with pytest.raises(SnapshotError, match="is of 2 envs, and is to go into 1"):
+        with pytest.raises(SnapshotError, match="is of 2 envs, but should go into 1"):
             group.restore(snapshot, env_ids=["e-0"])
         with pytest.raises(EnvBusy, match="twice"):
             group.restore(snapshot, env_ids=["e-0", "e-0"])

@@ -163,9 +163,9 @@ async def test_a_bad_batch_is_refused_as_a_whole(start: Any) -> None:
     for bad, error, said in (
         (batch.respond(action=np.zeros((4, 3))), BadAction, r"\(4, 2\).*\(4, 3\)"),
         (batch.respond(action=good.astype(complex)), BadAction, "float64.*complex128"),
-        (batch.respond(action=[[0, 1], [0, 1], [0, 1], [0]]), BadAction, "no array"),
+        (batch.respond(action=[[0, 1], [0, 1], [0, 1], [0]]), BadAction, "not an array"),
         (responses([*IDS, "probe-9"], 1, 2, 3, 4, 5), UnknownEnv, "'probe-9'.*probe-0"),
-        (responses([*IDS, "probe-1"], 1, 2, 3, 4, 5), EnvBusy, "'probe-1' comes twice"),
+        (responses([*IDS, "probe-1"], 1, 2, 3, 4, 5), EnvBusy, "'probe-1' appears twice"),
         (BatchedData(IDS[:2], [PolicyResponse("probe-0", [0, 1]), 3]), BadAction, "int"),
         (
             BatchedData(IDS[:2], [PolicyResponse("probe-0", [0, 1]), PolicyResponse("probe-1")]),
@@ -302,7 +302,9 @@ async def test_calls_of_methods_run_at_once_and_are_collected_together(start: An
         group.call_async("double", 1)
     assert await group.collect_calls() == [2, 2, "ababab"]
     group.call_async("double", "ab", times="ab")
-    with pytest.raises(EnvRaised, match=r"in the call of double\(\): TypeError.*used on") as caught:
+    with pytest.raises(
+        EnvRaised, match=r"in the call of double\(\): TypeError.*still usable"
+    ) as caught:
         await group.collect_calls()
     assert sorted(error.env_id for error in (caught.value, *caught.value.others)) == IDS
     group.call_async("double", 4)

@@ -85,5 +85,5 @@ def test_a_program_that_is_no_interpreter_ends_with_its_exit_code(program: str, 
     """It leaves no zombie behind, either."""
     assert lost(f"/bin/{program}") == (
         f"it exited with code {code} while it was importing gymnasium; is /bin/{program} a Python "
-        "with what workers need?"
+        "with the packages that workers need?"
     )

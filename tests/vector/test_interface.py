@@ -55,7 +55,7 @@ class Held(Plain):
 
 
 def test_halves_of_a_call_belong_together(tmp_path: Path) -> None:
-    """Each `wait` needs its own `async`; a timeout raises, and what comes late is dropped."""
+    """Each `wait` needs its own `async`; a timeout raises, and late results are dropped."""
     gate = tmp_path / "open"
     env = VectorEnv([lambda: Held(gate)] * 2, max_concurrency=1)
     assert len(set(env.call("worker"))) == 1

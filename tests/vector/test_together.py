@@ -156,7 +156,7 @@ def test_callables_may_return_vector_environments(mode: AutoresetMode) -> None:
 def test_vector_environments_must_go_together() -> None:
     """As many in each, in the mode that is asked for."""
     makers = [functools.partial(loops, AutoresetMode.NEXT_STEP, count) for count in (2, 3)]
-    with pytest.raises(RuntimeError, match="must be as many everywhere"):
+    with pytest.raises(RuntimeError, match="the number must be the same everywhere"):
         VectorEnv(makers, **INLINE)
     with pytest.raises(StartFailed, match="has autoreset_mode"):
         VectorEnv(makers[:1], autoreset_mode="SameStep", **INLINE)

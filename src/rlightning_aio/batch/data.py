@@ -322,7 +322,7 @@ class BatchedData:
         if self._origin is not None and self._columns is None and not len(self):
             return np.zeros(0, np.bool_)
         if not self._parts:
-            raise AttributeError("only results of a group tell this; this batch holds plain values")
+            raise AttributeError("only results of a group have this; this batch holds plain values")
         found = [(part, column(part)) for part in self._parts]
         if self._parts[0].positions is None:
             return found[0][1]
@@ -345,7 +345,7 @@ class BatchedData:
             AttributeError: the batch holds plain values, no results of a group.
         """
         if self._sources is None:
-            raise AttributeError("only results of a group tell what was sent for them")
+            raise AttributeError("only results of a group know what was sent for them")
         return Sent(self._sources, len(self))
 
     @property

@@ -120,7 +120,7 @@ class Sent:
             places.append(where)
         if not found:
             known = ", ".join(self.keys()) or "nothing"
-            raise KeyError(f"no {name!r} was sent for these results; what was: {known}")
+            raise KeyError(f"no {name!r} was sent for these results; sent were: {known}")
         if lacking:
             nobody = np.concatenate(lacking)
             found.append(mapped(lambda leaf: _filler(leaf, len(nobody)), found[0]))

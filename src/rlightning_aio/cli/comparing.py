@@ -89,7 +89,9 @@ def check_name(name: str | None, *, must_exist: bool) -> None:
     if name is None:
         return
     if not re.fullmatch(r"[\w-][\w.-]*", name):
-        raise ConfigError(f"{name!r} can't name figures: use letters, digits, '.', '_' and '-'")
+        raise ConfigError(
+            f"{name!r} is not a valid name for figures: use letters, digits, '.', '_' and '-'"
+        )
     if must_exist and not _path(name).is_file():
         known = ", ".join(sorted(path.stem for path in _FOLDER.glob("*.json"))) or "nothing"
         raise ConfigError(

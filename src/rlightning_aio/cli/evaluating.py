@@ -158,8 +158,8 @@ def _check_envs(path: Path, configs: Sequence[EnvConfig]) -> None:
         if config.backend == "env_server":
             raise ConfigError(
                 f"{path}: envs.{index} ({config.name!r}), backend: clients of an env_server come "
-                "and go, so they can't be given equally many episodes each; evaluate the env "
-                "itself, where it is"
+                "and go, so they can't all play the same number of episodes; evaluate the env "
+                "where it runs"
             )
 
 
@@ -322,7 +322,7 @@ def _print_table(
 ) -> None:
     title = f"{facts['policy']}: {counted(facts['episodes_each'], 'episode')} of each env"
     if facts["interrupted"]:
-        title = f"Interrupted, so those that end soon are favoured: {title}"
+        title = f"Interrupted, so short episodes are favoured: {title}"
     table = named_columns(
         title,
         "entry", "envs", "episodes", "mean\nreturn", "\n95 %", "mean\nlength", "\n95 % ",
@@ -341,7 +341,7 @@ def _print_table(
     console = out()
     print_table(console, table, ("\n95 % ", "envs"))
     if lost:
-        console.print(f"{counted(lost, 'episode')} lost with a worker, and begun anew")
+        console.print(f"{counted(lost, 'episode')} lost with a worker, and started again")
 
 
 def _with_interval(one: Estimate | None, words: Callable[[float], str]) -> tuple[str, str]:

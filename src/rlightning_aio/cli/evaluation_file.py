@@ -62,7 +62,7 @@ class EvaluationFile:
 
     def _read(self, about: dict[str, Any]) -> None:
         self._file.seek(0)
-        foreign = ConfigError(f"--resume {self._path}: is no file that eval has written")
+        foreign = ConfigError(f"--resume {self._path}: is not a file that eval has written")
         try:
             text = self._file.read()
             whole = text[: text.rfind("\n") + 1]
@@ -83,7 +83,7 @@ class EvaluationFile:
             )
             raise ConfigError(
                 f"--resume {self._path}: is of another evaluation ({told}); name another file, or "
-                "ask for the same as before"
+                "use the same settings as before"
             )
         else:
             self._file.truncate(len(whole.encode()))

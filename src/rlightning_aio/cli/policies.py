@@ -50,7 +50,7 @@ def load_policy(name: str) -> Policy:
     """
     module_name, colon, path = name.partition(":")
     if not (module_name and colon and path):
-        raise ConfigError(f"--policy {name!r}: should read like my_policies:greedy")
+        raise ConfigError(f"--policy {name!r}: should look like my_policies:greedy")
     try:
         found: Any = importlib.import_module(module_name)
     except Exception as error:

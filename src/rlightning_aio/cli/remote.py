@@ -99,7 +99,7 @@ def _split(address: str) -> tuple[str, int]:
     """Host and port of ``tcp://host:port``; an IPv6 host stands in brackets there."""
     match = re.fullmatch(r"tcp://(?:\[([0-9A-Fa-f:.]+)\]|([\w.-]+)):([0-9]{1,5})", address)
     if match is None or not 0 < int(match[3]) <= _MAX_PORT:
-        raise ConfigError(f"--connect {address!r}: should read like tcp://127.0.0.1:5555")
+        raise ConfigError(f"--connect {address!r}: should look like tcp://127.0.0.1:5555")
     return match[1] or match[2], int(match[3])
 
 

@@ -96,8 +96,8 @@ def _size(space: Any, num_envs: int) -> Any:
 def _algorithm_in(path: Path) -> str:
     """The algorithm that has saved a model, as far as its file tells."""
     unknown = ConfigError(
-        f"--policy {path}: doesn't tell which algorithm of Stable-Baselines3 has saved it; name it "
-        "by --algo"
+        f"--policy {path}: doesn't say which algorithm of Stable-Baselines3 saved it; name it "
+        "with --algo"
     )
     try:
         with zipfile.ZipFile(path) as archive:

@@ -150,7 +150,7 @@ async def _search(search: _Search, settings: Sequence[Setting], watch: Watch) ->
             for least in _least(_setting(contender).num_envs)
         ]
         watch.say(
-            f"trying {len(search.finals)} times min_results, {counted(search.rounds, 'round')}"
+            f"trying {len(search.finals)} values of min_results, {counted(search.rounds, 'round')}"
         )
         await take_turns(stands, search.finals, search.rounds, search.limits, watch.measured)
 
@@ -233,7 +233,7 @@ def _as_yaml(config: Path, best: Contender, *, interrupted: bool = False) -> str
     if interrupted:
         lines.insert(0, "Interrupted: not everything was tried.")
     if any(entry.num_envs > 1 for entry in setting.configs):
-        lines.append("With num_envs, a result is that of so many sub-environments at once.")
+        lines.append("With num_envs, one result covers that many sub-environments.")
     return ("".join(f"# {line}\n" for line in lines) + text).rstrip()
 
 

@@ -174,7 +174,9 @@ class Collector(Generic[G, R]):
 
     def _timed(self) -> Procedure[R]:
         if self._collecting:
-            raise RuntimeError("this collector is collecting already; one collect at a time")
+            raise RuntimeError(
+                "this collector is already collecting; only one collect can run at a time"
+            )
         if not self._group.resets_by_itself:
             raise RuntimeError(
                 "envs whose episode is over must be reset: collect inside "
@@ -285,7 +287,7 @@ class Collector(Generic[G, R]):
         num_steps, rest = divmod(self._quota, sum(counts))
         if rest or not num_steps:
             raise ValueError(
-                f"num_transitions={self._quota} makes no block of {sum(counts)} envs "
+                f"num_transitions={self._quota} can't fill a block of {sum(counts)} envs "
                 "(sub-environments counted); give a multiple of that"
             )
         self._num_steps = num_steps

@@ -138,11 +138,9 @@ class Kind:
             ) from None
         if "action" not in given:
             names = ", ".join(map(repr, given)) or "nothing"
-            raise ValueError(f"a policy returns columns by name, 'action' among them; not {names}")
+            raise ValueError(f"a policy returns columns by name, including 'action', not {names}")
         for name in _OWN & given.keys():
-            raise ValueError(
-                f"a rollout has a column {name!r} of its own; call the policy's another"
-            )
+            raise ValueError(f"a rollout has a column {name!r} of its own; rename the policy's")
         head = part.results.head
         columns = {name: rows_of(name, column, head) for name, column in given.items()}
         columns["observation"] = part.results.observation

@@ -86,7 +86,7 @@ class Record:
         """
         data = Path(path).read_bytes()
         if not data.startswith(_MAGIC):
-            raise ValueError(f"{path} holds no record of an order of results")
+            raise ValueError(f"{path} is not a record of the order of results")
         start = len(_MAGIC) + 16
         num_calls, length = struct.unpack("<QQ", data[len(_MAGIC) : start])
         record = cls()

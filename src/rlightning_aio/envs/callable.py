@@ -43,7 +43,7 @@ def env_of_callable(
     if isinstance(made, gym.Env | gym.vector.VectorEnv):
         return _GivenEnv(made, config, worker_index, preprocess_fn)
     raise TypeError(
-        f"what makes the envs of entry {config.name!r} must return a gymnasium.Env, a "
+        f"the callable of entry {config.name!r} must return a gymnasium.Env, a "
         f"gymnasium.vector.VectorEnv or a BaseEnv, not {type(made).__name__}"
     )
 
@@ -77,8 +77,8 @@ class _GivenEnv(GymnasiumEnv):
         is_vector = isinstance(made, gym.vector.VectorEnv)
         if config.num_envs not in (1, made.num_envs if is_vector else 1):
             raise ConfigError(
-                f"entry {config.name!r}, num_envs: {config.num_envs}, but what makes its envs "
-                f"returned {f'{made.num_envs} of them' if is_vector else 'a single env'}; leave "
+                f"entry {config.name!r}, num_envs: {config.num_envs}, but its callable returned "
+                f"{f'{made.num_envs} of them' if is_vector else 'a single env'}; leave "
                 "num_envs out"
             )
         if config.max_episode_steps is None:

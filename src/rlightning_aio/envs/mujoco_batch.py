@@ -267,7 +267,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             values, different = each[0], (not _same(each[0], other) for other in each)
         if name in _FIXED or any(different):
             raise ValueError(
-                f"{name} can't be set of simulations that are stepped together, which share their "
+                f"{name} can't be set for simulations that are stepped together, which share their "
                 "model and options; make separate envs (vectorization_mode='async')"
             )
         self._made.set_wrapper_attr(name, values)

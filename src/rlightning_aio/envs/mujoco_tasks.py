@@ -472,7 +472,9 @@ def task_of(env: gym.Env[Any, Any], simulations: list[Any]) -> Task:
         f"{kind.__module__}:{kind.__qualname__}".removeprefix("gymnasium.envs.mujoco.")
     )
     if found is None:
-        raise NotImplementedError(f"{kind.__name__} is none of Gymnasium's MuJoCo tasks, version 5")
+        raise NotImplementedError(
+            f"{kind.__name__} is not one of Gymnasium's MuJoCo tasks, version 5"
+        )
     for wrapper in wrappers_of(env):
         if not isinstance(wrapper, gym.wrappers.OrderEnforcing | gym.wrappers.TimeLimit):
             raise NotImplementedError(f"it is wrapped in {type(wrapper).__name__}")

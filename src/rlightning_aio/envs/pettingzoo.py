@@ -80,7 +80,7 @@ class PettingZooEnv(BaseEnv):
             pettingzoo.spec("parallel", name)
         except pettingzoo.env_registry.exceptions.PettingZooRegistryError as error:
             if name in pettingzoo.aec_registry:
-                reason = "is turn-based; convert it in a function of yours (module:function)"
+                reason = "is turn-based; convert it in your own function (module:function)"
             else:
                 known: list[str] = list(pettingzoo.parallel_registry)
                 near = difflib.get_close_matches(name, known, n=1)

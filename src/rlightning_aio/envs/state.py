@@ -302,8 +302,8 @@ def save_state(env: Any) -> SavedState:
     for path, part in parts.items():
         if part.kind.is_layer and type(part.value).__basicsize__ > _Plain.__basicsize__:
             raise NotImplementedError(
-                f"{path} of env {env.env_id!r} is a {type(part.value).__name__}, whose state lies "
-                f"in a library that doesn't give it away; {_WAY_OUT}"
+                f"{path} of env {env.env_id!r} is a {type(part.value).__name__}, whose state is "
+                f"in a library that gives no access to it; {_WAY_OUT}"
             )
     paths = {id(part.value): path for path, part in parts.items()}
     states = {path: part.kind.save(part.value) for path, part in parts.items()}
@@ -320,7 +320,7 @@ def _name_of(part: _Part) -> str:
     return f"{name} {part.value.signature}" if name == "MjModel" else name
 
 
-_WAY_OUT: Final = "a BaseEnv of your own can define save_state() and load_state()"
+_WAY_OUT: Final = "your own BaseEnv can define save_state() and load_state()"
 
 
 def _pickled(value: Any, paths: Mapping[int, str]) -> bytes:

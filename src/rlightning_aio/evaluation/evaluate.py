@@ -153,7 +153,7 @@ class _Play:
         for episode in played:
             meta = self._metas.get(episode.env_id)
             if meta is None or not 0 <= episode.sub_env < meta.num_envs:
-                raise ValueError(f"{episode} was played by no env of this group")
+                raise ValueError(f"{episode} was not played by an env of this group")
             self._found.episodes.append(episode)
             self._count[self._first[episode.env_id] + episode.sub_env] += 1
 
@@ -292,7 +292,7 @@ class _Play:
                 cause = info.get("worker_restarted", "its worker ended")
                 raise RLightningError(
                     f"env {env_id!r} has lost an episode with its worker {_LOSSES_IN_A_ROW} times "
-                    f"in a row, and plays none to its end: {cause}"
+                    f"in a row, and finishes none: {cause}"
                 )
 
 

@@ -248,7 +248,7 @@ def _as_array(value: Any) -> NDArray[Any]:
     try:
         return as_array(value)
     except (ValueError, TypeError, RuntimeError) as error:  # Of tensors: what NumPy has not.
-        raise BadAction(f"an action is no array: {error}; nothing was sent") from None
+        raise BadAction(f"an action is not an array: {error}; nothing was sent") from None
 
 
 def _at(tree: Tree, leaf: Leaf) -> Any:

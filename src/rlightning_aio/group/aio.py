@@ -106,7 +106,7 @@ class AioDriver:
             do = "build, use and close a group within one asyncio.run(), or use rlightning_aio.sync"
         elif ours.is_running():
             state = "runs in another thread"
-            do = "hand it what is to be done there, with asyncio.run_coroutine_threadsafe()"
+            do = "pass work to it with asyncio.run_coroutine_threadsafe()"
         else:
             state = "is not running"
             do = "use it there, or close it and build another here"

@@ -598,7 +598,8 @@ class Core:
         for slot in each:
             if ENVS.is_hardware(self.envs.configs[slot].backend):
                 raise SnapshotError(
-                    f"{self.envs.describe(slot)} moves something real: no snapshot puts that back"
+                    f"{self.envs.describe(slot)} moves something real, which a snapshot can't "
+                    "restore"
                 )
 
     def _snapshots(
@@ -645,7 +646,8 @@ class Core:
             env_ids = [snapshot.env_id for snapshot in snapshots]
         if len(env_ids) != len(snapshots):
             raise SnapshotError(
-                f"the snapshot is of {len(snapshots)} envs, and is to go into {len(env_ids)}; name "
+                f"the snapshot is of {len(snapshots)} envs, but should go into {len(env_ids)}; "
+                "name "
                 "as many in env_ids, in order; nothing was changed"
             )
         return self._dispatch.distinct(env_ids)

@@ -80,7 +80,8 @@ def _chosen(config: EnvConfig, left: list[float]) -> list[int] | None:
     wished = config.num_gpus
     if wished > 1 and wished != int(wished):
         raise ConfigError(
-            f"entry {config.name!r}, num_gpus: a worker has whole devices or a part of one, not "
+            f"entry {config.name!r}, num_gpus: a worker has whole devices or a fraction of one, "
+            "not "
             f"{wished:g}"
         )
     count, share = (1, wished) if wished < 1 else (int(wished), 1.0)
@@ -115,7 +116,7 @@ def _shortage(
     )
     there = f"{len(names)} ({', '.join(names)})" if names else "none"
     return (
-        f"entry {config.name!r}, num_gpus: there are too few GPUs: asked for are {asked}; visible "
+        f"entry {config.name!r}, num_gpus: there are too few GPUs: requested are {asked}; visible "
         f"here: {there}, by {known_by}; lower num_gpus, or put more envs into a worker "
         "(envs_per_process)"
     )

@@ -42,7 +42,7 @@ class Dispatch:
         slots = self._envs.find(env_ids)
         if slots is not self._envs.all and len(set(env_ids)) < len(slots):
             double = next(id_ for k, id_ in enumerate(env_ids) if id_ in env_ids[:k])
-            raise EnvBusy(f"{double!r} comes twice in one call; nothing was sent")
+            raise EnvBusy(f"{double!r} appears twice in one call; nothing was sent")
         return slots
 
     def check_sendable(self, slots: NDArray[np.intp], what: str) -> None:

@@ -57,7 +57,7 @@ class FirstLooks:
             del self.left[entry]
         if said:
             warnings.warn(
-                f"{self._envs.describe(slot)}: {said}; it is handed out as it is, so don't rely on "
+                f"{self._envs.describe(slot)}: {said}; it is passed on unchanged, so don't rely on "
                 "the bounds of this task's observations",
                 stacklevel=2,
             )

@@ -151,7 +151,7 @@ class Intake:
         go_on = "reset the env to go on"
         if answers_with_value(op):
             doing = f"the call of {self._requests.method(slot)}()"
-            go_on = "the env can be used on"
+            go_on = "the env is still usable"
         kind = ActionRefused if error.type_name == _BAD_ACTION else EnvRaised
         return kind(
             f"{self._envs.describe(slot)} raised in {doing}: {error.summary}{after}; the remote "

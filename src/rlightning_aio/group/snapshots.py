@@ -104,12 +104,13 @@ def unpack(data: bytes) -> list[EnvSnapshot]:
     start = len(_BEGINNING) + _DIGEST().digest_size
     if not data.startswith(_BEGINNING):
         raise SnapshotError(
-            "these bytes are no snapshot of this version of rlightning_aio: they don't begin as "
-            "one; nothing was changed"
+            "these bytes are not a snapshot of this version of rlightning_aio: they don't start "
+            "like one; nothing was changed"
         )
     if _DIGEST(data[start:]).digest() != data[len(_BEGINNING) : start]:
         raise SnapshotError(
-            "the snapshot was changed or cut since it was taken: its checksum doesn't fit; read "
+            "the snapshot was changed or truncated since it was taken: its checksum doesn't "
+            "match; read "
             "the file again, in binary; nothing was changed"
         )
     return msgspec.msgpack.decode(data[start:], type=list[EnvSnapshot])

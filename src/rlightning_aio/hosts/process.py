@@ -139,7 +139,7 @@ class ForkServer:
     def destroy(self) -> None:
         """Kill the fork server itself; the kernel then kills its workers."""
         if self._process is not None:
-            self._failure = "it did nothing that it was told, and was killed"
+            self._failure = "it didn't react to any request, and was killed"
             self._process.kill()
 
     @property
@@ -205,7 +205,7 @@ class ForkServer:
             if not self._ready:
                 why += f" while it was importing {self._imports}"
             if not self._ready and self._interpreter:
-                why += f"; is {self._interpreter} a Python with what workers need?"
+                why += f"; is {self._interpreter} a Python with the packages that workers need?"
         for host in hosts:
             host.on_fork_server_lost(why.rstrip())
 

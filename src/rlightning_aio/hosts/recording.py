@@ -156,7 +156,7 @@ class _Camera:
     def _stop(self, error: OSError) -> None:
         """A disk that is full ends the film, not the training."""
         self._off, self._file = True, None
-        sys.stderr.write(f"env {self._env.env_id!r} is filmed no more: {error}\n")
+        sys.stderr.write(f"env {self._env.env_id!r} is no longer filmed: {error}\n")
 
     def _frame(self) -> NDArray[np.uint8]:
         frame = as_numpy(self._env.render_one(self._config.sub_env))

@@ -166,7 +166,7 @@ class EnvRunner:
         if self._writer.shows_some:
             raise NotImplementedError(
                 f"env {self.env.env_id!r} gives results of some sub-environments at a time; there "
-                "is no moment at which all of them stand still"
+                "is no moment at which all of them are idle"
             )
         shown = self._restored
         if shown is None and self._began:

@@ -318,8 +318,8 @@ def _end_child() -> NoReturn:
         traceback.print_exception(error)
     else:
         sys.stderr.write(
-            "a process that an env has forked ends where it came back from the env's code; "
-            "it should have ended there, by os._exit\n"
+            "a process that an env forked has returned from the env's code and ends here; it "
+            "should have ended by os._exit\n"
         )
     with contextlib.suppress(Exception):
         sys.stdout.flush()

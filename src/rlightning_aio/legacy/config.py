@@ -106,7 +106,7 @@ class EnvConfig(Config):
     def _check_backend(self) -> Self:
         if self.backend not in _BACKENDS:
             warnings.warn(
-                f"backend {self.backend!r} is none of RLightning's ({', '.join(_BACKENDS)}); it "
+                f"backend {self.backend!r} is not one of RLightning's ({', '.join(_BACKENDS)}); it "
                 "must be registered by the program",
                 stacklevel=2,
             )

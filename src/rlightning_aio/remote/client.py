@@ -380,6 +380,6 @@ def _in_words(error: Exception) -> tuple[str, str, str]:
 
 _REFUSED_HANDSHAKES: Final[dict[int, str]] = {
     zmq.EVENT_HANDSHAKE_FAILED_AUTH: "the server does not know this client's key",
-    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: "the server speaks another security: keys on one side?",
-    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: "the server did not end the handshake: is this its key?",
+    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: "the server uses other security: keys on one side only?",
+    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: "the handshake was not completed: is the key right?",
 }

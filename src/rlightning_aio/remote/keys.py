@@ -96,7 +96,7 @@ def make_keys(directory: str | os.PathLike[str], names: Sequence[str]) -> list[P
     except OSError as error:
         raise ConfigError(
             f"no keys can be written into {top}: {error.strerror}: {error.filename}; name a "
-            "directory that is yours"
+            "directory that you own"
         ) from error
     return [top / name for name in names]
 
@@ -146,7 +146,7 @@ def read_server_keys(directory: str | os.PathLike[str]) -> ServerKeys:
     _, secret = _read_secret(Path(directory) / (_SERVER + _SECRET_SUFFIX))
     clients = Path(directory) / _ALLOWED
     if not clients.is_dir():
-        raise ConfigError(f"{clients} is no directory; the public keys of clients belong there")
+        raise ConfigError(f"{clients} is not a directory; the public keys of clients belong there")
     return ServerKeys(secret, clients)
 
 

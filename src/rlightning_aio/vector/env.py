@@ -208,7 +208,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         """Wait for `reset_async`, `timeout` seconds at most.
 
         Raises:
-            TimeoutError: the envs reset all the same; what comes late is dropped.
+            TimeoutError: the envs reset all the same; late results are dropped.
             NoAsyncCallError: nothing was sent.
         """
         batch = self._finish("reset", timeout, self._collect)
@@ -252,7 +252,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         """Wait for `step_async`, `timeout` seconds at most.
 
         Raises:
-            TimeoutError: the envs step all the same; what comes late is dropped.
+            TimeoutError: the envs step all the same; late results are dropped.
             NoAsyncCallError: nothing was sent.
         """
         return self._stepped(self._finish("step", timeout, self._collect))
@@ -261,7 +261,9 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         if self._fits_rows and not isinstance(actions, dict | tuple):
             actions = np.asarray(actions)
             if not actions.ndim:
-                raise TypeError(f"actions must be as many as envs, {self.num_envs}, not a scalar")
+                raise TypeError(
+                    f"there must be as many actions as envs, {self.num_envs}, not a scalar"
+                )
         if self._fits_rows:
             return self._answerable.respond(action=self._rows.actions(actions))
         env_ids = self.group.env_ids
@@ -314,7 +316,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
             found = collect(deadline=_seconds(timeout))
         except TimeoutError as error:
             raise multiprocessing.TimeoutError(
-                f"the envs have not answered {what}_async within {timeout} s; what comes late is "
+                f"the envs have not answered {what}_async within {timeout} s; late results are "
                 "dropped"
             ) from error
         self._late = False
@@ -351,7 +353,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         """Wait for `call_async`, `timeout` seconds at most; one value for each env.
 
         Raises:
-            TimeoutError: the methods run all the same; what comes late is dropped.
+            TimeoutError: the methods run all the same; late results are dropped.
             NoAsyncCallError: nothing was sent.
         """
         return tuple(self._rows.values(self._finish("call", timeout, self.group.collect_calls)))
@@ -368,7 +370,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         if len(each) != self.num_envs:
             raise ValueError(
                 f"{len(each)} values for num_envs={self.num_envs}; give one for each, or a single "
-                "one that is no list or tuple"
+                "one that is not a list or tuple"
             )
         self._begin("set_attr")
         self._late = True  # A value that can't be sent leaves the calls before it.

@@ -143,7 +143,7 @@ class Batches(Singles):
             if meta.num_envs != self._each:
                 raise RuntimeError(
                     f"env {meta.env_id!r} holds {meta.num_envs} sub-environments, and "
-                    f"{metas[0].env_id!r} {self._each}; they must be as many everywhere"
+                    f"{metas[0].env_id!r} {self._each}; the number must be the same everywhere"
                 )
         self.num_envs = len(metas) * self._each
         found: list[list[Any]] = []
@@ -154,7 +154,8 @@ class Batches(Singles):
         for space in pairs[0]:
             if leaves(space) is None:
                 raise RuntimeError(
-                    f"values of {space} have no fixed size; make separate envs, each by a callable"
+                    f"values of {space} have no fixed size; make separate envs, each with its own "
+                    "callable"
                 )
         self.spaces = [pair for pair in pairs for _ in range(self._each)]
         group.call_async("call_wrapped", "takes_masks")
@@ -186,7 +187,7 @@ class Batches(Singles):
     def _folded(self, column: Any) -> NDArray[Any]:
         array = np.asarray(column)
         if not array.ndim:
-            raise TypeError(f"actions must be as many as envs, {self.num_envs}, not a scalar")
+            raise TypeError(f"there must be as many actions as envs, {self.num_envs}, not a scalar")
         if len(array) != self.num_envs:
             raise ValueError(f"{len(array)} actions for num_envs={self.num_envs}")
         return array.reshape(-1, self._each, *array.shape[1:])
@@ -209,8 +210,7 @@ class Batches(Singles):
         own = [options[batch * self._each + k] for k in which]
         if any(one is not own[0] and one != own[0] for one in own):
             raise ValueError(
-                "options of a reset that differ between envs that are stepped together; make "
-                "separate envs"
+                "reset options differ between envs that are stepped together; make separate envs"
             )
         given = dict(own[0] or {})
         if len(which) < self._each:
@@ -263,8 +263,8 @@ class Batches(Singles):
         found = list(self._by_batch(chosen))
         if any(len(set(which)) < self._each for _, which in found):
             raise ValueError(
-                f"{name} can't be set of some envs that are stepped together with others; make "
-                "separate envs, each by a callable"
+                f"{name} can't be set for only some of the envs that are stepped together; make "
+                "separate envs, each with its own callable"
             )
         for batch, _ in found:
             values = [value] * self._each

@@ -158,7 +158,7 @@ def space_from(description: Any) -> gym.Space[Any]:
         raise
     # Gymnasium checks its arguments with assertions and with errors of NumPy's.
     except (AssertionError, ArithmeticError, LookupError, TypeError, ValueError) as error:
-        raise WireError(f"a space description makes no space: {error}") from None
+        raise WireError(f"a space description is not a valid space: {error}") from None
 
 
 class _Builder:
@@ -185,7 +185,7 @@ class _Builder:
         self._members_left -= 1
         if not isinstance(description, dict) or not depth or self._members_left < 0:
             raise WireError(
-                f"a space description is no map, deeper than {_MAX_DEPTH} levels, or has more "
+                f"a space description is not a map, deeper than {_MAX_DEPTH} levels, or has more "
                 f"than {_MAX_MEMBERS} members"
             )
         fields = cast("Description", description)
@@ -233,7 +233,9 @@ class _Builder:
         members: dict[str, gym.Space[Any]] = {}
         for key, inner in _list(fields["spaces"]):
             if not isinstance(key, str) or key in members:
-                raise WireError(f"a dict space has the key {key!r}, which is no string or not new")
+                raise WireError(
+                    f"a dict space has the key {key!r}, which is not a string or not new"
+                )
             members[key] = self.build(inner, depth)
         return spaces.Dict(list(members.items()), sort_keys=False)
 
