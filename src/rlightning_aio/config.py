@@ -63,16 +63,16 @@ class VideoConfig(BaseModel):
 
     folder: str = Field(min_length=1)
     """Gets ``<env id>-episode-<n>.mp4``; n counts the episodes of the env from 0, or from the
-    last film that is there. It is made if it isn't there."""
+    last film that is there. It is created if missing."""
     envs: tuple[Annotated[int, Field(ge=0)], ...] = Field(default=(0,), strict=False)
-    """Which envs of the entry, from 0. Each has a worker of its own, so that those that aren't
-    filmed wait for no frame, unless `EnvConfig.envs_per_process` says how many share one."""
+    """Which envs of the entry, from 0. Each has a worker of its own, so that the others never
+    wait for a frame, unless `EnvConfig.envs_per_process` says how many share one."""
     sub_env: int = Field(default=0, ge=0)
     """Which of an env's sub-environments."""
     every: int = Field(default=1, ge=1)
     """Film episodes 0, every, 2 * every, …"""
     episodes: tuple[Annotated[int, Field(ge=0)], ...] | None = Field(default=None, strict=False)
-    """Film these alone."""
+    """Film only these."""
 
     @field_validator("folder")
     @classmethod
@@ -95,8 +95,8 @@ class EnvConfig(BaseModel):
     name: str = Field(min_length=1)
     """Name of the entry; its envs are called ``<name>-0``, ``<name>-1``, …"""
     backend: str = Field(default="", validate_default=True)
-    """Simulator backend; see ``rlightning-aio backends``. Left out where envs come from a callable:
-    it is ``callable`` then."""
+    """Simulator backend; see ``rlightning-aio backends``. Leave it out where envs come from a
+    callable; it is ``callable`` then."""
     task: str = ""
     """Task name within the backend; required by every backend but ``env_server``. For the
     backend ``callable``: ``module:function``, which makes an env of ``env_kwargs``."""
@@ -106,8 +106,8 @@ class EnvConfig(BaseModel):
     """What makes an env, called in the worker with ``env_kwargs``: one callable, or one for each
     env. It returns a `gymnasium.Env`, a `gymnasium.vector.VectorEnv` or a `BaseEnv`."""
     num_workers: int = Field(default=1, ge=1)
-    """Envs of this entry. ``auto`` has `num_envs` be the sub-environments of all of them
-    together, and lays these over the cores: both fields then hold what came of it."""
+    """Envs of this entry. With ``auto``, `num_envs` is the total number of sub-environments,
+    which is spread over the cores; both fields then hold the outcome."""
     num_envs: int = Field(default=1, ge=1)
     """Vectorised sub-environments in each env, where the backend supports them."""
     max_episode_steps: int | None = Field(default=None, ge=1)
@@ -115,8 +115,8 @@ class EnvConfig(BaseModel):
     num_cpus: float = Field(default=1, ge=0)
     """CPUs of each worker, 0 for a share of what others leave (``placement: ray`` only)."""
     num_gpus: float = Field(default=0.0, ge=0)
-    """GPUs of each worker: of those that Ray has, or that this process sees; whole ones, or a part
-    of one."""
+    """GPUs of each worker, from those that Ray has or that this process sees; whole ones, or a
+    fraction of one."""
     env_kwargs: dict[str, Any] = Field(default_factory=dict)
     """Passed to the backend."""
     placement: str = "process"
@@ -124,8 +124,8 @@ class EnvConfig(BaseModel):
     envs_per_process: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
     """Envs that share a worker."""
     min_results: int | None = Field(default=None, ge=1)
-    """Results of this entry for which `collect_async` waits where it is not told how many; those of
-    all entries are summed up."""
+    """Results of this entry that `collect_async` waits for by default; the values of all entries
+    are added up."""
     step_timeout: float | None = Field(default=None, gt=0)
     """Seconds that one step may take before the env counts as hung."""
     reset_timeout: float | None = Field(default=None, gt=0)
@@ -137,7 +137,7 @@ class EnvConfig(BaseModel):
     )
     """What to do when a worker dies or hangs; ``raise`` by default for hardware."""
     snapshot_every: int | None = Field(default=None, ge=1)
-    """Steps after which an env's state is kept, for ``on_worker_death: resume``."""
+    """Number of steps after which an env's state is saved, for ``on_worker_death: resume``."""
     max_restarts: int = Field(default=3, ge=0)
     """Restarts in a row, without a step in between, before giving up."""
     imports: tuple[str, ...] = Field(default=(), strict=False)
@@ -150,8 +150,8 @@ class EnvConfig(BaseModel):
     cpu_affinity: bool = False
     """Pin worker k to the k-th core this process may use."""
     ray_options: dict[str, Any] = Field(default_factory=dict)
-    """Options of a Ray actor beside `num_cpus` and `num_gpus`, as its ``.options()`` takes them,
-    and ``address``, the cluster's (``placement: ray`` only)."""
+    """Options of a Ray actor other than `num_cpus` and `num_gpus`, as its ``.options()`` takes
+    them, and ``address``, that of the cluster (``placement: ray`` only)."""
     video: VideoConfig | None = None
     """Episodes that are filmed where the envs live; see `record_video`."""
 
@@ -257,7 +257,7 @@ def load_config(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> 
     """Read a YAML file with ``envs:`` (or ``env:``) and, optionally, ``imports:``.
 
     Args:
-        path: the file. Other sections, as those of a whole experiment, are left alone; entries
+        path: the file. Other sections, such as those of a whole experiment, are ignored; entries
             may refer to them (``${train.seed}``).
         overrides: ``key=value`` each, applied in order; keys are dotted from the top of the
             file (``envs.0.num_workers=8``), values are YAML. They reach other sections as well.

@@ -37,7 +37,7 @@ class RLightningError(Exception):
     """Base of every error raised by this package.
 
     All of them can be pickled and copied, as a process pool does, with their attributes; a cause
-    that is no error of this package's arrives as its text (`RemoteTraceback`).
+    that is not an error of this package arrives as its text (`RemoteTraceback`).
     """
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -77,7 +77,7 @@ class UnknownEnv(RLightningError, KeyError):
 
 
 class EnvBusy(RLightningError, RuntimeError):
-    """An env was asked again before its outstanding reply was collected; nothing was sent."""
+    """An env got a new request before its outstanding reply was collected; nothing was sent."""
 
 
 class NothingPending(RLightningError, RuntimeError):
@@ -85,7 +85,7 @@ class NothingPending(RLightningError, RuntimeError):
 
 
 class ReplayDiverged(RLightningError, RuntimeError):
-    """A replay can't hand out results in the recorded order; the message says where it left it."""
+    """A replay can't follow the recorded order of results; the message says where it left it."""
 
 
 class GroupClosed(RLightningError, RuntimeError):
@@ -93,16 +93,16 @@ class GroupClosed(RLightningError, RuntimeError):
 
 
 class SnapshotError(RLightningError, ValueError):
-    """A snapshot can't be put back: it is spoilt, or of other envs; nothing was changed.
+    """A snapshot can't be restored: it is damaged, or of other envs; nothing was changed.
 
-    Or envs can't be taken one of: robots, clients, those that were never reset.
+    Or it can't be taken: the envs are robots or clients, or were never reset.
     """
 
 
 class RemoteTraceback(Exception):
     """The traceback text of an exception that was raised where the env lives.
 
-    It stands as the ``__cause__`` of `EnvRaised`, so that Python prints it above
+    It is the ``__cause__`` of `EnvRaised`, so that Python prints it above
     the local traceback.
     """
 
@@ -115,12 +115,12 @@ class RemoteTraceback(Exception):
 
 
 class EnvFault(RLightningError):
-    """Base of what goes wrong with one env while the group itself stays usable.
+    """Base of errors of one env that leave the group itself usable.
 
     Attributes:
         env_id: the env at fault.
         results: for `step` and `reset`, a `BatchedData` of the other envs of the same
-            call, which did succeed; None where the call had no other envs.
+            call, which succeeded; None where the call had no other envs.
         others: further faults of the same call.
     """
 
@@ -157,7 +157,7 @@ class EnvRaised(EnvFault):
 
 
 class ActionRefused(EnvRaised, BadAction):
-    """The env itself raised `BadAction`, as a robot does for what is beyond its limits.
+    """The env itself raised `BadAction`, as a robot does for an action beyond its limits.
 
     Unlike other bad actions, it comes after the batch was sent: the other envs have stepped.
     """

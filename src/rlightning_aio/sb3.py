@@ -91,7 +91,7 @@ class VecEnv(_Base):
     Raises:
         ConfigError: a callable can't be sent to a worker, `entry` is wrong, or the envs'
             spaces differ.
-        StartFailed: a callable raised, or returned no env.
+        StartFailed: a callable raised, or didn't return an env.
         RuntimeError: vector environments are not of as many.
     """
 

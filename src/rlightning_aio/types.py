@@ -37,7 +37,7 @@ class PolicyResponse:
 
     @property
     def extras(self) -> dict[str, Any]:
-        """What was attached beside the action."""
+        """What was attached to the action."""
         return {k: v for k, v in self.__dict__.items() if k not in ("env_id", "action")}
 
     def __repr__(self) -> str:
@@ -76,10 +76,10 @@ class EnvRet(_Ret):
         last_reward: float, or ``[num_envs]`` if vectorised; 0.0 after a reset.
         last_terminated: bool, or ``[num_envs]`` bool.
         last_truncated: bool, or ``[num_envs]`` bool.
-        info: what the env reported beside.
+        info: what else the env reported.
         _extra: free for extensions.
-        ts_env_sent_ns: when the env produced it, in ns since the epoch; that of an env_server's
-            client is by the client's clock, which may differ from the trainer's.
+        ts_env_sent_ns: when the env produced it, in ns since the epoch; for a client of an
+            env_server, by the client's clock, which may differ from the trainer's.
     """
 
     last_reward: Any = 0.0
@@ -112,10 +112,10 @@ class EnvMeta(BaseModel):
         num_envs: vectorised sub-environments.
         agents: agent names of a multi-agent env, in order; empty otherwise.
         max_episode_steps: the configured limit, or the simulator's own; None if none.
-        autoreset: what a sub-environment does after its episode's end, in Gymnasium's words:
+        autoreset: what a sub-environment does after the end of its episode, in Gymnasium's terms:
             wait for a reset (``disabled``); reset itself in the next step, whose action and
             reward count for nothing (``next_step``); or within the step that ends the
-            episode, whose observation is the next one's first (``same_step``).
+            episode, whose observation is then the first of the next (``same_step``).
     """
 
     model_config = ConfigDict(arbitrary_types_allowed=True)

@@ -33,13 +33,13 @@ def record_video(
     Args:
         env_cfgs: as `build_env_group` takes them.
         folder: gets ``<env id>-episode-<n>.mp4``, or, of an env with sub-environments,
-            ``<env id>-sub-<k>-episode-<n>.mp4``; it is made if it isn't there. An episode that
-            had no end is called ``….partial.mp4``. A folder that has films of the env already
+            ``<env id>-sub-<k>-episode-<n>.mp4``; it is created if missing. An unfinished episode
+            is called ``….partial.mp4``. A folder that has films of the env already
             gets further ones: n goes on from the last.
         env_ids: which envs; None: the first of each config entry.
         sub_env: which of an env's sub-environments.
         every: film episodes 0, every, 2 * every, … of each.
-        episodes: film these alone.
+        episodes: film only these.
 
     Envs that `gymnasium.make` makes get ``render_mode: rgb_array``; others must be made such that
     ``render`` gives frames ``[height, width, 3]`` uint8. A film has the simulator's ``render_fps``.

@@ -243,8 +243,8 @@ class BatchedData:
     def truncated(self) -> Any:
         """Truncations: ``[n]`` bool, ``[n, num_envs]``, or a dict of such by agent.
 
-        By the env; true, too, where the step limit has cut the episode, if
-        `auto_reset` was asked to mark that, and where `restarted` is.
+        By the env; also true where the step limit cut the episode, if `auto_reset` was told to
+        mark that, and where `restarted` is.
         """
         return self._head("truncated", "last_truncated")
 
@@ -269,22 +269,22 @@ class BatchedData:
 
     @property
     def is_reset(self) -> NDArray[np.bool_]:
-        """Where the row is the first observation of an episode, and no transition ends.
+        """Whether the row is the first observation of an episode, where no transition ends.
 
-        True after a reset that was asked for, after one that `auto_reset` or the simulator
-        itself put in place of a step, of a client's first result, and of the result that marks
-        a replaced worker or a lost client. ``[n]`` bool, ``[n, num_envs]`` with
+        True after a reset that you asked for, after one that `auto_reset` or the simulator itself
+        put in place of a step, for a client's first result, and for the result that marks a
+        replaced worker or a lost client. ``[n]`` bool, ``[n, num_envs]`` with
         sub-environments.
 
         Raises:
-            AttributeError: the batch holds plain values, no results of a group.
-            ValueError: sub-environments are not as many everywhere; use `by_name`.
+            AttributeError: the batch holds plain values, not results of a group.
+            ValueError: the envs have different numbers of sub-environments; use `by_name`.
         """
         return self._by_row(lambda part: part.is_reset)
 
     @property
     def limit_reached(self) -> NDArray[np.bool_]:
-        """Where the step limit of `auto_reset` has cut the episode; as `is_reset`.
+        """Whether the step limit of `auto_reset` cut the episode; shaped as `is_reset`.
 
         `collect_async` returns the same flags, one for each env.
         """
@@ -292,7 +292,7 @@ class BatchedData:
 
     @property
     def restarted(self) -> NDArray[np.bool_]:
-        """Where the episode before was lost with its worker or client; as `is_reset`.
+        """Whether the previous episode was lost with its worker or client; shaped as `is_reset`.
 
         A learner that stores transitions cuts the env's chain there.
         """
@@ -302,8 +302,9 @@ class BatchedData:
     def index(self) -> NDArray[np.int64]:
         """Each row's place in the group: ``[n]``, ``[n, num_envs]`` with sub-environments.
 
-        That among `EnvGroup.env_ids`, sub-environments counted where there are any. Clients of
-        an env_server come after the local envs; each keeps its place while the group lives.
+        It is the place among `EnvGroup.env_ids`, counting sub-environments where there are any.
+        Clients of an env_server come after the local envs; each keeps its place while the group
+        lives.
         """
         return self._by_row(lambda part: part.index).astype(np.int64, copy=False)
 
@@ -314,7 +315,7 @@ class BatchedData:
 
     @property
     def busy_ns(self) -> NDArray[np.int64]:
-        """How long each env took for its step or reset, in ns; ``[n]``, one for each env."""
+        """How long each env worked on its step or reset, in ns; ``[n]``, one for each env."""
         return self._by_row(lambda part: part.busy_ns)
 
     def _by_row(self, column: Callable[[ResultColumns], Any]) -> NDArray[Any]:
@@ -342,7 +343,7 @@ class BatchedData:
         have stayed in this process. See `Sent`.
 
         Raises:
-            AttributeError: the batch holds plain values, no results of a group.
+            AttributeError: the batch holds plain values, not results of a group.
         """
         if self._sources is None:
             raise AttributeError("only results of a group know what was sent for them")
@@ -352,7 +353,7 @@ class BatchedData:
     def infos(self) -> dict[str, Any]:
         """Infos as columns, in Gymnasium's vector form; made when it is first read.
 
-        ``infos[key]`` is a typed array ``[n, ...]`` (of objects, where the values are no
+        ``infos[key]`` is a typed array ``[n, ...]`` (of objects, where the values are not
         numbers), ``infos["_" + key]`` tells which rows have the key; nested dicts likewise.
         """
         if self._infos is None:
@@ -447,7 +448,7 @@ class BatchedData:
             extras: further columns of n rows (``log_prob``, ``value``, …).
 
         Raises:
-            BadAction: a column has not as many rows as this batch has results.
+            BadAction: a column's number of rows is not this batch's number of results.
         """
         columns = {"action": action, **extras}
         for name, column in columns.items():

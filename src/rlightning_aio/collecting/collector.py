@@ -38,17 +38,17 @@ class Collector(Generic[G, R]):
     Without `wait_all` envs are stepped first come, first served: the policy is called as soon as
     `min_batch` results are there, and a rollout has a fixed total of transitions, of which a fast
     env makes more than a slow one. ``min_batch=len(group)`` waits for all envs each time, which
-    makes a run reproducible. With `wait_all` each env makes equally many transitions, and a
+    makes a run reproducible. With `wait_all` each env makes the same number of transitions, and a
     rollout is a block ``[T, N]``; envs whose episode is over are reset before the policy is
     called, which therefore always has a batch of all envs, in the group's order.
 
-    Nothing is lost or doubled at the seams: what is in flight when a rollout is full begins the
-    next one, and the results that have filled it are answered by the next `collect`, with the
+    Nothing is lost or duplicated between rollouts: requests in flight when a rollout is full
+    begin the next one, and the next `collect` answers the results that have filled it, with the
     policy that is newest then. Rows that are resets, transitions that were lost with a worker,
     and steps of a sub-environment that waits for others to end are in no rollout.
 
-    The group is the collector's alone while it is in use: who wants to step it otherwise takes
-    another one. Use it inside ``with group.auto_reset():``.
+    While the collector is in use, nothing else may step the group; use another group for that.
+    Use it inside ``with group.auto_reset():``.
 
         async with rl.build_env_group(config) as group:
             with group.auto_reset():
@@ -58,7 +58,7 @@ class Collector(Generic[G, R]):
                     learn(rollout)
                     collector.policy_version += 1
 
-    Over a group of `rlightning_aio.sync` it is ``collector.collect()``, without ``await``.
+    With a group of `rlightning_aio.sync`, call ``collector.collect()`` without ``await``.
 
     Args:
         group: initialised; or a `RecordedGroup` or `ReplayedGroup` in front of one.
@@ -75,8 +75,8 @@ class Collector(Generic[G, R]):
         seed: of the first reset, as of `EnvGroup.reset`.
 
     Attributes:
-        policy_version: yours to set: the number of the policy that acts. Each transition has
-            the one that its action was chosen under.
+        policy_version: set it to the number of the policy that acts. Each transition has the
+            version that chose its action.
 
     Raises:
         ValueError: a number isn't above 0, or `min_batch` comes with `wait_all`.

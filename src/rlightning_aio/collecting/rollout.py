@@ -19,7 +19,7 @@ __all__ = ["Lag", "Rollout", "Seconds"]
 
 
 class Lag(NamedTuple):
-    """How many policy versions older than the newest one the transitions' own was."""
+    """How many policy versions behind the newest one the transitions' own was."""
 
     min: int
     mean: float
@@ -31,13 +31,14 @@ class Seconds:
     """Where the time of a rollout went, in seconds.
 
     Attributes:
-        elapsed: since the rollout before was complete, or since the first call of `collect`.
-        collecting: inside of `Collector.collect`: how long a learner has waited that doesn't
-            work beside it.
+        elapsed: since the previous rollout was complete, or since the first call of `collect`.
+        collecting: inside `Collector.collect`: how long a learner has waited that doesn't work at
+            the same time.
         policy: in calls of the policy.
         env_busy: in steps and resets, summed over envs.
         waited_for_policy: between an env's result and its next request, summed over envs, less
-            the next: while the policy, or results of others for its batch, were waited for.
+            the next figure: the env waited for the policy, or for results of others to fill its
+            batch.
         waited_for_learner: the part of that in which nobody was in `collect`.
     """
 
@@ -54,9 +55,9 @@ class Rollout:
 
     Rows are ``[n]``, with each env's transitions side by side and in order (a *chain*), or
     ``[T, N]`` if the collector waits for all: row ``[t, i]`` is the t-th transition of the i-th
-    env. The *ends* are those transitions that the next one of their env does not follow in this
-    rollout: the last of each chain, those that end an episode, and those whose episode was lost
-    with its worker. Only behind these is anything needed to bootstrap from; it is in
+    env. The *ends* are those transitions that are not followed by the next one of their env in
+    this rollout: the last of each chain, those that end an episode, and those whose episode was
+    lost with its worker. Only after these is an observation needed to bootstrap from; it is in
     `end_observation`.
 
     What the policy attached is an attribute or an item: ``rollout.log_prob``,
@@ -73,12 +74,12 @@ class Rollout:
             env or by the step limit of `auto_reset`; done: either.
         policy_version: int64, `Collector.policy_version` when the action was chosen.
         index: int64, which env of the group: see `BatchedData.index`.
-        first: whether an episode begins with it, or goes on after a loss.
+        first: whether an episode begins with it, or continues after a loss.
         ends: ``[k]``, positions of the ends (for ``[T, N]``, in the flattened block). The last
             transition of each chain comes first, in the order of chains.
         end_observation: tree of ``[k, *obs]``, the observation after each end: the episode's
             final one where it is over.
-        num_chains: so many envs have transitions here.
+        num_chains: number of envs with transitions here.
         lag: how old the transitions' policies are; seconds: where the time went.
     """
 
@@ -179,9 +180,9 @@ class Rollout:
     def advantages(self, values: Any, next_values: Any, gamma: float, lam: float) -> Any:
         """Generalised advantage estimation over chains.
 
-        An episode that has terminated is worth nothing more. Wherever else a chain breaks off
-        (it was truncated, lost with its worker, or is in flight when the rollout is full)
-        `next_values` stand for what would have come.
+        After a termination the value is zero. Wherever else a chain breaks off (it was truncated,
+        lost with its worker, or is in flight when the rollout is full), `next_values` stand for
+        the rest of the episode.
 
         Args:
             values: of `observation`: an array or CPU tensor in the rollout's shape; a dict of
@@ -235,8 +236,8 @@ class Rollout:
                 name), in the rollout's shape; a dict of such by agent.
             gamma: discount.
             lam: scales the traces.
-            clip_rho: at most so much ratios weight errors and advantages.
-            clip_c: at most so much they carry corrections back.
+            clip_rho: upper limit of the ratios that weight errors and advantages.
+            clip_c: upper limit of the ratios that carry corrections back.
 
         Returns:
             Fresh arrays in the rollout's shape, or such by agent: targets of the value function

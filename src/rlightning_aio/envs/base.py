@@ -78,16 +78,16 @@ class BaseEnv(abc.ABC):
 
     Attributes:
         env_id: ``<entry name>-<worker index>``, the same after a restart.
-        trainer_pid: the trainer's process, where it is another one of this machine: set by the
-            worker once the env is built. A robot stops when that process is stopped.
+        trainer_pid: the trainer's process, if it is another process on this machine; the worker
+            sets it once the env is built. A robot stops when that process is stopped.
         transforms_actions: set it on a subclass whose `step` takes actions that need not
             fit the action space (chunks, logits, dicts).
         agents: agent names of a multi-agent env, in order; empty otherwise.
-        num_envs: sub-environments in each result. Where it is below the config's, results
-            come from some of them at a time, and ``info["env_id"]`` says from which.
-        autoreset: what sub-environments do after their episode's end; see `EnvMeta`.
+        num_envs: sub-environments in each result. If it is below the config's, each result comes
+            from some of them, and ``info["env_id"]`` says from which.
+        autoreset: what sub-environments do after the end of their episode; see `EnvMeta`.
         fresh_results: what `bare_step` returns consists of new arrays and dicts, which nobody
-            reads or writes again: with inline placement, observation and info are handed over
+            reads or writes again: with inline placement, observation and info are passed on
             uncopied.
     """
 
@@ -137,15 +137,15 @@ class BaseEnv(abc.ABC):
         """
 
     def step_async(self, policy_resp: PolicyResponse) -> None:
-        """Start a step, for an env that answers later: a machine elsewhere, say.
+        """Start a step, for an env that answers later, such as one on another machine.
 
-        An env with this and `collect_async` is stepped by the two in place of `step`, which may
-        raise NotImplementedError then. With inline placement a step starts when it is sent.
+        If an env has this and `collect_async`, they replace `step`, which may raise
+        NotImplementedError then. With inline placement a step starts when it is sent.
         """
         raise NotImplementedError(f"env {self.env_id!r} has no step_async()")
 
     def collect_async(self) -> Result:
-        """Wait for the end of the step that `step_async` has started; what it gave."""
+        """Wait for the end of the step that `step_async` has started, and return its result."""
         raise NotImplementedError(f"env {self.env_id!r} has no collect_async()")
 
     def bare_step(self) -> BareStep | None:
@@ -216,11 +216,11 @@ class BaseEnv(abc.ABC):
         return [int(one) for one in seed]
 
     def save_state(self) -> Any:
-        """All that the env needs to go on from here exactly as it would have, as a value that can
-        be pickled; see `load_state`.
+        """Everything that the env needs to continue from here exactly as it would have, as a
+        value that can be pickled; see `load_state`.
 
-        By default what this object and the layers of its simulator hold, see docs/state.md. Define
-        both methods if that can't be pickled, or isn't all.
+        By default it holds the attributes of this object and of the layers of its simulator; see
+        docs/state.md. Define both methods if these can't be pickled, or aren't the whole state.
 
         Raises:
             NotImplementedError: the env can't give its state; the message says why.
@@ -228,8 +228,8 @@ class BaseEnv(abc.ABC):
         return save_state(self)
 
     def load_state(self, state: Any) -> None:
-        """Go on from where `save_state` was called: on this env or on another of the same entry,
-        in this process or another, perhaps before its first reset.
+        """Continue from where `save_state` was called: on this env or on another of the same
+        entry, in this process or another, perhaps before its first reset.
         """
         load_state(self, state)
 
@@ -250,13 +250,13 @@ class BaseEnv(abc.ABC):
         raise NotImplementedError(f"backend {self.config.backend!r} has no offload()")
 
     def reload(self) -> None:
-        """Take the memory freed by `offload` again."""
+        """Allocate the memory freed by `offload` again."""
         raise NotImplementedError(f"backend {self.config.backend!r} has no reload()")
 
     def clear_memory(self) -> None:
-        """Give memory back that nothing uses any more; for `offload` to call at its end.
+        """Release memory that nothing uses any more; for `offload` to call at its end.
 
-        Collects garbage, then has torch, where it was imported, empty its cache of CUDA memory.
+        Collects garbage, then empties torch's cache of CUDA memory, if torch was imported.
         """
         gc.collect()
         torch: Any = sys.modules.get("torch")

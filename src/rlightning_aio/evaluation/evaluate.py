@@ -71,7 +71,7 @@ def evaluate(
     played: Iterable[Episode] = (),
     on_episode: Callable[[Episode], None] | None = None,
 ) -> Any:
-    """Play `episodes` episodes of each env with `policy`: to be awaited, if the group is.
+    """Play `episodes` episodes of each env with `policy`. Await it if the group is asynchronous.
 
     Use it inside ``with group.auto_reset():``, whose step limits hold.
 
@@ -89,7 +89,7 @@ def evaluate(
         played: episodes of an evaluation that was interrupted; they are not played again.
         on_episode: called with each episode as it ends.
 
-    An episode that is lost with its worker is begun anew, with its seed.
+    An episode that is lost with its worker starts again, with its seed.
 
     Raises:
         RuntimeError: the group has no `auto_reset` context open.

@@ -88,13 +88,13 @@ class AutoResetContext:
 
 
 class ServerView:
-    """What both kinds of `ServerHandle` tell without waiting."""
+    """What both kinds of `ServerHandle` know without waiting."""
 
     _membership: Membership
 
     @property
     def env_id(self) -> str:
-        """Its id, as in `EnvGroup.env_ids`, and what a batch calls its clients' results."""
+        """Its id, as in `EnvGroup.env_ids` and in batches of its clients' results."""
         return self._membership.server_id
 
     @property
@@ -113,7 +113,7 @@ class ServerView:
 
     @property
     def metas(self) -> list[EnvMeta]:
-        """What the envs of these clients are like, in the same order."""
+        """The metadata of these clients' envs, in the same order."""
         return list(self._membership.members().values())
 
 
@@ -212,23 +212,24 @@ class Facade:
     # -- requests -----------------------------------------------------------------
 
     def step_async(self, batch: BatchedData) -> None:
-        """Have the envs of `batch` step; `collect_async` gets the results. Never blocks.
+        """Send a step to each env of `batch`; `collect_async` returns the results. Never blocks.
 
         Args:
             batch: a batch of responses, from `BatchedData.respond` (columns, fast) or made of
                 `PolicyResponse` values.
 
-        The columns are the caller's again on return: what is sent, and what
-        `BatchedData.sent` gives back, are copies.
+        The caller may reuse the columns on return: the values sent, and those that
+        `BatchedData.sent` returns, are copies.
 
         Raises (before anything is sent):
             BadAction: an action's shape, dtype or count doesn't fit; it holds NaN, a number that
-                its dtype can't hold, or infinity where its space is bounded; or this is no batch.
-            EnvBusy: an env has a reply outstanding, or comes twice.
+                its dtype can't hold, or infinity where its space is bounded; or this is not a
+                batch.
+            EnvBusy: an env has a reply outstanding, or appears twice.
             UnknownEnv: no env of this group has that id.
             WorkerDied, EnvHung: an env's worker is gone and is not replaced.
             GroupClosed: the group was not initialised, or is closed.
-            RLightningError: the group is another thread's now, or another loop's.
+            RLightningError: another thread is using the group, or it belongs to another loop.
         """
         self._driver.check_caller()
         self._core.step_async(batch, time.monotonic())
@@ -239,8 +240,8 @@ class Facade:
         options: dict[str, Any] | None = None,
         env_ids: Sequence[str] | None = None,
     ) -> None:
-        """Have all envs begin a new episode, or those of `env_ids`; `collect_async` gets the
-        first observations. Never blocks, and waits for no client of an env_server.
+        """Send a reset to all envs, or to those of `env_ids`; `collect_async` returns the first
+        observations. Never blocks, and doesn't wait for clients of an env_server.
 
         Args:
             seed: as of `reset`.
@@ -248,13 +249,13 @@ class Facade:
             env_ids: which envs; None: all local ones and the clients that are connected.
 
         Raises (before anything is sent):
-            EnvBusy: an env has a reply outstanding, or comes twice.
+            EnvBusy: an env has a reply outstanding, or appears twice.
             UnknownEnv: no env of this group has that id.
-            ValueError: a seed is no int from 0 to 2**62 - 1, or there are not as many as envs.
+            ValueError: a seed is not an int from 0 to 2**62 - 1, or there isn't one for each env.
             TypeError: the options can't be sent to a worker.
             WorkerDied, EnvHung: an env's worker is gone and is not replaced.
             GroupClosed: the group was not initialised, or is closed.
-            RLightningError: the group is another thread's now, or another loop's.
+            RLightningError: another thread is using the group, or it belongs to another loop.
         """
         self._driver.check_caller()
         self._core.reset_async(time.monotonic(), seed, options, env_ids)
@@ -262,17 +263,17 @@ class Facade:
     def call_async(
         self, name: str, *args: Any, env_ids: Sequence[str] | None = None, **kwargs: Any
     ) -> None:
-        """Have method `name` called of all local envs, or of those of `env_ids`, all at once;
-        `collect_calls` gets the values. Never blocks.
+        """Call method `name` of all local envs, or of those of `env_ids`, all at once;
+        `collect_calls` returns the values. Never blocks.
 
         Raises (before anything is sent):
-            EnvBusy: an env has a reply outstanding, or comes twice.
+            EnvBusy: an env has a reply outstanding, or appears twice.
             UnknownEnv: no env of this group has that id.
             TypeError: the arguments can't be sent to a worker.
             NotImplementedError: an env is a client's, whose methods can't be called.
             WorkerDied, EnvHung: an env's worker is gone and is not replaced.
             GroupClosed: the group was not initialised, or is closed.
-            RLightningError: the group is another thread's now, or another loop's.
+            RLightningError: another thread is using the group, or it belongs to another loop.
         """
         self._driver.check_caller()
         self._core.call_async(time.monotonic(), env_ids, (name, args, kwargs))
@@ -324,9 +325,8 @@ class Facade:
     ) -> AutoResetContext:
         """Reset envs at their step limit, in place of their next step.
 
-        An env that has made the limit's number of steps says so in that result
-        (`BatchedData.limit_reached`, and the flag that comes with it). Its next step is replaced
-        by a reset, which returns reward 0 and `BatchedData.is_reset`. Works with ``with`` and
+        The result of the step that reaches the limit says so (`BatchedData.limit_reached`, and
+        the flag that comes with it). The env's next step is replaced by a reset, which returns reward 0 and `BatchedData.is_reset`. Works with ``with`` and
         ``async with``.
 
         Args:
@@ -359,7 +359,7 @@ class Facade:
         second of ``step``, as ``sync``, and of ``collect_async``, as ``async``);
         ``batch_size`` (results in a batch: mean, min, max); ``latency_us`` with ``p50`` and
         ``p99`` of the steps' ``step`` (in the env), ``wait`` (from sending until the env
-        begins) and ``transfer`` (from the env's end until the result is handed out). Where
+        begins) and ``transfer`` (from the env's end until the result is returned). Where
         nothing was measured yet, a dict is empty.
         """
         return self._core.stats.summary()
@@ -373,11 +373,11 @@ class Facade:
         episodes (``info["success"]`` and ``info["fail"]`` of the results that end them),
         ``success_rate`` and ``fail_rate`` are the shares that were true; None where it doesn't.
 
-        A client whose place in the group another has taken is counted in its entry's sums alone.
+        A client whose place in the group another has taken counts only in its entry's sums.
 
         Args:
-            reset: start the sums anew after this call.
-            by_entry: sum up by config entry.
+            reset: start the sums from zero after this call.
+            by_entry: add up the figures of each config entry.
         """
         stats = self._core.stats
         found = stats.by_entry() if by_entry else stats.by_env()
@@ -388,7 +388,8 @@ class Facade:
     def get_workers(self) -> list[dict[str, Any]]:
         """What each place where envs live is doing now: each worker, this process, each env_server.
 
-        It waits for nothing, and may be asked while another task waits for results, or for `init`.
+        It waits for nothing, and may be called while another task waits for results, or for
+        `init`.
 
         Keys: ``entry``; ``env_ids`` (of a server, those of clients that have joined); ``pid`` (of
         a process on this machine, else None); ``state`` (``"new"`` before `init`, ``"starting"``,
@@ -398,7 +399,7 @@ class Facade:
         first is; ``restarts`` (how often it was replaced).
 
         Raises:
-            RLightningError: the group is another thread's now, or another loop's.
+            RLightningError: another thread is using the group, or it belongs to another loop.
         """
         self._driver.check_caller()
         return self._core.describe_workers(time.monotonic_ns())
@@ -418,7 +419,7 @@ class Facade:
         ``with group.trace("run.json"):`` (or ``async with``) records what happens within; so do
         `Trace.start` and `Trace.stop`. It shows when each env stepped and was reset, what its
         worker and the trainer waited for, which request led to which result, and restarts, hangs
-        and step limits: docs/timeline.md. `span` adds what else the trainer does.
+        and step limits: docs/timeline.md. `span` adds the trainer's other work.
 
         Args:
             path: of the file, in Chrome's trace event format (JSON). It is written when the

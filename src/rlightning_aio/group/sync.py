@@ -222,9 +222,9 @@ class EnvGroup(Facade):
         `collect_async`.
 
         Raises:
-            EnvBusy: an env has a reply outstanding, or comes twice; nothing was sent.
+            EnvBusy: an env has a reply outstanding, or appears twice; nothing was sent.
             UnknownEnv: no env of this group has that id.
-            ValueError: a seed is no int from 0 to 2**62 - 1, or there are not as many as envs.
+            ValueError: a seed is not an int from 0 to 2**62 - 1, or there isn't one for each env.
             TypeError: the options can't be sent to a worker.
             TimeoutError: too few clients of an env_server have joined in time.
             EnvRaised, WorkerDied, EnvHung, EnvAway: an env failed, or its client is away; the
@@ -246,9 +246,10 @@ class EnvGroup(Facade):
 
         Raises:
             BadAction: an action's shape, dtype or count doesn't fit; it holds NaN, a number that
-                its dtype can't hold, or infinity where its space is bounded; or this is no batch.
+                its dtype can't hold, or infinity where its space is bounded; or this is not a
+                batch.
                 Nothing was sent.
-            EnvBusy: an env has a reply outstanding, or comes twice; nothing was sent.
+            EnvBusy: an env has a reply outstanding, or appears twice; nothing was sent.
             UnknownEnv: no env of this group has that id.
             NotImplementedError: the env is a client's, which answers when it can.
             EnvRaised, WorkerDied, EnvHung: an env failed; the others' results are in the
@@ -275,11 +276,12 @@ class EnvGroup(Facade):
             timeout: seconds of a further window, opened when the first result is ready, in
                 which more results join.
             wait_all: wait for all that are pending; `timeout` is ignored then, with a warning.
-            min_results: don't return before that many are ready (or all that are pending). None
-                is what the config entries' ``min_results`` sum up to, or 1.
-            max_results: leave what is above to the next call, first come first served.
-            deadline: seconds in all, from now.
-            entries: take results of these config entries only; the others' stay.
+            min_results: don't return before this many are ready (or all that are pending). None
+                is the sum of the config entries' ``min_results``, or 1.
+            max_results: leave results above this number to the next call, first come, first
+                served.
+            deadline: limit in seconds, from now.
+            entries: take results of these config entries only; those of others stay.
             ordered: in the group's order instead of that of arrival. With ``wait_all`` that
                 makes a run reproducible.
 
@@ -292,7 +294,7 @@ class EnvGroup(Facade):
             UnknownEnv: no config entry has such a name.
             ValueError: a time isn't above 0, a number isn't above 0, or `min_results` is above
                 `max_results`.
-            TimeoutError: `deadline` has passed; the next call gets the results.
+            TimeoutError: `deadline` has passed; the next call returns the results.
             EnvRaised, WorkerDied, EnvHung: the answer to one request; the results of others
                 stay for the next call.
             GroupClosed: the group was not initialised, or is closed.
@@ -307,7 +309,7 @@ class EnvGroup(Facade):
         """Wait for the values of all calls that `call_async` has sent.
 
         Args:
-            deadline: seconds in all, from now.
+            deadline: limit in seconds, from now.
 
         Returns them in the order in which they were sent: from a worker copies, from an inline
         env the objects themselves. Interrupted, it loses none.
@@ -324,14 +326,14 @@ class EnvGroup(Facade):
         return self._driver.run(self._collect_calls(deadline))
 
     def snapshot(self, env_ids: Sequence[str] | None = None) -> bytes:
-        """All that envs need to go on from here exactly as they would have, as bytes.
+        """Everything that envs need to continue from here exactly as they would have, as bytes.
 
         Args:
             env_ids: which envs, all idle and reset before; None: all local ones.
 
-        What is in it: the simulators' and wrappers' state, their generators, the sums of the
-        episodes under way, the counters of `auto_reset`, and what is due for a reset. See
-        docs/state.md, also for what isn't. The bytes can be stored, and `restore` takes them in
+        It holds the simulators' and wrappers' state, their generators, the sums of the current
+        episodes, the counters of `auto_reset`, and which envs are due for a reset. docs/state.md
+        also says what it leaves out. The bytes can be stored, and `restore` takes them in
         this group or another, in this process or another.
 
         Raises:
@@ -348,11 +350,11 @@ class EnvGroup(Facade):
     def restore(
         self, snapshot: bytes, env_ids: Sequence[str] | None = None
     ) -> tuple[BatchedData, list[bool]]:
-        """Have envs go on from where a snapshot was taken of them: all of them, or none.
+        """Restore envs to the state of a snapshot: all of them, or none.
 
         Args:
-            snapshot: what `snapshot` returned. It holds pickles, which can have a worker execute
-                anything: only take what you have written yourself.
+            snapshot: what `snapshot` returned. It holds pickles, which can make a worker execute
+                anything: only use what you have written yourself.
             env_ids: into which envs, all idle, in the order of the snapshot's; None: into those
                 of the same ids. Any env of an equal entry will do.
 
@@ -361,7 +363,7 @@ class EnvGroup(Facade):
         the envs begin anew with their next step, which says so as after a restart.
 
         Raises:
-            SnapshotError: the bytes are spoilt, or of another number of envs, another task,
+            SnapshotError: the bytes are damaged, or of another number of envs, another task,
                 other options or another version of a library; nothing was changed.
             EnvBusy: an env has a reply outstanding; nothing was sent.
             UnknownEnv: no env of this group has that id.
@@ -572,7 +574,7 @@ def build_env_group(
             all, a list with one for each entry, or one for each env. Anything that
             cloudpickle takes.
         mixed_actions: allow envs whose action spaces have different shapes.
-        zero_copy: hand out observations as read-only views, valid until that env's next
+        zero_copy: return observations as read-only views, valid until that env's next
             request, where the envs' rows are contiguous.
 
     Raises:

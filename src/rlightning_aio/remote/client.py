@@ -70,8 +70,8 @@ class RemoteEnvClient:
     """Lends one env to the env_server of a trainer's group.
 
     It dials in, and dials again with growing pauses whenever the server is gone; each time
-    it is let in, the env is reset and a new session begins. Whenever a session ends without
-    the env's doing, ``env.on_disconnect()`` is called, so that a robot stops.
+    it is let in, the env is reset and a new session begins. Whenever a session ends and the env
+    didn't end it, ``env.on_disconnect()`` is called, so that a robot stops.
 
     Args:
         env: newly built; the client owns it from now on, initialises it and closes it.
@@ -139,7 +139,7 @@ class RemoteEnvClient:
 
     @property
     def state(self) -> str:
-        """How things stand, in a few words."""
+        """The state of the connection, in a few words."""
         trouble = self._session.refusal or self._trouble
         phase = self._session.phase.value
         if not trouble or self._session.phase is Phase.SERVING:
@@ -153,7 +153,7 @@ class RemoteEnvClient:
             timeout: seconds; None waits as long as it takes.
 
         Raises:
-            TimeoutError: nobody let it in; the message has the last reason known.
+            TimeoutError: nobody let it in; the message has the last known reason.
             ClientRefused: the server will never let it in as it is.
         """
         if self._closed:
@@ -169,9 +169,9 @@ class RemoteEnvClient:
             self._turn(end)
 
     def run(self) -> None:
-        """Serve until ``env.is_finish()`` says so; connects first if need be.
+        """Serve until ``env.is_finish()`` is true; connects first if necessary.
 
-        It is asked after every reset, step and `on_disconnect`, among others.
+        ``is_finish`` is called after every reset, step and `on_disconnect`, among others.
 
         Raises:
             ClientRefused: the server will never let this client in.

@@ -72,7 +72,7 @@ def make_keys(directory: str | os.PathLike[str], names: Sequence[str]) -> list[P
     """Make the server's keys, unless they exist, and those of the clients `names`.
 
     Args:
-        directory: made if missing.
+        directory: created if missing.
         names: of clients; letters, digits, ``.``, ``_`` and ``-``.
 
     Returns:

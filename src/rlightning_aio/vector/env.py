@@ -41,20 +41,20 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
     """Envs in worker processes behind Gymnasium's vector interface.
 
     Args:
-        env_fns: one callable for each env, or for as many vector environments, each of as many
-            sub-environments, whose `autoreset_mode` is this one's. They run in the workers, and
+        env_fns: one callable for each env, or for each of several vector environments of the same
+            size whose `autoreset_mode` is this one's. They run in the workers, and
             only there; lambdas and functions of ``__main__`` will do.
-        shared_memory: accepted, and without meaning here.
-        copy: observations are the caller's own. False spares a copy: who writes to them writes
-            to what a later masked reset shows of envs that it doesn't reset.
-        context: accepted, and without meaning here.
-        daemon: accepted, and without meaning here.
+        shared_memory: accepted and ignored.
+        copy: observations are the caller's own. False saves a copy, but writing to them changes
+            what a later masked reset shows of envs that it doesn't reset.
+        context: accepted and ignored.
+        daemon: accepted and ignored.
         worker: must be None; there is no worker function to replace.
         observation_mode: ``same``, ``different`` (equal shapes and dtypes), or a pair of the
             batched and the single observation space.
-        autoreset_mode: what an env does after its episode's end.
-        max_concurrency: workers at most, each of which executes one env at a time; None for
-            as many as this process may use cores.
+        autoreset_mode: what an env does after the end of its episode.
+        max_concurrency: maximum number of workers, each of which executes one env at a time; None
+            for one per core that this process may use.
         entry: further fields of `EnvConfig` (``step_timeout``, ``on_worker_death``, …).
 
     Attributes:
@@ -63,7 +63,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
 
     Raises:
         ConfigError: a callable can't be sent to a worker, or `entry` is wrong.
-        StartFailed: a callable raised, or returned no env.
+        StartFailed: a callable raised, or didn't return an env.
         RuntimeError: the envs' spaces, or their numbers, don't go together.
     """
 
