@@ -326,7 +326,8 @@ class Facade:
         """Reset envs at their step limit, in place of their next step.
 
         The result of the step that reaches the limit says so (`BatchedData.limit_reached`, and
-        the flag that comes with it). The env's next step is replaced by a reset, which returns reward 0 and `BatchedData.is_reset`. Works with ``with`` and
+        the flag that comes with it). The env's next step is replaced by a
+        reset, which returns reward 0 and `BatchedData.is_reset`. Works with ``with`` and
         ``async with``.
 
         Args:
