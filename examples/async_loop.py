@@ -1,4 +1,4 @@
-"""Collect 20,000 transitions from CartPoles as they get ready, with random actions."""
+"""Collect 20,000 transitions from CartPoles as they become ready, with random actions."""
 
 import numpy as np
 

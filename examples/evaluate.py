@@ -1,9 +1,9 @@
-"""What ppo.py, ppo_async.py or ppo_overlap.py have learned, tried over some episodes.
+"""Evaluate what ppo.py, ppo_async.py or ppo_overlap.py have learned, over some episodes.
 
     python examples/evaluate.py --folder runs/ppo_async --episodes 10
 
-Each environment plays equally many episodes: to take those that end first would favour short ones.
-Actions are the likeliest ones, and observations are normalised by what training has seen.
+Each environment plays the same number of episodes: those that end first would favour short ones.
+Actions are the likeliest ones, and observations are normalised with training's statistics.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Running normalisation of observations and rewards in the trainer; not an example itself.
 
-Each environment has statistics of its own, as with Gymnasium's `NormalizeObservation` and
-`NormalizeReward` around each, and the results are theirs to the bit. All that come together
-are normalised with a few operations on whole arrays, and workers have nothing to do with it.
+Each environment has its own statistics, as with Gymnasium's `NormalizeObservation` and
+`NormalizeReward` around each, and the results equal theirs bit for bit. The results of a batch
+are normalised with a few operations on whole arrays, and workers do nothing for it.
 """
 
 from __future__ import annotations

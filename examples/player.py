@@ -1,7 +1,7 @@
-"""What acts for ppo_async.py and ppo_overlap.py; not an example itself.
+"""The policy that acts for ppo_async.py and ppo_overlap.py; not an example itself.
 
-A policy as `rlightning_aio.collecting.Collector` wants it: called with a batch of results, it
-returns columns with a row for each of them.
+It is a policy as `rlightning_aio.collecting.Collector` needs it: called with a batch of results,
+it returns columns with a row for each of them.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""PPO on a synchronous group: CleanRL's loop and hyperparameters, all environments in step.
+"""PPO on a synchronous group: CleanRL's loop and hyperparameters, in lockstep.
 
     python examples/ppo.py                          # HalfCheetah-v5
     python examples/ppo.py --task CartPole-v1
 
-With the same seeds it learns the same weights, to the bit, as that loop on Gymnasium's vector
-environments (SAME_STEP, its wrappers around each). Like that one it takes an episode that was
-cut short for one that has ended; ppo_async.py does better.
+With the same seeds it learns the same weights, bit for bit, as that loop on Gymnasium's vector
+environments (SAME_STEP, its wrappers around each). Like that loop, it treats a truncated episode
+as a terminated one; ppo_async.py does better.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
-"""PPO on an asynchronous group: whoever is ready goes on, and chains are as long as they get.
+"""PPO on an asynchronous group: first come, first served, with chains of any length.
 
     python examples/ppo_async.py                              # HalfCheetah-v5, 16 environments
     python examples/ppo_async.py --num-envs 2 --envs-each 8   # the same, 8 to a worker's call
     python examples/ppo_async.py --task CartPole-v1
 
 Network, loss and hyperparameters are those of ppo.py. A rollout has a fixed total of transitions,
-of which a fast environment makes more than a slow one. Episodes that were cut short and chains
-that go on in the next rollout are bootstrapped, each from its own next observation.
+of which a fast environment makes more than a slow one. Truncated episodes and chains
+that continue in the next rollout are bootstrapped, each from its own next observation.
 """
 
 from __future__ import annotations

@@ -3,9 +3,9 @@
     python examples/ppo_overlap.py                          # HalfCheetah-v5, 16 environments
     python examples/ppo_overlap.py --task CartPole-v1
 
-As ppo_async.py otherwise. Environments never wait for the learner, so what it learns from was
-chosen by the policy before: one version old at most. The ratio to the probability that the
-action had when it was chosen, which PPO clips, is what makes up for that.
+Otherwise it is like ppo_async.py. Environments never wait for the learner, so it learns from
+actions of the previous policy: one version old at most. PPO's clipped ratio to the probability
+that the action had when it was chosen makes up for that.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""SAC on an asynchronous group: a replay buffer that is fed by whoever is ready first.
+"""SAC on an asynchronous group: a replay buffer filled in order of arrival.
 
     python examples/sac.py --task HalfCheetah-v5
 
-What is in the buffer needn't come in any order, so nobody waits for anybody: results are stored
-as they come, their environments are sent on at once, and step while the learner learns.
+The buffer needs no order, so nobody waits for anybody: results are stored as they arrive, their
+environments get the next action at once, and they step while the learner learns.
 Hyperparameters are CleanRL's, one update for each transition.
 """
 

@@ -1,6 +1,6 @@
-"""What the examples of training share: arguments, progress, the curve, checkpoints, Ctrl-C.
+"""Shared code of the training examples: arguments, progress, the curve, checkpoints, Ctrl-C.
 
-Not an example itself. Nothing here knows of environments or of an algorithm.
+Not an example itself. Nothing here depends on environments or an algorithm.
 """
 
 from __future__ import annotations
