@@ -130,7 +130,7 @@ def test_a_python_without_isaac_lab_is_named() -> None:
     with pytest.raises(ConfigError, match=rf"isaac-0: {sys.executable} has no Isaac Lab") as raised:
         isaac_task.make_simulator("isaac-0", CONFIG, None)
     assert str(raised.value).endswith(
-        "interpreter name a Python of an environment made by: pip install 'rlightning-aio[isaac]' "
+        "interpreter to the Python of an environment made by: pip install 'rlightning-aio[isaac]' "
         "&& pip install --ignore-requires-python --no-deps isaaclab==3.0.0"
     )
 

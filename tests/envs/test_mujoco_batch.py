@@ -157,7 +157,7 @@ def test_a_group_of_batches_is_as_many_envs(placement: str) -> None:
 def test_what_can_not_be_batched_is_stepped_in_a_loop_and_says_so() -> None:
     """Older versions, and tasks that are wrapped."""
     config = EnvConfig(name="old", backend="mujoco", task="Hopper-v4", num_envs=2)
-    with pytest.warns(RuntimeWarning, match=r"one after the other: HopperEnv is none of"):
+    with pytest.warns(RuntimeWarning, match=r"one after the other: HopperEnv is not one of"):
         env = MujocoEnv(config)
     assert env.reset(seed=0).observation.shape == (2, 11)
     env.close()

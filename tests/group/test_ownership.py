@@ -132,7 +132,7 @@ def test_use_from_another_thread_is_refused_while_the_loop_runs(kind: str) -> No
 
     asyncio.run(main())
     assert len(refused) == 2
-    assert all("runs in another thread; hand it" in str(error) for error in refused)
+    assert all("runs in another thread; pass work" in str(error) for error in refused)
 
 
 def test_a_synchronous_group_is_one_thread_s_at_a_time() -> None:
