@@ -194,7 +194,8 @@ FAULTS: dict[str, Callable[[], object]] = {
     "deadlock": _deadlock,
     "deadlock with the GIL": _deadlock_with_the_gil,
     "close descriptors": lambda: os.closerange(3, 1000),
-    "stop": _signal(signal.SIGSTOP),
+    # To this thread: of a process with others it would run on until one of them takes it.
+    "stop": lambda: signal.pthread_kill(threading.get_ident(), signal.SIGSTOP),
     "tell and sleep": _tell_and_sleep,
     "interrupt the trainer": lambda: _signal_trainer(signal.SIGINT),
     "call the trainer": lambda: _signal_trainer(signal.SIGUSR1),
