@@ -22,7 +22,7 @@ from rlightning_aio.errors import ConfigError, EnvRaised
 from rlightning_aio.sync import EnvGroup, build_env_group
 from rlightning_aio.types import PolicyResponse
 from rlightning_aio.vector.leftovers import drop_outstanding
-from rlightning_aio.vector.making import steps_together, together
+from rlightning_aio.vector.making import imports_of, steps_together, together
 from rlightning_aio.vector.rows import rows_of
 
 if TYPE_CHECKING:
@@ -65,6 +65,7 @@ def make_vec_env(
     single = any(more.get(name) for name in _OF_SINGLE_ENVS)
     if isinstance(env_id, str) and not single and steps_together(spec := spec_of(env_id), kwargs):
         one = OneOf(spec, {"disable_env_checker": True, **kwargs})
+        fields = {**imports_of(spec), **fields}
         makers, fields = together(one, n_envs, AutoresetMode.SAME_STEP, fields)
         made = VecEnv(makers, **fields)
         made.seed(seed)

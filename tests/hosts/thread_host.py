@@ -37,7 +37,7 @@ from rlightning_aio.hosts.messages import (
     Saved,
     Value,
 )
-from rlightning_aio.hosts.runner import attach_all
+from rlightning_aio.hosts.runner import attach_all, close_all
 from rlightning_aio.protocol.entries import Operation, answers_with_value, op_of, slot_of
 from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
 
@@ -239,11 +239,4 @@ class EnvThread(threading.Thread):
 
     def close(self) -> None:
         """Close the envs, and say what they raised."""
-        errors: list[tuple[int, ErrorText]] = []
-        for index, runner in enumerate(self._runners):
-            try:
-                runner.env.close()
-            except BaseException as error:  # noqa: BLE001  # An env may raise anything.
-                errors.append((index, ErrorText.of(error)))
-        self._runners.clear()
-        self._tell(Closed(self._host_id, errors))
+        self._tell(Closed(self._host_id, close_all(self._runners)))

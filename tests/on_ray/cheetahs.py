@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import argparse
 import sys
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,6 +23,9 @@ if __name__ == "__main__":
 import ray_cluster
 
 from rlightning_aio import sync
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 NUM_ENVS, NUM_ACTORS = 6, 3
 SIM = "sim"
@@ -39,12 +43,13 @@ class Told:
 
     Attributes:
         steps: transitions that were equal; restarts: results that told of a lost episode.
-        causes: why.
+        causes: why; batch_seconds: how long each batch took, from its request on.
     """
 
     steps: int = 0
     restarts: int = 0
     causes: set[str] = field(default_factory=set[str])
+    batch_seconds: list[float] = field(default_factory=list[float], repr=False)
 
 
 def entry(**placed: Any) -> dict[str, Any]:
@@ -66,29 +71,45 @@ def add_node(cluster: Any) -> Any:
 def run(cluster: Any, num_batches: int, every: int) -> Told:
     """Step, killing the oldest of three nodes in every so many batches; a new one is added."""
     nodes = [add_node(cluster) for _ in range(3)]
-    told, draw = Told(), np.random.default_rng(0)
+
+    def strike(number: int) -> None:
+        if number % every == every // 2:
+            cluster.remove_node(nodes.pop(0), allow_graceful=False)
+            nodes.append(add_node(cluster))
+
     spread = {"envs_per_process": NUM_ENVS // NUM_ACTORS, "max_restarts": 20}
     try:
         with (
             sync.build_env_group(entry(**PLACED, **spread)) as group,
             sync.build_env_group(entry(placement="inline")) as twins,
         ):
-            batch, _ = group.reset(seed=0)
-            equal(batch, twins.reset(seed=0)[0], slice(None))
-            with group.auto_reset(), twins.auto_reset():
-                for number in range(num_batches):
-                    action = draw.uniform(-1, 1, (NUM_ENVS, 6))
-                    group.step_async(batch.respond(action=action))
-                    if number % every == every // 2:
-                        cluster.remove_node(nodes.pop(0), allow_graceful=False)
-                        nodes.append(add_node(cluster))
-                    batch, _ = group.collect_async(wait_all=True, ordered=True)
-                    local, _ = twins.step(batch.respond(action=action))
-                    check(told, batch, local)
-                    begin_anew(group, twins, batch, seed=number)
+            return step_both(group, twins, num_batches, strike)
     finally:
         for node in nodes:
             cluster.remove_node(node)
+
+
+def step_both(
+    group: sync.EnvGroup, twins: sync.EnvGroup, num_batches: int, strike: Callable[[int], None]
+) -> Told:
+    """Step envs of the cluster and their local twins, and hold them against each other.
+
+    While those of the cluster step, `strike` is called with the number of the batch.
+    """
+    told, draw = Told(), np.random.default_rng(0)
+    batch, _ = group.reset(seed=0)
+    equal(batch, twins.reset(seed=0)[0], slice(None))
+    with group.auto_reset(), twins.auto_reset():
+        for number in range(num_batches):
+            action = draw.uniform(-1, 1, (NUM_ENVS, 6))
+            began = time.monotonic()
+            group.step_async(batch.respond(action=action))
+            strike(number)
+            batch, _ = group.collect_async(wait_all=True, ordered=True)
+            told.batch_seconds.append(time.monotonic() - began)
+            local, _ = twins.step(batch.respond(action=action))
+            check(told, batch, local)
+            begin_anew(group, twins, batch, seed=number)
     return told
 
 

@@ -16,6 +16,7 @@ import os
 import random
 import select
 import signal
+import statistics
 import struct
 import subprocess
 import sys
@@ -23,9 +24,7 @@ import threading
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -38,6 +37,7 @@ if TYPE_CHECKING:
 NEAR, FAR = "rl-near", "rl-far"
 ADDRESSES = {NEAR: "10.77.0.1", FAR: "10.77.0.2"}
 PORT = 6399
+HALFWAY = "halfway\n"
 TUNSETIFF, IFF_TUN, IFF_NO_PI = 0x400454CA, 0x0001, 0x1000
 
 
@@ -100,36 +100,29 @@ def kill_raylet(node: subprocess.Popen[bytes]) -> None:
 def train(steps: int) -> None:
     """In the near namespace: step, and see one of the far nodes go."""
     import ray
-    from cheetahs import NUM_ENVS, PLACED, Told, begin_anew, check, entry, equal
+    from cheetahs import NUM_ENVS, PLACED, entry, step_both
 
     from rlightning_aio import sync
 
     ray.init(address=f"{ADDRESSES[NEAR]}:{PORT}", log_to_driver=False)
     while sum(node["Alive"] for node in ray.nodes()) < 3:
         time.sleep(0.1)
-    told, draw, times = Told(), np.random.default_rng(0), []
+    num_batches = steps // NUM_ENVS
+
+    def say_when(number: int) -> None:
+        if number == num_batches // 2:
+            sys.stdout.write(HALFWAY)
+            sys.stdout.flush()
+
     far = {"envs_per_process": NUM_ENVS // 2, "max_restarts": 20}
     with (
         sync.build_env_group(entry(**PLACED, **far)) as group,
         sync.build_env_group(entry(placement="inline")) as twins,
     ):
-        batch, _ = group.reset(seed=0)
-        equal(batch, twins.reset(seed=0)[0], slice(None))
-        with group.auto_reset(), twins.auto_reset():
-            for number in range(steps // NUM_ENVS):
-                action: Any = draw.uniform(-1, 1, (NUM_ENVS, 6))
-                began = time.monotonic()
-                group.step_async(batch.respond(action=action))
-                if number == steps // NUM_ENVS // 2:
-                    sys.stdout.write("halfway\n")
-                    sys.stdout.flush()
-                batch, _ = group.collect_async(wait_all=True, ordered=True)
-                times.append(time.monotonic() - began)
-                local, _ = twins.step(batch.respond(action=action))
-                check(told, batch, local)
-                begin_anew(group, twins, batch, seed=number)
+        told = step_both(group, twins, num_batches, say_when)
     ray_cluster.no_actor_left()
-    sys.stdout.write(f"{told}, {1e3 * float(np.median(times)):.1f} ms a batch\n")
+    median = statistics.median(told.batch_seconds)
+    sys.stdout.write(f"{told}, {1e3 * median:.1f} ms a batch\n")
 
 
 def main() -> None:
@@ -164,7 +157,7 @@ def main() -> None:
         assert trainer.stdout is not None
         for line in trainer.stdout:
             sys.stdout.write(line)
-            if line == "halfway\n":
+            if line == HALFWAY:
                 kill_raylet(nodes[1])
         sys.exit(trainer.wait())
 

@@ -9,10 +9,19 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from group.sample_envs import Gate, Probe
+from group.sample_envs import Probe
+from hosts import beside_others
+from hosts.beside_others import (
+    both_ways,
+    check_first_ready,
+    check_methods,
+    check_three_are_equal,
+    check_usable_after_an_error,
+    steps,
+)
 
-from rlightning_aio import ENVS, BaseEnv, BatchedData, EnvRet, PolicyResponse
-from rlightning_aio.errors import ConfigError, EnvRaised, StartFailed
+from rlightning_aio import ENVS, BaseEnv, EnvRet
+from rlightning_aio.errors import ConfigError, StartFailed
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -26,14 +35,7 @@ THREE_PLACES = ("inline", "ray", "process")
 
 
 def entry(name: str, backend: str = "probe", placement: str = "ray", **fields: Any) -> Any:
-    fields = {"task": "-", "imports": ["group.sample_envs"], **fields}
-    return {"name": name, "backend": backend, "placement": placement, **fields}
-
-
-def steps(**actions: Any) -> BatchedData:
-    ids = [name.replace("_", "-") for name in actions]
-    responses = [PolicyResponse(i, a) for i, a in zip(ids, actions.values(), strict=True)]
-    return BatchedData(ids, responses)
+    return beside_others.entry(name, backend, placement, **fields)
 
 
 async def test_trajectories_are_those_of_inline_envs_and_of_processes(facade: Place) -> None:
@@ -51,20 +53,8 @@ async def test_trajectories_are_those_of_inline_envs_and_of_processes(facade: Pl
         with group.auto_reset(max_episode_steps=20):
             for number in range(100):
                 action = np.tile(draw.uniform(-1, 1, (4, 6)), (3, 1))
-                if number % 2:
-                    batch, flags = await group.step(batch.respond(action=action))
-                else:
-                    group.step_async(batch.respond(action=action))
-                    batch, flags = await group.collect_async(wait_all=True, ordered=True)
-                for values in (
-                    *(batch.observation, batch.reward, batch.terminated, batch.truncated),
-                    *(batch.is_reset, batch.limit_reached, np.array(flags)),
-                ):
-                    inline, ray, process = np.split(np.asarray(values), 3)
-                    np.testing.assert_array_equal(ray, inline, strict=True)
-                    np.testing.assert_array_equal(process, inline, strict=True)
-                infos = [ret.info for ret in batch.values()]
-                assert infos[:4] == infos[4:8] == infos[8:]
+                batch, flags = await both_ways(number, group, batch, action)
+                check_three_are_equal(batch, flags)
                 resets += int(np.sum(batch.is_reset))
         stats = group.get_env_stats()
     episodes = [[stats[f"{place}-{k}"] for k in range(4)] for place in THREE_PLACES]
@@ -75,43 +65,18 @@ async def test_trajectories_are_those_of_inline_envs_and_of_processes(facade: Pl
 async def test_an_env_that_raises_stays_usable(sync_facade: Place) -> None:
     """Its neighbour's result comes with the error, and both go on."""
     async with sync_facade.build(entry("one", num_workers=2, envs_per_process=2)) as group:
-        await group.reset()
-        with pytest.raises(EnvRaised, match=r"env 'one-1'.* raised in step") as caught:
-            await group.step(steps(one_0=[0.0, 5.0], one_1=[Probe.RAISE, 0.0]))
-        assert caught.value.exception_type == "group.sample_envs.OddError"
-        assert "sample_envs.py" in caught.value.traceback_text
-        assert caught.value.results.reward.tolist() == [5]
-        batch, _ = await group.step(steps(one_0=[0.0, 6.0], one_1=[0.0, 7.0]))
-        assert batch.reward.tolist() == [6, 7]
+        await check_usable_after_an_error(group)
 
 
 async def test_methods_are_called_in_the_actor(sync_facade: Place) -> None:
     """In a process of its own; a value that can't be sent is the caller's error alone."""
     async with sync_facade.build([entry("one"), entry("two", placement="process")]) as group:
-        handle = group["one-0"]
-        assert await handle.call("double", [4], times=3) == [4, 4, 4]
-        with pytest.raises(EnvRaised, match=r"raised in the call of double\(\): TypeError"):
-            await handle.call("double", None)
-        await handle.set_attr("label", "changed")
-        assert await handle.get_attr("label") == "changed"
-        await group.reset()
-        assert (await handle.step([0.0, 2.0])).last_reward == 2
+        await check_methods(group)
 
 
 async def test_a_slow_actor_keeps_nobody_waiting(facade: Place, tmp_path: Path) -> None:
     """Whoever is ready comes first, from an actor, a process or inline."""
-    gate = Gate(str(tmp_path), "slow-0").make()
-    quick = [entry(f"quick_{place}", placement=place) for place in THREE_PLACES]
-    slow = entry("slow", "gated", env_kwargs={"gates": str(tmp_path)})
-    async with facade.build([slow, *quick]) as group:
-        batch, _ = await group.reset()
-        group.step_async(batch.respond(action=np.zeros((4, 2))))
-        came: set[str] = set()
-        while len(came) < 3:
-            came.update((await group.collect_async())[0].ids())
-        assert came == {f"quick_{place}-0" for place in THREE_PLACES}
-        gate.open()
-        assert (await group.collect_async())[0].ids() == ["slow-0"]
+    await check_first_ready(facade, THREE_PLACES, "ray", tmp_path)
 
 
 def wide() -> type[gym.Env[Any, Any]]:

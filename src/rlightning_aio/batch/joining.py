@@ -17,6 +17,7 @@ from rlightning_aio.batch.data import (
     sources_of,
 )
 from rlightning_aio.batch.sent import joined_sources
+from rlightning_aio.batch.stacking import concatenated
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -130,7 +131,7 @@ def _one(parts: list[ResultColumns]) -> ResultColumns:
         parts[0],
         names=parts[-1].names,
         positions=positions[order],
-        observation=_concatenated([part.observation for part in parts], order),
+        observation=concatenated([part.observation for part in parts], order),
         out_of_band={
             int(place[first + row]): kept
             for first, part in zip(first_rows, parts, strict=False)
@@ -138,14 +139,3 @@ def _one(parts: list[ResultColumns]) -> ResultColumns:
         },
         **{name: joined_rows(name) for name in ("slots", *BY_ROW)},
     )
-
-
-def _concatenated(trees: list[Tree], order: NDArray[np.intp]) -> Tree:
-    first = trees[0]
-    if isinstance(first, dict):
-        keys = cast("dict[str, Tree]", first)
-        return {key: _concatenated([tree[key] for tree in trees], order) for key in keys}
-    if isinstance(first, tuple):
-        count = len(cast("tuple[Tree, ...]", first))
-        return tuple(_concatenated([tree[k] for tree in trees], order) for k in range(count))
-    return np.concatenate(trees)[order]

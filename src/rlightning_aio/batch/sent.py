@@ -6,12 +6,11 @@ from, and the place there; columns are put together when somebody reads them.
 
 from __future__ import annotations
 
-import sys
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 
-from rlightning_aio.batch.stacking import columns_where_possible
+from rlightning_aio.batch.stacking import columns_where_possible, concatenated
 from rlightning_aio.protocol.columns import mapped
 
 if TYPE_CHECKING:
@@ -127,7 +126,7 @@ class Sent:
             places.append(nobody)
         if len(found) == 1:
             return found[0]
-        return _joined(found, np.argsort(np.concatenate(places)))
+        return concatenated(found, np.argsort(np.concatenate(places)))
 
     def _groups(self) -> Iterator[tuple[Mapping[str, Any] | None, NDArray[np.intp]]]:
         """The columns that rows came from, each with the places of its rows in the batch."""
@@ -155,24 +154,6 @@ def _filler(leaf: Any, count: int) -> Any:
         return np.full((count, *array.shape[1:]), nothing, array.dtype)
     nothing = float("nan") if leaf.is_floating_point() else 0
     return leaf.new_full((count, *leaf.shape[1:]), nothing)
-
-
-def _joined(trees: list[Any], order: NDArray[np.intp]) -> Any:
-    """Trees of one structure behind one another, their rows in another order."""
-    first = trees[0]
-    if isinstance(first, dict):
-        parts = cast("dict[str, Any]", first)
-        return {key: _joined([tree[key] for tree in trees], order) for key in parts}
-    if isinstance(first, tuple):
-        count = len(cast("tuple[Any, ...]", first))
-        return tuple(_joined([tree[k] for tree in trees], order) for k in range(count))
-    if isinstance(first, list):
-        rows = [row for tree in trees for row in tree]
-        return [rows[k] for k in order.tolist()]
-    if isinstance(first, np.ndarray):
-        return np.concatenate(trees)[order]
-    # A process that holds a tensor has imported torch.
-    return sys.modules["torch"].cat(trees)[order]
 
 
 def columns_of_values(values: Sequence[PolicyResponse]) -> dict[str, Any]:

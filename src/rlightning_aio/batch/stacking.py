@@ -1,13 +1,16 @@
-"""Values that came one by one, as columns."""
+"""Values that came one by one, or columns that came apart, as columns."""
 
 from __future__ import annotations
 
 import sys
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-__all__ = ["columns_where_possible", "differing", "stacked_values"]
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+__all__ = ["columns_where_possible", "concatenated", "differing", "stacked_values"]
 
 
 def stacked_values(values: list[Any]) -> Any:
@@ -54,3 +57,21 @@ def columns_where_possible(values: list[Any]) -> Any:
         return stacked_values(values)
     except (ValueError, TypeError, RuntimeError):  # Of tensors: a mixture, shapes.
         return values
+
+
+def concatenated(trees: list[Any], order: NDArray[np.intp]) -> Any:
+    """Trees of one structure behind one another, their rows in another order."""
+    first = trees[0]
+    if isinstance(first, dict):
+        parts = cast("dict[str, Any]", first)
+        return {key: concatenated([tree[key] for tree in trees], order) for key in parts}
+    if isinstance(first, tuple):
+        count = len(cast("tuple[Any, ...]", first))
+        return tuple(concatenated([tree[k] for tree in trees], order) for k in range(count))
+    if isinstance(first, list):
+        rows = [row for tree in trees for row in tree]
+        return [rows[k] for k in order.tolist()]
+    if isinstance(first, np.ndarray):
+        return np.concatenate(trees)[order]
+    # A process that holds a tensor has imported torch.
+    return sys.modules["torch"].cat(trees)[order]

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import importlib.metadata
 from dataclasses import asdict, dataclass
-from typing import Annotated
 
-import typer
 from rich.text import Text
 
+from rlightning_aio.cli.options import AsJson
 from rlightning_aio.cli.terminal import named_columns, out, print_json, print_table
 from rlightning_aio.registry import BACKENDS, ENTRY_POINT_GROUP
 
@@ -24,9 +23,7 @@ class _Row:
 
 
 def backends(
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON document instead of the table.")
-    ] = False,
+    as_json: AsJson = False,
 ) -> None:
     """List all backends: whether the simulator is installed here, and how to install it.
 

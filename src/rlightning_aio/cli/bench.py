@@ -17,6 +17,7 @@ from rlightning_aio.cli.collecting import check_trace
 from rlightning_aio.cli.comparing import Comparison, check_name, compared, save
 from rlightning_aio.cli.contender_table import as_csv, as_markdown, print_contenders
 from rlightning_aio.cli.measuring import Contender, Limits, Rule, Stand, opened, take_turns
+from rlightning_aio.cli.options import AsJson, Config, Overrides
 from rlightning_aio.cli.plots import check_plot, draw_contenders
 from rlightning_aio.cli.policies import Policy, load_policy
 from rlightning_aio.cli.settings import Setting, possible_settings
@@ -75,11 +76,8 @@ class _Bench:
 
 
 def bench(
-    config: Annotated[Path, typer.Argument(help="YAML file with envs:", show_default=False)],
-    overrides: Annotated[
-        list[str] | None,
-        typer.Argument(help="Dotted overrides, such as envs.0.num_workers=8", show_default=False),
-    ] = None,
+    config: Config,
+    overrides: Overrides = None,
     rounds: Annotated[int, typer.Option(min=1, help="Number of turns for each contender.")] = 5,
     seconds: Annotated[
         float, typer.Option(min=0.001, help="Length of one measurement, in seconds.")
@@ -117,9 +115,7 @@ def bench(
             "https://ui.perfetto.dev.",
         ),
     ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON document instead of the table.")
-    ] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Measure how fast a config's envs run, and how to make them run faster.
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import asdict, dataclass
-from pathlib import Path  # noqa: TC003 (Typer reads annotations)
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
 import rlightning_aio
 from rlightning_aio.cli.collecting import Roster, resetting, respond_to_all, responder
+from rlightning_aio.cli.options import Config, Overrides
 from rlightning_aio.cli.terminal import (
     INTERRUPTED,
     counted,
@@ -51,11 +51,8 @@ class _Finding:
 
 
 def check(
-    config: Annotated[Path, typer.Argument(help="YAML file with envs:", show_default=False)],
-    overrides: Annotated[
-        list[str] | None,
-        typer.Argument(help="Dotted overrides, such as envs.0.num_workers=8", show_default=False),
-    ] = None,
+    config: Config,
+    overrides: Overrides = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print one JSON document instead of the text.")
     ] = False,

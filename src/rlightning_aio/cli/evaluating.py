@@ -16,6 +16,7 @@ import rlightning_aio
 from rlightning_aio.cli.collecting import Roster, check_trace, resetting, responder, traced
 from rlightning_aio.cli.evaluation_file import EvaluationFile, subject
 from rlightning_aio.cli.films import Video, VideoEnvs, VideoEvery, filmed
+from rlightning_aio.cli.options import AsJson, Config, Overrides, TraceFile
 from rlightning_aio.cli.plots import check_plot, draw_evaluation
 from rlightning_aio.cli.policies import load_policy
 from rlightning_aio.cli.sb3_policies import SB3Policy, digest_of
@@ -62,11 +63,8 @@ class _Order:
 
 
 def evaluation(
-    config: Annotated[Path, typer.Argument(help="YAML file with envs:", show_default=False)],
-    overrides: Annotated[
-        list[str] | None,
-        typer.Argument(help="Dotted overrides, such as envs.0.num_workers=8", show_default=False),
-    ] = None,
+    config: Config,
+    overrides: Overrides = None,
     policy: Annotated[
         str,
         typer.Option(
@@ -94,13 +92,8 @@ def evaluation(
     video: Video = None,
     video_env: VideoEnvs = None,
     video_every: VideoEvery = None,
-    trace: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Write a timeline for https://ui.perfetto.dev."),
-    ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON document instead of the table.")
-    ] = False,
+    trace: TraceFile = None,
+    as_json: AsJson = False,
 ) -> None:
     """Evaluate a policy: play a fixed number of episodes for each env and print statistics.
 

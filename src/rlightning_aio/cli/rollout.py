@@ -22,6 +22,7 @@ from rlightning_aio.cli.collecting import (
 )
 from rlightning_aio.cli.films import Video, VideoEnvs, VideoEvery, filmed
 from rlightning_aio.cli.live import Display
+from rlightning_aio.cli.options import AsJson, Config, Overrides, TraceFile
 from rlightning_aio.cli.plots import check_plot, draw_rollout
 from rlightning_aio.cli.policies import Policy, load_policy
 from rlightning_aio.cli.rollout_statistics import EntryFigures, RolloutStatistics
@@ -71,11 +72,8 @@ class _Order:
 
 
 def rollout(
-    config: Annotated[Path, typer.Argument(help="YAML file with envs:", show_default=False)],
-    overrides: Annotated[
-        list[str] | None,
-        typer.Argument(help="Dotted overrides, such as envs.0.num_workers=8", show_default=False),
-    ] = None,
+    config: Config,
+    overrides: Overrides = None,
     steps: Annotated[
         int | None,
         typer.Option(min=1, help="Env steps to collect.", show_default="10000, or for --seconds"),
@@ -109,13 +107,8 @@ def rollout(
     video: Video = None,
     video_env: VideoEnvs = None,
     video_every: VideoEvery = None,
-    trace: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Write a timeline for https://ui.perfetto.dev."),
-    ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON document instead of the table.")
-    ] = False,
+    trace: TraceFile = None,
+    as_json: AsJson = False,
 ) -> None:
     """Collect steps from a config's envs and print a table of the results.
 

@@ -14,6 +14,7 @@ import rlightning_aio
 from rlightning_aio.cli.bench import Watch
 from rlightning_aio.cli.contender_table import print_contenders
 from rlightning_aio.cli.measuring import Contender, Limits, Rule, Stand, opened, take_turns
+from rlightning_aio.cli.options import Config, Overrides
 from rlightning_aio.cli.settings import Setting, possible_settings
 from rlightning_aio.cli.terminal import (
     INTERRUPTED,
@@ -87,11 +88,8 @@ class _Search:
 
 
 def tune(
-    config: Annotated[Path, typer.Argument(help="YAML file with envs:", show_default=False)],
-    overrides: Annotated[
-        list[str] | None,
-        typer.Argument(help="Dotted overrides, such as envs.0.num_workers=8", show_default=False),
-    ] = None,
+    config: Config,
+    overrides: Overrides = None,
     rounds: Annotated[int, typer.Option(min=1, help="Number of turns for each setting.")] = 5,
     seconds: Annotated[
         float, typer.Option(min=0.001, help="Length of one measurement, in seconds.")

@@ -30,10 +30,10 @@ class OneOf:
         kwargs: dict[str, Any],
         wrappers: Sequence[Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]]] = (),
     ) -> None:
-        self.spec, self._kwargs, self._wrappers = spec, kwargs, wrappers
+        self._spec, self._kwargs, self._wrappers = spec, kwargs, wrappers
 
     def __call__(self) -> gym.Env[Any, Any]:
-        env: gym.Env[Any, Any] = gym.make(self.spec, **self._kwargs)
+        env: gym.Env[Any, Any] = gym.make(self._spec, **self._kwargs)
         for wrap in self._wrappers:
             env = wrap(env)
         return env

@@ -113,7 +113,7 @@ class AutoReset:
         if configured:
             warnings.warn(
                 f"auto_reset(max_episode_steps={limit}) overrides the limits that are configured",
-                stacklevel=4,
+                stacklevel=5,
             )
         return np.full(len(envs), limit, np.int64)
 

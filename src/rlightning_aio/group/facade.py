@@ -6,11 +6,12 @@ import os
 import time
 import warnings
 import weakref
-from typing import TYPE_CHECKING, Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Protocol
 
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import BadAction, RLightningError
 from rlightning_aio.group.build import Plan, assemble
+from rlightning_aio.group.scope import Scope
 from rlightning_aio.group.trace import NO_SPAN, Trace
 from rlightning_aio.hosts.base import Watcher
 from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from contextlib import AbstractContextManager
     from pathlib import Path
-    from types import TracebackType
 
     import gymnasium as gym
 
@@ -47,7 +47,7 @@ def steps_of(env_id: str, response: PolicyResponse | Any) -> BatchedData:
     return BatchedData([env_id], [response])
 
 
-class AutoResetContext:
+class AutoResetContext(Scope):
     """What `EnvGroup.auto_reset` returns: its rule holds from entry to exit.
 
     It may be entered again after an exit.
@@ -61,29 +61,12 @@ class AutoResetContext:
         self._on_done = on_done
         self._mark_truncated = mark_truncated
 
-    def __enter__(self) -> Self:
+    def _enter(self) -> None:
         self._core.auto.begin(
             self._limit, on_done=self._on_done, mark_truncated=self._mark_truncated
         )
-        return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._core.auto.end()
-
-    async def __aenter__(self) -> Self:
-        return self.__enter__()
-
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def _leave(self) -> None:
         self._core.auto.end()
 
 

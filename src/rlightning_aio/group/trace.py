@@ -16,12 +16,13 @@ import os
 import threading
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
 from rlightning_aio.batch.data import parts_of
 from rlightning_aio.group.requests import State
+from rlightning_aio.group.scope import Scope
 from rlightning_aio.group.trace_file import HostTrack, Timeline, events
 from rlightning_aio.group.trace_records import Mark, Records
 from rlightning_aio.hosts.base import Killable, Membership
@@ -29,7 +30,6 @@ from rlightning_aio.protocol.entries import Operation
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-    from types import TracebackType
 
     from numpy.typing import NDArray
 
@@ -69,7 +69,7 @@ _clock: Final = time.monotonic_ns
 _current_task: Final = asyncio.current_task
 
 
-class Trace:
+class Trace(Scope):
     """What `EnvGroup.trace` returns: it records from `start` to `stop`, or within a ``with``.
 
     The newest 262,144 results are kept, and as many spans of the trainer, which takes some 60 MB of
@@ -121,27 +121,10 @@ class Trace:
         del self._records
         _write(self._path, timeline)
 
-    def __enter__(self) -> Self:
+    def _enter(self) -> None:
         self.start()
-        return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.stop()
-
-    async def __aenter__(self) -> Self:
-        return self.__enter__()
-
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def _leave(self) -> None:
         self.stop()
 
     # -- recording --------------------------------------------------------------------

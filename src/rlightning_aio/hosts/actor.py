@@ -23,7 +23,7 @@ from rlightning_aio.hosts.build_env import built_envs
 from rlightning_aio.hosts.messages import ErrorText
 from rlightning_aio.hosts.pickling import dumped, dumped_with_code
 from rlightning_aio.hosts.row_table import RowTable
-from rlightning_aio.hosts.runner import resume_all
+from rlightning_aio.hosts.runner import close_all, resume_all
 from rlightning_aio.protocol.entries import Operation, answers_with_value, op_of, slot_of
 from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
 from rlightning_aio.protocol.slab import Slab
@@ -228,14 +228,7 @@ class EnvActor:
 
     def close(self) -> list[tuple[int, ErrorText]]:
         """Close the envs; what that raised, by index."""
-        errors: list[tuple[int, ErrorText]] = []
-        for index, runner in enumerate(self._runners):
-            try:
-                runner.close()
-            except BaseException as error:
-                errors.append((index, ErrorText.of(error)))
-        self._runners.clear()
-        return errors
+        return close_all(self._runners)
 
 
 def _placed_here(runners: Sequence[EnvRunner]) -> Iterator[tuple[Slab, int]]:

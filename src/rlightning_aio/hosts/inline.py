@@ -29,7 +29,7 @@ from rlightning_aio.hosts.messages import (
     Saved,
     Value,
 )
-from rlightning_aio.hosts.runner import attach_all
+from rlightning_aio.hosts.runner import attach_all, close_all
 from rlightning_aio.protocol.entries import Operation, answers_with_value, op_of, slot_of
 from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
 
@@ -143,12 +143,7 @@ class InlineHost:
 
     def close(self) -> None:
         """Close the envs here and now."""
-        errors: list[tuple[int, ErrorText]] = []
-        for index, runner in enumerate(self._runners):
-            try:
-                runner.close()
-            except BaseException as error:
-                errors.append((index, ErrorText.of(error)))
+        errors = close_all(self._runners)
         self.release()
         self._tell(Closed(self.host_id, errors))
 

@@ -20,7 +20,7 @@ from rlightning_aio.envs.results import (
 )
 from rlightning_aio.envs.state import versions_of
 from rlightning_aio.envs.tensors import as_numpy, holds_tensor
-from rlightning_aio.hosts.messages import NO_ACTION, EnvStarted, OutOfBand
+from rlightning_aio.hosts.messages import NO_ACTION, EnvStarted, ErrorText, OutOfBand
 from rlightning_aio.hosts.row_writer import RowWriter
 from rlightning_aio.hosts.shown import packed_standing, show, shown_in, standing_of
 from rlightning_aio.protocol.columns import leaves, row_reader
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from rlightning_aio.hosts.shown import Shown
     from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet
 
-__all__ = ["EnvRunner", "Execute", "attach_all", "placed", "resume_all"]
+__all__ = ["EnvRunner", "Execute", "attach_all", "close_all", "placed", "resume_all"]
 
 Execute: TypeAlias = "Callable[[], OutOfBand | None]"
 """Executes a step or a reset; returns what of its result is out of band."""
@@ -409,6 +409,29 @@ def resume_all(runners: Sequence[EnvRunner], standings: Sequence[bytes | None]) 
     for runner, standing in zip(runners, standings, strict=False):
         if standing is not None:
             runner.resume(standing)
+
+
+def close_all(
+    runners: list[EnvRunner], begin: Callable[[int], None] | None = None
+) -> list[tuple[int, ErrorText]]:
+    """Close the envs of a host, and forget them.
+
+    Args:
+        runners: emptied.
+        begin: is told the index of each env before it is closed.
+
+    Returns what closing has raised, with the env's index.
+    """
+    errors: list[tuple[int, ErrorText]] = []
+    for index, runner in enumerate(runners):
+        if begin is not None:
+            begin(index)
+        try:
+            runner.close()
+        except BaseException as error:
+            errors.append((index, ErrorText.of(error)))
+    runners.clear()
+    return errors
 
 
 def _nobody_keeps(standing: bytes, before: bool) -> None:

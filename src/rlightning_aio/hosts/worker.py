@@ -21,7 +21,7 @@ from rlightning_aio.hosts.arena import make_private, map_shared
 from rlightning_aio.hosts.build_env import built_envs
 from rlightning_aio.hosts.messages import ErrorText
 from rlightning_aio.hosts.pickling import dumped, dumped_with_code
-from rlightning_aio.hosts.runner import attach_all
+from rlightning_aio.hosts.runner import attach_all, close_all
 from rlightning_aio.hosts.spinner import Spinner
 from rlightning_aio.protocol.bell import WorkerBell, bell_size
 from rlightning_aio.protocol.entries import (
@@ -267,15 +267,7 @@ class Worker:
     }
 
     def _close_envs(self) -> list[tuple[int, ErrorText]]:
-        errors: list[tuple[int, ErrorText]] = []
-        for index, runner in enumerate(self._runners):
-            self._begin_with(index)
-            try:
-                runner.close()
-            except BaseException as error:
-                errors.append((index, ErrorText.of(error)))
-        self._runners.clear()
-        return errors
+        return close_all(self._runners, self._begin_with)
 
     def _write(self, data: bytes) -> None:
         if self._is_child:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import gymnasium as gym
     from gymnasium.envs.registration import EnvSpec
 
-__all__ = ["make_vec", "steps_together", "together", "vector_entry_point"]
+__all__ = ["imports_of", "make_vec", "steps_together", "together", "vector_entry_point"]
 
 Mode = Literal["async", "vector_entry_point"]
 
@@ -53,7 +53,7 @@ def make_vec(
         ValueError: the task has no vector environment, or it takes no wrappers.
     """
     spec = copy.deepcopy(spec_of(id) if isinstance(id, str) else id)
-    given = dict(vector_kwargs or {})
+    given = {**imports_of(spec), **(vector_kwargs or {})}
     one = OneOf(spec, {"disable_env_checker": True, **kwargs}, tuple(wrappers))
     makers: list[Callable[[], Any]] = [one] * num_envs
     if vectorization_mode == "vector_entry_point":
@@ -70,7 +70,7 @@ def make_vec(
     elif vectorization_mode is None and not wrappers and steps_together(spec, kwargs):
         mode = AutoresetMode(given.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         makers, given = together(one, num_envs, mode, given)
-    env = VectorEnv(makers, **{**_imports_of(spec), **given})
+    env = VectorEnv(makers, **given)
     env.spec = copy.deepcopy(spec)
     env.spec.kwargs.update(kwargs)
     return env
@@ -118,7 +118,7 @@ def together(
         mode: what each does after its episode's end.
         arguments: as of `_laid_out`.
     """
-    count, given = _laid_out(num_envs, {**_imports_of(one.spec), **arguments})
+    count, given = _laid_out(num_envs, arguments)
     if not given.keys() & {"placement", *PLACEMENTS["split"].refuses}:
         given["placement"] = "split"
     return [one if count == num_envs else BatchOf(one, num_envs // count, mode)] * count, given
@@ -148,7 +148,7 @@ def _laid_out(num_envs: int, arguments: dict[str, Any]) -> tuple[int, dict[str, 
     return count, {**rest, "envs_per_process": -(-count // workers)}
 
 
-def _imports_of(spec: EnvSpec) -> dict[str, Any]:
+def imports_of(spec: EnvSpec) -> dict[str, Any]:
     """What an entry of the task has to say of it."""
     # Known before the first env is made, it need not tell every time that its assets are old.
     is_mujoco = str(spec.entry_point).startswith("gymnasium.envs.mujoco")
