@@ -117,6 +117,8 @@ CARTPOLE = Workload(
     ],
 )
 
+# Each env in a worker of its own; two results to a call of the policy.
+APART = {"placement": "process", "envs_per_process": 1, "envs_each": 1, "min_batch": 2}
 # SyncVectorEnv, which sleeps for one env after the other, would take 32 times as long.
 UNEVEN_POLE = Workload(
     "uneven",
@@ -126,10 +128,7 @@ UNEVEN_POLE = Workload(
     {"task": UNEVEN, "total_steps": 100_000, "num_envs": 32, "num_steps": 64},
     [
         Contender(ASYNC),
-        *(
-            Contender(name, name, {"placement": "process", "envs_per_process": 1, "envs_each": 1})
-            for name in ("ppo_async", "ppo_overlap")
-        ),
+        *(Contender(name, name, APART) for name in ("ppo_async", "ppo_overlap")),
     ],
     [
         *(Target(who, "rate", BETTER, 2.5, at_most=False) for who in ("ppo_async", "ppo_overlap")),

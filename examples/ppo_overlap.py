@@ -11,6 +11,7 @@ that the action had when it was chosen makes up for that.
 from __future__ import annotations
 
 import asyncio
+import sys
 from contextlib import nullcontext
 from dataclasses import dataclass
 
@@ -24,6 +25,8 @@ import rlightning_aio as rl
 from rlightning_aio.collecting import Collector
 
 MOST_LAG = 1
+# Seconds for which the learner's thread may keep Python from the loop, which has envs to answer.
+SWITCH_INTERVAL = 0.0005
 
 
 @dataclass
@@ -38,6 +41,7 @@ class CartPole(ppo_async.CartPole):
 
 async def train(args: Args | CartPole) -> Run:
     torch.manual_seed(args.seed)
+    sys.setswitchinterval(SWITCH_INTERVAL)
     run = Run(args.total_steps, args.folder, args.resume)
     async with rl.build_env_group(entry_of(args)) as group:
         learner = Learner(args, group, run)

@@ -136,14 +136,16 @@ class ResultColumns:
     @property
     def index(self) -> NDArray[np.int64]:
         """Place in the group, sub-environments counted: ``[n]`` or ``[n, num_envs]``."""
-        first: NDArray[np.int64] = self.by_sub_env(self.names.index_offset[self.slots])
-        if first.ndim == 1:
+        names, shape = self.names, self.is_reset.shape
+        first: NDArray[np.int64] = names.index_offset[self.slots]
+        if len(shape) == 1:
             return first
-        places = np.empty_like(first)
-        places[:] = np.arange(first.shape[1])
-        for row in np.flatnonzero(self.names.turns[self.slots]).tolist():
-            places[row] = self.info_of(row)["env_id"]
-        return first + places
+        num_envs: int = shape[1]
+        places = np.add.outer(first, np.arange(num_envs))
+        if np.count_nonzero(names.turns):
+            for row in np.flatnonzero(names.turns[self.slots]).tolist():
+                places[row] = first[row] + self.info_of(row)["env_id"]
+        return places
 
     @property
     def ready_ns(self) -> NDArray[np.int64]:

@@ -124,6 +124,9 @@ class Collector(Generic[G, R]):
         self.policy_version = 0
         self._group = group
         self._policy: Any = policy
+        self._policies: Mapping[str, Callable[[BatchedData], Any]] | None = (
+            policy if isinstance(policy, Mapping) else None
+        )
         self._quota = num_transitions
         self._min_batch = min_batch or 1
         self._block = wait_all
@@ -241,10 +244,9 @@ class Collector(Generic[G, R]):
 
     def _split(self, batch: BatchedData) -> list[tuple[Kind, BatchedData]]:
         """What each policy is to answer."""
-        policy: Any = self._policy
-        if not isinstance(policy, Mapping):
-            return [(self._kind("", policy), batch)]
-        policies = cast("Mapping[str, Callable[[BatchedData], Any]]", policy)
+        policies = self._policies
+        if policies is None:
+            return [(self._kind("", self._policy), batch)]
         parts = batch.by_name()
         for name in parts.keys() - policies.keys():
             raise ValueError(
@@ -339,7 +341,7 @@ class Collector(Generic[G, R]):
             )
             for name, kind in self._kinds.items()
         }
-        return cast("R", found if isinstance(self._policy, Mapping) else found[""])
+        return cast("R", found[""] if self._policies is None else found)
 
 
 def _is_server(meta: EnvMeta) -> bool:

@@ -220,7 +220,9 @@ class Staging:
             self._adopt_results(results)
         places = self._place[index]
         for name in _OF_RESULTS:
-            values = mapped(lambda leaf: leaf[rows], getattr(results, name))
+            values = getattr(results, name)
+            if not isinstance(rows, slice):
+                values = mapped(lambda leaf: leaf[rows], values)
             scattered(self.columns[name], places, values)
         self._is_complete[places] = True
         self._last[index] = places

@@ -63,18 +63,21 @@ def rows_of(name: str, tree: Any, head: tuple[int, ...]) -> Tree:
         ValueError: it has not one row for each of `head`.
         TypeError: it is a tensor of a GPU, or one with a gradient.
     """
+    if isinstance(tree, (dict, tuple)):
+        return mapped(lambda leaf: _leaf_rows(name, leaf, head), cast("Tree", tree))
+    return _leaf_rows(name, tree, head)
 
-    def leaf(value: Any) -> NDArray[Any]:
-        array = as_column(name, value)
-        if array.shape[: len(head)] != head:
-            raise ValueError(
-                f"column {name!r} has shape {list(array.shape)}; its first "
-                f"{'axis' if len(head) == 1 else 'axes'} must be {list(head)}: one row for each "
-                f"{'result' if len(head) == 1 else 'result and sub-environment'}"
-            )
-        return array if len(head) == 1 else array.reshape(-1, *array.shape[len(head) :])
 
-    return mapped(leaf, tree)
+def _leaf_rows(name: str, value: Any, head: tuple[int, ...]) -> NDArray[Any]:
+    array = as_column(name, value)
+    shape, depth = array.shape, len(head)
+    if shape[:depth] != head:
+        raise ValueError(
+            f"column {name!r} has shape {list(shape)}; its first "
+            f"{'axis' if depth == 1 else 'axes'} must be {list(head)}: one row for each "
+            f"{'result' if depth == 1 else 'result and sub-environment'}"
+        )
+    return array if depth == 1 else array.reshape(-1, *shape[depth:])
 
 
 def allocated(like: Tree, count: int) -> Tree:
