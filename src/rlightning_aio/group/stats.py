@@ -170,16 +170,19 @@ class Stats:
 
         Returns the rows in which any has ended.
         """
-        flat = np.flatnonzero(ended)
+        flat = ended.reshape(-1).nonzero()[0]
         owners = flat // (ended.size // len(ended))
         own_returns, own_lengths = returns.reshape(-1)[flat], lengths.reshape(-1)[flat]
-        # Where each row's begin among those that have ended.
-        begins = np.flatnonzero(np.diff(owners, prepend=-1))
-        rows, counts = owners[begins], np.diff(begins, append=len(flat))
-        chosen, ends = slots[rows], begins + counts - 1
-        self._sums[chosen, 0] += counts
-        self._sums[chosen, 1] += np.add.reduceat(own_returns, begins)
-        self._sums[chosen, 2] += np.add.reduceat(own_lengths, begins)
+        counts = np.bincount(owners, minlength=len(ended))
+        rows = counts.nonzero()[0]
+        chosen = slots[rows]
+        outcomes = np.empty((len(rows), 3))
+        outcomes[:, 0] = counts[rows]
+        outcomes[:, 1] = np.bincount(owners, own_returns)[rows]
+        outcomes[:, 2] = np.bincount(owners, own_lengths)[rows]
+        self._sums[chosen] += outcomes
+        # A row's last one comes before the next row's first.
+        ends = np.add.accumulate(counts[rows]) - 1
         self._last[chosen, 0], self._last[chosen, 1] = own_returns[ends], own_lengths[ends]
         return rows
 
