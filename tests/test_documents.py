@@ -83,6 +83,15 @@ def test_lists_are_lists_on_the_site() -> None:
             before = line
 
 
+def test_each_item_of_a_list_begins_a_line() -> None:
+    """One that follows another within a line is lost on the site."""
+    for page in PAGES:
+        words = re.sub(r"`[^`]+`", "`", prose(page))
+        assert not re.search(r"^(?!\|).*[.;:)`] (-|\d\.)( [A-Z`*].*)?$", words, re.MULTILINE), named(
+            page
+        )
+
+
 def test_every_page_has_its_place_in_the_navigation() -> None:
     """And no place is without a page."""
     nav = (ROOT / "mkdocs.yml").read_text().partition("\nnav:\n")[2].partition("\n\n")[0]

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import signal
+from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import pytest
 from cli.command import CARTPOLE, invoke, invoke_json, run, start, write_config
 from patience import HANG
+from timelines import Seen
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -97,17 +99,27 @@ def test_ctrl_c_keeps_what_was_played(tmp_path: Path) -> None:
     assert names == {"slow-0-episode-0.mp4", "slow-0-episode-1.partial.mp4"}
 
 
-def test_it_is_drawn_and_filmed(tmp_path: Path) -> None:
-    """In the files that were named."""
+def test_it_is_drawn_filmed_and_traced(tmp_path: Path) -> None:
+    """In the files that were named; the timeline holds each episode from its reset on."""
     config = write_config(tmp_path, {**JUDGED, "num_workers": 2}, STUB)
-    plot, films = tmp_path / "plot.png", tmp_path / "films"
+    plot, films, trace = tmp_path / "plot.png", tmp_path / "films", tmp_path / "run.json"
     filming = ("--video", films, "--video-env", "judged-1", "--video-every", 2)
+    drawing = ("--plot", plot, "--trace", trace, "--json")
     # In a process of its own: matplotlib keeps its fonts open.
-    done = run("eval", config, "--episodes", 3, "--seed", 0, "--plot", plot, *filming)
+    done = run("eval", config, "--episodes", 3, "--seed", 0, *drawing, *filming)
     assert done.returncode == 0, done.stderr
     assert plot.read_bytes().startswith(b"\x89PNG")
     names = sorted(path.name for path in films.iterdir())
     assert names == ["judged-1-episode-0.mp4", "judged-1-episode-2.mp4"]
+    seen = Seen(trace)
+    played = Counter(one["env_id"] for one in json.loads(done.stdout)["episodes"])
+    for env_id, count in played.items():
+        lasted = [one.name for one in seen.of(env_id)]
+        assert lasted[0] == "reset"
+        assert lasted.count("reset") >= count == 3
+    assert seen.called("policy")
+    absent = tmp_path / "absent" / "run.json"
+    assert "there is no folder" in refused(config, "--trace", absent)
 
 
 def refused(*words: object) -> str:
