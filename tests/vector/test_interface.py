@@ -14,6 +14,7 @@ from gymnasium import spaces
 from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import vector as wrappers
+from timelines import Seen
 from vector.toys import Toy, assert_alike, toy
 
 from rlightning_aio.errors import EnvRaised
@@ -152,6 +153,21 @@ def test_what_the_whole_tells_of_itself() -> None:
     assert env.np_random_seed == (5, 9)
     assert [frame.shape for frame in env.render()] == [(2, 2, 3)] * 2
     env.close()
+
+
+def test_a_timeline_is_recorded_through_its_group(tmp_path: Path) -> None:
+    """Under wrappers, too: each step and reset of each env."""
+    env = wrappers.RecordEpisodeStatistics(
+        make_vec("CartPole-v1", 2, vector_kwargs={"placement": "inline"})
+    )
+    with env.group.trace(tmp_path / "run.json"):
+        env.reset(seed=0)
+        for _ in range(3):
+            env.step(np.zeros(2, np.int64))
+    env.close()
+    seen = Seen(tmp_path / "run.json")
+    for env_id in ("env-0", "env-1"):
+        assert [one.name for one in seen.of(env_id)] == ["reset", "step", "step", "step"]
 
 
 def test_make_vec_takes_what_gymnasiums_takes() -> None:

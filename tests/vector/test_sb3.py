@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from timelines import Seen
 from vector.toys import assert_alike
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 pytestmark = pytest.mark.simulators
 
@@ -113,8 +117,8 @@ def test_sac_learns_the_very_same_on_it() -> None:
     assert all((weights[0][key] == weights[1][key]).all() for key in weights[0])
 
 
-def test_ppo_is_evaluated_on_it() -> None:
-    """With monitors and stacked frames around it."""
+def test_ppo_is_evaluated_on_it(tmp_path: Path) -> None:
+    """With monitors and stacked frames around it, and a timeline recorded."""
     from stable_baselines3 import PPO
     from stable_baselines3.common.evaluation import evaluate_policy
     from stable_baselines3.common.vec_env import VecFrameStack, VecMonitor
@@ -123,6 +127,10 @@ def test_ppo_is_evaluated_on_it() -> None:
 
     env = VecMonitor(VecFrameStack(VecEnv([pendulum] * 2), 2))
     model = PPO("MlpPolicy", env, n_steps=16, batch_size=16, seed=0, device="cpu").learn(64)
-    mean, _ = evaluate_policy(model, env, n_eval_episodes=2)
+    with env.group.trace(tmp_path / "run.json"):
+        mean, _ = evaluate_policy(model, env, n_eval_episodes=2)
     assert -1000 < mean < 0
     env.close()
+    played = [one.name for one in Seen(tmp_path / "run.json").of("env-1")]
+    assert played[0] == "reset"
+    assert len(played) > 2
