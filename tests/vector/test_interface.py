@@ -160,7 +160,7 @@ def test_a_timeline_is_recorded_through_its_group(tmp_path: Path) -> None:
     env = wrappers.RecordEpisodeStatistics(
         make_vec("CartPole-v1", 2, vector_kwargs={"placement": "inline"})
     )
-    with env.group.trace(tmp_path / "run.json"):
+    with env.unwrapped.group.trace(tmp_path / "run.json"):
         env.reset(seed=0)
         for _ in range(3):
             env.step(np.zeros(2, np.int64))
