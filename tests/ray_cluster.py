@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import time
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
 
 # Nothing is to be written to the home directory, and nobody to be told.
 os.environ.update(RAY_AUTH_MODE="disabled", RAY_USAGE_STATS_ENABLED="0", RAY_DEDUP_LOGS="0")
+# A busy machine takes its time to start the head of a cluster, too.
+os.environ["RAY_gcs_server_port_wait_time_s"] = f"{HANG:.0f}"
 
 OBJECT_STORE_BYTES = 80 * 2**20
 
@@ -24,14 +27,15 @@ def cluster(num_cpus: int) -> Iterator[Any]:
     import ray
     from ray.cluster_utils import Cluster
 
-    settings: dict[str, Any] = {
-        "num_cpus": num_cpus,
-        "object_store_memory": OBJECT_STORE_BYTES,
-        "include_dashboard": False,
-    }
-    made = Cluster(initialize_head=True, head_node_args=settings)
+    settings: dict[str, Any] = {"num_cpus": num_cpus, "include_dashboard": False}
+    made = Cluster()
+    at_sigterm = signal.getsignal(signal.SIGTERM)
     try:
+        _added(made, **settings)
         ray.init(address=made.address, log_to_driver=False)
+        # Ray has made it an exception: one test would fail of it, and all others go on, each
+        # waiting for a cluster that may have got the signal as well.
+        signal.signal(signal.SIGTERM, at_sigterm)
         yield made
     finally:
         ray.shutdown()
@@ -40,9 +44,14 @@ def cluster(num_cpus: int) -> Iterator[Any]:
 
 def add_node(made: Any, num_cpus: int, **resources: float) -> Any:
     """One more node."""
-    return made.add_node(
-        num_cpus=num_cpus, object_store_memory=OBJECT_STORE_BYTES, resources=resources
-    )
+    return _added(made, num_cpus=num_cpus, resources=resources)
+
+
+def _added(made: Any, **settings: Any) -> Any:
+    """A node that the cluster knows of, however long that takes."""
+    node = made.add_node(wait=False, object_store_memory=OBJECT_STORE_BYTES, **settings)
+    made._wait_for_node(node, timeout=HANG)
+    return node
 
 
 def living_actors() -> list[str]:

@@ -13,6 +13,7 @@ import pytest
 import pytest_asyncio
 import ray_cluster
 from group import sample_envs
+from patience import HANG
 
 import rlightning_aio
 import rlightning_aio.sync
@@ -81,8 +82,10 @@ INLINE_SYNC = Place("inline", {"placement": "inline"}, synchronous=True)
 SEVERAL = Place("several workers", {"envs_per_process": 2})
 SPLIT_SYNC = Place("split", {"placement": "split", "envs_per_process": 2}, synchronous=True)
 """Two envs in each worker, and the last two in this process."""
-RAY = Place("ray", {"placement": "ray", "envs_per_process": 2, "num_cpus": 0})
-RAY_SYNC = Place("ray", {"placement": "ray", "envs_per_process": 100, "num_cpus": 0}, True)
+# Each actor is a Python of its own; on a busy machine, four of them may take minutes to start.
+ON_ACTORS = {"placement": "ray", "num_cpus": 0, "start_timeout": HANG}
+RAY = Place("ray", {**ON_ACTORS, "envs_per_process": 2})
+RAY_SYNC = Place("ray", {**ON_ACTORS, "envs_per_process": 100}, synchronous=True)
 # Ray takes an environment and some minutes of its own: `make test-ray`.
 ON_RAY = "RLIGHTNING_AIO_ON_RAY" in os.environ
 PLACES = [RAY, RAY_SYNC] if ON_RAY else [INLINE, INLINE_SYNC, SPLIT_SYNC, SEVERAL]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import select
+import signal
 import subprocess
 import sys
 from typing import TYPE_CHECKING, Any
@@ -161,6 +162,12 @@ def test_actors_end_with_their_trainer(nodes: Any) -> None:
     for watch in watches:
         assert select.select([watch], [], [], HANG)[0], "it lives"
         os.close(watch)
+
+
+def test_a_signal_that_ends_the_tests_fails_none_of_them(nodes: Any) -> None:
+    """Ray would have it raise `SystemExit` in one, and all others run without a cluster."""
+    del nodes
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
 def test_trajectories_are_local_ones_while_nodes_die_and_come(nodes: Any) -> None:
