@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 # Nothing is to be written to the home directory, and nobody to be told.
 os.environ.update(RAY_AUTH_MODE="disabled", RAY_USAGE_STATS_ENABLED="0", RAY_DEDUP_LOGS="0")
 # A busy machine takes its time to start the head of a cluster, too.
-os.environ["RAY_gcs_server_port_wait_time_s"] = f"{HANG:.0f}"
+os.environ.update(RAY_gcs_server_port_wait_time_s=f"{HANG:.0f}")
 
 OBJECT_STORE_BYTES = 80 * 2**20
 
