@@ -158,7 +158,7 @@ def test_what_a_step_given_up_raised_reaches_the_collector(new_group: NewGroup) 
 def test_the_value_of_a_call_given_up_is_dropped(new_group: NewGroup, name: str) -> None:
     """Nobody collects it, and the env can be stepped once it has replied."""
     group = new_group(1)
-    running = group.begin(group.core.call(group.now, 0, (name, (), {})))
+    running = group.begin(group.core.calls.call(group.now, 0, (name, (), {})))
     group.cancel(running)
     with pytest.raises(NothingPending):
         collect(group).result()
@@ -229,7 +229,7 @@ def test_a_group_that_is_not_open_says_so(moment: str) -> None:
     with pytest.raises(GroupClosed, match=hint):
         group.begin(group.core.reset(group.now, None, None, None)).result()
     with pytest.raises(GroupClosed, match=hint):
-        group.begin(group.core.call(group.now, 0, ("who", (), {}))).result()
+        group.begin(group.core.calls.call(group.now, 0, ("who", (), {}))).result()
     group.close()
 
 
@@ -248,7 +248,7 @@ def test_what_cannot_be_pickled_is_refused_before_anything_is_sent(new_group: Ne
     with pytest.raises(TypeError, match="options for env 'fake-0'"):
         group.begin(group.core.reset(group.now, 0, {"bad": unpicklable}, None)).result()
     with pytest.raises(TypeError, match=r"arguments of who\(\)"):
-        group.begin(group.core.call(group.now, 0, ("who", (unpicklable,), {}))).result()
+        group.begin(group.core.calls.call(group.now, 0, ("who", (unpicklable,), {}))).result()
     assert not any(host.waiting for host in group.hosts)
     running = group.begin(group.core.step(steps(0, 1), group.now))
     group.finish(0)

@@ -289,7 +289,9 @@ class CoreMachine(RuleBasedStateMachine):
         slot = data.draw(st.sampled_from(self.idle()))
         request = Request("call", RAISES if raises else PLAIN)
         self.envs[slot].request = request
-        operation = self.core.call(self.group.now, slot, ("raise" if raises else "who", (), {}))
+        operation = self.core.calls.call(
+            self.group.now, slot, ("raise" if raises else "who", (), {})
+        )
         self.operate(operation, [slot], [request])
 
     def operate(self, operation: Any, slots: list[int], requests: list[Request]) -> None:

@@ -482,14 +482,14 @@ class EnvGroup(Facade):
             WorkerDied, EnvHung: a worker ended meanwhile; a replacement does not repeat it.
             GroupClosed: the group was not initialised, or is closed.
         """
-        await self._driver.run(self._core.call_all(time.monotonic(), "offload"))
+        await self._driver.run(self._core.calls.call_all(time.monotonic(), "offload"))
 
     async def reload(self) -> None:
         """Make every local env allocate its device memory again; done when it returns.
 
         Cancellation and errors are those of `offload`.
         """
-        await self._driver.run(self._core.call_all(time.monotonic(), "reload"))
+        await self._driver.run(self._core.calls.call_all(time.monotonic(), "reload"))
 
     async def close(self) -> None:
         """Close all envs and end their workers, by force after a second and a half.
@@ -567,7 +567,7 @@ class EnvHandle:
             GroupClosed: the group was not initialised, or is closed.
         """
         slot = self._core.envs.find_one(self._env_id)
-        procedure = self._core.call(time.monotonic(), slot, (name, args, kwargs))
+        procedure = self._core.calls.call(time.monotonic(), slot, (name, args, kwargs))
         return await self._driver.run(procedure)
 
     async def get_attr(self, name: str, target: str = "unwrapped") -> Any:

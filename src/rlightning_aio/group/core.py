@@ -25,14 +25,12 @@ from rlightning_aio.batch.data import (
 from rlightning_aio.batch.sent import columns_of_values
 from rlightning_aio.errors import (
     BadAction,
-    EnvFault,
     NothingPending,
     RLightningError,
-    SnapshotError,
-    WorkerDied,
 )
 from rlightning_aio.group.actions import write_actions
 from rlightning_aio.group.auto_reset import NO_RESETS, AutoReset
+from rlightning_aio.group.calls import Calls
 from rlightning_aio.group.dispatch import Dispatch
 from rlightning_aio.group.first_looks import FirstLooks
 from rlightning_aio.group.hint import HINT_AFTER_BATCHES
@@ -41,12 +39,12 @@ from rlightning_aio.group.recovery import Recovery
 from rlightning_aio.group.requests import COLLECTOR
 from rlightning_aio.group.results import Results
 from rlightning_aio.group.seeds import checked_seed, seeds_for
-from rlightning_aio.group.snapshots import EnvSnapshot, check_same, identity_of, pack, unpack
+from rlightning_aio.group.states import States
 from rlightning_aio.group.stats import Stats
-from rlightning_aio.group.wait import TURN, Procedure, Wait, earliest
+from rlightning_aio.group.wait import Procedure, Wait, earliest
+from rlightning_aio.group.waiting import Waiting
 from rlightning_aio.protocol.entries import Operation
 from rlightning_aio.protocol.slab import AS_RESTORED, TRUNCATED
-from rlightning_aio.registry import ENVS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -68,8 +66,6 @@ if TYPE_CHECKING:
 __all__ = ["Core", "Flags"]
 
 Flags: TypeAlias = "list[bool]"
-Call: TypeAlias = "tuple[str, tuple[Any, ...], dict[str, Any]]"
-"""Name of a method and its arguments."""
 
 
 class Core:
@@ -103,7 +99,6 @@ class Core:
         self.auto = AutoReset(envs, requests)
         self.stats = Stats(envs, requests)
         self._layout = layout
-        self._watcher = watcher
         self._results = Results(envs, layout, zero_copy=zero_copy)
         self._first_looks = FirstLooks(envs)
         self._recovery = Recovery()
@@ -124,13 +119,29 @@ class Core:
         )
         # Takes in what hosts have told; a driver calls it before a procedure goes on.
         self.drain = self._intake.drain
+        self._waiting = Waiting(requests, supervisor, poller, self._intake, watcher)
+        self.calls = Calls(
+            envs,
+            requests,
+            supervisor,
+            self._dispatch,
+            self._intake,
+            self.auto,
+            resumption,
+            self._waiting,
+        )
+        self._states = States(
+            envs,
+            supervisor,
+            self._dispatch,
+            self.calls,
+            self.auto,
+            self._recovery,
+            resumption,
+            self._waiting,
+        )
         self._collecting = False
         self._handed_out = 0
-        # Calls of methods that `collect_calls` will answer.
-        self._calls: list[Ticket] = []
-        self._collecting_calls = False
-        # How many results each call that waits wants.
-        self._wanted: list[int] = []
 
     # -- life -------------------------------------------------------------------------
 
@@ -147,7 +158,7 @@ class Core:
     def describe_workers(self, now_ns: int) -> list[dict[str, Any]]:
         """See `EnvGroup.get_workers`."""
         if self.supervisor.open:
-            self._poll()  # Results that lie there are owed no more.
+            self._waiting.poll()  # Results that lie there are owed no more.
         return self.supervisor.describe(now_ns)
 
     # -- requests ---------------------------------------------------------------------
@@ -155,9 +166,8 @@ class Core:
     def step_async(self, batch: BatchedData, now: float) -> None:
         """Send a batch of steps that `collect` will answer."""
         self._send_steps(batch, self._slots_of(batch), None, now)
-        if self._wanted:
-            # The collector has not asked these envs' workers to wake it.
-            self._watcher.wake()
+        # The collector has not asked these envs' workers to wake it.
+        self._waiting.wake()
 
     def _slots_of(self, batch: BatchedData) -> NDArray[np.intp]:
         """Slots of a batch's envs; free for a batch that answers one of ours."""
@@ -231,61 +241,6 @@ class Core:
         env_ids, values = batch.env_ids(), batch.values()
         return BatchedData([env_ids[k] for k in kept], [values[k] for k in kept]), slots[kept]
 
-    # -- waiting ----------------------------------------------------------------------
-
-    def _poll(self) -> None:
-        """Take in what hosts have ready.
-
-        Invariant: a call that waits looks again, and arms the bell anew, after every reply that
-        is taken in; here another call takes it.
-        """
-        self.poller.poll()
-        self._intake.drain()
-        if self.requests.answered:
-            self.requests.answered = False
-            if self._wanted:
-                self._watcher.wake()
-
-    def _check_liveness(self, now: float) -> Procedure[float]:
-        """Look at all hosts now and then: a caller that always finds enough ready never has to
-        wait, and would never hear of the dead and the hung.
-        """
-        if self.supervisor.is_overdue(now):
-            now = yield Wait(0.0)
-            self._check(now)
-        return now
-
-    def _check(self, now: float) -> None:
-        self._intake.now = now
-        if self.supervisor.timed:
-            self._poll()  # What is done is not hung.
-        self.supervisor.check(now)
-        self._intake.drain()
-
-    def _wait(self, wanted: int, now: float, until: float | None) -> Procedure[float]:
-        """One turn of waiting for `wanted` more replies; the time after it."""
-        self._wanted.append(wanted)
-        try:
-            # The other calls that wait must be woken as early as they asked for.
-            poller, first = self.poller, min(self._wanted)
-            if poller.execute(wanted, until):
-                return (yield from self._check_liveness((yield Wait(0.0))))
-            came, look_again = poller.spin(first), None
-            if not came:
-                came, look_again = poller.arm(first, now)
-            if came:
-                return (yield from self._check_liveness((yield TURN)))
-            now = yield Wait(earliest(until, look_again, self.supervisor.next_check()))
-            poller.slept()
-        finally:
-            self._wanted.remove(wanted)
-        self._check(now)
-        return now
-
-    def _stop_waiting(self) -> None:
-        if not self._wanted:
-            self.poller.disarm()
-
     # -- collect ----------------------------------------------------------------------
 
     def collect(
@@ -311,9 +266,9 @@ class Core:
         try:
             end = None if deadline is None else now + deadline
             window = None
-            now = yield from self._check_liveness(now)
+            now = yield from self._waiting.check_liveness(now)
             while True:
-                self._poll()
+                self._waiting.poll()
                 if self.requests.faults:
                     self._raise_fault(among)
                 ready, total = self.requests.pending(among)
@@ -338,10 +293,10 @@ class Core:
                 few = 1 if timeout is not None else max(need - ready, 1)
                 wanted = most - ready if ready and open_window else few
                 until = earliest(end, window if open_window else None)
-                now = yield from self._wait(wanted, now, until)
+                now = yield from self._waiting.turn(wanted, now, until)
         finally:
             self._collecting = False
-            self._stop_waiting()
+            self._waiting.end()
         slots = self.requests.take(most, among)
         return self.hand_out(np.sort(slots) if ordered else slots, synchronous=False)
 
@@ -401,25 +356,6 @@ class Core:
         if self._handed_out == HINT_AFTER_BATCHES:
             self.supervisor.give_hint(self.stats.summary()["latency_us"])
 
-    # -- calls that wait for their own replies ----------------------------------------
-
-    def _await(self, ticket: Ticket, now: float) -> Procedure[None]:
-        """Until all replies of `ticket` are there. Given up, they go to `collect_async`."""
-        try:
-            if self.supervisor.has_members:
-                self._poll()  # What clients have sent already may wake nobody any more.
-            while ticket.remaining > 0:
-                now = yield from self._wait(ticket.remaining, now, None)
-                self._poll()
-        except BaseException:
-            self.requests.give_up(ticket)
-            if self._wanted:
-                self._watcher.wake()
-            raise
-        finally:
-            self._stop_waiting()
-        self.requests.settle(ticket)
-
     def step(self, batch: BatchedData, now: float) -> Procedure[tuple[BatchedData, Flags | None]]:
         """See `EnvGroup.step`."""
         slots = self._slots_of(batch)
@@ -430,7 +366,7 @@ class Core:
         except BaseException:
             self.requests.drop(ticket)
             raise
-        yield from self._await(ticket, now)
+        yield from self._waiting.until_replied(ticket, now)
         results, flags = self._settled(ticket, slots)
         return results, flags if self.auto.active else None
 
@@ -494,7 +430,7 @@ class Core:
         began = now
         while (missing := self.supervisor.missing(now - began)) is not None:
             now = yield Wait(earliest(began + missing, self.supervisor.next_check()))
-            self._check(now)
+            self._waiting.check(now)
         return now
 
     def reset_async(
@@ -511,8 +447,7 @@ class Core:
         packed = self._packed_resets(slots, seeds, options)
         self._forget_losses(slots)
         self._submit_resets(slots, seeds, packed, COLLECTOR, now)
-        if self._wanted:
-            self._watcher.wake()
+        self._waiting.wake()
 
     def _forget_losses(self, slots: NDArray[np.intp]) -> None:
         """Whoever resets begins a new episode anyway, and needn't be told of the one before."""
@@ -536,7 +471,7 @@ class Core:
             if enough:
                 asked, seeds = slots[~joined], seeds[~joined]
         self._submit_resets(asked, seeds, packed, ticket.owner, now)
-        yield from self._await(ticket, now)
+        yield from self._waiting.until_replied(ticket, now)
         return self._settled(ticket, slots)
 
     def _seeds_for(self, slots: NDArray[np.intp], seed: Seeds, now: float) -> NDArray[np.int64]:
@@ -581,216 +516,23 @@ class Core:
 
     def snapshot(self, now: float, env_ids: Sequence[str] | None) -> Procedure[bytes]:
         """See `EnvGroup.snapshot`."""
-        slots = self.envs.all if env_ids is None else self._dispatch.distinct(env_ids)
-        self._check_restorable(slots)
-        snapshots = yield from self._snapshots(now, slots)
-        for snapshot, begun in snapshots:
-            if not begun:
-                raise SnapshotError(
-                    f"env {snapshot.env_id!r} has no state yet: reset it before its snapshot is "
-                    "taken"
-                )
-        return pack([snapshot for snapshot, _ in snapshots])
-
-    def _check_restorable(self, slots: NDArray[np.intp]) -> None:
-        self._dispatch.check_local(slots, "take a snapshot of, or restore,")
-        each: list[int] = slots.tolist()
-        for slot in each:
-            if ENVS.is_hardware(self.envs.configs[slot].backend):
-                raise SnapshotError(
-                    f"{self.envs.describe(slot)} moves something real, which a snapshot can't "
-                    "restore"
-                )
-
-    def _snapshots(
-        self, now: float, slots: NDArray[np.intp]
-    ) -> Procedure[list[tuple[EnvSnapshot, bool]]]:
-        """Of each env what it is and where it stands, and whether it was reset ever."""
-        op, nothing = Operation.SNAPSHOT, [()] * len(slots)
-        ticket = self._send_for_values(now, slots, op, "snapshot", nothing, "nothing")
-        yield from self._await(ticket, now)
-        each: list[int] = slots.tolist()
-        told = zip(each, self.auto.counters(slots), _values([ticket]), strict=True)
-        snapshots: list[tuple[EnvSnapshot, bool]] = []
-        for slot, (count, cut), (versions, begun, standing) in told:
-            identity = identity_of(self.envs.configs[slot], self.supervisor.metas[slot], versions)
-            env_id = self.envs.env_ids[slot]
-            snapshots.append((EnvSnapshot(env_id, identity, count, cut, standing), begun))
-        return snapshots
+        return self._states.snapshot(now, env_ids)
 
     def restore(
         self, now: float, data: bytes, env_ids: Sequence[str] | None
     ) -> Procedure[tuple[BatchedData, Flags]]:
         """See `EnvGroup.restore`."""
-        snapshots = unpack(data)
-        slots = self._slots_for(snapshots, env_ids)
-        self._check_restorable(slots)
-        # What they are, and the way back, should any of them fail.
-        before = yield from self._snapshots(now, slots)
-        for slot, snapshot, (own, _) in zip(slots.tolist(), snapshots, before, strict=True):
-            check_same(snapshot, own.identity, self.envs.describe(slot))
-        yield from self._put_back(now, slots, snapshots, [own.standing for own, _ in before])
+        slots = yield from self._states.put_back(now, data, env_ids)
         self._forget_losses(slots)
         ticket = self.requests.open_ticket(slots)
-        self.auto.restore(slots, [(snapshot.count, snapshot.cut) for snapshot in snapshots])
-        self._resumption.note_no_step(slots.tolist())
         self._submit_resets(slots, np.full(len(slots), AS_RESTORED), None, ticket.owner, now)
-        yield from self._await(ticket, now)
+        yield from self._waiting.until_replied(ticket, now)
         return self._settled(ticket, slots)
-
-    def _slots_for(
-        self, snapshots: Sequence[EnvSnapshot], env_ids: Sequence[str] | None
-    ) -> NDArray[np.intp]:
-        """The slots of `env_ids`, or else of the envs that the snapshots are of."""
-        if env_ids is None:
-            env_ids = [snapshot.env_id for snapshot in snapshots]
-        if len(env_ids) != len(snapshots):
-            raise SnapshotError(
-                f"the snapshot is of {len(snapshots)} envs, but should go into {len(env_ids)}; "
-                "name "
-                "as many in env_ids, in order; nothing was changed"
-            )
-        return self._dispatch.distinct(env_ids)
-
-    def _put_back(
-        self,
-        now: float,
-        slots: NDArray[np.intp],
-        snapshots: Sequence[EnvSnapshot],
-        before: Sequence[bytes],
-    ) -> Procedure[None]:
-        """Have all envs stand where their snapshots do; if any fails, where they stood before.
-
-        One that can't even go back there, and all if this is cancelled, begin anew.
-        """
-        standings = [(snapshot.standing, True) for snapshot in snapshots]
-        try:
-            yield from self._send_standings(now, slots, standings)
-        except EnvFault as fault:
-            failed = {one.env_id for one in (fault, *fault.others) if isinstance(one, WorkerDied)}
-            kept = [k for k, slot in enumerate(slots) if self.envs.env_ids[slot] not in failed]
-            back = [(before[k], False) for k in kept]
-            try:
-                yield from self._send_standings(now, slots[kept], back)
-            except EnvFault as again:
-                lost = {one.env_id for one in (again, *again.others)}
-                left = [slot for slot in slots[kept].tolist() if self.envs.env_ids[slot] in lost]
-                self._recovery.lose(left, "could not be put back")
-            fault.add_note("nothing was restored: the other envs are where they were before")
-            raise
-        except BaseException:
-            self._recovery.lose(slots.tolist(), "was being restored when that was cancelled")
-            raise
-
-    def _send_standings(
-        self, now: float, slots: NDArray[np.intp], standings: Sequence[tuple[bytes, bool]]
-    ) -> Procedure[None]:
-        op = Operation.RESTORE
-        ticket = self._send_for_values(now, slots, op, "restore", standings, "its snapshot")
-        yield from self._await(ticket, now)
-        _values([ticket])
-
-    # -- methods of envs --------------------------------------------------------------
-
-    def call(self, now: float, slot: int, call: Call) -> Procedure[Any]:
-        """Call a method of one env; its value."""
-        return (yield from self._call(now, self.requests.alone(slot), call))[0]
-
-    def call_all(self, now: float, name: str) -> Procedure[None]:
-        """Call a method of every env, all at once."""
-        yield from self._call(now, self.envs.all, (name, (), {}))
-
-    def _call(self, now: float, slots: NDArray[np.intp], call: Call) -> Procedure[list[Any]]:
-        ticket = self._send_calls(now, slots, call)
-        yield from self._await(ticket, now)
-        return _values([ticket])
-
-    def call_async(self, now: float, env_ids: Sequence[str] | None, call: Call) -> None:
-        """Send calls of a method that `collect_calls` will answer."""
-        slots = self.envs.all if env_ids is None else self._dispatch.distinct(env_ids)
-        self._calls.append(self._send_calls(now, slots, call))
-
-    def _send_calls(self, now: float, slots: NDArray[np.intp], call: Call) -> Ticket:
-        return self._send_for_values(
-            now,
-            slots,
-            Operation.CALL,
-            call[0],
-            [call] * len(slots),
-            f"the arguments of {call[0]}()",
-        )
-
-    def _send_for_values(
-        self,
-        now: float,
-        slots: NDArray[np.intp],
-        op: Operation,
-        name: str,
-        arguments: Sequence[Any],
-        what: str,
-    ) -> Ticket:
-        """Send what is answered by a value, with one of the `arguments`, called `what`, each."""
-        self._intake.drain()
-        self._dispatch.check_local(slots, f"call {name} of")
-        self._dispatch.check_sendable(slots, f"call {name} of")
-        packed = [
-            self._dispatch.packed(slot, own, what)
-            for slot, own in zip(slots.tolist(), arguments, strict=True)
-        ]
-        ticket = self.requests.open_ticket(slots, method=name)
-        entries = self.requests.submit(slots, op, ticket.owner, now)
-        self.auto.not_completed(slots)
-        self._resumption.note_no_step(slots.tolist())
-        self._dispatch.hand_over(slots, entries, packed)
-        return ticket
-
-    def collect_calls(self, now: float, deadline: float | None) -> Procedure[list[Any]]:
-        """See `EnvGroup.collect_calls`."""
-        self.supervisor.check_open()
-        if self._collecting_calls:
-            raise RLightningError(
-                "another collect_calls is already waiting on this group; one at a time"
-            )
-        if not self._calls:
-            raise NothingPending("no call is outstanding; send one with call_async")
-        end = None if deadline is None else now + deadline
-        self._collecting_calls = True
-        try:
-            while True:
-                self._poll()
-                remaining = sum(ticket.remaining for ticket in self._calls)
-                if not remaining:
-                    break
-                if end is not None and now >= end:
-                    raise TimeoutError(
-                        f"{remaining} calls have not returned within {deadline} s; nothing is "
-                        "lost, the next collect_calls gets their values"
-                    )
-                now = yield from self._wait(remaining, now, end)
-        finally:
-            self._collecting_calls = False
-            self._stop_waiting()
-        tickets, self._calls = self._calls, []
-        for ticket in tickets:
-            self.requests.settle(ticket)
-        return _values(tickets)
 
     def pending(self) -> int:
         """Requests that `collect_async` has still to answer, ready or not."""
         self._intake.drain()
         return self.requests.pending()[1]
-
-
-def _values(tickets: Sequence[Ticket]) -> list[Any]:
-    """What calls have returned, in the order in which they were sent.
-
-    Raises their faults instead, if there are any: the first, with the others.
-    """
-    faults = [fault for ticket in tickets for fault in ticket.faults]
-    if faults:
-        faults[0].others = tuple(faults[1:])
-        raise faults[0]
-    return [ticket.values[slot] for ticket in tickets for slot in ticket.slots.tolist()]
 
 
 def _owner(ticket: Ticket | None) -> int:

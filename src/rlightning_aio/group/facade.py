@@ -259,11 +259,11 @@ class Facade:
             RLightningError: another thread is using the group, or it belongs to another loop.
         """
         self._driver.check_caller()
-        self._core.call_async(time.monotonic(), env_ids, (name, args, kwargs))
+        self._core.calls.call_async(time.monotonic(), env_ids, (name, args, kwargs))
 
     def _collect_calls(self, deadline: float | None) -> Procedure[list[Any]]:
         _check_seconds("deadline", deadline)
-        return self._core.collect_calls(time.monotonic(), deadline)
+        return self._core.calls.collect_calls(time.monotonic(), deadline)
 
     def _collect(
         self,

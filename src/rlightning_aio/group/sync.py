@@ -397,14 +397,14 @@ class EnvGroup(Facade):
             WorkerDied, EnvHung: a worker ended meanwhile; a replacement does not repeat it.
             GroupClosed: the group was not initialised, or is closed.
         """
-        self._driver.run(self._core.call_all(time.monotonic(), "offload"))
+        self._driver.run(self._core.calls.call_all(time.monotonic(), "offload"))
 
     def reload(self) -> None:
         """Have every local env take its device memory again; return when all have.
 
         Interruption and errors are those of `offload`.
         """
-        self._driver.run(self._core.call_all(time.monotonic(), "reload"))
+        self._driver.run(self._core.calls.call_all(time.monotonic(), "reload"))
 
     def close(self) -> None:
         """Close all envs and end their workers, by force after a second and a half.
@@ -478,7 +478,7 @@ class EnvHandle:
             GroupClosed: the group was not initialised, or is closed.
         """
         slot = self._core.envs.find_one(self._env_id)
-        procedure = self._core.call(time.monotonic(), slot, (name, args, kwargs))
+        procedure = self._core.calls.call(time.monotonic(), slot, (name, args, kwargs))
         return self._driver.run(procedure)
 
     def get_attr(self, name: str, target: str = "unwrapped") -> Any:

@@ -51,7 +51,7 @@ NO_SPAN: Final = contextlib.nullcontext()
 _CALLS: Final = {
     "step_async": ("step_async", 1),
     "reset_async": ("reset_async", 0),
-    "call_async": ("call_async", 0),
+    "calls.call_async": ("call_async", 0),
 }
 _PROCEDURES: Final = {
     "start": ("init", 0),
@@ -59,9 +59,9 @@ _PROCEDURES: Final = {
     "step": ("step", 1),
     "reset": ("reset", 0),
     "reset_members": ("reset", 0),
-    "call": ("call", 0),
-    "call_all": ("call", 0),
-    "collect_calls": ("collect_calls", 0),
+    "calls.call": ("call", 0),
+    "calls.call_all": ("call", 0),
+    "calls.collect_calls": ("collect_calls", 0),
     "snapshot": ("snapshot", 0),
     "restore": ("restore", 0),
 }
@@ -134,19 +134,27 @@ class Trace(Scope):
         return _Span(self._records, self._lanes, self._records.name(name))
 
     def _cover(self) -> None:
-        core, covers = self._core, vars(self._core)
-        for method, (name, place) in _CALLS.items():
-            covers[method] = self._covered_call(getattr(core, method), name, place)
-        for method, (name, place) in _PROCEDURES.items():
-            covers[method] = self._covered_procedure(getattr(core, method), name, place)
-        covers["hand_out"] = self._covered_hand_out(core.hand_out)
+        core = self._core
+        for path, (name, place) in _CALLS.items():
+            part, method = self._part(path)
+            vars(part)[method] = self._covered_call(getattr(part, method), name, place)
+        for path, (name, place) in _PROCEDURES.items():
+            part, method = self._part(path)
+            vars(part)[method] = self._covered_procedure(getattr(part, method), name, place)
+        vars(core)["hand_out"] = self._covered_hand_out(core.hand_out)
         self._told_before = core.supervisor.tell_of
         core.supervisor.tell_of = self._note_fate
 
     def _uncover(self) -> None:
-        for method in (*_CALLS, *_PROCEDURES, "hand_out"):
-            del vars(self._core)[method]
+        for path in (*_CALLS, *_PROCEDURES, "hand_out"):
+            part, method = self._part(path)
+            del vars(part)[method]
         self._core.supervisor.tell_of = self._told_before
+
+    def _part(self, path: str) -> tuple[object, str]:
+        """The part of the core that has what `path` names, and its name there."""
+        part, _, method = path.rpartition(".")
+        return (getattr(self._core, part) if part else self._core), method
 
     def _covered_call(
         self, call: Callable[..., None], name: str, place: int
