@@ -18,7 +18,7 @@ import rlightning_aio as rl
 from rlightning_aio import sync
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
 STEP = 8
@@ -36,7 +36,7 @@ class Brighter(gym.Env[Any, Any]):
 
     def __init__(self, render_mode: str | None = "rgb_array", start: int = 0) -> None:
         self.render_mode, self._start, self._steps = render_mode, start, 0
-        self.pid = os.getpid()
+        self.pid, self.rendered = os.getpid(), 0
 
     def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         self._steps = 0
@@ -49,6 +49,7 @@ class Brighter(gym.Env[Any, Any]):
         return np.zeros(1, np.float32), 1.0, self._steps == self.length, False, {}
 
     def render(self) -> Any:
+        self.rendered += 1
         return np.full((*self.size, 3), self._start + STEP * self._steps, np.uint8)
 
 
@@ -84,6 +85,11 @@ def entry(make_env: Callable[[], Any], **fields: Any) -> dict[str, Any]:
     return {"name": "env", "make_env": make_env, "placement": "inline", **fields}
 
 
+def filmed(make_env: Callable[[], Any], folder: Path, **video: Any) -> dict[str, Any]:
+    """From its first episode on."""
+    return entry(make_env, video={"folder": str(folder), **video})
+
+
 def play(group: sync.EnvGroup, num_steps: int, action: Any = 0) -> None:
     """Reset and step all envs, resetting those whose episode is over."""
     batch, _ = group.reset()
@@ -94,9 +100,8 @@ def play(group: sync.EnvGroup, num_steps: int, action: Any = 0) -> None:
 
 def test_each_episode_is_a_film_of_all_that_was_seen(tmp_path: Path) -> None:
     """From the frame of the reset to that of the last step; in worker processes, too."""
-    config = entry(Brighter, num_workers=3, placement="process")
-    config = rl.record_video(config, tmp_path, ["env-0", "env-2"])
-    with sync.build_env_group(config) as group:
+    config = filmed(Brighter, tmp_path, envs=[0, 2])
+    with sync.build_env_group({**config, "num_workers": 3, "placement": "process"}) as group:
         play(group, 7)
     whole = [0, 1, 2, 3]
     assert films(tmp_path) == {f"env-{k}-episode-{n}.mp4": whole for k in (0, 2) for n in range(2)}
@@ -104,7 +109,7 @@ def test_each_episode_is_a_film_of_all_that_was_seen(tmp_path: Path) -> None:
 
 def test_an_episode_without_an_end_is_marked_as_such(tmp_path: Path) -> None:
     """What there is when the group closes can be played."""
-    with sync.build_env_group(rl.record_video(entry(Brighter), tmp_path)) as group:
+    with sync.build_env_group(filmed(Brighter, tmp_path)) as group:
         play(group, 5)
     assert films(tmp_path) == {
         "env-0-episode-0.mp4": [0, 1, 2, 3],
@@ -114,7 +119,7 @@ def test_an_episode_without_an_end_is_marked_as_such(tmp_path: Path) -> None:
 
 def test_a_step_limit_ends_a_film(tmp_path: Path) -> None:
     """Also one that only the group knows, by the reset that follows."""
-    with sync.build_env_group(rl.record_video(entry(Endless), tmp_path)) as group:
+    with sync.build_env_group(filmed(Endless, tmp_path)) as group:
         batch, _ = group.reset()
         with group.auto_reset(2):
             for _ in range(3):
@@ -127,7 +132,7 @@ def test_a_step_limit_ends_a_film(tmp_path: Path) -> None:
 )
 def test_episodes_are_chosen(tmp_path: Path, chosen: dict[str, Any], numbers: list[int]) -> None:
     """Every so manyth, or those that are named."""
-    with sync.build_env_group(rl.record_video(entry(Brighter), tmp_path, **chosen)) as group:
+    with sync.build_env_group(filmed(Brighter, tmp_path, **chosen)) as group:
         play(group, 4 * 4 - 1)
     assert list(films(tmp_path)) == [f"env-0-episode-{n}.mp4" for n in numbers]
 
@@ -139,7 +144,7 @@ def test_one_of_several_sub_environments_is_filmed(tmp_path: Path, mode: Autores
     def make() -> Any:
         return SyncVectorEnv([lambda: Brighter(start=100), Brighter], autoreset_mode=mode)
 
-    config = rl.record_video(entry(make), tmp_path, sub_env=1)
+    config = filmed(make, tmp_path, sub_env=1)
     with sync.build_env_group(config) as group:
         batch, _ = group.reset()
         for _ in range(8):
@@ -151,7 +156,7 @@ def test_one_of_several_sub_environments_is_filmed(tmp_path: Path, mode: Autores
 
 def test_frames_of_any_size_and_envs_of_ones_own(tmp_path: Path) -> None:
     """An odd width or height gets a border."""
-    with sync.build_env_group(rl.record_video(entry(Odd), tmp_path)) as group:
+    with sync.build_env_group(filmed(Odd, tmp_path)) as group:
         play(group, 3)
     (path,) = tmp_path.iterdir()
     said = ffmpeg(path).stderr.decode()
@@ -161,8 +166,8 @@ def test_frames_of_any_size_and_envs_of_ones_own(tmp_path: Path) -> None:
 
 def test_a_replaced_worker_goes_on_filming(tmp_path: Path) -> None:
     """The film of the episode that was lost is marked, until the next one takes its number."""
-    config = entry(Brighter, placement="process")
-    with sync.build_env_group(rl.record_video(config, tmp_path)) as group:
+    config = filmed(Brighter, tmp_path) | {"placement": "process"}
+    with sync.build_env_group(config) as group:
         play(group, 5)
         batch, _ = group.step(rl.BatchedData(["env-0"], [rl.PolicyResponse("env-0", 9)]))
         assert batch.restarted.all()
@@ -177,20 +182,112 @@ def test_a_replaced_worker_goes_on_filming(tmp_path: Path) -> None:
 def test_a_folder_of_films_gets_more(tmp_path: Path) -> None:
     """No film is overwritten by another run."""
     for _ in range(2):
-        with sync.build_env_group(rl.record_video(entry(Brighter), tmp_path)) as group:
+        with sync.build_env_group(filmed(Brighter, tmp_path)) as group:
             play(group, 3)
     assert list(films(tmp_path)) == ["env-0-episode-0.mp4", "env-0-episode-1.mp4"]
 
 
 def test_a_filmed_env_has_a_worker_of_its_own(tmp_path: Path) -> None:
     """So no other env waits for its frames, however many share the other workers."""
-    config = rl.record_video(
-        entry(Brighter, num_workers=6, placement="process"), tmp_path, ["env-2"]
-    )
+    config = filmed(Brighter, tmp_path, envs=[2]) | {"num_workers": 6, "placement": "process"}
     with sync.build_env_group(config) as group:
         pids = [group[env_id].get_attr("pid") for env_id in group.env_ids]
     assert pids.count(pids[2]) == 1
     assert len(set(pids)) < len(pids)
+
+
+# -- a running group --------------------------------------------------------------------
+
+
+def two() -> sync.EnvGroup:
+    """They share a worker."""
+    config = entry(Brighter, num_workers=2, placement="process", envs_per_process=2)
+    return sync.build_env_group(config)
+
+
+@pytest.fixture(scope="module")
+def running() -> Iterator[sync.EnvGroup]:
+    with two() as group:
+        yield group
+
+
+def rendered(group: sync.EnvGroup) -> list[int]:
+    return [group[env_id].get_attr("rendered") for env_id in group.env_ids]
+
+
+def test_a_running_group_is_filmed_for_a_while(running: sync.EnvGroup, tmp_path: Path) -> None:
+    """Chosen envs and episodes; before and after, and of others, nothing is rendered."""
+    play(running, 2)
+    before = rendered(running)
+    rl.record_video(running, ["env-1"], tmp_path, every=2)
+    play(running, 10)
+    rl.record_video(running, ["env-1"], None)
+    count = rendered(running)
+    assert [n - m for n, m in zip(count, before, strict=True)] == [0, 7]
+    play(running, 5)
+    assert rendered(running) == count
+    assert films(tmp_path) == {
+        "env-1-episode-0.mp4": [0, 1, 2, 3],
+        "env-1-episode-2.partial.mp4": [0, 1, 2],
+    }
+
+
+def test_a_film_begins_with_an_episode(running: sync.EnvGroup, tmp_path: Path) -> None:
+    """That which is under way isn't filmed. A later call replaces an earlier one."""
+    batch, _ = running.reset()
+    for folder in ("left", "taken"):
+        rl.record_video(running, ["env-0"], tmp_path / folder)
+        batch, _ = running.step(batch.respond(action=[0, 0]))
+    play(running, 3)
+    rl.record_video(running, ["env-0"], None)
+    assert films(tmp_path / "left") == {}
+    assert films(tmp_path / "taken") == {"env-0-episode-0.mp4": [0, 1, 2, 3]}
+
+
+def test_a_death_leaves_films_that_can_be_played(tmp_path: Path) -> None:
+    """Of all that was seen before; the replacement isn't filmed."""
+    with two() as group:
+        rl.record_video(group, group.env_ids, tmp_path)
+        play(group, 2)
+        group.step(rl.BatchedData(["env-0"], [rl.PolicyResponse("env-0", 9)]))
+        play(group, 3)
+    for path in tmp_path.iterdir():
+        while ffmpeg(path, "-f", "null", "-").returncode:
+            """The ffmpeg of the worker that has died is about to end."""
+    assert films(tmp_path) == {f"env-{k}-episode-0.partial.mp4": [0, 1, 2] for k in range(2)}
+
+
+async def test_an_asynchronous_group_is_filmed(tmp_path: Path) -> None:
+    """With `await`. Here a sub-environment, of an env that gives its state away."""
+    both = {"on_worker_death": "resume", "snapshot_every": 2, "placement": "process"}
+    config = entry(lambda: SyncVectorEnv([Odd, Brighter]), **both)
+    async with rl.build_env_group(config) as group:
+        batch, _ = await group.reset()
+        await rl.record_video(group, ["env-0"], tmp_path, sub_env=1, episodes=[1])
+        batch, _ = await group.reset()
+        for _ in range(8):
+            batch, _ = await group.step(batch.respond(action=np.zeros((1, 2), np.int64)))
+        await rl.record_video(group, ["env-0"], None)
+    assert films(tmp_path) == {"env-0-sub-1-episode-1.mp4": [0, 1, 2, 3]}
+
+
+def test_what_cannot_be_filmed_is_told_and_leaves_nobody_filmed(tmp_path: Path) -> None:
+    """By the env or the field, with what to do."""
+    makers = (Brighter, lambda: Brighter(None))
+    with sync.build_env_group({**entry(Brighter, num_workers=2), "make_env": makers}) as group:
+        with pytest.raises(rl.EnvRaised, match="'env-1' can't be filmed: its render_mode is None"):
+            rl.record_video(group, group.env_ids, tmp_path)
+        with pytest.raises(rl.EnvRaised, match="no sub-environment 2"):
+            rl.record_video(group, ["env-0"], tmp_path, sub_env=2)
+        with pytest.raises(rl.UnknownEnv, match="'env_0'"):
+            rl.record_video(group, ["env_0"], tmp_path)
+        with pytest.raises(rl.ConfigError, match=r"record_video: every: .* not 0"):
+            rl.record_video(group, ["env-0"], tmp_path, every=0)
+        (tmp_path / "file").touch()
+        with pytest.raises(rl.EnvRaised, match="File exists"):
+            rl.record_video(group, ["env-0"], tmp_path / "file")
+        play(group, 3)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 # -- errors -----------------------------------------------------------------------------
@@ -199,7 +296,7 @@ def test_a_filmed_env_has_a_worker_of_its_own(tmp_path: Path) -> None:
 def test_a_folder_that_cannot_be_written_is_told_before_anything_starts(tmp_path: Path) -> None:
     """By the entry and the field."""
     (tmp_path / "file").touch()
-    config = rl.record_video(entry(Brighter), tmp_path / "file" / "films")
+    config = filmed(Brighter, tmp_path / "file" / "films")
     with pytest.raises(rl.ConfigError, match=r"entry 'env', video.folder: .*file/films"):
         sync.build_env_group(config)
 
@@ -210,13 +307,7 @@ def test_a_missing_package_is_told_before_anything_starts(
     """With the command that installs it."""
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(rl.ConfigError, match=r"pip install 'rlightning-aio\[video\]'"):
-        sync.build_env_group(rl.record_video(entry(Brighter), tmp_path))
-
-
-def test_an_unknown_env_is_told(tmp_path: Path) -> None:
-    """With the nearest one."""
-    with pytest.raises(rl.ConfigError, match="did you mean 'env-0'"):
-        rl.record_video(entry(Brighter), tmp_path, ["env_0"])
+        sync.build_env_group(filmed(Brighter, tmp_path))
 
 
 @pytest.mark.parametrize(
@@ -238,7 +329,7 @@ def test_a_config_that_cannot_be_filmed_is_refused(video: dict[str, Any], words:
 
 def test_an_env_that_renders_nothing_is_told_at_its_start(tmp_path: Path) -> None:
     """It can't be known before, as its maker is the user's."""
-    config = rl.record_video(entry(lambda: Brighter(None)), tmp_path)
+    config = filmed(lambda: Brighter(None), tmp_path)
     with pytest.raises(
         rl.StartFailed, match="env 'env-0' can't be filmed: its render_mode is None"
     ):
@@ -250,7 +341,7 @@ def test_a_film_that_cannot_be_written_ends_no_training(
 ) -> None:
     """Here its folder goes away meanwhile; it is said once."""
     folder = tmp_path / "films"
-    with sync.build_env_group(rl.record_video(entry(Brighter), folder)) as group:
+    with sync.build_env_group(filmed(Brighter, folder)) as group:
         folder.rmdir()
         play(group, 9)
     assert capfd.readouterr().err.count("env 'env-0' is no longer filmed") == 1

@@ -153,7 +153,7 @@ class EnvConfig(BaseModel):
     """Options of a Ray actor other than `num_cpus` and `num_gpus`, as its ``.options()`` takes
     them, and ``address``, that of the cluster (``placement: ray`` only)."""
     video: VideoConfig | None = None
-    """Episodes that are filmed where the envs live; see `record_video`."""
+    """Episodes that are filmed where the envs live; of a running group, see `record_video`."""
 
     @model_validator(mode="before")
     @classmethod

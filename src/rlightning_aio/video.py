@@ -1,89 +1,98 @@
-"""`record_video`: films of chosen envs and episodes, as Gymnasium's `RecordVideo` makes them.
+"""`record_video`: films of chosen envs of a group, as Gymnasium's `RecordVideo` makes of one env.
 
 An env is filmed where it lives: its worker renders and encodes, and no frame crosses to the
-trainer.
+trainer. Each is told by a call, as of a method, whatever its host.
 """
 
 from __future__ import annotations
 
-import difflib
 import os
+from contextlib import suppress
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from rlightning_aio.config import MADE_BY_GYMNASIUM, EnvConfig, parse_configs
-from rlightning_aio.errors import ConfigError
+from pydantic import ValidationError
+
+from rlightning_aio.collecting.procedure import run
+from rlightning_aio.config import VideoConfig
+from rlightning_aio.errors import ConfigError, RLightningError
+from rlightning_aio.hosts.messages import RECORD_VIDEO
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from rlightning_aio.collecting.procedure import Procedure
+    from rlightning_aio.group.aio import EnvGroup as AsyncEnvGroup
+    from rlightning_aio.group.sync import EnvGroup as SyncEnvGroup
 
 __all__ = ["record_video"]
 
 
 def record_video(
-    env_cfgs: Any,
-    folder: str | os.PathLike[str],
-    env_ids: Sequence[str] | None = None,
+    group: AsyncEnvGroup | SyncEnvGroup,
+    env_ids: Sequence[str],
+    folder: str | os.PathLike[str] | None,
     *,
     sub_env: int = 0,
     every: int = 1,
     episodes: Sequence[int] | None = None,
-) -> list[EnvConfig]:
-    """Configurations of the same envs, of which some are filmed; for `build_env_group`.
+) -> Any:
+    """Film envs of a running group, from their next episode on; or no longer.
+
+    To be awaited where the group is asynchronous. The envs must be idle: call it before the first
+    reset, or while their results are collected and not answered. A later call for the same env
+    replaces an earlier one.
 
     Args:
-        env_cfgs: as `build_env_group` takes them.
+        group: initialised.
+        env_ids: which envs. One that shares its worker makes its neighbours wait for frames; the
+            field ``video`` of its entry gives it a worker of its own.
         folder: gets ``<env id>-episode-<n>.mp4``, or, of an env with sub-environments,
             ``<env id>-sub-<k>-episode-<n>.mp4``; it is created if missing. An unfinished episode
             is called ``….partial.mp4``. A folder that has films of the env already
-            gets further ones: n goes on from the last.
-        env_ids: which envs; None: the first of each config entry.
+            gets further ones: n goes on from the last. None: film no longer; a film under way
+            ends here, as a partial one.
         sub_env: which of an env's sub-environments.
-        every: film episodes 0, every, 2 * every, … of each.
+        every: film episodes 0, every, 2 * every, … of each, counted from now on.
         episodes: film only these.
 
-    Envs that `gymnasium.make` makes get ``render_mode: rgb_array``; others must be made such that
-    ``render`` gives frames ``[height, width, 3]`` uint8. A film has the simulator's ``render_fps``.
+    ``render`` must give frames ``[height, width, 3]`` uint8, as Gymnasium's envs do that are made
+    with ``render_mode: rgb_array``. A film has the simulator's ``render_fps``.
 
-    Raises:
-        ConfigError: a config is wrong, no env has such an id, or an env can't be filmed.
+    Raises (no env of `env_ids` is filmed then):
+        EnvRaised: an env renders nothing, has no such sub-environment, or finds no ffmpeg or
+            folder.
+        EnvBusy: an env has a reply outstanding.
+        UnknownEnv: no env of this group has that id.
+        NotImplementedError: an env is an env_server's.
+        WorkerDied, EnvHung: a worker ended meanwhile. Replacements are not filmed.
+        ConfigError: `sub_env`, `every` or `episodes` isn't what it should be.
+        GroupClosed: the group was not initialised, or is closed.
     """
-    configs = parse_configs(env_cfgs)
-    chosen = _chosen(configs, env_ids)
-    fields = {"folder": os.fspath(folder), "sub_env": sub_env, "every": every}
-    fields |= {} if episodes is None else {"episodes": list(episodes)}
-    return parse_configs(
-        [
-            _filmed(config, {**fields, "envs": own}) if own else config
-            for config, own in zip(configs, chosen, strict=True)
-        ]
-    )
+    video = None if folder is None else _video(folder, sub_env, every, episodes)
+    handles = [group[env_id] for env_id in dict.fromkeys(env_ids)]
+    return run(_record(handles, video), group)
 
 
-def _chosen(configs: Sequence[EnvConfig], env_ids: Sequence[str] | None) -> list[list[int]]:
-    """Which envs of each entry."""
-    if env_ids is None:
-        return [[] if config.backend == "env_server" else [0] for config in configs]
-    places = {
-        f"{config.name}-{index}": (entry, index)
-        for entry, config in enumerate(configs)
-        for index in range(config.num_workers)
-    }
-    chosen: list[list[int]] = [[] for _ in configs]
-    for env_id in dict.fromkeys(env_ids):
-        if env_id not in places:
-            near = difflib.get_close_matches(env_id, places, n=1)
-            hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(places)}"
-            raise ConfigError(f"no env {env_id!r} to film; {hint}")
-        entry, index = places[env_id]
-        chosen[entry].append(index)
-    return chosen
-
-
-def _filmed(config: EnvConfig, video: dict[str, Any]) -> EnvConfig:
-    fields = {name: getattr(config, name) for name in config.model_fields_set}
-    if config.backend in MADE_BY_GYMNASIUM:
-        fields["env_kwargs"] = {"render_mode": "rgb_array", **config.env_kwargs}
+def _video(
+    folder: str | os.PathLike[str], sub_env: int, every: int, episodes: Sequence[int] | None
+) -> VideoConfig:
+    numbers = None if episodes is None else tuple(episodes)
     try:
-        return EnvConfig.model_validate({**fields, "video": video})
-    except ValueError as error:
-        raise ConfigError(f"entry {config.name!r}, video: {error}") from None
+        return VideoConfig(folder=os.fspath(folder), sub_env=sub_env, every=every, episodes=numbers)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise ConfigError(
+            f"record_video: {first['loc'][0]}: {first['msg']}, not {first['input']!r}"
+        ) from None
+
+
+def _record(handles: Sequence[Any], video: VideoConfig | None) -> Procedure[None]:
+    for place, handle in enumerate(handles):
+        try:
+            yield partial(handle.call, RECORD_VIDEO, video)
+        except BaseException:
+            for other in handles[:place]:
+                with suppress(RLightningError):
+                    yield partial(other.call, RECORD_VIDEO, None)
+            raise

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
+import difflib
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
 
+from rlightning_aio.config import MADE_BY_GYMNASIUM, EnvConfig
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.video import record_video
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-    from rlightning_aio.config import EnvConfig
 
 __all__ = ["Video", "VideoEnvs", "VideoEvery", "filmed"]
 
@@ -52,8 +51,43 @@ def filmed(
         ConfigError: an option lacks --video, or an env can't be filmed.
     """
     if folder is not None:
-        return record_video(list(configs), folder, env_ids or None, every=every or 1)
+        fields = {"folder": str(folder), "every": every or 1}
+        chosen = _chosen(configs, env_ids or None)
+        return [
+            _filmed(config, {**fields, "envs": own}) if own else config
+            for config, own in zip(configs, chosen, strict=True)
+        ]
     for name, given in (("--video-env", env_ids), ("--video-every", every)):
         if given:
             raise ConfigError(f"{name} says what to film, but not where to: add --video FOLDER")
     return list(configs)
+
+
+def _chosen(configs: Sequence[EnvConfig], env_ids: Sequence[str] | None) -> list[list[int]]:
+    """Which envs of each entry."""
+    if env_ids is None:
+        return [[] if config.backend == "env_server" else [0] for config in configs]
+    places = {
+        f"{config.name}-{index}": (entry, index)
+        for entry, config in enumerate(configs)
+        for index in range(config.num_workers)
+    }
+    chosen: list[list[int]] = [[] for _ in configs]
+    for env_id in dict.fromkeys(env_ids):
+        if env_id not in places:
+            near = difflib.get_close_matches(env_id, places, n=1)
+            hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(places)}"
+            raise ConfigError(f"no env {env_id!r} to film; {hint}")
+        entry, index = places[env_id]
+        chosen[entry].append(index)
+    return chosen
+
+
+def _filmed(config: EnvConfig, video: dict[str, Any]) -> EnvConfig:
+    fields = {name: getattr(config, name) for name in config.model_fields_set}
+    if config.backend in MADE_BY_GYMNASIUM:
+        fields["env_kwargs"] = {"render_mode": "rgb_array", **config.env_kwargs}
+    try:
+        return EnvConfig.model_validate({**fields, "video": video})
+    except ValueError as error:
+        raise ConfigError(f"entry {config.name!r}, video: {error}") from None

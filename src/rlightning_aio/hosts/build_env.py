@@ -43,18 +43,7 @@ def built_envs(order: StartOrder, *, inline: bool = False) -> Iterator[EnvRunner
             config = config.model_copy(update={"make_env": makers[place]})
         env = build_env(config, order.env_class, index, fn)
         env.trainer_pid = None if inline else order.trainer_pid
-        yield _runner_class(config, index)(env, inline=inline)
-
-
-def _runner_class(config: EnvConfig, worker_index: int) -> type[EnvRunner]:
-    """What executes the requests of an entry's env: whether it gives standings away, or films."""
-    saves = config.snapshot_every is not None
-    if config.video is None or worker_index not in config.video.envs:
-        return SavingRunner if saves else EnvRunner
-    # Not at the top: few workers need it.
-    from rlightning_aio.hosts.recording import (  # noqa: PLC0415
-        RecordingRunner,
-        RecordingSavingRunner,
-    )
-
-    return RecordingSavingRunner if saves else RecordingRunner
+        runner = EnvRunner if config.snapshot_every is None else SavingRunner
+        video = config.video
+        filmed = video is not None and index in video.envs
+        yield runner(env, inline=inline, video=video if filmed else None)

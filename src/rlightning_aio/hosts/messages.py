@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "NO_ACTION",
+    "RECORD_VIDEO",
     "AttachOrder",
     "Attached",
     "Built",
@@ -57,6 +58,8 @@ __all__ = [
 
 NO_ACTION: Final = "the action is in the row"
 """Travels in place of an action whose extras alone go out of band."""
+RECORD_VIDEO: Final = "rlightning_aio.record_video"
+"""A call of this name is for the runner, not for its env, none of whose methods is called so."""
 OutOfBand: TypeAlias = dict[str, Any]
 """What of a result has no place in its row. Keys: ``observation``, ``info``, ``extra`` (the
 result's ``_extra``), ``ret`` (all of it)."""

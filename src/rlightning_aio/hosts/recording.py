@@ -1,4 +1,4 @@
-"""`RecordingRunner`: an env whose episodes are filmed where it lives.
+"""`Camera`: films the episodes of an env where it lives.
 
 It renders after each result and hands the frame to an encoder beside it (`VideoFile`), so no
 frame travels. An episode's film begins with what its reset shows, and ends with what its last
@@ -15,80 +15,33 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from rlightning_aio.envs.tensors import as_numpy
-from rlightning_aio.hosts.runner import EnvRunner
-from rlightning_aio.hosts.saving import SavingRunner
 from rlightning_aio.hosts.video_file import VideoFile, find_ffmpeg
-from rlightning_aio.protocol.entries import Operation
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from numpy.typing import NDArray
 
     from rlightning_aio.config import VideoConfig
     from rlightning_aio.envs.base import BaseEnv
-    from rlightning_aio.hosts.messages import OutOfBand
-    from rlightning_aio.hosts.runner import Execute
-    from rlightning_aio.protocol.info import InfoSchema
     from rlightning_aio.protocol.slab import Slab
 
-__all__ = ["RecordingRunner", "RecordingSavingRunner"]
+__all__ = ["Camera"]
 
 _DEFAULT_FPS: Final = 30.0
 
 
-class RecordingRunner(EnvRunner):
-    """See the module. Its env's config has a ``video``.
+class Camera:
+    """Films the episodes of one env, or of one of its sub-environments.
 
     Raises:
         ImportError: ffmpeg isn't installed where the env lives.
+        OSError: there is no such folder, and it can't be made.
         ValueError: the env renders nothing, or can't be filmed.
     """
 
-    def __init__(self, env: BaseEnv, *, inline: bool = False) -> None:
-        super().__init__(env, inline=inline)
-        assert env.config.video is not None
-        find_ffmpeg()
-        _check_renders(env)
-        self._camera = _Camera(env, env.config.video)
-
-    def attach(self, slab: Slab, row: int, announce: Callable[[InfoSchema], int]) -> None:
-        super().attach(slab, row, announce)
-        self._camera.watch(slab, row, self.meta.autoreset, self.meta.max_episode_steps)
-        self.step = self._filmed(self.step)
-        self._own_reset = self._filmed(self._own_reset)
-        # Its halves would not come by here.
-        self.begin_step = None
-
-    def execute(self, op: int, arguments: Any) -> Any:
-        outcome = super().execute(op, arguments)
-        if op in (Operation.STEP, Operation.RESET):
-            self._camera.see()
-        return outcome
-
-    def _filmed(self, execute: Execute) -> Execute:
-        def execute_and_film() -> OutOfBand | None:
-            outcome = execute()
-            self._camera.see()
-            return outcome
-
-        return execute_and_film
-
-    def close(self) -> None:
-        try:
-            self._camera.close()
-        finally:
-            super().close()
-
-
-class RecordingSavingRunner(RecordingRunner, SavingRunner):
-    """One that gives its standing away as well."""
-
-
-class _Camera:
-    """Films the episodes of one env, or of one of its sub-environments."""
-
     def __init__(self, env: BaseEnv, config: VideoConfig) -> None:
+        find_ffmpeg()
+        _check_renders(env, config.sub_env)
+        Path(config.folder).mkdir(parents=True, exist_ok=True)
         self._env, self._config = env, config
         self._name = env.env_id
         if env.num_envs > 1:
@@ -179,17 +132,16 @@ class _Camera:
             file.abandon()
 
 
-def _check_renders(env: BaseEnv) -> None:
+def _check_renders(env: BaseEnv, sub_env: int) -> None:
     mode = getattr(env.env, "render_mode", "rgb_array")
     if mode != "rgb_array":
         raise ValueError(
             f"env {env.env_id!r} can't be filmed: its render_mode is {mode!r}; make it with "
             "render_mode 'rgb_array', which goes into the entry's env_kwargs"
         )
-    assert env.config.video is not None
-    if env.config.video.sub_env >= env.num_envs:
+    if sub_env >= env.num_envs:
         raise ValueError(
-            f"env {env.env_id!r} has no sub-environment {env.config.video.sub_env} that could be "
+            f"env {env.env_id!r} has no sub-environment {sub_env} that could be "
             f"filmed: it has {env.num_envs}, from 0"
         )
     if env.config.num_envs > env.num_envs:

@@ -20,7 +20,7 @@ from rlightning_aio.envs.results import (
 )
 from rlightning_aio.envs.state import versions_of
 from rlightning_aio.envs.tensors import as_numpy, holds_tensor
-from rlightning_aio.hosts.messages import NO_ACTION, EnvStarted, ErrorText, OutOfBand
+from rlightning_aio.hosts.messages import NO_ACTION, RECORD_VIDEO, EnvStarted, ErrorText, OutOfBand
 from rlightning_aio.hosts.row_writer import RowWriter
 from rlightning_aio.hosts.shown import packed_standing, show, shown_in, standing_of
 from rlightning_aio.protocol.columns import leaves, row_reader
@@ -33,12 +33,21 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from rlightning_aio.config import VideoConfig
     from rlightning_aio.envs.base import BareReset, BareResult, BareStep, BaseEnv
     from rlightning_aio.hosts.messages import AttachOrder
+    from rlightning_aio.hosts.recording import Camera
     from rlightning_aio.hosts.shown import Shown
     from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet
 
-__all__ = ["EnvRunner", "Execute", "attach_all", "close_all", "placed", "resume_all"]
+__all__ = [
+    "EnvRunner",
+    "Execute",
+    "attach_all",
+    "close_all",
+    "placed",
+    "resume_all",
+]
 
 Execute: TypeAlias = "Callable[[], OutOfBand | None]"
 """Executes a step or a reset; returns what of its result is out of band."""
@@ -61,15 +70,20 @@ class EnvRunner:
         env: built, not yet initialised.
         inline: results stay in this process. Those that hold torch tensors are handed over
             whole and untouched then; elsewhere tensors become NumPy arrays on the CPU.
+        video: what is filmed from the first episode on; None: nothing.
 
     Attributes:
         step: with the action that lies in the row.
         begin_step: starts a step whose simulator computes by itself, and returns what ends
             it; None if it has none. `step` is both in one.
         reset_from_row: with the seed that lies in the row.
+
+    Raises what `recording.Camera` raises.
     """
 
-    def __init__(self, env: BaseEnv, *, inline: bool = False) -> None:
+    def __init__(
+        self, env: BaseEnv, *, inline: bool = False, video: VideoConfig | None = None
+    ) -> None:
         self.env = env
         self.meta: EnvMeta = env.initialised()
         self._inline = inline
@@ -84,6 +98,7 @@ class EnvRunner:
         self._began = False
         self._restored: Shown | None = None
         self._whole: Any = None
+        self._camera = None if video is None else _camera(env, video)
 
     def started(self) -> EnvStarted:
         """What a trainer is told of the env."""
@@ -136,8 +151,14 @@ class EnvRunner:
         # Where there is a short way, it and the writer tell each other what they have written.
         self._before_writing: Callable[[], None] = _nothing
         self._after_writing: Callable[[], None] = _nothing
-        self._own_reset = self._reset_from_row
         self.reset_from_row = self._first_reset
+        self._bind(layout)
+        if self._camera is not None:
+            self._roll(self._camera)
+
+    def _bind(self, layout: RowLayout) -> None:
+        """Make what executes requests."""
+        self._own_reset = self._reset_from_row
         self.step = self._step_taking = self._stepper(layout)
 
     def execute(self, op: int, arguments: Any) -> Any:
@@ -147,17 +168,47 @@ class EnvRunner:
         """
         if op == Operation.CALL:
             return self._call(*arguments)
-        if op == Operation.RESET:
-            return self._reset(*arguments)
         if op == Operation.SNAPSHOT:
             return versions_of(self.env), self._began, self.standing()
         if op == Operation.RESTORE:
             return self._restore(*arguments)
-        return self._step_with(*arguments)
+        execute = self._reset if op == Operation.RESET else self._step_with
+        outcome = execute(*arguments)
+        if self._camera is not None:
+            self._camera.see()
+        return outcome
 
     def close(self) -> None:
-        """Close the env."""
-        self.env.close()
+        """Close the env, and the film of an episode that is under way."""
+        try:
+            if self._camera is not None:
+                self._camera.close()
+        finally:
+            self.env.close()
+
+    # -- films --------------------------------------------------------------------
+
+    def _record_video(self, video: VideoConfig | None) -> None:
+        """Film episodes from the next one on, or no more; a film under way ends here."""
+        camera = None if video is None else _camera(self.env, video)
+        former, self._camera = self._camera, camera
+        if former is not None:
+            self.step, self._own_reset, self.begin_step = self._unfilmed
+        if camera is not None:
+            self._roll(camera)
+        if self._began and self._restored is None:
+            self.reset_from_row = self._own_reset
+        if former is not None:
+            former.close()
+
+    def _roll(self, camera: Camera) -> None:
+        """Have the camera see each result. Nothing of it is in the way of others."""
+        camera.watch(self._slab, self._row, self.meta.autoreset, self.meta.max_episode_steps)
+        self._unfilmed = self.step, self._own_reset, self.begin_step
+        self.step = _seen(self.step, camera.see)
+        self._own_reset = _seen(self._own_reset, camera.see)
+        # Its halves would not come by here.
+        self.begin_step = None
 
     # -- standings ----------------------------------------------------------------
 
@@ -210,6 +261,8 @@ class EnvRunner:
             return _get_attr(self.env, *args, **kwargs)
         if name == "set_attr":
             return _set_attr(self.env, *args, **kwargs)
+        if name == RECORD_VIDEO:
+            return self._record_video(*args)
         for owner in _layers(self.env):
             if hasattr(owner, name):
                 return getattr(owner, name)(*args, **kwargs)
@@ -432,6 +485,24 @@ def close_all(
             errors.append((index, ErrorText.of(error)))
     runners.clear()
     return errors
+
+
+def _seen(execute: Execute, see: Callable[[], None]) -> Execute:
+    """`execute`, whose result is then seen."""
+
+    def execute_and_see() -> OutOfBand | None:
+        outcome = execute()
+        see()
+        return outcome
+
+    return execute_and_see
+
+
+def _camera(env: BaseEnv, video: VideoConfig) -> Camera:
+    # Not at the top: few workers need it.
+    from rlightning_aio.hosts.recording import Camera  # noqa: PLC0415
+
+    return Camera(env, video)
 
 
 def _nobody_keeps(standing: bytes, before: bool) -> None:

@@ -14,13 +14,11 @@ from rlightning_aio.hosts.runner import EnvRunner
 from rlightning_aio.protocol.entries import Operation
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
+    from rlightning_aio.config import VideoConfig
     from rlightning_aio.envs.base import BaseEnv
     from rlightning_aio.hosts.messages import OutOfBand
     from rlightning_aio.hosts.runner import Execute
-    from rlightning_aio.protocol.info import InfoSchema
-    from rlightning_aio.protocol.slab import Slab
+    from rlightning_aio.protocol.slab import RowLayout
 
 __all__ = ["SavingRunner"]
 
@@ -28,15 +26,17 @@ __all__ = ["SavingRunner"]
 class SavingRunner(EnvRunner):
     """See the module. Its env's config says how many steps come between two standings at most."""
 
-    def __init__(self, env: BaseEnv, *, inline: bool = False) -> None:
-        super().__init__(env, inline=inline)
+    def __init__(
+        self, env: BaseEnv, *, inline: bool = False, video: VideoConfig | None = None
+    ) -> None:
+        super().__init__(env, inline=inline, video=video)
         assert env.config.snapshot_every is not None
         self._every = env.config.snapshot_every
         self._since = 0
 
-    def attach(self, slab: Slab, row: int, announce: Callable[[InfoSchema], int]) -> None:
-        super().attach(slab, row, announce)
-        self._over = slab.over[row, ...]
+    def _bind(self, layout: RowLayout) -> None:
+        super()._bind(layout)
+        self._over = self._slab.over[self._row, ...]
         self.step = self._saving(self.step)
         self._own_reset = self._resetting(self._own_reset)
         # Its halves would not come by here.

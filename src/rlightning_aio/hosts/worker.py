@@ -241,7 +241,10 @@ class Worker:
         self._begin(request)
         try:
             arguments = pickle.loads(frame.payload)
-            outcome = self._runners[slot_of(request) - self._first_slot].execute(op, arguments)
+            index = slot_of(request) - self._first_slot
+            runner = self._runners[index]
+            outcome = runner.execute(op, arguments)
+            self._steps[index] = runner.step  # It may be filmed from now on.
             if answers_with_value(op):
                 self._send(FrameKind.VALUE, request, dumped(outcome, "what it returned"))
             elif outcome is None:
