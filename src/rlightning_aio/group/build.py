@@ -30,6 +30,7 @@ from rlightning_aio.group.supervisor import Supervisor
 from rlightning_aio.group.videos import check_videos, filmed_alone
 from rlightning_aio.hosts.arena import Arena, map_shared
 from rlightning_aio.hosts.base import Wiring
+from rlightning_aio.hosts.known_tasks import known_tasks
 from rlightning_aio.hosts.messages import StartOrder
 from rlightning_aio.hosts.pickling import dumped_with_code
 from rlightning_aio.protocol.bell import TrainerBell, bell_size
@@ -287,6 +288,8 @@ def _orders(plan: Plan, servers: Sequence[EnvConfig], cores: Sequence[int]) -> l
             break
     num_processes = sum(_has_worker_here(config) for config, _ in shares)
     surroundings = _surroundings([config for config, _ in shares])
+    elsewhere = any(config.placement != "inline" for config, _ in shares)
+    tasks = known_tasks() if elsewhere else ()
     orders = [
         StartOrder(
             config=_own_makers(config, [index for index, _ in share]).model_copy(
@@ -297,6 +300,7 @@ def _orders(plan: Plan, servers: Sequence[EnvConfig], cores: Sequence[int]) -> l
             preprocess_fns=tuple(fn for _, fn in share),
             spins=num_processes <= len(cores),
             core=cores[host_id % len(cores)] if config.cpu_affinity else None,
+            tasks=tasks,
         )
         for host_id, (config, share) in enumerate(shares)
     ]

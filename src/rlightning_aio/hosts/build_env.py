@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from gymnasium.error import UnregisteredEnv
+
+from rlightning_aio.hosts.known_tasks import register_tasks
 from rlightning_aio.hosts.runner import EnvRunner
 from rlightning_aio.hosts.saving import SavingRunner
 from rlightning_aio.registry import ENVS
@@ -41,9 +45,18 @@ def built_envs(order: StartOrder, *, inline: bool = False) -> Iterator[EnvRunner
         makers: Any = config.make_env
         if isinstance(makers, tuple):
             config = config.model_copy(update={"make_env": makers[place]})
-        env = build_env(config, order.env_class, index, fn)
+        env = _built(order, config, index, fn)
         env.trainer_pid = None if inline else order.trainer_pid
         runner = EnvRunner if config.snapshot_every is None else SavingRunner
         video = config.video
         filmed = video is not None and index in video.envs
         yield runner(env, inline=inline, video=video if filmed else None)
+
+
+def _built(order: StartOrder, config: EnvConfig, index: int, preprocess_fn: Any) -> BaseEnv:
+    if order.tasks:
+        # Only if one is missing: whoever registers it here would be warned that it is there.
+        with contextlib.suppress(UnregisteredEnv):
+            return build_env(config, order.env_class, index, preprocess_fn)
+        register_tasks(order.tasks)
+    return build_env(config, order.env_class, index, preprocess_fn)

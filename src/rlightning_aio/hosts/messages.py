@@ -81,6 +81,7 @@ class StartOrder:
         spins: whether waiting may burn a core for some microseconds.
         core: the core to stay on; None for any.
         trainer_pid: the process that gives the order; None where it runs on another machine.
+        tasks: of `known_tasks`.
     """
 
     config: EnvConfig
@@ -90,6 +91,7 @@ class StartOrder:
     spins: bool
     core: int | None
     trainer_pid: int | None = field(default_factory=os.getpid)
+    tasks: tuple[bytes, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,43 @@
+"""Gymnasium's tasks that the training process knows, for workers that are asked for one of them.
+
+A script registers its envs where it begins, which no worker executes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import pickle
+from typing import TYPE_CHECKING
+
+import gymnasium as gym
+
+from rlightning_aio.hosts.pickling import dumped_with_code
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from gymnasium.envs.registration import EnvSpec
+
+__all__ = ["known_tasks", "register_tasks"]
+
+
+def known_tasks() -> tuple[bytes, ...]:
+    """What is registered in this process, but for what can't be pickled."""
+    return tuple(_pickled(list(gym.registry.values())))
+
+
+def _pickled(specs: Sequence[EnvSpec]) -> Iterator[bytes]:
+    try:
+        yield dumped_with_code(specs)
+    except Exception:
+        if len(specs) > 1:
+            for spec in specs:
+                yield from _pickled([spec])
+
+
+def register_tasks(tasks: Sequence[bytes]) -> None:
+    """Register those of `known_tasks` that this process lacks, as far as they can be read here."""
+    for pickled in tasks:
+        with contextlib.suppress(Exception):
+            for spec in pickle.loads(pickled):
+                gym.registry.setdefault(spec.id, spec)
