@@ -16,10 +16,6 @@ from rlightning_aio.group.requests import COLLECTOR, Requests
 from rlightning_aio.protocol.bell import TrainerBell, WorkerBell, bell_size
 from rlightning_aio.protocol.entries import Operation
 
-LONGEST_PACE = 256
-SHORT, LONG = 5e3, 5e6
-"""Steps in ns: short or long beside a wake-up."""
-
 
 @dataclass(eq=False)
 class Worker:
@@ -85,12 +81,12 @@ class Scene:
         self.requests = Requests(np.repeat(np.arange(count), in_flight), count)
         self.requests.submit(np.arange(sum(in_flight)), Operation.STEP, COLLECTOR, 0.0)
         self.requests.in_flight[:] = in_flight
-        self.orders: list[tuple[int, int]] = []
+        self.orders: list[tuple[int, bool]] = []
         arm = self.bell.arm
 
-        def noted(goal: int, pace: int) -> bool:
-            self.orders.append((goal - self.bell.goal(0), pace))
-            return arm(goal, pace)
+        def noted(goal: int, *, at_last: bool) -> None:
+            self.orders.append((goal - self.bell.goal(0), at_last))
+            arm(goal, at_last=at_last)
 
         self.bell.arm = noted  # type: ignore[method-assign]
         given_clock = {} if clock is None else {"clock": clock}
@@ -99,12 +95,6 @@ class Scene:
         self.hosts: list[Any] = [kind(k) for k, kind in enumerate(kinds)]
         for host in self.hosts:
             self.poller.add(host)
-
-    def note_steps(self, *step_ns: float) -> None:
-        """Until nothing else is remembered."""
-        for _ in range(200):
-            for host_id, ns in enumerate(step_ns):
-                self.poller.note_step(host_id, ns)
 
     def report(self, host_id: int, count: int = 1) -> None:
         self.counts[host_id] += count
@@ -117,19 +107,19 @@ class Scene:
             self.bell.took(host_id, count)
             self.requests.in_flight[host_id] -= count
 
-    def arm(self, wanted: int, now: float = 0.0) -> tuple[bool, float | None]:
-        return self.poller.arm(wanted, now)
+    def arm(self, wanted: int) -> bool:
+        return self.poller.arm(wanted)
 
 
 # -- orders
 
 
 @pytest.mark.parametrize("wanted", [32, 40])
-def test_for_all_results_exactly_all_are_ordered_at_the_slowest_pace(wanted: int) -> None:
-    """The last to finish rings; nobody looks in between, and neither does the trainer."""
+def test_for_all_results_workers_look_when_they_have_nothing_left(wanted: int) -> None:
+    """The last to finish rings; nobody looks in between."""
     scene = Scene(16, 16)
-    assert scene.arm(wanted) == (False, None)
-    assert scene.orders == [(32, LONGEST_PACE)]
+    assert not scene.arm(wanted)
+    assert scene.orders == [(32, True)]
 
 
 def test_the_same_wait_gives_the_same_order() -> None:
@@ -143,80 +133,20 @@ def test_the_same_wait_gives_the_same_order() -> None:
     assert scene.bell._armed == armed
 
 
-def test_for_some_of_short_steps_a_few_more_are_ordered_at_first() -> None:
-    """One look soon after; then exactly what is wanted, with no more looks."""
-    scene = Scene(16, 16)
-    scene.note_steps(SHORT, SHORT)
-    came, again = scene.arm(16, now=10.0)
-    assert not came
-    assert again is not None
-    assert 10.0 < again < 10.001
-    # Half of what is left over; nobody runs dry meanwhile.
-    assert scene.orders == [(16 + 8, 1)]
-    assert scene.arm(16, now=again)[0] is False
-    assert scene.orders[1:] == [(16, 1)]
-    # That order is new, so it may have been overlooked in the moment it was given.
-    for later in (10.002, 20.0):
-        assert scene.arm(16, now=later) == (False, None)
-    assert scene.orders[2:] == [(16, 1)] * 2
-
-
-def test_long_steps_are_not_waited_for_because_others_are_short() -> None:
-    """A group may hold simulators of very different speed."""
-    scene = Scene(16, 16)
-    scene.note_steps(SHORT, LONG)
-    scene.arm(16)
-    assert scene.orders == [(16 + 4, 1)]
-
-
-def test_a_new_wait_begins_with_a_few_more_again() -> None:
-    """Also for as many results as the last one, which are others."""
-    scene = Scene(16, 16)
-    scene.note_steps(SHORT, SHORT)
-    scene.arm(16)
-    scene.arm(16)
-    scene.poller.disarm()
-    scene.arm(16)
-    assert [count for count, _ in scene.orders] == [24, 16, 24]
-
-
-def test_who_wants_one_result_gets_the_first() -> None:
-    """It is not kept waiting for others."""
-    scene = Scene(16, 16)
-    scene.note_steps(SHORT, SHORT)
-    scene.arm(1)
-    assert scene.orders == [(1, 1)]
-
-
 @given(
     in_flight=st.lists(st.integers(1, 64), min_size=1, max_size=8),
     wanted=st.integers(1, 512),
-    step_ns=st.floats(0, 1e8),
     data=st.data(),
 )
-def test_orders_can_be_met_and_come_in_time(
-    in_flight: list[int], wanted: int, step_ns: float, data: st.DataObject
+def test_an_order_is_met_by_the_last_result_that_is_wanted(
+    in_flight: list[int], wanted: int, data: st.DataObject
 ) -> None:
-    """Never more than is in flight; never fewer than wanted; not for long more than wanted."""
+    """Never more than is in flight, and whichever worker makes it."""
     scene = Scene(*in_flight)
-    scene.note_steps(*[step_ns] * len(in_flight))
     total = sum(in_flight)
-    now = 0.0
-    for turn in range(6):
-        came, again = scene.arm(wanted, now)
-        least = min(wanted, total)
-        ordered, pace = scene.orders[-1]
-        assert least <= ordered <= total
-        assert pace == (LONGEST_PACE if least == total else 1)
-        if turn or step_ns > 160_000 or wanted == 1:
-            assert ordered == least
-        assert came == (scene.bell.unread() >= least)
-        if again is not None:
-            assert now < again < now + 1e-3
-            now = again
-    # In the end it sleeps until it is rung.
-    assert again is None
-    # And the bell that it has ordered is rung by whoever reports the last that is wanted.
+    least = min(wanted, total)
+    assert not scene.arm(wanted)
+    assert scene.orders == [(least, least == total)]
     rung = 0
     order = [k for k, count in enumerate(in_flight) for _ in range(count)]
     left = list(in_flight)
@@ -226,10 +156,7 @@ def test_orders_can_be_met_and_come_in_time(
         worker = scene.workers[host_id]
         if worker.publish(scene.counts[host_id]) or not left[host_id]:
             rung += worker.is_due()
-        if pace == 1:
-            assert (rung > 0) == (number >= least)
-        else:
-            assert (rung > 0) == (number == total)
+        assert (rung > 0) == (number >= least)
 
 
 def test_results_that_are_there_are_not_waited_for() -> None:
@@ -237,16 +164,16 @@ def test_results_that_are_there_are_not_waited_for() -> None:
     scene = Scene(4, 4)
     scene.report(0, 4)
     scene.report(1, 1)
-    assert scene.arm(5)[0] is True
-    assert scene.arm(6)[0] is False
+    assert scene.arm(5)
+    assert not scene.arm(6)
     scene.report(1, 3)
-    assert scene.arm(8) == (True, None)
+    assert scene.arm(8)
 
 
 def test_nothing_is_ordered_where_no_worker_has_anything_to_do() -> None:
     """Clients and inline envs wake the trainer by themselves, or are asked."""
     scene = Scene(0, 3, kinds=(Worker, Server))
-    assert scene.arm(2) == (False, None)
+    assert not scene.arm(2)
     assert scene.orders == []
 
 

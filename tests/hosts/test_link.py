@@ -199,7 +199,7 @@ def test_a_bell_that_is_read_along_with_a_frame_can_be_ordered_again(started: Sc
     scene, bell = started, started.bell
     for number in (1, 2, 3):
         scene.host.submit(steps(number))
-        bell.arm(bell.goal(2), 256)
+        bell.arm(bell.goal(2), at_last=False)
         assert bell.unread() == 0
         scene.serve()
         assert scene.rung == number
@@ -400,7 +400,7 @@ def test_a_replacement_begins_anew(started: Scene) -> None:
     with pytest.raises(BrokenPipeError):
         old.send(encode(FrameKind.RESULT, step(1, 1), b"late"))
     started.host.submit(steps(3))
-    bell.arm(bell.goal(2), 256)
+    bell.arm(bell.goal(2), at_last=False)
     started.serve()
     assert started.rung == 1
     started.read()

@@ -20,8 +20,6 @@ from rlightning_aio.protocol.bell import TrainerBell, WorkerBell, bell_size
 from rlightning_aio.protocol.entries import Operation, entry
 from rlightning_aio.protocol.rings import TrainerRings, WorkerRings, rings_size
 
-PACES = st.sampled_from([1, 2, 4, 256])
-
 
 class Worker:
     """One worker between its memory accesses.
@@ -36,7 +34,7 @@ class Worker:
         self.bell = bell
         self.waiting = self.count = 0
         self.looks = False
-        self.rung: list[tuple[int, int, int]] = []
+        self.rung: list[tuple[int, int, bool]] = []
 
 
 class BellMachine(RuleBasedStateMachine):
@@ -52,8 +50,8 @@ class BellMachine(RuleBasedStateMachine):
         self.trainer = TrainerBell(self.memory, num_workers)
         self.workers = [self.new_worker(k) for k in range(num_workers)]
         self.read = [0] * num_workers
-        # The order that stands: number of its kind of counting, sum to come to, pace.
-        self.order: tuple[int, int, int] | None = None
+        # The order that stands: number of its kind of counting, sum to come to, at last.
+        self.order: tuple[int, int, bool] | None = None
         self.restarts = 0
         self.rung = False
 
@@ -74,12 +72,12 @@ class BellMachine(RuleBasedStateMachine):
     def submit(self, data: st.DataObject, count: int) -> None:
         self.worker(data).waiting += count
 
-    @rule(wanted=st.integers(1, 12), pace=PACES)
-    def arm(self, wanted: int, pace: int) -> None:
+    @rule(wanted=st.integers(1, 12), at_last=st.booleans())
+    def arm(self, wanted: int, at_last: bool) -> None:
         goal = self.trainer.goal(wanted)
         assert goal == sum(self.read) + wanted
-        order = (self.restarts, goal, pace)
-        assert self.trainer.arm(goal, pace) == (order != self.order)
+        order = (self.restarts, goal, at_last)
+        self.trainer.arm(goal, at_last=at_last)
         if order != self.order:
             self.order, self.rung = order, False
         if sum(self.unread()) >= wanted:
@@ -122,8 +120,7 @@ class BellMachine(RuleBasedStateMachine):
         worker.waiting -= 1
         worker.count += 1
         looks = worker.bell.publish(worker.count)
-        if looks and self.order is not None:
-            assert worker.count % self.order[2] == 0
+        assert looks == (self.order is None or not self.order[2])
         # It looks in any case when it has nothing left to do.
         worker.looks = looks or not worker.waiting
 
@@ -146,11 +143,11 @@ class BellMachine(RuleBasedStateMachine):
     def nobody_sleeps_on_enough(self) -> None:
         if getattr(self, "order", None) is None:
             return
-        _, goal, pace = self.order
+        _, goal, at_last = self.order
         if self.rung or sum(w.count for w in self.workers) < goal:
             return
-        # Whoever came to it is about to look, or has more to do and looks seldom.
-        assert self.can_look() or (pace > 1 and any(w.waiting for w in self.workers))
+        # Whoever came to it is about to look, or has more to do and looks at last.
+        assert self.can_look() or (at_last and any(w.waiting for w in self.workers))
 
     @invariant()
     def the_trainer_knows_what_is_unread(self) -> None:
@@ -175,8 +172,8 @@ def bells(num_workers: int) -> tuple[TrainerBell, list[WorkerBell]]:
 
 
 @pytest.mark.parametrize("num_workers", [2, 13])
-@pytest.mark.parametrize("pace", [1, 256])
-def test_of_workers_that_finish_at_the_same_time_one_rings(num_workers: int, pace: int) -> None:
+@pytest.mark.parametrize("at_last", [False, True])
+def test_of_workers_that_finish_at_the_same_time_one_rings(num_workers: int, at_last: bool) -> None:
     """Whichever order their last reports and looks come in, each one's report before its look."""
     events = [("publish", 0), ("look", 0), ("publish", 1), ("look", 1)]
     orders = [
@@ -187,7 +184,7 @@ def test_of_workers_that_finish_at_the_same_time_one_rings(num_workers: int, pac
     assert len(orders) == 6
     for order in orders:
         trainer, workers = bells(num_workers)
-        trainer.arm(trainer.goal(2), pace)
+        trainer.arm(trainer.goal(2), at_last=at_last)
         rung = [0, 0]
         for what, index in order:
             if what == "publish":
@@ -203,20 +200,22 @@ def test_of_workers_that_finish_at_the_same_time_one_rings(num_workers: int, pac
 def test_for_all_results_workers_look_when_they_have_nothing_left_to_do() -> None:
     """Not after each report, which would cost each of them a fence."""
     trainer, (worker, _) = bells(2)
-    trainer.arm(trainer.goal(300), 256)
-    assert [count for count in range(1, 300) if worker.publish(count)] == [256]
+    trainer.arm(trainer.goal(300), at_last=True)
+    assert not any(worker.publish(count) for count in range(1, 300))
+    trainer.arm(trainer.goal(301), at_last=False)
+    assert worker.publish(300)
 
 
 def test_an_order_that_is_withdrawn_is_rung_for_by_nobody() -> None:
     """The trainer is awake already; the next order, be it the same, is another one."""
     trainer, (worker,) = bells(1)
-    trainer.arm(trainer.goal(2), 1)
+    trainer.arm(trainer.goal(2), at_last=False)
     trainer.disarm()
     worker.publish(2)
     assert not worker.is_due()
     trainer.took(0, 2)
     for round_ in (3, 4):
-        assert trainer.arm(trainer.goal(1), 1)
+        trainer.arm(trainer.goal(1), at_last=False)
         worker.publish(round_)
         assert worker.is_due()
         assert not worker.is_due()
@@ -231,7 +230,7 @@ def test_a_bell_that_was_released_keeps_quiet() -> None:
     trainer.release()
     assert trainer.unread() == 0
     assert trainer.with_news() == []
-    assert trainer.arm(trainer.goal(1), 1)
+    trainer.arm(trainer.goal(1), at_last=False)
     worker.publish(4)
     assert not worker.is_due()
 
@@ -296,7 +295,7 @@ def test_a_trainer_of_several_processes_is_never_left_asleep(num_workers: int, r
             found = 0
             while found < sum(asked):
                 left = sum(asked) - found
-                bell.arm(bell.goal(left), 256)
+                bell.arm(bell.goal(left), at_last=True)
                 if bell.unread() < left:
                     _any_bell(channels)
                 found += sum(len(rings[k].reports()) for k in bell.with_news())

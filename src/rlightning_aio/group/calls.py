@@ -65,7 +65,7 @@ class Calls:
 
     def _call(self, now: float, slots: NDArray[np.intp], call: Call) -> Procedure[list[Any]]:
         ticket = self._send_calls(now, slots, call)
-        yield from self._waiting.until_replied(ticket, now)
+        yield from self._waiting.until_replied(ticket)
         return values_of([ticket])
 
     def call_async(self, now: float, env_ids: Sequence[str] | None, call: Call) -> None:
@@ -131,7 +131,7 @@ class Calls:
                         f"{remaining} calls have not returned within {deadline} s; nothing is "
                         "lost, the next collect_calls gets their values"
                     )
-                now = yield from self._waiting.turn(remaining, now, end)
+                now = yield from self._waiting.turn(remaining, end)
         finally:
             self._collecting = False
             self._waiting.end()

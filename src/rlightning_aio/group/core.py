@@ -293,7 +293,7 @@ class Core:
                 few = 1 if timeout is not None else max(need - ready, 1)
                 wanted = most - ready if ready and open_window else few
                 until = earliest(end, window if open_window else None)
-                now = yield from self._waiting.turn(wanted, now, until)
+                now = yield from self._waiting.turn(wanted, until)
         finally:
             self._collecting = False
             self._waiting.end()
@@ -323,8 +323,8 @@ class Core:
             self.requests.put_back(slots)
             raise
         self._handed_out += 1
-        if len(slots) and self._handed_out % 8 == 0:
-            self._note_eighth(parts)
+        if self._handed_out == HINT_AFTER_BATCHES:
+            self.supervisor.give_hint(self.stats.summary()["latency_us"])
         if self._intake.held_back:
             self._intake.admit(slots)
         return batch, flags
@@ -346,16 +346,6 @@ class Core:
         origin = Origin(self, slots, self.envs.names)
         return batch_of_results(parts, origin, results.sources(slots)), limits, parts
 
-    def _note_eighth(self, parts: Sequence[ResultColumns]) -> None:
-        """Learn from one result in a while how long steps take there."""
-        turn = self._handed_out // 8
-        part = parts[turn % len(parts)]
-        row = turn % len(part)
-        host_id = self.requests.host_of(part.slots.item(row))
-        self.poller.note_step(host_id, part.times.item(row, 1))
-        if self._handed_out == HINT_AFTER_BATCHES:
-            self.supervisor.give_hint(self.stats.summary()["latency_us"])
-
     def step(self, batch: BatchedData, now: float) -> Procedure[tuple[BatchedData, Flags | None]]:
         """See `EnvGroup.step`."""
         slots = self._slots_of(batch)
@@ -366,7 +356,7 @@ class Core:
         except BaseException:
             self.requests.drop(ticket)
             raise
-        yield from self._waiting.until_replied(ticket, now)
+        yield from self._waiting.until_replied(ticket)
         results, flags = self._settled(ticket, slots)
         return results, flags if self.auto.active else None
 
@@ -471,7 +461,7 @@ class Core:
             if enough:
                 asked, seeds = slots[~joined], seeds[~joined]
         self._submit_resets(asked, seeds, packed, ticket.owner, now)
-        yield from self._waiting.until_replied(ticket, now)
+        yield from self._waiting.until_replied(ticket)
         return self._settled(ticket, slots)
 
     def _seeds_for(self, slots: NDArray[np.intp], seed: Seeds, now: float) -> NDArray[np.int64]:
@@ -526,7 +516,7 @@ class Core:
         self._forget_losses(slots)
         ticket = self.requests.open_ticket(slots)
         self._submit_resets(slots, np.full(len(slots), AS_RESTORED), None, ticket.owner, now)
-        yield from self._waiting.until_replied(ticket, now)
+        yield from self._waiting.until_replied(ticket)
         return self._settled(ticket, slots)
 
     def pending(self) -> int:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from rlightning_aio.hosts.base import Executing, Membership, Polled
 from rlightning_aio.hosts.spinner import Spinner
@@ -22,14 +22,6 @@ if TYPE_CHECKING:
     from rlightning_aio.protocol.bell import TrainerBell
 
 __all__ = ["Poller"]
-
-_WAKE_UP_NS: Final = 160_000
-"""What it costs to wake the trainer, about: what it needs itself, and what the worker whose
-core it takes needs to get back into its stride."""
-_LOOK_AGAIN_SECONDS: Final = 0.0006
-"""How long after it has armed the bell anew the trainer looks once by itself; drivers make it
-up to twice as long. No result that was waited for is later than that."""
-_LONGEST_PACE: Final = 256
 
 
 class Poller:
@@ -56,12 +48,8 @@ class Poller:
         self._workers: dict[int, Polled] = {}
         self._env_servers: dict[int, Membership] = {}
         self._executing: deque[tuple[int, Executing]] = deque()
-        # What a step takes there lately, about; until anything is known, as long as waking us.
-        self._step_ns: dict[int, float] = {}
         self._spinner = Spinner(enabled=True)
         self._spun = False
-        # What is being waited for.
-        self._goal = -1
 
     def add(self, host: Host) -> None:
         """Take in a host of the group."""
@@ -151,59 +139,21 @@ class Poller:
         if self._spun:
             self._spinner.slept()
 
-    def arm(self, wanted: int, now: float) -> tuple[bool, float | None]:
-        """Have the workers wake us when `wanted` results are ready.
-
-        Where steps are short, a few more are asked for at first: they are there before the
-        trainer would be, one wake-up brings them along, and workers lose their stride less
-        often. Some half a millisecond later the trainer looks by itself, and asks for no more than
-        it needs from then on; so a wait that is longer loses nothing by it. That look also finds
-        what came in the very moment of arming (see `protocol.bell`).
+    def arm(self, wanted: int) -> bool:
+        """Have the workers wake us when `wanted` results are ready; whether they are already.
 
         Args:
             wanted: by the call that wants the fewest.
-            now: monotonic seconds.
-
-        Returns:
-            Whether they are there already, and when to look without being woken (None: not
-            before a bell).
         """
         in_flight = self._requests.in_flight
-        busy = [host_id for host_id in self._workers if in_flight[host_id]]
-        total = sum([in_flight[host_id] for host_id in busy])
+        total = sum([in_flight[host_id] for host_id in self._workers])
         if not total:
-            return False, None
+            return False
         wanted = min(wanted, total)
-        goal = self._bell.goal(wanted)
-        if wanted == total:
-            # Each of them looks when it has nothing left to do, and the last of all rings.
-            self._bell.arm(goal, _LONGEST_PACE)
-            return self._bell.unread() >= wanted, None
-        first, self._goal = goal != self._goal, goal
-        more = self._steps_meanwhile(busy, wanted, total) if first else 0
-        is_new = self._bell.arm(goal + more, 1)
-        return self._bell.unread() >= wanted, now + _LOOK_AGAIN_SECONDS if is_new else None
+        bell = self._bell
+        bell.arm(bell.goal(wanted), at_last=wanted == total)
+        return bell.unread() >= wanted
 
     def disarm(self) -> None:
         """Nobody waits any more."""
         self._bell.disarm()
-        self._goal = -1
-
-    def _steps_meanwhile(self, busy: list[int], wanted: int, total: int) -> int:
-        """Results that come while the trainer is being woken, and leave workers enough to do."""
-        if wanted == 1:
-            return 0
-        in_flight = self._requests.in_flight
-        spare = (total - wanted) / 2 / total
-        return sum(
-            [
-                min(int(_WAKE_UP_NS / max(self._step_ns.get(k, _WAKE_UP_NS), 1.0)),
-                    int(in_flight[k] * spare))
-                for k in busy
-            ]
-        )  # fmt: skip
-
-    def note_step(self, host_id: int, ns: float) -> None:
-        """Take note of what a step has taken."""
-        before = self._step_ns.get(host_id, _WAKE_UP_NS)
-        self._step_ns[host_id] = before + 0.2 * (ns - before)

@@ -81,7 +81,7 @@ class States:
         """Of each env what it is and where it stands, and whether it was reset ever."""
         op, nothing = Operation.SNAPSHOT, [()] * len(slots)
         ticket = self._calls.ask(now, slots, op, "snapshot", nothing, "nothing")
-        yield from self._waiting.until_replied(ticket, now)
+        yield from self._waiting.until_replied(ticket)
         each: list[int] = slots.tolist()
         told = zip(each, self._auto.counters(slots), values_of([ticket]), strict=True)
         snapshots: list[tuple[EnvSnapshot, bool]] = []
@@ -156,5 +156,5 @@ class States:
     ) -> Procedure[None]:
         op = Operation.RESTORE
         ticket = self._calls.ask(now, slots, op, "restore", standings, "its snapshot")
-        yield from self._waiting.until_replied(ticket, now)
+        yield from self._waiting.until_replied(ticket)
         values_of([ticket])

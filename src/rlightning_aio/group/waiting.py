@@ -75,7 +75,7 @@ class Waiting:
         self._supervisor.check(now)
         self._intake.drain()
 
-    def turn(self, wanted: int, now: float, until: float | None) -> Procedure[float]:
+    def turn(self, wanted: int, until: float | None) -> Procedure[float]:
         """One turn of waiting for `wanted` more replies; the time after it."""
         self._wanted.append(wanted)
         try:
@@ -83,12 +83,9 @@ class Waiting:
             poller, first = self._poller, min(self._wanted)
             if poller.execute(wanted, until):
                 return (yield from self.check_liveness((yield Wait(0.0))))
-            came, look_again = poller.spin(first), None
-            if not came:
-                came, look_again = poller.arm(first, now)
-            if came:
+            if poller.spin(first) or poller.arm(first):
                 return (yield from self.check_liveness((yield TURN)))
-            now = yield Wait(earliest(until, look_again, self._supervisor.next_check()))
+            now = yield Wait(earliest(until, self._supervisor.next_check()))
             poller.slept()
         finally:
             self._wanted.remove(wanted)
@@ -100,13 +97,13 @@ class Waiting:
         if not self._wanted:
             self._poller.disarm()
 
-    def until_replied(self, ticket: Ticket, now: float) -> Procedure[None]:
+    def until_replied(self, ticket: Ticket) -> Procedure[None]:
         """Until all replies of `ticket` are there. Given up, they go to `collect_async`."""
         try:
             if self._supervisor.has_members:
                 self.poll()  # What clients have sent already may wake nobody any more.
             while ticket.remaining > 0:
-                now = yield from self.turn(ticket.remaining, now, None)
+                yield from self.turn(ticket.remaining, None)
                 self.poll()
         except BaseException:
             self._requests.give_up(ticket)

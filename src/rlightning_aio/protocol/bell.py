@@ -6,11 +6,12 @@ there rings, by a few bytes in its channel. So the trainer is woken once, when t
 and by nobody before.
 
 Invariant: every word has one writer. A worker publishes its counter and fences before it
-adds up everybody's; so of two that finish at the same time at least one sees the sum.
-Not fenced: the look at the armed word after each report. One that is being written at that
-very moment may be overlooked there, and is seen after the next one, or when the worker has
-nothing left to do. A trainer that arms the bell for a part of what is in flight therefore
-looks once more a moment later (see `group.poller`).
+looks at the armed word and adds up everybody's counters; the trainer arms the bell and fences
+before it adds them up. So of two workers that finish at the same time at least one sees the
+sum, and a report that comes while the bell is being armed is seen by its worker or by the trainer.
+A worker that sees a bell armed for all that is in flight leaves it, and the fence, until it has
+nothing left to do. If the bell is armed for fewer in that very moment, the worker sees it after its
+next report.
 """
 
 from __future__ import annotations
@@ -28,10 +29,9 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ARMED",
+    "AT_LAST",
     "IN_ORDER",
     "LINE",
-    "PACE_MASK",
-    "PACE_SHIFT",
     "TrainerBell",
     "WorkerBell",
     "bell_size",
@@ -47,12 +47,11 @@ elsewhere an entry could be seen after its count, or be read before it."""
 ARMED: Final = 0
 _COUNTERS: Final = LINE
 
-# The armed word is, from the lowest bit: 1, the pace, the sum at which to ring, and how often
-# counters have begun anew; 0 is disarmed.
-PACE_SHIFT: Final = 1
-PACE_MASK: Final = 0xFF
-_GOAL_SHIFT: Final = 9
-_GOAL_MASK: Final = (1 << 46) - 1
+# The armed word is, from the lowest bit: 1, whether workers may leave it alone while they have
+# something to do, the sum at which to ring, and how often counters have begun anew; 0 is disarmed.
+AT_LAST: Final = 2
+_GOAL_SHIFT: Final = 2
+_GOAL_MASK: Final = (1 << 53) - 1
 _EPOCH_SHIFT: Final = 55
 _EPOCH_MASK: Final = 0x7F
 _FEW: Final = 12
@@ -116,7 +115,7 @@ class TrainerBell:
     def _attach(self, buffer: memoryview, num_workers: int) -> None:
         self._words = _words(buffer, num_workers)
         self._sum = _sum_of(self._words)
-        self._counters: NDArray[np.int64] = np.frombuffer(self._words, np.int64)[_COUNTERS::LINE]
+        self._counters = self._words[_COUNTERS::LINE]
         self._read = [0] * num_workers
         self._read_in_all = 0
         self._armed = 0
@@ -146,32 +145,27 @@ class TrainerBell:
 
     def with_news(self) -> list[int]:
         """Workers whose reports wait to be read."""
-        read = self._read
-        if len(read) > _FEW:
-            return np.flatnonzero(self._counters != read).tolist()
-        words = self._words
-        return [k for k in range(len(read)) if words[_COUNTERS + LINE * k] != read[k]]
+        counts, read = self._counters.tolist(), self._read
+        if counts == read:
+            return []
+        return [k for k, count in enumerate(counts) if count != read[k]]
 
     def goal(self, wanted: int) -> int:
         """What to arm for so many unread reports; the same until they are read."""
         return self._read_in_all + wanted
 
-    def arm(self, goal: int, pace: int) -> bool:
-        """Have one bell rung at `goal`; whether that was not armed before.
+    def arm(self, goal: int, *, at_last: bool) -> None:
+        """Have one bell rung at `goal`, once for each that is new.
 
         Args:
             goal: see there.
-            pace: workers look after each 1st, 2nd, 4th, … report: a power of two, 256 at
-                most. They look in any case when they have nothing left to do.
+            at_last: it is reached by a worker that has nothing left to do, and nobody else need
+                look.
         """
-        armed = (
-            (self._epoch << _EPOCH_SHIFT) | (goal << _GOAL_SHIFT) | ((pace - 1) << PACE_SHIFT) | 1
-        )
-        if armed == self._armed:
-            return False
-        self._words[ARMED] = self._armed = armed
-        self._fence()
-        return True
+        armed = (self._epoch << _EPOCH_SHIFT) | (goal << _GOAL_SHIFT) | (AT_LAST if at_last else 0)
+        if armed | 1 != self._armed:
+            self._words[ARMED] = self._armed = armed | 1
+            self._fence()
 
     def disarm(self) -> None:
         """Have no bell rung: the trainer is awake."""
@@ -193,7 +187,6 @@ class WorkerBell:
 
     Attributes:
         words, own: the shared memory, and where its own counter lies there.
-        settled: the armed word for which it has rung, or need not ring.
     """
 
     def __init__(self, buffer: memoryview, num_workers: int, index: int) -> None:
@@ -201,22 +194,25 @@ class WorkerBell:
         self._sum = _sum_of(self.words)
         self.own = _COUNTERS + LINE * index
         self._fence = new_fence()
-        self.settled = 0
+        # The armed word for which it has rung, or need not ring.
+        self._settled = 0
 
     def publish(self, count: int) -> bool:
         """Say how many reports there are; whether it is time to ask `is_due`."""
         words = self.words
         words[self.own] = count
-        armed = words[ARMED]
-        return armed != self.settled and not count & (armed >> PACE_SHIFT & PACE_MASK)
+        return not words[ARMED] & AT_LAST
 
     def is_due(self) -> bool:
-        """Whether this worker is to ring the trainer, now; True once after each arming."""
+        """Whether this worker is to ring the trainer, now; True once after each arming.
+
+        To be asked when there is nothing left to do, too.
+        """
         self._fence()
         armed = self.words[ARMED]
-        if armed == self.settled:
+        if armed == self._settled:
             return False
         if armed and self._sum() < (armed >> _GOAL_SHIFT & _GOAL_MASK):
             return False
-        self.settled = armed
+        self._settled = armed
         return armed != 0

@@ -19,10 +19,9 @@ import numpy as np
 
 from rlightning_aio.protocol.bell import (
     ARMED,
+    AT_LAST,
     IN_ORDER,
     LINE,
-    PACE_MASK,
-    PACE_SHIFT,
     new_fence,
 )
 
@@ -217,12 +216,7 @@ class WorkerRings:
                 self._fence()
             # `WorkerBell.publish`, spelt out: it would be felt in every step.
             words[own] = sent
-            armed = words[ARMED]
-            if (
-                armed != bell.settled
-                and not sent & (armed >> PACE_SHIFT & PACE_MASK)
-                and bell.is_due()
-            ):
+            if not words[ARMED] & AT_LAST and bell.is_due():
                 ring()
         if bell.is_due():
             ring()
