@@ -1,8 +1,8 @@
 """The asynchronous `EnvGroup` and the driver that waits on an asyncio event loop.
 
-A call that waits has one future, which any source (a worker, a fork server, an env_server)
-fulfils: with one for each, a collect would cost the more the more workers there are, and with
-one env to a worker, the more envs.
+Waiting is `asyncio.wait(..., return_when=FIRST_COMPLETED)` on one future, which any source
+(a worker, a fork server, an env_server) fulfils: with one for each, a collect would cost
+the more the more workers there are, and with one env to a worker, the more envs.
 Absent on purpose: rules. Every one of them is in the core.
 """
 
@@ -44,9 +44,9 @@ class AioDriver:
     def __init__(self) -> None:
         # Takes in what sources have told; set by the group.
         self.drain: Callable[[], None] = _nothing
-        # Of the calls that wait now. One that starts to wait gets one that is not done: what was
-        # told before is in the core already.
-        self._told: list[asyncio.Future[None]] = []
+        # Invariant: the future of those who wait now; None while nobody does. A call that starts
+        # to wait gets one that is not done: what was told before is in the core already.
+        self._told: asyncio.Future[None] | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._pid = os.getpid()
         self._descriptors: dict[Source, int] = {}
@@ -154,10 +154,9 @@ class AioDriver:
 
     def wake(self) -> None:
         """See `base.Watcher.wake`."""
-        for told in self._told:
-            if not told.done() and not told.get_loop().is_closed():
-                told.set_result(None)
-        self._told.clear()
+        told, self._told = self._told, None
+        if told is not None and not told.done() and not told.get_loop().is_closed():
+            told.set_result(None)
 
     def forget(self) -> None:
         """See `facade.Driver.forget`."""
@@ -207,9 +206,7 @@ class AioDriver:
             while True:
                 try:
                     await self._block(wait.until)
-                    if self._raised is not None:
-                        await asyncio.sleep(0)  # What was kept from being read is read first.
-                        self._raise_kept()
+                    self._raise_kept()
                     self.drain()
                 except BaseException as error:
                     # Thrown, not closed: closing down takes waiting, too.
@@ -235,18 +232,9 @@ class AioDriver:
         if (timeout is None and not self._descriptors) or (timeout is not None and timeout <= 0):
             await asyncio.sleep(0)
             return
-        # Not `asyncio.wait`, which takes as long as all the rest of a collect's waiting.
-        loop = asyncio.get_running_loop()
-        told = loop.create_future()
-        self._told.append(told)
-        timer = None if timeout is None else loop.call_later(timeout, self.wake)
-        try:
-            await told
-        finally:
-            if timer is not None:
-                timer.cancel()
-            if told in self._told:
-                self._told.remove(told)
+        if self._told is None:
+            self._told = asyncio.get_running_loop().create_future()
+        await asyncio.wait((self._told,), timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
 
 
 class EnvGroup(Facade):
