@@ -79,6 +79,32 @@ class Core:
         zero_copy: observations are handed out as views where their rows are contiguous.
     """
 
+    # The dict is for what a timeline covers its methods with. Attributes that were in it too would
+    # take longer to read from then on.
+    __slots__ = (
+        "__dict__",
+        "__weakref__",
+        "_collecting",
+        "_dispatch",
+        "_first_looks",
+        "_handed_out",
+        "_intake",
+        "_layout",
+        "_recovery",
+        "_results",
+        "_resumption",
+        "_states",
+        "_waiting",
+        "auto",
+        "calls",
+        "drain",
+        "envs",
+        "poller",
+        "requests",
+        "stats",
+        "supervisor",
+    )
+
     def __init__(
         self,
         envs: EnvTable,

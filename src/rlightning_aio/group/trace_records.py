@@ -1,14 +1,13 @@
 """`Records`: what a timeline is made of, in bounded memory.
 
-Numbers only: a result takes 32 bytes, its batch 24, and a span of the trainer some 170. Of a long
-run the newest are kept, `KEPT` of each kind.
+Numbers only: a result takes 48 bytes, and a span of the trainer some 170. Of a long run the newest
+are kept, `KEPT` of each kind.
 """
 
 from __future__ import annotations
 
-from array import array
 from collections import deque
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -20,9 +19,12 @@ __all__ = ["KEPT", "Mark", "Records", "Results", "Span"]
 KEPT: Final = 1 << 18
 """How many results are kept, and how many spans: the newest."""
 _MARKS: Final = 10_000
-_PAGES: Final = 16
-_PAGE: Final = KEPT // _PAGES
-"""Results of a page: the oldest are dropped by the page."""
+_BATCHES_APART: Final = 512
+_RESULTS_APART: Final = KEPT // 16
+"""So many are joined at a time: each batch alone would take more memory for its arrays' headers
+than for what is in them."""
+
+_Batch: TypeAlias = "tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], int, int]"
 
 
 class Span(NamedTuple):
@@ -72,30 +74,6 @@ class Results(NamedTuple):
         return Results(*(column[which] for column in self))
 
 
-class _Page:
-    """Results one after the other, as bytes: nothing costs less to add to, or to keep.
-
-    Attributes:
-        entries, sent, times: columns of int64, the last one of pairs.
-        batches: of each batch the number of its results, when they were taken, and the lane.
-    """
-
-    __slots__ = ("batches", "entries", "sent", "times")
-
-    def __init__(self) -> None:
-        self.entries, self.sent, self.times = bytearray(), bytearray(), bytearray()
-        self.batches = array("q")
-
-    def results(self) -> Results:
-        """What is on it."""
-        entries, sent, times, batches = (
-            np.frombuffer(column, np.int64)
-            for column in (self.entries, self.sent, self.times, self.batches)
-        )
-        (done, busy), (counts, taken, lanes) = times.reshape(-1, 2).T, batches.reshape(-1, 3).T
-        return Results(entries, sent, done, busy, taken.repeat(counts), lanes.repeat(counts))
-
-
 class Records:
     """See the module.
 
@@ -109,7 +87,10 @@ class Records:
         self._spans: deque[tuple[int, int, int, int]] = deque(maxlen=KEPT)
         self.add_span = self._spans.append
         self.marks: deque[Mark] = deque(maxlen=_MARKS)
-        self._pages: deque[_Page] = deque([_Page()])
+        # Batches as they came, and those before joined to fewer and longer arrays.
+        self._batches: list[_Batch] = []
+        self._results: deque[Results] = deque()
+        self._num_apart = self._num_joined = 0
         # When the last result that was dropped had been handed out.
         self._dropped_until = 0
 
@@ -125,21 +106,35 @@ class Records:
         taken: int,
         lane: int,
     ) -> None:
-        """Keep results that were handed out together; `times` are those of `ResultColumns`."""
-        page = self._pages[-1]
-        if len(page.entries) // 8 + len(entries) > _PAGE and page.batches:
-            page = self._turn()
-        page.entries.extend(entries.tobytes())
-        page.sent.extend(sent.tobytes())
-        page.times.extend(times.tobytes())
-        page.batches.extend((len(entries), taken, lane))
+        """Keep results that were handed out together; the arrays are nobody else's to change.
 
-    def _turn(self) -> _Page:
-        """Begin a page."""
-        if len(self._pages) == _PAGES:
-            _, self._dropped_until, _ = self._pages.popleft().batches[-3:]
-        self._pages.append(_Page())
-        return self._pages[-1]
+        `times` are those of `ResultColumns`.
+        """
+        self._batches.append((entries, sent, times, taken, lane))
+        self._num_apart += len(entries)
+        if len(self._batches) == _BATCHES_APART or self._num_apart >= _RESULTS_APART:
+            self._join()
+
+    def _join(self) -> None:
+        entries, sent, times, taken, lanes = zip(*self._batches, strict=True)
+        self._batches.clear()
+        self._num_apart = 0
+        counts = [len(part) for part in entries]
+        done, busy = np.concatenate(times).T
+        found = Results(
+            np.concatenate(entries),
+            np.concatenate(sent),
+            done,
+            busy,
+            np.repeat(taken, counts),
+            np.repeat(lanes, counts),
+        )
+        self._results.append(found)
+        self._num_joined += len(found.entries)
+        while self._num_joined > KEPT and len(self._results) > 1:
+            dropped = self._results.popleft()
+            self._num_joined -= len(dropped.entries)
+            self._dropped_until = int(dropped.taken.max(initial=self._dropped_until))
 
     @property
     def complete_since(self) -> int:
@@ -149,8 +144,12 @@ class Records:
 
     def results(self) -> Results:
         """All results that are kept."""
-        parts = [page.results() for page in self._pages]
-        return Results(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+        if self._batches:
+            self._join()
+        nothing = np.empty(0, np.int64)
+        if not self._results:
+            return Results(*[nothing] * len(Results._fields))
+        return Results(*(np.concatenate(parts) for parts in zip(*self._results, strict=True)))
 
     def spans(self) -> list[Span]:
         """All spans that are kept, in the order in which they ended."""
