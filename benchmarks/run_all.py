@@ -26,7 +26,7 @@ README = HERE / "README.md"
 SCRIPTS = (
     "adapters", "cheetah", "batches", "peers", "humanoid", "cartpole", "pong", "round_trip",
     "facade", "trainer_cpu", "stragglers", "uneven", "start", "memory", "remote", "worker", "pool",
-    "tracing",
+    "tracing", "filming",
 )  # fmt: skip
 # Run only if they are named.
 LONG = ("training",)

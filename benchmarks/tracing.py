@@ -1,14 +1,18 @@
 """What does a timeline cost while it is recorded (`group.trace`)?
 
-The same groups with a trace running and without. The file is written when the recording ends; that
-is no part of the rate.
+A group is stepped by turns with a trace running and without, for a moment each. So what makes one
+group faster than another like it, or one moment than another, is the same for both. A control
+takes the same turns and records nothing. The file is written when a recording ends, between the
+turns.
 """
 
 from __future__ import annotations
 
 import tempfile
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from contenders import OursAsync, OursSync, Work
@@ -17,38 +21,56 @@ from harness import Contender, Question, Target, main
 CHEETAHS = Work("HalfCheetah-v5", num_envs=32, backend="mujoco")
 POLES = Work("CartPole-v1", num_envs=64)
 RATE = 0.97
+TURNS = 16
 
 
-class _Traced:
-    """A round is recorded from its beginning to its end."""
+class _ByTurns:
+    """The median of one moment's rate over that of the moment beside it."""
 
+    traced = False
     _envs: Any
 
     def round(self, seconds: float) -> float:
-        with tempfile.TemporaryDirectory() as folder, self._envs.trace(Path(folder) / "run.json"):
-            return super().round(seconds)  # type: ignore[misc]
+        """`TURNS` pairs of moments; every other pair begins with the second."""
+        with tempfile.TemporaryDirectory() as folder:
+            ratios: list[float] = []
+            for turn in range(TURNS):
+                rates = [0.0, 0.0]
+                for second in (0, 1) if turn % 2 else (1, 0):
+                    with self._recording(folder) if second else nullcontext():
+                        rates[second] = super().round(seconds / 2 / TURNS)  # type: ignore[misc]
+                ratios.append(rates[1] / rates[0])
+        return median(ratios)
+
+    def _recording(self, folder: str) -> AbstractContextManager[Any]:
+        return self._envs.trace(Path(folder) / "run.json") if self.traced else nullcontext()
 
 
 @dataclass
-class TracedSync(_Traced, OursSync):
-    """See `_Traced`."""
+class SyncByTurns(_ByTurns, OursSync):
+    """See `_ByTurns`."""
+
+    traced: bool = False
 
 
 @dataclass
-class TracedAsync(_Traced, OursAsync):
-    """See `_Traced`."""
+class AsyncByTurns(_ByTurns, OursAsync):
+    """See `_ByTurns`."""
+
+    traced: bool = False
 
 
 def _pairs() -> list[tuple[Contender, Contender]]:
-    """Each group without a trace, and with one."""
+    """Each group's control, and with a trace."""
     pairs: list[tuple[Contender, Contender]] = []
     for work, name in ((CHEETAHS, "HalfCheetah x 32"), (POLES, "CartPole x 64")):
         half = work.num_envs // 2
+        names = f"sync, {name}", f"async half, {name}"
         pairs += [
-            (OursSync(f"sync, {name}", work), TracedSync(f"traced sync, {name}", work)),
+            (SyncByTurns(names[0], work), SyncByTurns(f"traced {names[0]}", work, traced=True)),
             (
-                OursAsync(f"async half, {name}", work, min_results=half),
-                TracedAsync(f"traced async half, {name}", work, min_results=half),
+                AsyncByTurns(names[1], work, min_results=half),
+                AsyncByTurns(f"traced {names[1]}", work, min_results=half, traced=True),
             ),
         ]
     return pairs
@@ -57,12 +79,13 @@ def _pairs() -> list[tuple[Contender, Contender]]:
 PAIRS = _pairs()
 QUESTION = Question(
     name="tracing",
-    title="With a timeline recorded and without",
-    unit="env steps/s",
+    title="Rate with a timeline recorded over the rate without, in the same group",
+    unit="ratio",
     contenders=[contender for pair in PAIRS for contender in pair],
     targets=[Target(traced.name, plain.name, RATE) for plain, traced in PAIRS],
-    rounds=15,
-    seconds=1.0,
+    rounds=5,
+    seconds=1.5,
+    counts_steps=False,
 )
 
 if __name__ == "__main__":

@@ -36,12 +36,13 @@ ASKED = {
     "memory": ["rlightning_aio"],
     "pong": ["rlightning_aio"],
     "tracing": ["async half, CartPole"],
+    "filming": ["compute"],
     "peers": ["Gymnasium", "SB3", "Tianshou", "EnvPool, 16 of 32", "TorchRL", "PufferLib"],
 }
 # Here the work itself gives the length.
 WITHOUT_SECONDS = ("start", "memory")
 TOGETHER = (
-    ("cheetah", "batches", "cartpole", "humanoid", "start", "memory", "tracing"),
+    ("cheetah", "batches", "cartpole", "humanoid", "start", "memory", "tracing", "filming"),
     ("round_trip", "facade", "trainer_cpu", "stragglers", "uneven", "peers", "pong", "adapters"),
 )
 RARELY_SLOW = "all work 50 µs, 2 of 8 rarely take 100 ms, 4 to a worker"
@@ -96,6 +97,7 @@ def test_a_script_run_by_itself(tmp_path: Path) -> None:
         ("start", 2),
         ("memory", 1),
         ("tracing", 2),
+        ("filming", 2),
     ],
 )
 def test_script_measures_each_of_its_contenders(
