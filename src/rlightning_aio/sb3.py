@@ -7,6 +7,7 @@ bit. docs/stable_baselines3.md tells what differs.
 from __future__ import annotations
 
 import contextlib
+import inspect
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
@@ -44,6 +45,7 @@ def make_vec_env(
     seed: int | None = None,
     env_kwargs: dict[str, Any] | None = None,
     vec_env_kwargs: dict[str, Any] | None = None,
+    vec_env_cls: type[Any] | None = None,
     **more: Any,
 ) -> Any:
     """Monitored envs of one task; see `stable_baselines3.common.env_util.make_vec_env`.
@@ -59,8 +61,23 @@ def make_vec_env(
         seed: env k gets ``seed + k`` at the next reset.
         env_kwargs: of `gymnasium.make`.
         vec_env_kwargs: of `VecEnv`: fields of a config entry.
+        vec_env_cls: accepted where it is a class that `VecEnv` takes the place of, and without
+            meaning here.
         more: of Stable-Baselines3's function.
+
+    Raises:
+        ValueError: `vec_env_cls` is another class.
+        TypeError: an argument is unknown.
     """
+    vec_envs = import_module("stable_baselines3.common.vec_env")
+    if vec_env_cls not in (None, VecEnv, vec_envs.SubprocVecEnv, vec_envs.DummyVecEnv):
+        raise ValueError(
+            f"vec_env_cls is {vec_env_cls.__name__}, and these envs are in a {VecEnv.__name__}: "
+            "leave it out, or call Stable-Baselines3's make_vec_env"
+        )
+    make: Any = import_module("stable_baselines3.common.env_util").make_vec_env
+    given = {"env_kwargs": env_kwargs, "vec_env_kwargs": vec_env_kwargs, **more}
+    inspect.signature(make).bind(env_id, n_envs, seed, **given)
     fields, kwargs = vec_env_kwargs or {}, {"render_mode": "rgb_array", **(env_kwargs or {})}
     single = any(more.get(name) for name in _OF_SINGLE_ENVS)
     if isinstance(env_id, str) and not single and steps_together(spec := spec_of(env_id), kwargs):
@@ -69,9 +86,7 @@ def make_vec_env(
         makers, fields = together(one, n_envs, AutoresetMode.SAME_STEP, fields)
         made = VecEnv(makers, **fields)
         made.seed(seed)
-        return import_module("stable_baselines3.common.vec_env").VecMonitor(made)
-    make: Any = import_module("stable_baselines3.common.env_util").make_vec_env
-    given = {"env_kwargs": env_kwargs, "vec_env_kwargs": vec_env_kwargs, **more}
+        return vec_envs.VecMonitor(made)
     return make(env_id, n_envs, seed, vec_env_cls=VecEnv, **given)
 
 

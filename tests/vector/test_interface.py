@@ -189,6 +189,17 @@ def test_make_vec_takes_what_gymnasiums_takes() -> None:
         one.close()
 
 
+def test_make_vec_takes_gymnasiums_modes() -> None:
+    """By name or by its enum; what is none of ours is refused with the way to it."""
+    inline = {"placement": "inline"}
+    for mode in (gym.VectorizeMode.ASYNC, "async", None):
+        make_vec("Pendulum-v1", 1, mode, inline).close()
+    make_vec("CartPole-v1", 2, gym.VectorizeMode.VECTOR_ENTRY_POINT, inline).close()
+    for mode in (gym.VectorizeMode.SYNC, "sync"):
+        with pytest.raises(ValueError, match="not 'sync'; vector_kwargs="):
+            make_vec("Pendulum-v1", 1, mode)  # pyright: ignore[reportArgumentType]
+
+
 def test_gymnasium_makes_it_by_a_vector_entry_point() -> None:
     """As RLlib does, say."""
     gym.register(

@@ -117,6 +117,22 @@ def test_sac_learns_the_very_same_on_it() -> None:
     assert all((weights[0][key] == weights[1][key]).all() for key in weights[0])
 
 
+@pytest.mark.parametrize("task", ["CartPole-v1", "Hopper-v5"])  # Separate, and stepped together.
+def test_make_vec_env_is_called_as_theirs(task: str) -> None:
+    """A class that it takes the place of changes nothing; another, or a slip, is refused."""
+    from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+
+    from rlightning_aio.sb3 import make_vec_env
+
+    entry = {"placement": "inline", "start_method": "fork"}
+    for kind in (SubprocVecEnv, DummyVecEnv):
+        make_vec_env(task, 1, 0, vec_env_cls=kind, vec_env_kwargs=entry).close()
+    with pytest.raises(ValueError, match="vec_env_cls is object, and these envs are in a VecEnv"):
+        make_vec_env(task, 1, vec_env_cls=object)
+    with pytest.raises(TypeError, match="unexpected keyword argument 'monitor'"):
+        make_vec_env(task, 1, monitor=True)
+
+
 def test_ppo_is_evaluated_on_it(tmp_path: Path) -> None:
     """With monitors and stacked frames around it, and a timeline recorded."""
     from stable_baselines3 import PPO

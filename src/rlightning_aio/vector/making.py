@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     import gymnasium as gym
+    from gymnasium import VectorizeMode
     from gymnasium.envs.registration import EnvSpec
 
 __all__ = ["imports_of", "make_vec", "steps_together", "together", "vector_entry_point"]
@@ -28,7 +29,7 @@ Mode = Literal["async", "vector_entry_point"]
 def make_vec(
     id: str | EnvSpec,  # noqa: A002  # As Gymnasium calls it.
     num_envs: int = 1,
-    vectorization_mode: Mode | None = None,
+    vectorization_mode: VectorizeMode | Mode | None = None,
     vector_kwargs: Mapping[str, Any] | None = None,
     wrappers: Sequence[Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]]] = (),
     **kwargs: Any,
@@ -50,26 +51,29 @@ def make_vec(
             ``disable_env_checker=False`` is among them; envs with it are separate.
 
     Raises:
-        ValueError: the task has no vector environment, or it takes no wrappers.
+        ValueError: the task has no vector environment, or it takes no wrappers; or the mode is
+            none of these.
     """
+    mode = getattr(vectorization_mode, "value", vectorization_mode)
     spec = copy.deepcopy(spec_of(id) if isinstance(id, str) else id)
     given = {**imports_of(spec), **(vector_kwargs or {})}
     one = OneOf(spec, {"disable_env_checker": True, **kwargs}, tuple(wrappers))
     makers: list[Callable[[], Any]] = [one] * num_envs
-    if vectorization_mode == "vector_entry_point":
+    if mode == "vector_entry_point":
         if spec.vector_entry_point is None or wrappers:
             reason = "takes no wrappers of single envs" if wrappers else "has no such entry point"
             raise ValueError(f"{spec.id} {reason}; leave vectorization_mode out")
         count, given = _laid_out(num_envs, given)
         makers = [VectorOf(spec, num_envs // count, kwargs)] * count
-    elif vectorization_mode not in (None, "async"):
+    elif mode not in (None, "async"):
         raise ValueError(
             "vectorization_mode must be None, 'async' or 'vector_entry_point', not "
-            f"{vectorization_mode!r}"
+            f"{mode!r}; vector_kwargs={{'placement': 'inline'}} keeps envs in this "
+            "process"
         )
-    elif vectorization_mode is None and not wrappers and steps_together(spec, kwargs):
-        mode = AutoresetMode(given.get("autoreset_mode", AutoresetMode.NEXT_STEP))
-        makers, given = together(one, num_envs, mode, given)
+    elif mode is None and not wrappers and steps_together(spec, kwargs):
+        autoreset = AutoresetMode(given.get("autoreset_mode", AutoresetMode.NEXT_STEP))
+        makers, given = together(one, num_envs, autoreset, given)
     env = VectorEnv(makers, **given)
     env.spec = copy.deepcopy(spec)
     env.spec.kwargs.update(kwargs)
