@@ -177,6 +177,22 @@ def test_requests_out_of_band_count_as_those_in_the_row_do(
         assert row.told(found) == other_row.told(expected)
 
 
+def test_a_reward_is_one_number_in_whatever_form() -> None:
+    """An array of one is one, as on the long way; what is none is named."""
+    runner, env, row = runner_and_row()
+    for number, reward in enumerate((2, np.float32(2), np.array(2.0), np.array([2.0])), 1):
+        env.next = reward, False, False, {}
+        runner.step()
+        assert (row.slab.reward[1], row.slab.episode_return[1]) == (2, 2 * number)
+    for reward, message in (
+        (None, r"reward of env 'plain-0' must be a number, not None"),
+        (np.zeros(2), r"reward of env 'plain-0' has shape \(2,\), expected \(\)"),
+    ):
+        env.next = reward, False, False, {}
+        with pytest.raises(ValueError, match=message):
+            runner.step()
+
+
 def test_the_seed_of_a_reset_is_the_one_in_the_row() -> None:
     """Once; the next reset has none."""
     runner, env, row = runner_and_row()

@@ -163,6 +163,19 @@ class RowWriter:
             )
         return array
 
+    def number(self, what: str, value: Any) -> float:
+        """The one number that `value` holds, an array of shape (1,) say.
+
+        Raises:
+            ValueError: it holds none, or several.
+        """
+        try:
+            return float(self._checked(what, value))
+        except TypeError:
+            raise ValueError(
+                f"{what} of env {self._env_id!r} must be a number, not {value!r}"
+            ) from None
+
     def write_times(self, done_ns: int, busy_ns: int) -> None:
         """Write when the result was ready (monotonic), and what it took the env, in ns."""
         self._slab.times[self._row] = done_ns, busy_ns

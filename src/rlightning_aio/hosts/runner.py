@@ -512,7 +512,7 @@ def _nobody_keeps(standing: bytes, before: bool) -> None:
 def _nothing() -> None: ...
 
 
-def _short_steps(
+def _short_steps(  # noqa: PLR0915  # A call more would be felt in every step.
     bare: BareStep,
     bare_reset: BareReset | None,
     take: _Take,
@@ -553,7 +553,10 @@ def _short_steps(
         done_times[row] = done
         busy_times[row] = done - began
         write_observation(observation)
-        rewards[row] = reward
+        try:
+            rewards[row] = reward
+        except TypeError:
+            rewards[row] = reward = writer.number("reward", reward)
         if fresh:
             resets[row] = fresh = False
         if over and resets_itself:
