@@ -371,6 +371,13 @@ def test_a_wrong_field_is_named_with_file_and_entry(
     assert caught.value.__cause__ is None
 
 
+def test_a_wrong_field_is_all_that_a_program_is_told_of() -> None:
+    """Defaults that depend on others add nothing."""
+    with pytest.raises(ValidationError) as caught:
+        EnvConfig(name="pole", backend="gymnasium", task="CartPole-v1", num_workers=0)
+    assert [fault["loc"] for fault in caught.value.errors()] == [("num_workers",)]
+
+
 def test_backends_of_single_envs_take_several_workers_instead() -> None:
     """What to write instead is said."""
     arm = {"name": "arm", "backend": "piper", "task": "can0", "num_envs": 4}

@@ -132,9 +132,7 @@ class EnvConfig(BaseModel):
     """Seconds that one reset may take."""
     start_timeout: float = Field(default=120.0, gt=0)
     """Seconds from the start of a worker until its envs are built."""
-    on_worker_death: Literal["restart", "raise", "resume"] = Field(
-        default_factory=lambda fields: _ending_for(fields.get("backend", ""))
-    )
+    on_worker_death: Literal["restart", "raise", "resume"] = "restart"
     """What to do when a worker dies or hangs; ``raise`` by default for hardware."""
     snapshot_every: int | None = Field(default=None, ge=1)
     """Number of steps after which an env's state is saved, for ``on_worker_death: resume``."""
@@ -220,10 +218,13 @@ class EnvConfig(BaseModel):
         # pathlib would make `python` of `./python`, which is looked for elsewhere.
         return interpreter and os.path.expanduser(interpreter)  # noqa: PTH111
 
-
-def _ending_for(backend: str) -> Literal["restart", "raise"]:
-    # Nobody but the user has a robot's worker replaced.
-    return "raise" if ENVS.is_hardware(backend) else "restart"
+    @model_validator(mode="after")
+    def _leave_robots_alone(self) -> EnvConfig:
+        # Nobody but the user has a robot's worker replaced. Past the frozen fields' guard, which
+        # would count this as given.
+        if "on_worker_death" not in self.model_fields_set and ENVS.is_hardware(self.backend):
+            object.__setattr__(self, "on_worker_death", "raise")
+        return self
 
 
 def _with_backend(fields: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -462,12 +463,7 @@ def _read_entry(entry: object, place: str, problems: _Problems) -> _Entry | None
     try:
         return _Entry(place, EnvConfig.model_validate(fields), set())
     except ValidationError as error:
-        # A default that another field's fault leaves open is no fault of its own.
-        faults = [
-            fault
-            for fault in error.errors(include_url=False)
-            if fault["type"] != "default_factory_not_called"
-        ]
+        faults = error.errors(include_url=False)
     for path, text in _explain(faults, fields):
         problems.add(f"{place}, {path}", text)
     faulty = {str(fault["loc"][0]) for fault in faults}
@@ -539,9 +535,7 @@ def _refused(config: EnvConfig) -> dict[str, str]:
 
 def _asks_for_nothing(config: EnvConfig, name: str) -> bool:
     """Whether a field was set to what it says anyway: no limit, nothing, not, or one."""
-    default = EnvConfig.model_fields[name].get_default(
-        call_default_factory=True, validated_data={"backend": config.backend}
-    )
+    default = EnvConfig.model_fields[name].get_default(call_default_factory=True, validated_data={})
     return (not default or default == 1) and getattr(config, name) == default
 
 
