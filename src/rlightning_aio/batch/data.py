@@ -459,10 +459,11 @@ class BatchedData:
         try:
             rows = len(column)
         except TypeError:
-            rows = 0
+            rows = None
         if rows != len(self):
+            found = f"is {column!r}" if rows is None else f"has {rows} rows"
             raise BadAction(
-                f"column {name!r} has {rows} rows for a batch of {len(self)}; give one row for "
+                f"column {name!r} {found} for a batch of {len(self)}; give one row for "
                 "each result, in the batch's order"
             )
 
