@@ -108,7 +108,8 @@ class Scene:
             self.requests.in_flight[host_id] -= count
 
     def arm(self, wanted: int) -> bool:
-        return self.poller.arm(wanted)
+        self.poller.arm(wanted)
+        return self.poller.came()
 
 
 # -- orders

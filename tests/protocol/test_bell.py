@@ -120,7 +120,7 @@ class BellMachine(RuleBasedStateMachine):
         worker.waiting -= 1
         worker.count += 1
         looks = worker.bell.publish(worker.count)
-        assert looks == (self.order is None or not self.order[2])
+        assert not (looks and self.order is not None and self.order[2])
         # It looks in any case when it has nothing left to do.
         worker.looks = looks or not worker.waiting
 
@@ -155,6 +155,8 @@ class BellMachine(RuleBasedStateMachine):
             return
         unread = self.unread()
         assert self.trainer.unread() == sum(unread)
+        reached = self.order is not None and sum(w.count for w in self.workers) >= self.order[1]
+        assert self.trainer.reached() == reached
         assert self.trainer.with_news() == [k for k, count in enumerate(unread) if count]
         assert [self.trainer.count(k) for k in range(len(unread))] == [
             w.count for w in self.workers

@@ -139,20 +139,23 @@ class Poller:
         if self._spun:
             self._spinner.slept()
 
-    def arm(self, wanted: int) -> bool:
-        """Have the workers wake us when `wanted` results are ready; whether they are already.
+    def arm(self, wanted: int) -> None:
+        """Have the workers wake us when `wanted` results are ready, or all that they owe.
 
         Args:
             wanted: by the call that wants the fewest.
         """
         in_flight = self._requests.in_flight
         total = sum([in_flight[host_id] for host_id in self._workers])
-        if not total:
-            return False
-        wanted = min(wanted, total)
-        bell = self._bell
-        bell.arm(bell.goal(wanted), at_last=wanted == total)
-        return bell.unread() >= wanted
+        if total:
+            wanted = min(wanted, total)
+            self._bell.arm(self._bell.goal(wanted), at_last=wanted == total)
+        else:
+            self._bell.disarm()
+
+    def came(self) -> bool:
+        """Whether they are ready already; to be asked last before the trainer sleeps."""
+        return self._bell.reached()
 
     def disarm(self) -> None:
         """Nobody waits any more."""

@@ -83,9 +83,13 @@ class Waiting:
             poller, first = self._poller, min(self._wanted)
             if poller.execute(wanted, until):
                 return (yield from self.check_liveness((yield Wait(0.0))))
-            if poller.spin(first) or poller.arm(first):
+            if poller.spin(first):
                 return (yield from self.check_liveness((yield TURN)))
-            now = yield Wait(earliest(until, self._supervisor.next_check()))
+            poller.arm(first)
+            until = earliest(until, self._supervisor.next_check())
+            if poller.came():
+                return (yield from self.check_liveness((yield TURN)))
+            now = yield Wait(until)
             poller.slept()
         finally:
             self._wanted.remove(wanted)

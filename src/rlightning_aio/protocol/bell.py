@@ -6,12 +6,11 @@ there rings, by a few bytes in its channel. So the trainer is woken once, when t
 and by nobody before.
 
 Invariant: every word has one writer. A worker publishes its counter and fences before it
-looks at the armed word and adds up everybody's counters; the trainer arms the bell and fences
-before it adds them up. So of two workers that finish at the same time at least one sees the
-sum, and a report that comes while the bell is being armed is seen by its worker or by the trainer.
-A worker that sees a bell armed for all that is in flight leaves it, and the fence, until it has
-nothing left to do. If the bell is armed for fewer in that very moment, the worker sees it after its
-next report.
+adds up everybody's; so of two that finish at the same time at least one sees the sum.
+Not fenced: a worker's look at the armed word after each report, which no-work envs would feel.
+While its report is on the way to memory, for a fraction of a microsecond, it may overlook a bell
+that is being armed. So the trainer fences when it has armed the bell, and looks whether the goal
+is `reached` a few microseconds later. A worker that has nothing left to do looks with a fence.
 """
 
 from __future__ import annotations
@@ -167,6 +166,12 @@ class TrainerBell:
             self._words[ARMED] = self._armed = armed | 1
             self._fence()
 
+    def reached(self) -> bool:
+        """Whether the goal for which the bell is armed is reached: somebody rings, or nobody
+        need.
+        """
+        return self._armed != 0 and self._sum() >= (self._armed >> _GOAL_SHIFT & _GOAL_MASK)
+
     def disarm(self) -> None:
         """Have no bell rung: the trainer is awake."""
         if self._armed:
@@ -187,6 +192,7 @@ class WorkerBell:
 
     Attributes:
         words, own: the shared memory, and where its own counter lies there.
+        settled: the armed word for which it has rung, or need not ring.
     """
 
     def __init__(self, buffer: memoryview, num_workers: int, index: int) -> None:
@@ -194,14 +200,14 @@ class WorkerBell:
         self._sum = _sum_of(self.words)
         self.own = _COUNTERS + LINE * index
         self._fence = new_fence()
-        # The armed word for which it has rung, or need not ring.
-        self._settled = 0
+        self.settled = 0
 
     def publish(self, count: int) -> bool:
         """Say how many reports there are; whether it is time to ask `is_due`."""
         words = self.words
         words[self.own] = count
-        return not words[ARMED] & AT_LAST
+        armed = words[ARMED]
+        return armed != self.settled and not armed & AT_LAST
 
     def is_due(self) -> bool:
         """Whether this worker is to ring the trainer, now; True once after each arming.
@@ -210,9 +216,9 @@ class WorkerBell:
         """
         self._fence()
         armed = self.words[ARMED]
-        if armed == self._settled:
+        if armed == self.settled:
             return False
         if armed and self._sum() < (armed >> _GOAL_SHIFT & _GOAL_MASK):
             return False
-        self._settled = armed
+        self.settled = armed
         return armed != 0

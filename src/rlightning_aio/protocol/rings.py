@@ -216,7 +216,8 @@ class WorkerRings:
                 self._fence()
             # `WorkerBell.publish`, spelt out: it would be felt in every step.
             words[own] = sent
-            if not words[ARMED] & AT_LAST and bell.is_due():
+            armed = words[ARMED]
+            if armed != bell.settled and not armed & AT_LAST and bell.is_due():
                 ring()
         if bell.is_due():
             ring()
