@@ -1,4 +1,4 @@
-"""`ResultColumns`: what a group hands out, as arrays; the stuff of a batch of results."""
+"""`ResultColumns`: the arrays that a batch of results consists of."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Batches of results put together: for whoever keeps some results and waits for others."""
+"""Joins batches of results, for callers that keep some results while they wait for others."""
 
 from __future__ import annotations
 

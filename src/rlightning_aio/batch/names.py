@@ -1,7 +1,7 @@
 """`EnvNames`: who the envs of a group are, as batches know them.
 
-Rule: it never changes. A group whose envs change (a client takes another's place) has another
-one from then on, and what was handed out before keeps the names that were true of it.
+Rule: it never changes. When a client takes another's place, the group gets a new one, and batches
+that were returned before keep the names that were true of them.
 """
 
 from __future__ import annotations

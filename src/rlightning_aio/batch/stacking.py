@@ -1,4 +1,4 @@
-"""Values that came one by one, or columns that came apart, as columns."""
+"""Stacks single values, or parts of columns, into columns."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """`Collector`: steps a group with a policy, and gives out rollouts.
 
-It stands on the public `EnvGroup` alone. Whatever comes between a result and the next request
-(a policy that raises, a task that is cancelled, a rollout that is full) leaves the results that
-are still to be answered with it, and the next `collect` goes on from there.
+It stands on the public `EnvGroup` alone. If something interrupts it between a result and the next
+request (a policy raises, a task is cancelled, a rollout is full), it keeps the results that are
+still to be answered, and the next `collect` continues there.
 """
 
 from __future__ import annotations

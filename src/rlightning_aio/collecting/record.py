@@ -1,7 +1,7 @@
-"""The order in which a group has handed out its results: kept, and kept to.
+"""Records the order in which a group returns its results, and replays it.
 
-With the same seeds and the same policy everything else follows from it: so an asynchronous run
-is repeated bit for bit. Both groups here stand before an `EnvGroup`, whose every method they have.
+With the same seeds and the same policy, everything else follows from that order, so an asynchronous
+run can be repeated bit for bit. Both groups here wrap an `EnvGroup` and have all of its methods.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""`Rollout`: transitions of many envs as columns, and what a learner works out of them."""
+"""`Rollout`: transitions of many envs as columns, and what a learner computes from them."""
 
 from __future__ import annotations
 

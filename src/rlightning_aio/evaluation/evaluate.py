@@ -1,8 +1,8 @@
 """`evaluate`: equally many episodes of each env, first come, first served.
 
-Rule: which episodes are played is settled before the first step; how long one takes, and when it
-ends, has no part in it. An env that resets itself is stepped on until each of its sub-environments
-has its number, and what it plays beyond is not looked at.
+Rule: which episodes are played is decided before the first step, whatever their length. An env that
+resets itself is stepped until each of its sub-environments has played its number; episodes beyond
+that are ignored.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """The asynchronous `EnvGroup` and the driver that waits on an asyncio event loop.
 
-Waiting is `asyncio.wait(..., return_when=FIRST_COMPLETED)` on one future, which any source
-(a worker, a fork server, an env_server) fulfils: with one for each, a collect would cost
-the more the more workers there are, and with one env to a worker, the more envs.
-Absent on purpose: rules. Every one of them is in the core.
+A call that waits has one future, and any source (a worker, a fork server, an env_server) fulfils
+it. With a future for each source, the cost of a collect would grow with the number of workers.
+Absent on purpose: rules. All of them are in the core.
 """
 
 from __future__ import annotations

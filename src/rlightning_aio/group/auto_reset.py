@@ -1,12 +1,12 @@
 """The rule of `auto_reset`: which envs are reset in place of their next step.
 
 An env's counter is 0 after a reset and one more after each completed step. Inside the
-context the step that reaches the limit is flagged, and the next step of that env is
-replaced by a reset; so a limit of L gives a period of L + 1 calls. What is due when a context
-is left is due in the next one, if nothing has come in between.
+context, the step that reaches the limit is flagged, and the next step of that env is
+replaced by a reset, so a limit of L gives a period of L + 1 calls. A reset that is due when a
+context ends is due in the next one, unless the env was reset or called in between.
 
 Nothing is counted step by step: a counter is the number of the env's request less that of
-its last reset, and limits are looked at only when one can have been reached.
+its last reset, and limits are checked only when one can have been reached.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""GPUs of this machine, dealt out to the workers whose entries wish for them.
+"""GPUs of this machine, assigned to the workers whose entries ask for them.
 
-Rule: before anything starts, in the order of the workers; a worker has its devices for itself,
-or shares one with others whose shares add up to it. What is dealt out is what the trainer's own
-`CUDA_VISIBLE_DEVICES` leaves, and a worker sees it by that variable.
+Rule: they are assigned before anything starts, in the order of the workers. A worker has its
+devices to itself, or shares one with workers whose shares add up to it. Only devices that the
+trainer's own `CUDA_VISIBLE_DEVICES` leaves are assigned; a worker sees its own by that variable.
 Absent on purpose: CUDA. Nothing here initialises a device.
 """
 

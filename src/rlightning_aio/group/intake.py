@@ -1,8 +1,8 @@
 """`Intake`: what completions mean: for requests, for results, and after a death.
 
-Hosts append to one queue; here, and nowhere else, what they have told takes effect.
-Rule: it asks nothing by itself, but for what a dead worker owed, which its replacement
-answers.
+Hosts append to one queue. What they report takes effect here, and nowhere else.
+Rule: it sends no requests of its own, except those that a dead worker owed; the replacement
+answers them.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """`Recovery`: which envs have lost their episode with their worker, until somebody was told.
 
-An env that owed a reply tells with the reset that answers in its place; one that owed
-nothing tells in place of its next step, unless it is reset before. A reset that raises begins
-no episode, so there is still something to tell. Nobody mistakes a new episode for the old one.
+If the env owed a reply, the reset that answers in its place tells of the loss. Otherwise its next
+step is replaced by a reset that does, unless the env is reset before. A reset that raises begins no
+episode, so the loss is still to be told. Nobody mistakes a new episode for the old one.
 """
 
 from __future__ import annotations

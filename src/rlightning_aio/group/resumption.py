@@ -1,7 +1,7 @@
 """`Resumption`: where the envs of a dead worker go on, and how many steps they have lost.
 
-An env of an entry with ``snapshot_every`` gives its standing away by itself. One that comes
-with a request is good once that request was answered: nobody has heard of what it did before.
+An env of an entry with ``snapshot_every`` sends its standing by itself. A standing that was sent
+during a request counts once that request is answered: until then, nobody knows what the env did.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""`States`: where envs stand is taken out of them, and put back."""
+"""`States`: takes the state of envs out of them, and puts it back."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
-"""`Supervisor`: the life of a group's hosts, from their first start to their last breath.
+"""`Supervisor`: the life of a group's hosts, from their first start to their end.
 
 It starts them, has their envs placed in slabs, notices that one is dead or hung, replaces
-it, and closes them all. What a death means for requests is the core's affair: it is told
+it, and closes them all. What a death means for requests is the core's affair, which is told
 what to do about them (`GivenUp`, `Replaced`).
-Rule: no wait but by yielding one; the time is passed in, but for that of a death, which
-comes to light at no certain time.
+Rule: it waits only by yielding a `Wait`. The time is passed in, except that of a death, which may
+be found at any moment.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What filming needs, looked for before anything is started."""
+"""Checks what filming needs, before anything is started."""
 
 from __future__ import annotations
 

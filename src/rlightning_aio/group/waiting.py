@@ -1,7 +1,7 @@
-"""`Waiting`: how the calls of a group wait, side by side, for what hosts have to tell.
+"""`Waiting`: how the calls of a group wait, side by side, for what hosts report.
 
-Each of them is a procedure that takes turns here until its replies are there. They are woken as
-early as the least patient of them has asked for.
+Each call is a procedure that takes turns here until its replies are there. They are woken as
+early as the least patient of them asks for.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """`Allowance`: what may be spent on strangers, as time goes by.
 
-Rule: amounts are seconds of the trainer's processor, by fixed prices instead of a clock's, so that
-what strangers may do does not depend on what else the machine has to do.
+Rule: amounts are seconds of the trainer's processor, at fixed prices instead of measured ones, so
+what strangers may do doesn't depend on what else the machine does.
 """
 
 from __future__ import annotations

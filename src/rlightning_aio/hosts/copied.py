@@ -1,4 +1,4 @@
-"""Values that stay in one process, as if they had travelled."""
+"""Copies values that stay in one process, as if they had travelled."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""`Door`: the connections of an env_server's socket, and an end to those that are of no use.
+"""`Door`: watches the connections of an env_server's socket, and ends those that are of no use.
 
-Rule: ZMQ accepts whoever comes, and tells by its monitor; whoever then takes up room or time
-without becoming a client is cut off. The trainer may be away for a while, in which ZMQ goes on
-accepting: it stands still when some thousand events wait to be read, so that no flood takes
-more descriptors than `ROOM`, which is added to what the process may open.
+Rule: ZMQ accepts whoever comes, and tells by its monitor. Whoever then takes up room or time
+without becoming a client is cut off. While the trainer is away, ZMQ goes on accepting, but stops
+when some thousand events wait to be read. So no flood takes more descriptors than `ROOM`, which
+is added to what the process may open.
 Absent on purpose: what messages mean, and who is let in.
 """
 

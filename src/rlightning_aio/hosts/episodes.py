@@ -1,9 +1,9 @@
 """`EpisodeSums`: return and length of the episodes that are under way in one env.
 
-Rule: one sum for each agent and sub-environment, over the steps between a reset and an
-end, kept in the very row that carries them to the trainer, where a step limit, which ends
-an episode elsewhere, finds them. A step in which a sub-environment resets itself
-belongs to no episode, nor does what comes after an end that nobody has reset yet.
+Rule: there is one sum for each agent and sub-environment, over the steps between a reset and an
+end. The sums are kept in the row that carries them to the trainer, where a step limit, which ends
+an episode elsewhere, finds them. A step in which a sub-environment resets itself belongs to no
+episode, and neither does what comes between an end and the next reset.
 """
 
 from __future__ import annotations

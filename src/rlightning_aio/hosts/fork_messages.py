@@ -1,8 +1,8 @@
 """What a trainer and a fork server tell each other, and the socket that carries it.
 
-Rule: neither end waits for the other one to read; what finds no room waits in here. A fork
+Rule: neither end waits for the other one to read; messages that find no room wait in here. A fork
 server imports this before it knows whether its interpreter has what workers need, so it
-imports nothing but Python's own.
+imports nothing but Python's own modules.
 Absent on purpose: what the messages mean; that is `fork_server`'s and `process`'s.
 """
 

@@ -1,11 +1,11 @@
 """`Gate`: whose connection to an env_server goes on, and when (ZMQ's ZAP, RFC 27).
 
-Rule: ZMQ asks about every connection in the midst of its handshake, and reads nothing of it before
-it is answered. Whoever has a known key is let in. Strangers wait for their turn until there is an
-allowance for one more of them; meanwhile they keep what they have to say. Turns go round by
-address, so that a crowd at one doesn't keep out who comes from another.
-Being asked has ZMQ refuse connections in protocols before ZMTP 3, too; of these, one that comes
-while the socket closes would end the process (an assertion of libzmq 4.3, which knows no better).
+Rule: ZMQ asks about every connection in the middle of its handshake, and reads nothing of it until
+it has the answer. Whoever has a known key is let in. Strangers wait until there is an allowance for
+one more of them, and nothing that they send is read meanwhile. Addresses take turns, so a crowd at
+one of them keeps out nobody at another.
+With a gate, ZMQ also refuses connections in protocols before ZMTP 3. One of these that came while
+the socket closes would end the process (an assertion of libzmq 4.3).
 """
 
 from __future__ import annotations

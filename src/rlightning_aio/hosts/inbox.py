@@ -1,4 +1,4 @@
-"""`Inbox`: what other threads have to tell the trainer's, and a descriptor that says so."""
+"""`Inbox`: what other threads tell the trainer's, and a descriptor that says so."""
 
 from __future__ import annotations
 

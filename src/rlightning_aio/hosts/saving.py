@@ -1,9 +1,9 @@
-"""`SavingRunner`: an env that gives its standing away now and then, for a replaced worker.
+"""`SavingRunner`: an env that sends its standing now and then, for a replacement of its worker.
 
-It does so after each reset, after each end, and after every so many steps in between; and
-before a reset if it has stepped since, so that what an episode has made of generators and
-wrappers isn't lost. So whatever was answered last, the standing that was given away last lies
-in the same episode.
+It does so after each reset, after each end, and after every so many steps in between. It also does
+so before a reset if it has stepped since, so that the state that an episode has left in generators
+and wrappers isn't lost. So the last standing sent always lies in the same episode as the last
+answer.
 """
 
 from __future__ import annotations

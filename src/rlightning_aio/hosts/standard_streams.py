@@ -1,6 +1,7 @@
-"""Descriptors 0, 1 and 2, which are nobody's in a program that was started without its streams.
+"""Keeps descriptors 0, 1 and 2 taken in a program that was started without its streams.
 
-What is opened next would land there, and be written into by whatever writes to stderr.
+Otherwise, whatever is opened next would get one of them, and all that goes to stderr would be
+written into it.
 """
 
 from __future__ import annotations
