@@ -319,7 +319,7 @@ def test_a_column_has_a_row_for_each_result(bad: Any) -> None:
     """The column at fault is named."""
     with pytest.raises(BadAction, match=r"'action' (has \d rows|is 7) for a batch of 2"):
         results(columns([0, 1], np.zeros((2, 1)))).respond(action=bad)
-    with pytest.raises(BadAction, match="'value' (has|is)"):
+    with pytest.raises(BadAction, match=r"'value' (has|is)"):
         results(columns([0, 1], np.zeros((2, 1)))).respond(action=np.zeros(2), value=bad)
 
 
