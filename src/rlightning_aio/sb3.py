@@ -138,6 +138,7 @@ class VecEnv(_Base):
                     )
             # Results of all envs, in order, which actions can answer.
             self._answerable = BatchedData(self.group.env_ids, [None] * len(metas))
+            self._unfinished = False
             _Base.__init__(self, self._rows.num_envs, *first)
         except BaseException:
             self.group.close()
@@ -152,6 +153,7 @@ class VecEnv(_Base):
         Raises:
             EnvRaised, WorkerDied, EnvHung: an env failed; the others' results are dropped.
         """
+        drop_outstanding(self.group)
         with self._dropping_the_rest():
             self._rows.send_resets(self._seeds, self._options, range(self.num_envs))
             batch, _ = self.group.collect_async(wait_all=True, ordered=True)
@@ -161,7 +163,13 @@ class VecEnv(_Base):
         return self._rows.observation(batch)
 
     def step_async(self, actions: Any) -> None:
-        """Send one action to each env, from an array or a sequence; cast to the space's dtype."""
+        """Send one action to each env, from an array or a sequence; cast to the space's dtype.
+
+        What a step without its `step_wait` (after Ctrl-C, say) has left is waited for, and dropped.
+        """
+        if self._unfinished:
+            drop_outstanding(self.group)
+        self._unfinished = True
         if isinstance(self.action_space, gym.spaces.Dict | gym.spaces.Tuple):
             pairs = zip(self.group.env_ids, actions, strict=True)
             responses = [PolicyResponse(env_id, action) for env_id, action in pairs]
@@ -182,7 +190,7 @@ class VecEnv(_Base):
         """
         with self._dropping_the_rest():
             batch, _ = self.group.collect_async(wait_all=True, ordered=True)
-        self._answerable = batch
+        self._answerable, self._unfinished = batch, False
         rows = self._rows
         infos = rows.info_list(batch)
         truncated = rows.flat(batch.truncated & ~batch.terminated).tolist()

@@ -15,7 +15,7 @@ from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoA
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import vector as wrappers
 from timelines import Seen
-from vector.toys import Toy, assert_alike, toy
+from vector.toys import Toy, assert_alike, press_ctrl_c, toy
 
 from rlightning_aio.errors import EnvRaised
 from rlightning_aio.vector import VectorEnv, make_vec, vector_entry_point
@@ -187,6 +187,34 @@ def test_make_vec_takes_what_gymnasiums_takes() -> None:
     assert_alike(found, expected)
     for one in (ours, theirs):
         one.close()
+
+
+class Interrupting(Plain):
+    """Action 1 presses Ctrl-C while the trainer waits for it."""
+
+    def __init__(self, trainer: int) -> None:
+        super().__init__()
+        self.trainer = trainer
+
+    def step(self, action: Any) -> Any:
+        if action == 1:
+            press_ctrl_c(self.trainer)
+        return super().step(action)
+
+
+def test_after_ctrl_c_it_steps_and_resets() -> None:
+    """What the interrupted step has left is dropped."""
+    trainer = os.getpid()
+    env = VectorEnv([lambda: Interrupting(trainer)] * 2)
+    first, _ = env.reset(seed=0)
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            env.step([1, 0])
+        env.step([0, 0])
+    with pytest.raises(KeyboardInterrupt):
+        env.step([0, 1])
+    np.testing.assert_array_equal(env.reset(seed=0)[0], first)
+    env.close()
 
 
 def test_make_vec_takes_gymnasiums_modes() -> None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from timelines import Seen
-from vector.toys import assert_alike
+from vector.toys import assert_alike, press_ctrl_c
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -98,6 +99,42 @@ def test_after_an_env_has_raised_all_are_reset() -> None:
         env.step(np.array([1, 0, 1]))
     assert env.reset().tolist() == [0, 0, 0]
     env.step(np.zeros(3, np.int64))
+    env.close()
+
+
+class Interrupting(gym.Env[Any, Any]):
+    """Its first step presses Ctrl-C where the trainer waits for it."""
+
+    observation_space = gym.spaces.Discrete(10)
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, trainer: int) -> None:
+        self.trainer, self.count = trainer, 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        self.count = 0
+        return 0, {}
+
+    def step(self, action: Any) -> Any:
+        self.count += 1
+        if action == 1:
+            press_ctrl_c(self.trainer)
+        return self.count, 0.0, False, False, {}
+
+
+def test_after_ctrl_c_it_steps_and_resets() -> None:
+    """What the interrupted step has left comes up neither in the next step nor in a reset."""
+    from rlightning_aio.sb3 import VecEnv
+
+    trainer = os.getpid()
+    env = VecEnv([lambda: Interrupting(trainer)] * 2)
+    env.reset()
+    with pytest.raises(KeyboardInterrupt):
+        env.step([1, 0])
+    assert env.step([0, 0])[0].tolist() == [2, 2]
+    with pytest.raises(KeyboardInterrupt):
+        env.step([0, 1])
+    assert env.reset().tolist() == [0, 0]
     env.close()
 
 

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import time
+from pathlib import Path
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -75,3 +79,10 @@ def assert_alike(found: Any, expected: Any, where: str = "") -> None:
             assert same, f"{where}: {found}, not {expected}"
     else:
         assert found == expected, where
+
+
+def press_ctrl_c(trainer: int) -> None:
+    """As soon as that process sleeps, which it does where it waits for envs."""
+    while Path(f"/proc/{trainer}/stat").read_text().rpartition(")")[2].split()[0] != "S":
+        time.sleep(0.001)
+    os.kill(trainer, signal.SIGINT)

@@ -237,14 +237,17 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
             AlreadyPendingCallError, ClosedEnvironmentError: it is no time for it.
         """
         self._begin("step_async")
+        self._late = True  # Ctrl-C leaves what was sent.
         self._answerable, _ = self.group.step(self._batch(actions))
+        self._late = False
         return self._stepped(self._answerable)
 
     def step_async(self, actions: Any) -> None:
         """Send steps, which `step_wait` waits for; see `step`."""
         self._begin("step_async")
+        self._late = True  # Ctrl-C leaves what was sent.
         self.group.step_async(self._batch(actions))
-        self._pending = "step"
+        self._pending, self._late = "step", False
 
     def step_wait(
         self, timeout: float | None = None
