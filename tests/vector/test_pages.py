@@ -21,8 +21,12 @@ DOCS = Path(__file__).parents[2] / "docs"
         ("stable_baselines3", ["stable_baselines3"]),
     ],
 )
-def test_program_runs(page: str, needed: list[str], tmp_path: Path) -> None:
+def test_program_runs(
+    page: str, needed: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """To its end, and prints what it says."""
+    # Ray would join a cluster that happens to be there, of other tests, say.
+    monkeypatch.setenv("RAY_ADDRESS", "local")
     if missing := [name for name in needed if importlib.util.find_spec(name) is None]:
         pytest.skip(f"{', '.join(missing)} not installed")
     text = (DOCS / f"{page}.md").read_text()
