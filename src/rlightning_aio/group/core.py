@@ -99,7 +99,6 @@ class Core:
         "calls",
         "drain",
         "envs",
-        "poller",
         "requests",
         "stats",
         "supervisor",
@@ -121,7 +120,6 @@ class Core:
         self.envs = envs
         self.requests = requests
         self.supervisor = supervisor
-        self.poller = poller
         self.auto = AutoReset(envs, requests)
         self.stats = Stats(envs, requests)
         self._layout = layout
