@@ -117,8 +117,8 @@ CARTPOLE = Workload(
     ],
 )
 
-# Each env in a worker of its own; two results to a call of the policy.
-APART = {"placement": "process", "envs_per_process": 1, "envs_each": 1, "min_batch": 2}
+# Each env in a worker of its own, answered as soon as it is ready.
+APART = {"placement": "process", "envs_per_process": 1, "envs_each": 1, "min_batch": 1}
 # SyncVectorEnv, which sleeps for one env after the other, would take 32 times as long.
 UNEVEN_POLE = Workload(
     "uneven",

@@ -1,19 +1,24 @@
-"""PPO that learns in a thread of its own, while the next rollout is being collected.
+"""PPO that learns in a process of its own, while the next rollout is being collected.
 
     python examples/ppo_overlap.py                          # HalfCheetah-v5, 16 environments
     python examples/ppo_overlap.py --task CartPole-v1
 
 Otherwise it is like ppo_async.py. Environments never wait for the learner, so it learns from
 actions of the previous policy: one version old at most. PPO's clipped ratio to the probability
-that the action had when it was chosen makes up for that.
+that the action had when it was chosen makes up for that. A thread would share Python with the
+loop that answers the environments, and each would wait for the other.
 """
 
 from __future__ import annotations
 
 import asyncio
-import sys
-from contextlib import nullcontext
+import io
+import multiprocessing
+import os
+import signal
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import ppo_async
@@ -24,9 +29,10 @@ from training_run import Run, arguments
 import rlightning_aio as rl
 from rlightning_aio.collecting import Collector
 
+if TYPE_CHECKING:
+    from multiprocessing.connection import Connection
+
 MOST_LAG = 1
-# Seconds for which the learner's thread may keep Python from the loop, which has envs to answer.
-SWITCH_INTERVAL = 0.0005
 
 
 @dataclass
@@ -39,9 +45,72 @@ class CartPole(ppo_async.CartPole):
     folder: str = "runs/ppo_overlap"
 
 
+class LearnerProcess:
+    """Has the agent of `learner` learn in a process that shares its weights with this one.
+
+    They change in place: nobody may read them before `learn` has returned.
+    """
+
+    def __init__(self, learner: Learner) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        learner.agent.share_memory()
+        given = (learner, torch.get_rng_state(), theirs)
+        self._process = context.Process(target=_learn, args=given, daemon=True)
+        self._process.start()
+        theirs.close()
+
+    async def __aenter__(self) -> Self:
+        await self.state()  # Once it answers, it has started.
+        return self
+
+    async def __aexit__(self, *error: object) -> None:
+        self._process.terminate()
+        self._process.join()
+
+    async def learn(self, columns: dict[str, torch.Tensor], rate: float) -> dict[str, float]:
+        return await self._ask(({name: column.numpy() for name, column in columns.items()}, rate))
+
+    async def state(self) -> dict[str, Any]:
+        """What of a checkpoint is there: the optimiser and the random numbers."""
+        return torch.load(io.BytesIO(await self._ask(None)), weights_only=True)
+
+    async def _ask(self, what: Any) -> Any:
+        loop, answered = asyncio.get_running_loop(), asyncio.Event()
+        descriptor = self._pipe.fileno()
+        try:
+            self._pipe.send(what)
+            loop.add_reader(descriptor, answered.set)
+            try:
+                await answered.wait()
+            finally:
+                loop.remove_reader(descriptor)
+                os.set_blocking(descriptor, True)  # uvloop has changed that.
+            return self._pipe.recv()
+        except (EOFError, OSError):
+            raise RuntimeError("the learner's process has ended; it says above why") from None
+
+
+def _learn(learner: Learner, random: torch.Tensor, pipe: Connection) -> None:
+    """What the process does: an update for each rollout that comes, until nobody sends any."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the trainer's to decide about.
+    torch.set_rng_state(random)
+    with suppress(EOFError):
+        while True:
+            given = pipe.recv()
+            if given is None:
+                state = {"optimizer": learner.optimizer.state_dict()}
+                written = io.BytesIO()
+                torch.save(state | {"random": torch.get_rng_state()}, written)
+                pipe.send(written.getvalue())
+            else:
+                columns, rate = given
+                tensors = {name: torch.from_numpy(column) for name, column in columns.items()}
+                pipe.send(learner.learn(tensors, rate))
+
+
 async def train(args: Args | CartPole) -> Run:
     torch.manual_seed(args.seed)
-    sys.setswitchinterval(SWITCH_INTERVAL)
     run = Run(args.total_steps, args.folder, args.resume)
     async with rl.build_env_group(entry_of(args)) as group:
         learner = Learner(args, group, run)
@@ -54,29 +123,30 @@ async def train(args: Args | CartPole) -> Run:
             seed=args.seed + run.steps,
         )
         trace = group.trace(args.trace) if args.trace else nullcontext()
-        with group.auto_reset(), run, trace:
-            rollout = await collector.collect()
-            while run.goes_on():
-                columns = learner.columns(rollout)
-                lag = collector.policy_version - rollout.policy_version
-                # What was in flight while the learner was slow can be older: left out.
-                if lag.max() > MOST_LAG:
-                    young = torch.from_numpy(np.flatnonzero(lag <= MOST_LAG))
-                    columns = {name: column[young] for name, column in columns.items()}
-                rate = args.learning_rate * run.remaining
-                async with asyncio.TaskGroup() as both:
-                    # Arrays of a rollout are its own until the next one but one.
-                    collecting = both.create_task(collector.collect())
-                    with run.learning(), group.span("learner"):
-                        figures = await asyncio.to_thread(learner.learn, columns, rate)
-                    player.take(learner.agent)
-                    collector.policy_version += 1
-                figures |= waiting(rollout) | {"lag": lag.clip(max=MOST_LAG).mean()}
-                run.record(len(rollout), player.ended(), **figures)
-                rollout = collecting.result()
-                if len(run.rows) % args.save_every == 0:
-                    run.save(learner.state())
-            run.save(learner.state())
+        async with LearnerProcess(learner) as apart:
+            with group.auto_reset(), run, trace:
+                rollout = await collector.collect()
+                while run.goes_on():
+                    columns = learner.columns(rollout)
+                    lag = collector.policy_version - rollout.policy_version
+                    # What was in flight while the learner was slow can be older: left out.
+                    if lag.max() > MOST_LAG:
+                        young = torch.from_numpy(np.flatnonzero(lag <= MOST_LAG))
+                        columns = {name: column[young] for name, column in columns.items()}
+                    rate = args.learning_rate * run.remaining
+                    async with asyncio.TaskGroup() as both:
+                        # Arrays of a rollout are its own until the next one but one.
+                        collecting = both.create_task(collector.collect())
+                        with run.learning(), group.span("learner"):
+                            figures = await apart.learn(columns, rate)
+                        player.take(learner.agent)
+                        collector.policy_version += 1
+                    figures |= waiting(rollout) | {"lag": lag.clip(max=MOST_LAG).mean()}
+                    run.record(len(rollout), player.ended(), **figures)
+                    rollout = collecting.result()
+                    if len(run.rows) % args.save_every == 0:
+                        run.save(learner.state() | await apart.state())
+                run.save(learner.state() | await apart.state())
     return run
 
 
