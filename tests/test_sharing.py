@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import os
+from typing import TYPE_CHECKING
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.sharing import num_batches, num_cores
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 
 @given(total=st.integers(1, 3000), workers=st.integers(1, 128))
@@ -44,3 +50,26 @@ def test_an_entry_is_laid_over_the_cores_where_it_asks_for_it() -> None:
     for fields in ({"backend": "pettingzoo"}, {"backend": "callable"}):
         with pytest.raises(ValueError, match="and these envs have none; give a number"):
             laid_out(**fields)
+
+
+@pytest.mark.parametrize(
+    ("told", "cores"),
+    [
+        ({}, 8),
+        ({"cpu.max": "max 100000\n"}, 8),
+        ({"cpu.max": "200000 100000\n"}, 2),
+        ({"cpu.max": "250000 100000\n"}, 3),
+        ({"cpu.max": "1000 100000\n"}, 1),
+        ({"cpu.max": "9900000 100000\n"}, 8),
+        ({"cpu/cpu.cfs_quota_us": "-1\n", "cpu/cpu.cfs_period_us": "100000\n"}, 8),
+        ({"cpu/cpu.cfs_quota_us": "400000\n", "cpu/cpu.cfs_period_us": "100000\n"}, 4),
+    ],
+)
+def test_a_container_s_limit_counts_as_cores(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: dict[str, str], cores: int
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)))
+    for name, text in told.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    assert num_cores(tmp_path) == cores

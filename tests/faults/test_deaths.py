@@ -189,6 +189,7 @@ def test_error_tells_what_the_worker_wrote_and_where_it_crashed(start: Start) ->
     assert "Segmentation fault" in caught.value.stderr_tail
     assert "in string_at" in caught.value.stderr_tail
     assert "in do" in str(caught.value)
+    assert "a call of do()" in str(caught.value)
 
 
 @on_one_driver

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from typing import Any
 
@@ -10,6 +9,7 @@ import pytest
 
 from rlightning_aio import sync
 from rlightning_aio.errors import ConfigError
+from rlightning_aio.group import build
 
 POLE = {"backend": "gymnasium", "task": "CartPole-v1"}
 OTHER = {"backend": "probe", "task": "x"}
@@ -43,7 +43,7 @@ def test_entries_share_the_cores(
     spread: list[list[int]],
 ) -> None:
     """By their numbers of envs, and each has a worker at least."""
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(num_cores)))
+    monkeypatch.setattr(build, "num_cores", lambda: num_cores)
     named = [entry | {"name": f"e{k}"} for k, entry in enumerate(entries)]
     group = sync.build_env_group(named)
     hosts = [host.num_envs for host in group._core.supervisor.hosts]

@@ -184,6 +184,12 @@ def test_run_picks_the_faster_loop() -> None:
     assert rlightning_aio.run(main()) == uvloop.__name__
 
 
+async def test_run_says_what_to_do_where_a_loop_runs() -> None:
+    """As in a notebook, whose user may not know of one."""
+    with pytest.raises(RuntimeError, match="`await` the coroutine instead"):
+        rlightning_aio.run(asyncio.sleep(0))
+
+
 async def test_groups_of_both_kinds_side_by_side() -> None:
     """Two async and a sync one in one loop, each with its own workers."""
     async with (

@@ -168,6 +168,11 @@ async def test_a_bad_batch_is_refused_as_a_whole(start: Any) -> None:
         (responses([*IDS, "probe-1"], 1, 2, 3, 4, 5), EnvBusy, "'probe-1' appears twice"),
         (BatchedData(IDS[:2], [PolicyResponse("probe-0", [0, 1]), 3]), BadAction, "int"),
         (
+            BatchedData(IDS[:1], [PolicyResponse("probe-1", [0, 1])]),
+            BadAction,
+            "under the id 'probe-0' there is a response of 'probe-1'",
+        ),
+        (
             BatchedData(IDS[:2], [PolicyResponse("probe-0", [0, 1]), PolicyResponse("probe-1")]),
             BadAction,
             r"'probe-1' .*task 'x'.*\(2,\).*\(\)",

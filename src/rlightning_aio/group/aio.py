@@ -673,9 +673,27 @@ def build_env_group(
 
 
 def run(main: Coroutine[Any, Any, T]) -> T:
-    """Run `main` to its end on a uvloop event loop (or asyncio's, where uvloop is missing)."""
+    """Run `main` to its end on a uvloop event loop (or asyncio's, where uvloop is missing).
+
+    Raises:
+        RuntimeError: an event loop runs already in this thread.
+    """
+    if _is_loop_running():
+        main.close()
+        raise RuntimeError(
+            "an event loop runs here already, as in a notebook: `await` the coroutine instead of "
+            "giving it to rlightning_aio.run"
+        )
     try:
         import uvloop  # noqa: PLC0415  # There is none for Windows.
     except ImportError:
         return asyncio.run(main)
     return uvloop.run(main)
+
+
+def _is_loop_running() -> bool:
+    try:
+        asyncio.get_running_loop()
+    except RuntimeError:
+        return False
+    return True

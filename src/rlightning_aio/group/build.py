@@ -35,6 +35,7 @@ from rlightning_aio.hosts.messages import StartOrder
 from rlightning_aio.hosts.pickling import dumped_with_code
 from rlightning_aio.protocol.bell import TrainerBell, bell_size
 from rlightning_aio.registry import ENVS, load, placement_of
+from rlightning_aio.sharing import num_cores
 from rlightning_aio.types import PolicyResponse, default_env_preprocess_fn
 
 if TYPE_CHECKING:
@@ -217,8 +218,7 @@ def _assembled(plan: Plan, watcher: Watcher, arena: Arena, *, shares_thread: boo
         [f"{config.name}-{index}" for config in local for index in range(config.num_workers)],
         [(f"{config.name}-0", config, MAX_CLIENTS) for config in servers],
     )
-    cores = sorted(os.sched_getaffinity(0))
-    orders = _orders(plan, servers, cores)
+    orders = _orders(plan, servers)
     bell_offset = arena.append(bell_size(len(orders)))
     bell_memory = map_shared(arena.descriptor, bell_offset, bell_size(len(orders)))
     bell = TrainerBell(bell_memory, len(orders))
@@ -237,10 +237,10 @@ def _assembled(plan: Plan, watcher: Watcher, arena: Arena, *, shares_thread: boo
         arena,
         completions.append,
         mixed_actions=plan.mixed_actions,
-        num_cores=len(cores),
+        num_cores=num_cores(),
     )
     supervisor.resources["bell"] = bell
-    poller = Poller(requests, bell, len(cores))
+    poller = Poller(requests, bell, num_cores())
     wiring = Wiring(
         completions=completions,
         watcher=watcher,
@@ -268,14 +268,14 @@ def _assembled(plan: Plan, watcher: Watcher, arena: Arena, *, shares_thread: boo
     return Core(*parts, zero_copy=plan.zero_copy)
 
 
-def _orders(plan: Plan, servers: Sequence[EnvConfig], cores: Sequence[int]) -> list[StartOrder]:
+def _orders(plan: Plan, servers: Sequence[EnvConfig]) -> list[StartOrder]:
     """What each host is to build: local ones first, then the env_servers."""
     local = [
         (config, fns)
         for config, fns in zip(plan.configs, plan.preprocess_fns, strict=True)
         if config.backend != ENV_SERVER
     ]
-    nums_hosts = _nums_hosts([config for config, _ in local], len(cores))
+    nums_hosts = _nums_hosts([config for config, _ in local])
     shares = [
         (config, share)
         for (config, fns), num_hosts in zip(local, nums_hosts, strict=True)
@@ -286,6 +286,7 @@ def _orders(plan: Plan, servers: Sequence[EnvConfig], cores: Sequence[int]) -> l
         if _place(config).own_share:
             shares[k] = moved(config, "inline"), share
             break
+    cores = sorted(os.sched_getaffinity(0))
     num_processes = sum(_has_worker_here(config) for config, _ in shares)
     surroundings = _surroundings([config for config, _ in shares])
     elsewhere = any(config.placement != "inline" for config, _ in shares)
@@ -298,7 +299,7 @@ def _orders(plan: Plan, servers: Sequence[EnvConfig], cores: Sequence[int]) -> l
             env_class=ENVS.registered(config.backend),
             worker_indices=tuple(index for index, _ in share),
             preprocess_fns=tuple(fn for _, fn in share),
-            spins=num_processes <= len(cores),
+            spins=num_processes <= num_cores(),
             core=cores[host_id % len(cores)] if config.cpu_affinity else None,
             tasks=tasks,
         )
@@ -338,7 +339,7 @@ def _own_makers(config: EnvConfig, indices: Sequence[int]) -> EnvConfig:
     return config.model_copy(update={"make_env": tuple(makers[k] for k in indices)})
 
 
-def _nums_hosts(configs: Sequence[EnvConfig], num_cores: int) -> list[int]:
+def _nums_hosts(configs: Sequence[EnvConfig]) -> list[int]:
     """Over how many hosts the envs of each entry are spread.
 
     Entries of CPU-bound simulators that don't say it share the cores, by their numbers of envs;
@@ -356,7 +357,7 @@ def _nums_hosts(configs: Sequence[EnvConfig], num_cores: int) -> list[int]:
             sharing.append(k)
         else:
             nums.append(config.num_workers)
-    for _ in range(num_cores - len(sharing)):
+    for _ in range(num_cores() - len(sharing)):
         # One more worker where most envs share one.
         crowded = max(sharing, key=lambda k: configs[k].num_workers / nums[k], default=None)
         if crowded is None or nums[crowded] == configs[crowded].num_workers:

@@ -201,7 +201,7 @@ class Core:
                 "results with batch.respond(action=...); nothing was sent"
             )
         slots = slots_of(batch, self)
-        return self._dispatch.distinct(batch.env_ids()) if slots is None else slots
+        return self._dispatch.distinct(_answered(batch)) if slots is None else slots
 
     def _send_steps(
         self, batch: BatchedData, slots: NDArray[np.intp], ticket: Ticket | None, now: float
@@ -551,6 +551,18 @@ class Core:
 
 def _owner(ticket: Ticket | None) -> int:
     return COLLECTOR if ticket is None else ticket.owner
+
+
+def _answered(batch: BatchedData) -> list[str]:
+    """The envs that a batch of somebody's own making answers."""
+    env_ids = batch.env_ids()
+    for id_, env_id in zip(batch.ids(), env_ids, strict=True):
+        if env_id != id_ and not env_id.startswith(f"{id_}/"):
+            raise BadAction(
+                f"under the id {id_!r} there is a response of {env_id!r}; give each under its own "
+                "env's id; nothing was sent"
+            )
+    return env_ids
 
 
 def _columns(batch: BatchedData) -> Mapping[str, Any]:

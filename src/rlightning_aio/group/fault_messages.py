@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rlightning_aio.errors import EnvHung, StartFailed, WorkerDied
-from rlightning_aio.protocol.entries import Operation, number_of, op_of, slot_of
+from rlightning_aio.protocol.entries import Operation, number_of, slot_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from rlightning_aio.group.env_table import EnvTable
     from rlightning_aio.group.host_record import HostRecord
+    from rlightning_aio.group.requests import Requests
     from rlightning_aio.hosts.messages import Death
 
 __all__ = ["cause_of", "culprit_of", "death_error", "late_fault", "start_fault"]
@@ -51,29 +52,29 @@ def _starting(record: HostRecord, death: Death) -> int:
 
 
 def culprit_of(
-    record: HostRecord, death: Death, entries: NDArray[np.int64], owed: NDArray[np.intp]
+    record: HostRecord, death: Death, requests: Requests, owed: NDArray[np.intp]
 ) -> int | None:
     """The env that a worker was executing when it died, as far as can be known.
 
     Args:
         record: of its host.
         death: what is known of its end.
-        entries: the current request of every slot.
+        requests: of the group.
         owed: slots of which it owed a reply.
     """
     if record.hung_slot is not None:
         return record.hung_slot
     for entry in death.requests:
         slot = slot_of(entry)
-        if slot in owed and number_of(entries.item(slot)) == number_of(entry):
+        if slot in owed and requests.number(slot) == number_of(entry):
             return slot
     return int(owed[0]) if len(owed) else None
 
 
-def cause_of(record: HostRecord, death: Death, entries: NDArray[np.int64]) -> str:
+def cause_of(record: HostRecord, death: Death, requests: Requests) -> str:
     """Why a worker is gone, as far as the supervisor knows it better than the kernel."""
     if record.hung_slot is not None:
-        return f"hung in {_doing(entries.item(record.hung_slot))} and was killed"
+        return f"hung in {_doing(requests, record.hung_slot)} and was killed"
     if record.rebuild_error is not None:
         error = record.rebuild_error
         return f"could not be rebuilt: {error.summary}"
@@ -83,23 +84,23 @@ def cause_of(record: HostRecord, death: Death, entries: NDArray[np.int64]) -> st
     return death.cause
 
 
-def _doing(entry: int) -> str:
-    op = op_of(entry)
-    named = (Operation.STEP, Operation.RESET, Operation.SNAPSHOT, Operation.RESTORE)
-    return f"a {Operation(op).name.lower()}" if op in named else "a call"
+def _doing(requests: Requests, slot: int) -> str:
+    op, method = requests.op(slot), requests.method(slot)
+    if op in (Operation.STEP, Operation.RESET, Operation.SNAPSHOT, Operation.RESTORE):
+        return f"a {Operation(op).name.lower()}"
+    return f"a call of {method}()" if method else "a call"
 
 
 def death_error(
-    envs: EnvTable, record: HostRecord, death: Death, entries: NDArray[np.int64], outcome: str
+    envs: EnvTable, record: HostRecord, death: Death, requests: Requests, outcome: str
 ) -> Callable[[NDArray[np.intp]], WorkerDied]:
     """Makes the error for those of the slots that owed a reply, as things are now."""
     slot = record.host.first_slot if record.culprit is None else record.culprit
-    entry = entries.item(slot)
-    doing, number = _doing(entry), number_of(entry)
+    doing, number = _doing(requests, slot), requests.number(slot)
     last = f"request {number}, {doing}" if number else "none"
     if record.hung_slot is not None:
         config = record.config
-        stepped = op_of(entry) == Operation.STEP
+        stepped = requests.op(slot) == Operation.STEP
         limit = config.step_timeout if stepped else config.reset_timeout
         what = f"{envs.describe(slot)} took longer than {limit} s for {doing} and was killed"
     else:

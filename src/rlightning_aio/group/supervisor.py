@@ -575,13 +575,13 @@ class Supervisor:
         self, record: HostRecord, death: Death, owed: NDArray[np.intp]
     ) -> tuple[ErrorFor, str, bool]:
         """The error that tells of a death, its cause, and whether it was one too many."""
-        entries, config = self._requests.entry, record.config
+        requests, config = self._requests, record.config
         if record.stage is Stage.UP:
             # A replacement that fails to come up falls to the env that made it necessary.
-            record.culprit = culprit_of(record, death, entries, owed)
+            record.culprit = culprit_of(record, death, requests, owed)
         deaths = record.deaths[record.culprit] = record.deaths.get(record.culprit, 0) + 1
         self.recovering = True
-        cause = cause_of(record, death, entries)
+        cause = cause_of(record, death, requests)
         is_last = config.on_worker_death == "raise" or deaths > config.max_restarts
         if config.on_worker_death == "raise":
             outcome = "on_worker_death is 'raise', so it is not replaced"
@@ -594,7 +594,7 @@ class Supervisor:
             if ENVS.is_hardware(config.backend):
                 outcome += "; it moves nothing until you reset it"
         told = replace(death, cause=cause)
-        error_for = death_error(self._envs, record, told, entries.copy(), outcome)
+        error_for = death_error(self._envs, record, told, requests, outcome)
         record.hung_slot = record.rebuild_error = None
         return error_for, cause, is_last
 
