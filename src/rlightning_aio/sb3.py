@@ -122,7 +122,9 @@ class VecEnv(_Base):
             {
                 "name": "env",
                 "num_workers": len(env_fns),
-                "make_env": adapted(env_fns, AutoresetMode.SAME_STEP),
+                "make_env": adapted(
+                    env_fns, AutoresetMode.SAME_STEP, entry.pop("max_episode_steps", None)
+                ),
                 **entry,
             }
         )
@@ -140,6 +142,8 @@ class VecEnv(_Base):
             self._answerable = BatchedData(self.group.env_ids, [None] * len(metas))
             self._unfinished = False
             _Base.__init__(self, self._rows.num_envs, *first)
+            with contextlib.suppress(AttributeError):  # Of some that are stepped together.
+                self.metadata: dict[str, Any] = {**self.get_attr("metadata", 0)[0], **self.metadata}
         except BaseException:
             self.group.close()
             raise
@@ -153,23 +157,19 @@ class VecEnv(_Base):
         Raises:
             EnvRaised, WorkerDied, EnvHung: an env failed; the others' results are dropped.
         """
-        drop_outstanding(self.group)
+        self._begin()
         with self._dropping_the_rest():
             self._rows.send_resets(self._seeds, self._options, range(self.num_envs))
             batch, _ = self.group.collect_async(wait_all=True, ordered=True)
+        self._unfinished = False
         self.reset_infos = self._rows.info_list(batch)
         self._reset_seeds()
         self._reset_options()
         return self._rows.observation(batch)
 
     def step_async(self, actions: Any) -> None:
-        """Send one action to each env, from an array or a sequence; cast to the space's dtype.
-
-        What a step without its `step_wait` (after Ctrl-C, say) has left is waited for, and dropped.
-        """
-        if self._unfinished:
-            drop_outstanding(self.group)
-        self._unfinished = True
+        """Send one action to each env, from an array or a sequence; cast to the space's dtype."""
+        self._begin()
         if isinstance(self.action_space, gym.spaces.Dict | gym.spaces.Tuple):
             pairs = zip(self.group.env_ids, actions, strict=True)
             responses = [PolicyResponse(env_id, action) for env_id, action in pairs]
@@ -201,6 +201,14 @@ class VecEnv(_Base):
             info["TimeLimit.truncated"] = cut
         return rows.observation(batch), rows.flat(batch.reward), done, infos
 
+    def _begin(self) -> None:
+        """Before anything is sent. What was left in the middle (by Ctrl-C, say) is waited for, and
+        dropped.
+        """
+        if self._unfinished:
+            drop_outstanding(self.group)
+        self._unfinished = True
+
     @contextlib.contextmanager
     def _dropping_the_rest(self) -> Generator[None]:
         """Where an env fails, let the others end what they do, so that all can be reset."""
@@ -229,13 +237,19 @@ class VecEnv(_Base):
                 raise AttributeError(error.exception_text) from error
             raise
 
+    def has_attr(self, attr_name: str) -> bool:
+        """Whether all envs have an attribute. Its value, a method perhaps, stays with them."""
+        return all(self._call(None, "has_wrapper_attr", attr_name))
+
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Set an attribute of the outermost wrapper of envs.
 
         Raises:
             ValueError: of some envs that are stepped together with others.
         """
+        self._begin()
         self._rows.set_outermost(attr_name, value, list(self._get_indices(indices)))
+        self._unfinished = False
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
@@ -245,16 +259,22 @@ class VecEnv(_Base):
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
         """Whether `wrapper_class` is among the wrappers of envs."""
-        return self._rows.are_wrapped(wrapper_class, list(self._get_indices(indices)))
+        self._begin()
+        found = self._rows.are_wrapped(wrapper_class, list(self._get_indices(indices)))
+        self._unfinished = False
+        return found
 
     def get_images(self) -> list[Any]:
         """One frame of each env, as it renders it."""
         return self._call(None, "render")
 
-    def _call(self, indices: Any, name: str, *args: Any, **kwargs: Any) -> list[Any]:
+    def _call(self, indices: Any, name: str, /, *args: Any, **kwargs: Any) -> list[Any]:
         chosen: list[int] = list(self._get_indices(indices))
+        self._begin()
         self._rows.call(name, args, kwargs, chosen)
-        return self._rows.values(self.group.collect_calls(), chosen)
+        collected = self.group.collect_calls()
+        self._unfinished = False
+        return self._rows.values(collected, chosen)
 
 
 def _last_and_first(info: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from collecting.scripted import Tickets, scripted_group
+from collecting.scripted import Script, Tickets, scripted_group
 from faults.driven import entry
 from faults.faulty import CODES
 from group import sample_envs
@@ -70,6 +70,29 @@ def test_each_kind_of_env_has_a_policy_and_a_rollout_of_its_own() -> None:
                 for name, shape in expected.items():
                     assert rollouts[name].shape == shape
                     assert rollouts[name].action.shape[:2] == shape
+
+
+def test_a_kind_whose_first_step_has_not_ended_has_an_empty_rollout() -> None:
+    """Its step is in a later one; the other kind's rollouts are complete."""
+    after: dict[str, Any] = {}
+    group = sync.build_env_group([{**POLE, "name": name} for name in ("one", "other")])
+    with group, group.auto_reset():
+        collector = Collector(
+            group, {"one": zeros, "other": zeros}, num_transitions=1, min_batch=1, seed=0
+        )
+        for _ in range(4):
+            rollouts = collector.collect()
+            assert sorted(map(len, rollouts.values())) == [0, 1]
+            for name, rollout in rollouts.items():
+                values, nothing = np.zeros(len(rollout)), np.zeros(len(rollout.ends))
+                assert rollout.advantages(values, nothing, 0.99, 0.95).shape == rollout.shape
+                assert rollout.next_observation.shape == (len(rollout), 4)
+                for before, following in zip(
+                    rollout.observation, rollout.next_observation, strict=True
+                ):
+                    np.testing.assert_array_equal(before, after.get(name, before))
+                    after[name] = following.copy()
+    assert set(after) == {"one", "other"}
 
 
 def test_an_entry_without_a_policy_is_named_again_and_again() -> None:
@@ -186,6 +209,23 @@ def test_a_block_has_what_gymnasiums_vector_env_steps_through() -> None:
     envs.close()
 
 
+def test_the_step_limit_cuts_envs_that_reset_themselves_at_once() -> None:
+    """They have not begun anew then: what they show is what comes after the last step."""
+
+    def make() -> Any:
+        makers = [lambda number=number: Script(number, 0.0) for number in range(2)]
+        return gym.vector.SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP)
+
+    def policy(batch: BatchedData) -> dict[str, Any]:
+        return {"action": np.zeros((*batch.is_reset.shape, 1))}
+
+    group = sync.build_env_group({"name": "v", "make_env": make, "placement": "inline"})
+    with group, group.auto_reset(3):
+        rollout = Collector(group, policy, num_transitions=12, seed=0).collect()
+    assert np.count_nonzero(rollout.truncated) == 4
+    assert (rollout.next_observation[:, 2] == rollout.observation[:, 2] + 1).all()
+
+
 def test_the_step_limit_truncates() -> None:
     with poles(1) as group, group.auto_reset(4):
         rollout = Collector(group, zeros, num_transitions=10, seed=0).collect()
@@ -257,6 +297,32 @@ def test_clients_join_while_it_collects() -> None:
     first.join()
     assert second is not None
     second.join()
+
+
+async def test_a_start_that_waited_for_clients_is_made_again() -> None:
+    """Cancelled, it has asked nobody for anything: local envs take part, from their seeds."""
+
+    def policy(batch: BatchedData) -> dict[str, Any]:
+        return {"action": np.zeros((len(batch), 2), np.float32)}
+
+    kwargs = {"heartbeat": 5.0, "connect_timeout": HANG}
+    server = {"name": "robots", "backend": "env_server", "env_kwargs": kwargs}
+    local = {"name": "here", "make_env": lambda: CountingEnv(7), "placement": "inline"}
+    async with rl.build_env_group([local, server]) as group:
+        with group.auto_reset(4):
+            collector = Collector(group, policy, num_transitions=4, seed=3)
+            task = asyncio.ensure_future(collector.collect())
+            await asyncio.sleep(0)  # It has begun to wait.
+            task.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await task
+            client = ClientThread(group["robots-0"].address, "c0", CountingEnv(0))
+            rollout = await collector.collect()
+            while 0 not in rollout.index:
+                rollout = await collector.collect()
+            first = rollout.observation[rollout.index == 0][0]
+            assert first.tolist() == [7, 3, 0]
+    client.join()
 
 
 # -- policies

@@ -158,6 +158,22 @@ async def test_limits_are_each_entrys_own(start: Any) -> None:
         pass
 
 
+async def test_envs_that_reset_themselves_keep_to_their_limit(start: Any) -> None:
+    """Each sub-environment in its own time: no count of the group's cuts any of them."""
+    entry = {"name": "v", "backend": "gymnasium", "task": "CartPole-v1", "num_envs": 4}
+    group = await start({**entry, "max_episode_steps": 9})
+    batch, _ = await group.reset(seed=0)
+    before, at_different_times = batch.done, False
+    with group.auto_reset():
+        for _ in range(60):
+            batch, flags = await group.step(batch.respond(action=np.zeros((1, 4), int)))
+            assert flags == [False]
+            np.testing.assert_array_equal(batch.is_reset, before)
+            before = batch.done
+            at_different_times |= bool(before.any() and not before.all())
+    assert at_different_times
+
+
 def test_a_limit_is_a_positive_int() -> None:
     """Anything else is refused by value, and the context stays closed."""
     with sync.build_env_group({**ENTRY, "placement": "inline"}) as group:

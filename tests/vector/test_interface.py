@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import threading
@@ -215,6 +216,35 @@ def test_after_ctrl_c_it_steps_and_resets() -> None:
         env.step([0, 1])
     np.testing.assert_array_equal(env.reset(seed=0)[0], first)
     env.close()
+
+
+def test_a_tuple_of_actions_is_one_for_each_env() -> None:
+    """As a list is; only the actions of Tuple and Dict spaces are trees."""
+    with contextlib.closing(make_vec("CartPole-v1", 3)) as env:
+        env.reset(seed=0)
+        listed = env.step([0, 1, 0])
+        env.reset(seed=0)
+        assert_alike(env.step((0, 1, 0)), listed)
+        env.step(tuple(np.int64(1) for _ in range(3)))
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_a_step_limit_of_the_entry_ends_episodes(mode: AutoresetMode) -> None:
+    """In the mode that is asked for, again and again."""
+    makers = [lambda: gym.make("Pendulum-v1")] * 2
+    with contextlib.closing(VectorEnv(makers, autoreset_mode=mode, max_episode_steps=3)) as env:
+        env.reset()
+        period = 4 if mode == AutoresetMode.NEXT_STEP else 3
+        for step in range(1, 10):
+            truncated = env.step(np.zeros((2, 1), np.float32))[3]
+            assert truncated.tolist() == [step % period == 3 % period] * 2
+
+
+def test_arguments_of_methods_may_have_any_name() -> None:
+    with contextlib.closing(VectorEnv([toy] * 2)) as env:
+        env.call("set_wrapper_attr", name="note", value=3)
+        assert env.get_attr("note") == (3, 3)
 
 
 def test_make_vec_takes_gymnasiums_modes() -> None:

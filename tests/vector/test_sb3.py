@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, Any
+import threading
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.vector import AutoresetMode
 from timelines import Seen
 from vector.toys import assert_alike, press_ctrl_c
+
+from rlightning_aio.envs.of_spec import BatchOf, OneOf
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -135,6 +139,89 @@ def test_after_ctrl_c_it_steps_and_resets() -> None:
     with pytest.raises(KeyboardInterrupt):
         env.step([0, 1])
     assert env.reset().tolist() == [0, 0]
+    with pytest.raises(KeyboardInterrupt):
+        env.step([1, 0])
+    assert env.env_is_wrapped(gym.wrappers.TimeLimit) == [False, False]
+    assert env.get_attr("count") == [1, 1]
+    with pytest.raises(KeyboardInterrupt):
+        env.env_method("step", 1, indices=[0])
+    assert env.get_attr("count", indices=[1]) == [1]
+    env.set_attr("note", 7)
+    assert env.step([0, 0])[0].tolist() == [3, 2]
+    env.close()
+
+
+def hoppers_together() -> Any:
+    one = OneOf(gym.spec("Hopper-v5"), {"disable_env_checker": True})
+    return BatchOf(one, 2, AutoresetMode.SAME_STEP)()
+
+
+def hoppers_in_turn() -> Any:
+    makers = [lambda: gym.make("Hopper-v5")] * 2
+    return gym.vector.SyncVectorEnv(makers, autoreset_mode=AutoresetMode.SAME_STEP)
+
+
+@pytest.mark.parametrize("make", [hoppers_together, hoppers_in_turn])
+def test_a_method_of_some_envs_leaves_the_others_alone(make: Any) -> None:
+    """Of those that are stepped together, too; what they share can't be set for some."""
+    from rlightning_aio.errors import EnvRaised
+    from rlightning_aio.sb3 import VecEnv
+
+    env = VecEnv([make] * 2, placement="inline")
+    env.seed(0)
+    env.reset()
+    before = env.env_method("state_vector")
+    state = np.arange(6) / 10
+    assert env.env_method("set_state", state, -state, indices=[3, 1]) == [None, None]
+    after = env.env_method("state_vector")
+    same = [np.array_equal(one, other) for one, other in zip(before, after, strict=True)]
+    assert same == [True, False, True, False]
+    np.testing.assert_array_equal(after[1], [*state, *-state])
+    if make is hoppers_together:
+        with pytest.raises(EnvRaised, match="note can't be set for simulations"):
+            env.env_method("set_wrapper_attr", "note", 1, indices=[0])
+    env.env_method("set_wrapper_attr", name="note", value=[1, 2])
+    assert env.get_attr("note", indices=[2]) == [[1, 2]]
+    env.close()
+
+
+def test_a_step_limit_of_the_entry_ends_episodes() -> None:
+    """In the step that reaches it, and again as many steps later."""
+    from rlightning_aio.sb3 import VecEnv
+
+    env = VecEnv([lambda: gym.make("Pendulum-v1")] * 2, max_episode_steps=3)
+    env.reset()
+    for step in range(1, 8):
+        first, _, done, infos = env.step(np.zeros((2, 1), np.float32))
+        assert done.tolist() == [step % 3 == 0] * 2
+        for info, observation in zip(infos, first, strict=True):
+            assert info["TimeLimit.truncated"] == (step % 3 == 0)
+            assert ("terminal_observation" in info) == (step % 3 == 0)
+            assert not np.array_equal(info.get("terminal_observation"), observation)
+    env.close()
+
+
+class Locked(Choosy):
+    """Has what can't be sent."""
+
+    metadata: ClassVar = {"render_modes": [], "render_fps": 7}
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+
+    def masks(self) -> list[int]:
+        return [0, 1]
+
+
+def test_what_envs_have_is_told_without_sending_it() -> None:
+    """As a mask's method is looked for; films have the envs' own rate."""
+    from rlightning_aio.sb3 import VecEnv
+
+    env = VecEnv([Locked] * 2)
+    assert env.has_attr("lock")
+    assert env.has_attr("masks")
+    assert not env.has_attr("nothing")
+    assert env.metadata["render_fps"] == 7
     env.close()
 
 

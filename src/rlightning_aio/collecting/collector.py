@@ -16,6 +16,7 @@ from rlightning_aio.collecting.kind import Kind, Part
 from rlightning_aio.collecting.procedure import Procedure, run
 from rlightning_aio.collecting.record import RecordedGroup, ReplayedGroup
 from rlightning_aio.collecting.rollout import Rollout
+from rlightning_aio.errors import EnvBusy
 from rlightning_aio.group.aio import EnvGroup as AsyncEnvGroup
 from rlightning_aio.group.sync import EnvGroup as SyncEnvGroup
 
@@ -134,7 +135,7 @@ class Collector(Generic[G, R]):
         self._seed = seed
         self._clock = Clock()
         self._kinds: dict[str, Kind] = {}
-        self._started = False
+        self._started = self._start_cut_off = False
         self._collecting = False
         self._metas: dict[str, EnvMeta] = {}
         # What has come and was not looked at; of the rest, what is to be stored, and what is to
@@ -213,15 +214,19 @@ class Collector(Generic[G, R]):
             self._expecting = True
 
     def _start(self) -> Procedure[None]:
-        """Reset all envs. Cancelled, that leaves its results to be collected."""
-        self._started = self._expecting = True
+        """Reset all envs. A reset that was cancelled when it had been sent is to be collected."""
         try:
             batch, _ = yield lambda: self._group.reset(seed=self._seed)
-        except Exception:
-            self._started = self._expecting = False
+        except EnvBusy:
+            if not self._start_cut_off:
+                raise
+            self._started = self._expecting = True
+        except BaseException as error:
+            self._start_cut_off = not isinstance(error, Exception)
             raise
-        self._expecting = False
-        self._received = batch
+        else:
+            self._started = True
+            self._received = batch
 
     def _receive(self) -> Procedure[None]:
         if self._block:

@@ -75,6 +75,8 @@ class Staging:
         self.end_observation: Tree = None
         # Names of the columns that come with a request.
         self._given: KeysView[str] = {}.keys()
+        # Whether a transition has ever been completed: resets may tell less than steps.
+        self._knows_results = False
         # By place.
         size = quota + num_envs
         self._env = np.zeros(size, np.int64)
@@ -189,6 +191,8 @@ class Staging:
         Returns:
             The rows that are left: transitions of the next rollout.
         """
+        if not self._knows_results:
+            self._adopt_results(results)
         all_rows = len(rows) == len(results.index)
         index = results.index if all_rows else results.index[rows]
         resets = results.is_reset if all_rows else results.is_reset[rows]
@@ -216,8 +220,7 @@ class Staging:
         self._over[index] = False
 
     def _complete(self, results: Results, index: NDArray[np.int64], rows: Rows) -> None:
-        if "reward" not in self.columns:
-            self._adopt_results(results)
+        self._knows_results = True
         places = self._place[index]
         for name in _OF_RESULTS:
             values = getattr(results, name)
@@ -248,8 +251,12 @@ class Staging:
         final = gather(results.observation, rows)
         at_once = np.flatnonzero(self._resets_itself_at_once[index])
         if len(at_once):
-            before = gather(self.columns["observation"], places[at_once])
-            told = results.final_observation(rows[at_once], otherwise=before)
+            # Where the group's limit alone has cut the episode, nothing has begun anew.
+            limit = results.batch.limit_reached.reshape(-1)[rows]
+            otherwise = gather(self.columns["observation"], places[at_once])
+            cut = np.flatnonzero(limit[at_once])
+            scattered(otherwise, cut, gather(final, at_once[cut]))
+            told = results.final_observation(rows[at_once], otherwise)
             scattered(final, at_once, told)
         return final
 
@@ -287,7 +294,7 @@ class Staging:
         position = np.empty(self._used, np.intp)
         position[order] = np.arange(len(order))
         ends = position[self._end_place[: self._num_ends]]
-        lasts = np.append(np.flatnonzero(np.diff(envs)), len(envs) - 1)
+        lasts = np.append(np.flatnonzero(np.diff(envs)), len(envs) - 1)[: len(envs)]
         inner = np.ones(len(order), np.bool_)
         inner[lasts] = False
         end_rows = np.lexsort((ends, inner[ends]))

@@ -96,7 +96,7 @@ class GymnasiumEnv(BaseEnv):
     def bare_reset(self) -> BareReset | None:
         return self.env.reset if type(self).reset is GymnasiumEnv.reset else None
 
-    def call_wrapped(self, name: str, *args: Any, **kwargs: Any) -> Any:
+    def call_wrapped(self, name: str, /, *args: Any, **kwargs: Any) -> Any:
         """Call method `name` of the outermost wrapper that has it; an attribute's value is
         returned as it is.
         """

@@ -234,14 +234,22 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
 
     # -- one of them --------------------------------------------------------------------
 
-    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+    def call(self, name: str, /, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call method `name` of the env of each simulation, or get its attribute."""
         if name == "set_wrapper_attr":
-            self.set_attr(args[0], [args[1]] * self.num_envs)
+            attribute, value = _attribute(*args, **kwargs)
+            self.set_attr(attribute, [value] * self.num_envs)
             return (True,) * self.num_envs
-        return tuple(self._call_one(k, name, args, kwargs) for k in range(self.num_envs))
+        return tuple(self.call_one(k, name, *args, **kwargs) for k in range(self.num_envs))
 
-    def _call_one(self, k: int, name: str, args: Any, kwargs: Any) -> Any:
+    def call_one(self, k: int, name: str, /, *args: Any, **kwargs: Any) -> Any:
+        """Call method `name` of the env of simulation `k`, or get its attribute.
+
+        Raises:
+            ValueError: it sets an attribute, which all simulations share.
+        """
+        if name == "set_wrapper_attr":
+            raise _shared(_attribute(*args, **kwargs)[0])
         if name == "render":
             return self.render_one(k)
         self._lend(k)
@@ -266,10 +274,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             each = cast("list[Any]", values)
             values, different = each[0], (not _same(each[0], other) for other in each)
         if name in _FIXED or any(different):
-            raise ValueError(
-                f"{name} can't be set for simulations that are stepped together, which share their "
-                "model and options; make separate envs (vectorization_mode='async')"
-            )
+            raise _shared(name)
         self._made.set_wrapper_attr(name, values)
         self._read_options()
 
@@ -333,6 +338,19 @@ def _only(infos: dict[str, Any], chosen: NDArray[np.bool_]) -> dict[str, Any]:
             found[name][~chosen] = 0
             found["_" + name] = chosen.copy()
     return found
+
+
+def _attribute(name: str, value: Any, *, force: bool = True) -> tuple[str, Any]:
+    """What `set_wrapper_attr` is called with."""
+    del force
+    return name, value
+
+
+def _shared(name: str) -> ValueError:
+    return ValueError(
+        f"{name} can't be set for simulations that are stepped together, which share their "
+        "model and options; make separate envs (vectorization_mode='async')"
+    )
 
 
 def _same(one: Any, other: Any) -> bool:

@@ -98,14 +98,14 @@ class AutoReset:
         envs = self._envs
         if given is None:
             here = np.array([bool(env_id) for env_id in envs.env_ids])
-            lacking = np.flatnonzero(here & (envs.step_limits == 0))
+            lacking = np.flatnonzero(here & (envs.step_limits == 0) & ~envs.resets_itself)
             if len(lacking):
                 raise ValueError(
                     f"{envs.describe(int(lacking[0]))} has no step limit, neither a configured "
                     "max_episode_steps nor one of the simulator's own; configure one or pass "
                     "auto_reset(max_episode_steps=…)"
                 )
-            return np.where(envs.step_limits == 0, _ENDLESS, envs.step_limits)
+            return np.where(self._endless(...), _ENDLESS, envs.step_limits)
         limit = as_int(given)
         if limit is None or limit < 1:
             raise ValueError(f"max_episode_steps must be a positive int, not {given!r}")
@@ -120,8 +120,14 @@ class AutoReset:
     def note_joined(self, slot: int) -> None:
         """A client has taken `slot`, and has told what limit its simulator has."""
         if self._limits is not None and self._own_limits:
-            self._limits[slot] = self._envs.step_limits[slot] or _ENDLESS
+            self._limits[slot] = _ENDLESS if self._endless(slot) else self._envs.step_limits[slot]
             self._margin = 0
+
+    def _endless(self, slots: Any) -> Any:
+        """Which envs the group's own count doesn't cut: those that reset themselves keep to their
+        limit, each of their sub-environments in its own time.
+        """
+        return (self._envs.step_limits[slots] == 0) | self._envs.resets_itself[slots]
 
     def end(self) -> None:
         """Close the context: steps are plain again."""

@@ -244,7 +244,7 @@ class Facade:
         self._core.reset_async(time.monotonic(), seed, options, env_ids)
 
     def call_async(
-        self, name: str, *args: Any, env_ids: Sequence[str] | None = None, **kwargs: Any
+        self, name: str, /, *args: Any, env_ids: Sequence[str] | None = None, **kwargs: Any
     ) -> None:
         """Call method `name` of all local envs, or of those of `env_ids`, all at once;
         `collect_calls` returns the values. Never blocks.

@@ -462,7 +462,7 @@ class EnvHandle:
         """
         return only_result(self._group.step(steps_of(self.env_id, response)))
 
-    def call(self, name: str, *args: Any, **kwargs: Any) -> Any:
+    def call(self, name: str, /, *args: Any, **kwargs: Any) -> Any:
         """Call method `name` of the env, or of the first that has one of its simulator's wrappers,
         from the outermost in, and the simulator.
 
@@ -555,7 +555,7 @@ class ServerHandle(ServerView, EnvHandle):
             f"{self.env_id} is an env_server; use the group's step_async and collect_async"
         )
 
-    def call(self, name: str, *args: Any, **kwargs: Any) -> Any:
+    def call(self, name: str, /, *args: Any, **kwargs: Any) -> Any:
         """Raises NotImplementedError: methods of remote envs can't be called."""
         raise NotImplementedError(f"{self.env_id} is an env_server; it can't call {name}()")
 

@@ -100,7 +100,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         self._late = False
         if max_concurrency is not None:
             entry = {"envs_per_process": per_worker(max_concurrency, len(env_fns)), **entry}
-        makers = adapted(env_fns, self.autoreset_mode)
+        makers = adapted(env_fns, self.autoreset_mode, entry.pop("max_episode_steps", None))
         self.group: EnvGroup = build_env_group(
             {"name": "env", "num_workers": len(makers), "make_env": makers, **entry},
             mixed_actions=True,
@@ -261,7 +261,8 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         return self._stepped(self._finish("step", timeout, self._collect))
 
     def _batch(self, actions: Any) -> BatchedData:
-        if self._fits_rows and not isinstance(actions, dict | tuple):
+        trees = isinstance(self.single_action_space, gym.spaces.Dict | gym.spaces.Tuple)
+        if self._fits_rows and not (trees and isinstance(actions, dict | tuple)):
             actions = np.asarray(actions)
             if not actions.ndim:
                 raise TypeError(
@@ -339,7 +340,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
 
     # -- methods and attributes -------------------------------------------------------
 
-    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+    def call(self, name: str, /, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call method `name` of every env, found through its wrappers, or get an attribute."""
         self.call_async(name, *args, **kwargs)
         return self.call_wait()
