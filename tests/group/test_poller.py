@@ -45,7 +45,8 @@ class Server(Worker):
     def _not_asked(self, *args: Any) -> Any:
         raise AssertionError
 
-    member_indices = num_sub_envs = check_step = missing = deadline = tick = _not_asked
+    member_indices = num_sub_envs = check_step = check_reset = _not_asked
+    missing = deadline = tick = _not_asked
 
 
 @dataclass(eq=False)

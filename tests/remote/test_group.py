@@ -19,7 +19,7 @@ from remote.counting import ClientThread, CountingEnv
 
 import rlightning_aio
 from rlightning_aio import sync
-from rlightning_aio.errors import ClientRefused, EnvRaised, GroupClosed, UnknownEnv
+from rlightning_aio.errors import BadAction, ClientRefused, EnvRaised, GroupClosed, UnknownEnv
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -119,6 +119,37 @@ def test_a_step_of_a_client_must_be_asynchronous() -> None:
             group.step(batch.respond(action=actions(batch)))
         with pytest.raises(NotImplementedError, match=r"step_async and collect_async"):
             group["robots-0"].step(batch.respond(action=actions(batch)).values()[0])
+        group.close()
+
+
+def test_options_that_cannot_travel_to_a_client_are_refused_before_anything_is_sent() -> None:
+    """Although local envs could have them; all of them can be asked again."""
+    with (
+        sync.build_env_group([CARTPOLE, entry()], mixed_actions=True) as group,
+        clients(group, CountingEnv()),
+    ):
+        group.reset()
+        for reset in (group.reset, group.reset_async, group["robots-0"].reset):
+            with pytest.raises(TypeError, match=r"reset of robots-0/c0: .*; nothing was sent"):
+                reset(options={"goal": object()})
+        batch, _ = group.reset(options={"goal": 1})
+        assert len(batch) == 3
+        group.close()
+
+
+def test_extras_that_are_too_large_together_are_refused_before_anything_is_sent() -> None:
+    """Although each of them is not; the clients can be stepped with less."""
+    large = ["x" * (3 << 20)] * 2
+    with (
+        sync.build_env_group(entry(min_clients=2)) as group,
+        clients(group, CountingEnv(0), CountingEnv(1)),
+    ):
+        batch, _ = group.reset()
+        with pytest.raises(BadAction, match=r"for robots-0/c.: .* are allowed"):
+            group.step_async(batch.respond(action=actions(batch), one=large, other=large))
+        group.step_async(batch.respond(action=actions(batch), one=["x"] * 2))
+        batch, _ = group.collect_async(wait_all=True, deadline=HANG)
+        assert batch.observation[:, 2].tolist() == [1, 1]
         group.close()
 
 

@@ -310,7 +310,7 @@ class EnvGroup(Facade):
             EnvBusy: an env has a reply outstanding, or appears twice; nothing was sent.
             UnknownEnv: no env of this group has that id.
             ValueError: a seed is not an int from 0 to 2**62 - 1, or there isn't one for each env.
-            TypeError: the options can't be sent to a worker.
+            TypeError: the options can't be sent to a worker or a client.
             TimeoutError: too few clients of an env_server have joined in time.
             EnvRaised, WorkerDied, EnvHung, EnvAway: an env failed, or its client is away; the
                 others' results are in the error's ``results``.
@@ -630,6 +630,7 @@ class ServerHandle(ServerView, EnvHandle):
         Raises:
             TimeoutError: too few clients have joined within ``connect_timeout``.
             EnvBusy: a client has a reply outstanding; nothing was sent.
+            TypeError: the options can't be sent to a client; nothing was sent.
             EnvRaised, EnvAway: a client's env failed, or the client is away; the others'
                 results are in the error's ``results``.
             GroupClosed: the group was not initialised, or is closed.

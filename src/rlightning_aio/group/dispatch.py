@@ -12,7 +12,6 @@ import numpy as np
 
 from rlightning_aio.errors import BadAction, EnvBusy
 from rlightning_aio.group.requests import State
-from rlightning_aio.hosts.messages import NO_ACTION
 from rlightning_aio.protocol.slab import NO_SEED
 
 if TYPE_CHECKING:
@@ -69,10 +68,10 @@ class Dispatch:
         """What goes out of band, packed before anything is sent."""
         chosen = slots[out_of_band.positions].tolist()
         try:
-            for slot, (action, _) in zip(chosen, out_of_band.contents, strict=True):
-                if slot >= len(self._envs.all) and action is not NO_ACTION:
+            for slot, (action, extras) in zip(chosen, out_of_band.contents, strict=True):
+                if slot >= len(self._envs.all):
                     host = self._host_of(slot)
-                    cast("Membership", host).check_step(slot - host.first_slot, action)
+                    cast("Membership", host).check_step(slot - host.first_slot, action, extras)
             return [
                 self.packed(slot, content, "the response")
                 for slot, content in zip(chosen, out_of_band.contents, strict=True)
@@ -83,10 +82,20 @@ class Dispatch:
     def packed_resets(
         self, slots: NDArray[np.intp], seeds: NDArray[np.int64], options: dict[str, Any]
     ) -> list[Any]:
-        return [
-            self.packed(slot, (None if seed == NO_SEED else seed, options), "the options")
-            for slot, seed in zip(slots.tolist(), seeds.tolist(), strict=True)
-        ]
+        packed: list[Any] = []
+        for slot, seed in zip(slots.tolist(), seeds.tolist(), strict=True):
+            given = (None if seed == NO_SEED else seed, options)
+            if slot >= len(self._envs.all):
+                self._check_reset(slot, *given)
+            packed.append(self.packed(slot, given, "the options"))
+        return packed
+
+    def _check_reset(self, slot: int, seed: int | None, options: dict[str, Any]) -> None:
+        host = self._host_of(slot)
+        try:
+            cast("Membership", host).check_reset(slot - host.first_slot, seed, options)
+        except ValueError as error:
+            raise TypeError(f"{error}; nothing was sent") from error
 
     def packed(self, slot: int, arguments: Any, what: str) -> Any:
         try:

@@ -235,7 +235,7 @@ class Facade:
             EnvBusy: an env has a reply outstanding, or appears twice.
             UnknownEnv: no env of this group has that id.
             ValueError: a seed is not an int from 0 to 2**62 - 1, or there isn't one for each env.
-            TypeError: the options can't be sent to a worker.
+            TypeError: the options can't be sent to a worker or a client.
             WorkerDied, EnvHung: an env's worker is gone and is not replaced.
             GroupClosed: the group was not initialised, or is closed.
             RLightningError: another thread is using the group, or it belongs to another loop.

@@ -213,8 +213,12 @@ class Membership(Protocol):
         """Sub-environments of an env that is here."""
         ...
 
-    def check_step(self, index: int, action: Any) -> None:
-        """Raises `BadAction` if an env can't take `action`."""
+    def check_step(self, index: int, action: Any, extras: dict[str, Any]) -> None:
+        """Raises `BadAction` if an env can't be sent these; `NO_ACTION` means the row's."""
+        ...
+
+    def check_reset(self, index: int, seed: int | None, options: dict[str, Any]) -> None:
+        """Raises ValueError if an env can't be sent these."""
         ...
 
     def missing(self, waited: float) -> float | None:

@@ -53,15 +53,14 @@ class _Place:
     Attributes:
         name: of the client.
         entry: of what it owes.
-        read_action: None where actions travel out of band.
     """
 
     def __init__(self, slab: Slab, row: int) -> None:
         self.name = ""
         self.entry = 0
-        self.read_action: Callable[[], Any] | None = None
+        self._read_action: Callable[[], Any] | None = None
         if slab.action is not None:
-            self.read_action = row_reader(slab.layout.action_space, slab.action, row)
+            self._read_action = row_reader(slab.layout.action_space, slab.action, row)
         self._slab = slab
         self._row = row
         self._sent_ns = cast("NDArray[np.int64]", slab.sent_ns)
@@ -76,6 +75,12 @@ class _Place:
             autoreset=meta.autoreset,
             announce=infos_out_of_band,
         )
+
+    def action(self, given: Any) -> Any:
+        """The action of a step: what was `given`, or what lies in the row."""
+        if given is NO_ACTION and self._read_action is not None:
+            return self._read_action()
+        return given
 
     def write(self, result: RemoteResult) -> OutOfBand | None:
         """Put a result into the row; what of it is out of band."""
@@ -168,9 +173,14 @@ class EnvServerHost:
         """See `base.Membership.num_sub_envs`."""
         return self.members()[self._places[index].name].num_envs
 
-    def check_step(self, index: int, action: Any) -> None:
+    def check_step(self, index: int, action: Any, extras: dict[str, Any]) -> None:
         """See `base.Membership.check_step`."""
-        self._listener.check(self._places[index].name, action)
+        place = self._places[index]
+        self._listener.check(place.name, place.action(action), extras)
+
+    def check_reset(self, index: int, seed: int | None, options: dict[str, Any]) -> None:
+        """See `base.Membership.check_reset`."""
+        self._listener.check_reset(self._places[index].name, seed, options)
 
     def missing(self, waited: float) -> float | None:
         """See `base.Membership.missing`."""
@@ -213,7 +223,7 @@ class EnvServerHost:
     # -- requests -----------------------------------------------------------------
 
     def packed(self, arguments: Any) -> Any:
-        """The wire format packs; nothing is pickled."""
+        """The wire format packs; what it has no form for, `check_step` and `check_reset` find."""
         return arguments
 
     def submit(self, entries: NDArray[np.int64], arguments: Sequence[Any] | None = None) -> None:
@@ -243,9 +253,8 @@ class EnvServerHost:
         self, place: _Place, entry: int, given: tuple[Any, dict[str, Any]] | None, now: float
     ) -> bool:
         action, extras = given or (NO_ACTION, {})
-        if action is NO_ACTION and place.read_action is not None:
-            action = place.read_action()
-        return self._listener.submit(place.name, number_of(entry), action, extras, now)
+        number = number_of(entry)
+        return self._listener.submit(place.name, number, place.action(action), extras, now)
 
     def _reset(
         self, place: _Place, index: int, entry: int, given: tuple[Any, Any] | None, now: float

@@ -344,9 +344,13 @@ class Listener:
         """Send a client away that is here; it is told `cause`."""
         self._sessions.dismiss(client, cause)
 
-    def check(self, client: str, action: Any) -> None:
-        """Raises `BadAction` if `client` can't take `action`; nothing is sent."""
-        self._sessions.check(client, action)
+    def check(self, client: str, action: Any, extras: Mapping[str, Any]) -> None:
+        """Raises `BadAction` if a step can't be sent; see `ServerSessions.check`."""
+        self._sessions.check(client, action, extras)
+
+    def check_reset(self, client: str, seed: int | None, options: dict[str, Any]) -> None:
+        """Raises `ValueError` if a reset can't be sent; see `ServerSessions.check_reset`."""
+        self._sessions.check_reset(client, seed, options)
 
     def submit(
         self, client: str, number: int, action: Any, extras: Mapping[str, Any], now: float

@@ -524,12 +524,21 @@ class ServerSessions:
             raise UnknownEnv(f"no client named {client!r} is connected to {self._server_id}")
         return ClientTraits(session.free_actions, session.reads_extras)
 
-    def check(self, client: str, action: Any) -> None:
-        """Raises `BadAction` if `client` is here and can't take `action`; nothing is sent."""
+    def check(self, client: str, action: Any, extras: Mapping[str, Any]) -> None:
+        """Raises `BadAction` if `client` is here and can't be sent the step; nothing is sent."""
+        if (session := self._session_at(client)) is not None:
+            self._step_parts(session, action, extras)
+
+    def check_reset(
+        self, client: str, seed: int | list[int] | None, options: dict[str, Any] | None
+    ) -> None:
+        """Raises `ValueError` if `client` is here and can't be sent the reset; nothing is sent."""
+        if (session := self._session_at(client)) is not None:
+            self._reset_parts(session, seed, options)
+
+    def _session_at(self, client: str) -> _Session | None:
         seat = self._seats.get(client)
-        session = None if seat is None else seat.session
-        if session is not None:
-            self._step_parts(session, action, {})
+        return None if seat is None else seat.session
 
     def submit(
         self, client: str, number: int, action: Any, extras: Mapping[str, Any], now: float
@@ -550,7 +559,7 @@ class ServerSessions:
         Raises:
             UnknownEnv: no client of that name ever joined.
             EnvBusy: it owes a result.
-            BadAction: the action doesn't fit; nothing was sent.
+            BadAction: the action doesn't fit, or the response can't travel; nothing was sent.
         """
         seat, last = self._free_seat(client)
         session = seat.session
@@ -564,8 +573,8 @@ class ServerSessions:
             return True
         if session is None or not session.joined:
             return False
-        session.last_number += 1
         parts = self._step_parts(session, action, extras)
+        session.last_number += 1
         self._ask(seat, session, number, parts, "step", self._step_timeout, now)
         return True
 
@@ -583,18 +592,12 @@ class ServerSessions:
         """
         seat, _ = self._free_seat(client)
         session = seat.session
+        parts = [] if session is None else self._reset_parts(session, seed, options)
         seat.unreported = seat.early = None
         self._results = [r for r in self._results if r.client != client or r.number is not None]
         if session is None:
             return False
         session.last_number += 1
-        reset = Reset(session=session.token, number=session.last_number, seed=seed, options=options)
-        try:
-            parts = self._writer.write(reset)
-        except Untransferable as error:
-            raise ValueError(
-                f"reset of {session.meta.env_id}: seed or options can't be sent: {error}"
-            ) from None
         self._ask(seat, session, number, parts, "reset", self._reset_timeout, now)
         return True
 
@@ -613,7 +616,8 @@ class ServerSessions:
         return seat, seat.last
 
     def _step_parts(self, session: _Session, action: Any, extras: Mapping[str, Any]) -> list[bytes]:
-        step = Step(session=session.token, number=session.last_number)
+        """The next request of a session, if it is this step."""
+        step = Step(session=session.token, number=session.last_number + 1)
         packed = Packed([], step.texts)
         try:
             if session.free_actions:
@@ -624,7 +628,22 @@ class ServerSessions:
                 step.extras = self._portable_extras(extras)
             return self._writer.write(step, packed.frames)
         except (Misfit, Untransferable) as error:
-            raise BadAction(f"action for {session.meta.env_id}: {error}") from None
+            raise BadAction(
+                f"response for {session.meta.env_id}: {error}; nothing was sent"
+            ) from None
+
+    def _reset_parts(
+        self, session: _Session, seed: int | list[int] | None, options: dict[str, Any] | None
+    ) -> list[bytes]:
+        """The next request of a session, if it is this reset."""
+        number = session.last_number + 1
+        reset = Reset(session=session.token, number=number, seed=seed, options=options)
+        try:
+            return self._writer.write(reset)
+        except Untransferable as error:
+            raise ValueError(
+                f"reset of {session.meta.env_id}: seed or options can't be sent: {error}"
+            ) from None
 
     def _portable_extras(self, extras: Mapping[str, Any]) -> dict[str, Any]:
         lost: list[str] = []
