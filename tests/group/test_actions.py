@@ -33,7 +33,7 @@ class Rows:
         layout = RowLayout(spaces.Discrete(2), space, (), ())
         self.slab = Slab(layout, memoryview(bytearray(layout.size(3))), 3)
         self.layout: Any = SimpleNamespace(
-            slabs=[self.slab], slab=np.zeros(3, np.intp), row=np.arange(3)
+            slabs=[self.slab], slab=np.zeros(3, np.intp), row=np.arange(3), row_is_slot=True
         )
 
     def write(self, actions: Any, form: str = "columns") -> Any:

@@ -24,7 +24,7 @@ from rlightning_aio.errors import BadAction, ClientRefused, EnvRaised, GroupClos
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rlightning_aio.types import EnvRet
+    from rlightning_aio.types import EnvRet, PolicyResponse
 
 HEARTBEAT = 5.0
 """Seconds; nobody who is merely waiting for its turn is taken for dead."""
@@ -236,6 +236,29 @@ def test_a_client_that_joins_a_running_group_comes_through_collect() -> None:
             seen.update(ret.env_id for ret in batch.values())
             group.step_async(batch.respond(action=actions(batch)))
             batch, _ = group.collect_async(deadline=HANG)
+        group.close()
+
+
+def test_a_server_to_which_nobody_has_come_yet_is_no_obstacle_to_the_next() -> None:
+    """Whatever goes along with actions, they reach the clients for whom they are."""
+
+    class Telling(CountingEnv):
+        def step(self, policy_resp: PolicyResponse) -> EnvRet:
+            ret = super().step(policy_resp)
+            ret.last_reward = float(policy_resp.action[0])
+            return ret
+
+    with (
+        sync.build_env_group([entry("early"), entry("late")]) as group,
+        clients(group, Telling(), server="late-0"),
+    ):
+        batch, _ = group.collect_async(deadline=HANG)
+        for step, extras in enumerate(({}, {"value": np.zeros(1)}), start=1):
+            action = np.full((1, 2), step / 4, np.float32)
+            group.step_async(batch.respond(action=action, **extras))
+            batch, _ = group.collect_async(deadline=HANG)
+            assert batch.observation[0, 2] == step
+            assert batch.reward.tolist() == [step / 4]
         group.close()
 
 

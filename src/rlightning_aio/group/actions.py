@@ -15,7 +15,7 @@ import numpy as np
 from rlightning_aio.batch.data import columns_of_responses
 from rlightning_aio.errors import BadAction
 from rlightning_aio.hosts.messages import NO_ACTION
-from rlightning_aio.protocol.columns import Leaf, Tree, as_array, index, out_of_range
+from rlightning_aio.protocol.columns import Leaf, Rows, Tree, as_array, index, out_of_range
 
 if TYPE_CHECKING:
     from gymnasium import spaces
@@ -58,15 +58,17 @@ def write_actions(
             return out_of_band
     columns = columns_of_responses(batch)
     if columns is not None and len(layout.slabs) == 1 and out_of_band is None:
-        _write_column(columns.get("action"), layout.slabs[0], slots, envs)
+        rows = _rows(slots, envs, layout)
+        _write_column(columns.get("action"), layout.slabs[0], slots, rows, envs)
         return None
     _write_one_by_one(batch, slots, envs, layout, out_of_band)
     return out_of_band
 
 
-def _write_column(action: Any, slab: Slab, slots: NDArray[np.intp], envs: EnvTable) -> None:
+def _write_column(
+    action: Any, slab: Slab, slots: NDArray[np.intp], rows: Rows, envs: EnvTable
+) -> None:
     """Write the actions of a whole batch with one copy for each array."""
-    rows = slice(None) if slots is envs.all else slots
     for leaf, target in slab.action_columns:
         source = _as_array(_column_at(action, leaf) if leaf.path else action)
         if source.shape != (len(slots), *leaf.shape) or not _castable(source, leaf):
@@ -74,6 +76,13 @@ def _write_column(action: Any, slab: Slab, slots: NDArray[np.intp], envs: EnvTab
         if (unfit := _unfit(source, leaf, slab)) is not None:
             raise _unfit_error(unfit, source, leaf, slots, envs)
         target[rows] = source
+
+
+def _rows(slots: NDArray[np.intp], envs: EnvTable, layout: SlabLayout) -> Rows:
+    """Rows of `slots` in the only slab, which may be that of an env_server behind another."""
+    if slots is envs.all:
+        return slice(None)
+    return slots if layout.row_is_slot else layout.row[slots]
 
 
 def _write_one_by_one(
@@ -187,7 +196,7 @@ def _chosen_out_of_band(
         if _fits(action, layout.slabs[0], len(slots)):
             if not any_extras:
                 return None
-            _write(action, layout.slabs[0], slots)
+            _write(action, layout.slabs[0], _rows(slots, envs, layout))
             readers = np.flatnonzero(envs.reads_extras[slots])
             contents = [(NO_ACTION, _extras(batch, k)) for k in readers.tolist()]
             return OutOfBandSteps(readers, contents) if contents else None
