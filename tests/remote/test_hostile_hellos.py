@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 import tracemalloc
 import warnings
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,7 @@ from remote.random_spaces import any_space
 
 from rlightning_aio import sync
 from rlightning_aio.errors import EnvRaised
+from rlightning_aio.protocol.net import wire
 from rlightning_aio.protocol.net.server_session import ServerSessions
 from rlightning_aio.protocol.net.space_description import describe, space_from
 from rlightning_aio.protocol.net.wire import MAX_BYTES_IN_ALL, Bye, Failure, Hello, Result, Writer
@@ -234,6 +236,40 @@ def test_numbers_of_clients_raise_nothing_in_a_trainer_that_has_them_raise() -> 
     assert error.exception_text.isprintable()
     assert "\x1b" not in error.traceback_text
     assert len(error.traceback_text.splitlines()) > 3
+
+
+class _Deep(CountingEnv):
+    """What it tells takes a stack to be taken apart that no process has."""
+
+    def step(self, policy_resp: PolicyResponse) -> EnvRet:
+        ret = super().step(policy_resp)
+        for _ in range(sys.getrecursionlimit() // 2):
+            ret.info = {"deep": ret.info}
+        return ret
+
+
+def test_an_info_of_any_depth_costs_its_own_client_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its session ends, and the others' results arrive."""
+    # As a client that knows no limit would.
+    monkeypatch.setattr(wire, "_OPEN_FIELDS", {}, raising=False)
+    settings = {"connect_timeout": HANG, "min_clients": 2}
+    with sync.build_env_group(
+        {"name": "robots", "backend": "env_server", "env_kwargs": settings}
+    ) as group:
+        address = group["robots-0"].address
+        threads = [ClientThread(address, "deep", _Deep()), ClientThread(address, "friend")]
+        batch, _ = group.reset()
+        lost: list[EnvRet] = []
+        while not lost:
+            group.step_async(batch.respond(action=np.zeros((len(batch), 2), np.float32)))
+            batch, _ = group.collect_async(deadline=HANG)
+            lost = [ret for ret in batch.values() if "client_lost" in ret.info]
+        assert lost[0].env_id == "robots-0/deep"
+        assert "nested more than" in lost[0].info["client_lost"]
+        assert group["robots-0"].clients == ["robots-0/friend"]
+        group.close()
+        for thread in threads:
+            thread.join()
 
 
 def test_a_space_made_of_a_description_is_a_box_like_any_other() -> None:

@@ -6,6 +6,7 @@ import logging
 from typing import Any
 
 import gymnasium as gym
+import msgspec
 import numpy as np
 import pytest
 from remote.unreliable import HEARTBEAT, OBSERVATION, Client, World
@@ -13,7 +14,7 @@ from remote.unreliable import HEARTBEAT, OBSERVATION, Client, World
 from rlightning_aio.errors import BadAction, EnvBusy, EnvRaised, UnknownEnv
 from rlightning_aio.protocol.net.client_session import ClientSession, Ended, Phase, Refused
 from rlightning_aio.protocol.net.server_session import ServerSessions
-from rlightning_aio.protocol.net.wire import Hello, Welcome, Writer
+from rlightning_aio.protocol.net.wire import MAX_NESTING, Hello, Welcome, Writer
 from rlightning_aio.types import EnvMeta, EnvRet
 
 
@@ -390,6 +391,28 @@ def test_results_that_never_fit_end_the_session() -> None:
     assert "don't fit what it announced" in only(world.take()).info["client_lost"]
     world.settle()
     assert client.ended
+
+
+def test_results_that_are_nested_too_deep_end_the_session() -> None:
+    """They are none: nothing that takes an info apart may run out of stack."""
+    world = World("a")
+    world.join_all()
+    world.take()
+    client = world.clients["a"]
+    world.submit("a", 1)
+    world.to_client(client)
+    client.execute()
+    (header, frame), client.outbox[:] = client.outbox[0], []
+    deep: dict[str, Any] = {}
+    for _ in range(MAX_NESTING):
+        deep = {"deep": deep}
+    for name in ("info", "extra", "info"):
+        assert not world.results
+        result = {**msgspec.msgpack.decode(header), name: deep}
+        parts = [msgspec.msgpack.encode(result), frame]
+        world.server.receive(client.route or b"", None, parts, 0.0)
+        world.flush()
+    assert "nested more than 32 deep" in only(world.take()).info["client_lost"]
 
 
 def test_a_client_counts_and_drops_what_is_no_message(world: World) -> None:

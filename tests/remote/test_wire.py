@@ -19,7 +19,15 @@ from rlightning_aio.protocol.columns import Misfit
 from rlightning_aio.protocol.net import wire
 from rlightning_aio.protocol.net.payload import Outcome, Packed, ResultLayout, SpaceLayout
 from rlightning_aio.protocol.net.space_description import UnsupportedSpace, describe, space_from
-from rlightning_aio.protocol.net.wire import FromClient, Reader, Result, WireError, Writer, portable
+from rlightning_aio.protocol.net.wire import (
+    FromClient,
+    Reader,
+    Result,
+    Untransferable,
+    WireError,
+    Writer,
+    portable,
+)
 
 
 def through_wire(message: Any, frames: list[bytes] | None = None) -> tuple[Any, Any]:
@@ -84,6 +92,27 @@ def test_what_cannot_travel_is_left_out_and_named() -> None:
     kept = portable(info, lost)
     assert same(kept, {"good": 1, "deep": {"array": np.ones(2)}})
     assert lost == ["deep.bad", "big"]
+
+
+def nested(depth: int) -> Any:
+    """That many maps and arrays in one another."""
+    value: Any = 1
+    for level in range(depth):
+        value = {"a": value} if level % 2 else [value]
+    return value
+
+
+def test_what_is_nested_too_deep_is_left_out_and_named() -> None:
+    """Whoever passes it on would run out of stack; as deep as is allowed, it survives."""
+    info = {"deepest": nested(wire.MAX_NESTING - 1), "deeper": nested(wire.MAX_NESTING)}
+    with pytest.raises(Untransferable, match="info is nested more than 32 deep"):
+        Writer().write(Result(session=1, number=2, info=info))
+    lost: list[str] = []
+    kept = portable(info, lost)
+    assert kept == {"deepest": info["deepest"], "deeper": {}}
+    assert lost == ["deeper.a"]
+    message, _ = through_wire(Result(session=1, number=2, info=kept))
+    assert message.info == kept
 
 
 def test_an_info_that_contains_itself_is_left_out() -> None:

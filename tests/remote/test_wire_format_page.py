@@ -120,6 +120,7 @@ def test_the_limits_are_those_of_the_code() -> None:
     assert f"| a result and an action of all clients | {wire.MAX_BYTES_IN_ALL >> 30} GiB |" in PAGE
     assert f"| frame | {wire.MAX_FRAME_BYTES >> 20} MiB |" in PAGE
     assert f"| parts of a message | {wire.MAX_PARTS:,} |" in PAGE
+    assert f"`extras` or `options` | {wire.MAX_NESTING} |" in PAGE
 
 
 def test_the_described_space_is_one() -> None:

@@ -27,6 +27,7 @@ from rlightning_aio.protocol.net.texts import in_lines, in_one_line
 from rlightning_aio.protocol.net.wire import (
     MAX_BYTES_IN_ALL,
     MAX_HELLO_BYTES,
+    MAX_NESTING,
     STALE_REQUEST,
     VERSION,
     Bye,
@@ -46,6 +47,7 @@ from rlightning_aio.protocol.net.wire import (
     Welcome,
     WireError,
     Writer,
+    nests_too_deep,
     portable,
 )
 from rlightning_aio.types import ClientTraits, EnvMeta
@@ -682,6 +684,8 @@ class ServerSessions:
             self.late += 1
             return
         try:
+            if nests_too_deep(message.info) or nests_too_deep(message.extra):
+                raise WireError(f"an info is nested more than {MAX_NESTING} deep")
             header = (message.reward, message.terminated, message.truncated)
             outcome = session.results.unpack(frames, message.texts, header)
         except WireError as error:

@@ -31,6 +31,7 @@ __all__ = [
     "MAX_HEADER_BYTES",
     "MAX_HELLO_BYTES",
     "MAX_NAME_LENGTH",
+    "MAX_NESTING",
     "MAX_PARTS",
     "STALE_REQUEST",
     "VERSION",
@@ -53,6 +54,7 @@ __all__ = [
     "Welcome",
     "WireError",
     "Writer",
+    "nests_too_deep",
     "portable",
 ]
 
@@ -66,6 +68,8 @@ MAX_BYTES_IN_ALL: Final = 1 << 30
 MAX_PARTS: Final = 1024
 """Header and frames of one message."""
 MAX_NAME_LENGTH: Final = 128
+MAX_NESTING: Final = 32
+"""Of maps and arrays in a value: to pass one on takes several calls within calls for each level."""
 STALE_REQUEST: Final = "StaleRequest"
 """What a client calls a request that is older than one it has executed."""
 
@@ -80,7 +84,7 @@ DTYPES: Final[Mapping[str, np.dtype[Any]]] = {
 """What arrays may consist of; little-endian on the wire."""
 
 _ARRAY_EXTENSION: Final = 1
-_MAX_NESTING: Final = 32
+_MAX_AXES: Final = 32
 
 Part: TypeAlias = bytes | memoryview
 Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
@@ -212,6 +216,28 @@ FromClient: TypeAlias = Hello | Result | Failure | Ping | Pong | Bye
 FromServer: TypeAlias = Welcome | Refusal | Step | Reset | Ping | Pong | Gone | Bye
 Message = TypeVar("Message")
 
+_OPEN_FIELDS: Final[Mapping[type[Struct], tuple[str, ...]]] = {
+    Step: ("extras",),
+    Reset: ("options",),
+    Result: ("info", "extra"),
+}
+"""What of a message an env or a policy has made."""
+
+_FLAT: Final = frozenset({type(None), bool, int, float, str, bytes})
+
+
+def nests_too_deep(value: Any, levels: int = MAX_NESTING) -> bool:
+    """Whether more than `levels` maps and arrays lie in one another in `value`."""
+    if isinstance(value, dict):
+        parts = cast("dict[Any, Any]", value).values()
+    elif isinstance(value, list | tuple):
+        parts = cast("Sequence[Any]", value)
+    else:
+        return False
+    return not levels or any(
+        nests_too_deep(part, levels - 1) for part in parts if type(part) not in _FLAT
+    )
+
 
 class ArrayForm:
     """What a frame must be to hold an array of one dtype and shape."""
@@ -279,7 +305,7 @@ class Reader(Generic[Message]):
         dtype = DTYPES.get(dtype_name)
         # Each frame may be named once, or a small message could unfold to any size.
         is_there = position < len(self._frames) and position not in self._named
-        if dtype is None or not is_there or len(shape) > _MAX_NESTING:
+        if dtype is None or not is_there or len(shape) > _MAX_AXES:
             raise WireError(f"a header names an array {dtype_name!r}{shape} that is not there")
         self._named.add(position)
         return ArrayForm(dtype, tuple(shape)).read(self._frames[position]).copy()
@@ -296,9 +322,12 @@ class Writer:
         """The parts of `message`: its header, then `frames`, then arrays within the header.
 
         Raises:
-            Untransferable: a value has no form in this format, or is too large.
+            Untransferable: a value has no form in this format, is too large or nested too deep.
         """
         self._frames = frames = [] if frames is None else frames
+        for name in _OPEN_FIELDS.get(type(message), ()):
+            if nests_too_deep(getattr(message, name)):
+                raise Untransferable(f"{name} is nested more than {MAX_NESTING} deep")
         try:
             header = self._encode(message)
         except Untransferable:
@@ -347,7 +376,7 @@ class _Value(Struct):
 
 
 def _portable(value: Any, path: str, lost: list[str], writer: Writer, depth: int) -> Any:
-    if isinstance(value, dict) and depth < _MAX_NESTING:
+    if isinstance(value, dict) and depth < MAX_NESTING:
         kept: dict[Any, Any] = {}
         for key, inner in cast("dict[Any, Any]", value).items():
             place = f"{path}.{key}" if path else str(key)
@@ -357,6 +386,9 @@ def _portable(value: Any, path: str, lost: list[str], writer: Writer, depth: int
             elif portable_inner is not _Lost:
                 kept[key] = portable_inner
         return kept
+    if nests_too_deep(value, MAX_NESTING - depth):
+        lost.append(path)
+        return _Lost
     try:
         writer.write(_Value(value))
     except Untransferable:
