@@ -13,6 +13,7 @@ from remote.unreliable import HEARTBEAT, OBSERVATION, Client, World
 
 from rlightning_aio.errors import BadAction, EnvBusy, EnvRaised, UnknownEnv
 from rlightning_aio.protocol.net.client_session import ClientSession, Ended, Phase, Refused
+from rlightning_aio.protocol.net.payload import Outcome
 from rlightning_aio.protocol.net.server_session import ServerSessions
 from rlightning_aio.protocol.net.wire import MAX_NESTING, Hello, Welcome, Writer
 from rlightning_aio.types import EnvMeta, EnvRet
@@ -71,10 +72,12 @@ def test_an_action_that_does_not_fit_is_not_sent(world: World) -> None:
     assert world.submit("a", 2)
 
 
-def test_reset_options_that_cannot_travel_are_refused(world: World) -> None:
+@pytest.mark.parametrize("options", [{"x": object()}, {0: "x"}, {"x": {"y": 2**70}}])
+def test_reset_options_that_cannot_travel_are_refused(world: World, options: Any) -> None:
     """They would arrive as something else, or not at all."""
     with pytest.raises(ValueError, match="options can't be sent"):
-        world.submit_reset("a", 1, options={"x": object()})
+        world.submit_reset("a", 1, options=options)
+    assert world.submit_reset("a", 2)
 
 
 def test_an_exception_arrives_with_its_traceback_and_the_env_goes_on(world: World) -> None:
@@ -454,6 +457,28 @@ def test_what_of_an_info_cannot_travel_is_named_once(
     assert [result.info for result in world.take()] == [{"fine": 1}] * 2
     assert [record.message for record in caplog.records] == [
         "a: of the env's info, camera can't travel and is left out"
+    ]
+
+
+def test_a_step_whose_info_has_a_number_as_key_is_answered(
+    world: World, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Without it. Refused, the result would be asked for, and refused, again and again."""
+    world.take()
+    client = world.clients["a"]
+    world.submit("a", 1)
+    world.to_client(client)
+    assert client.todo is not None
+    number, client.todo = client.todo.number, None
+    info: dict[Any, Any] = {"fine": {1: 2}, 0: "cup"}
+    outcome = Outcome(client.observation(), 1.0, False, False)
+    # As a client gives on what a bare step returns.
+    client.session.answer(number, outcome, info, {}, 0, 0)
+    client.flush()
+    world.settle()
+    assert only(world.take()).info == {"fine": {1: 2}}
+    assert [record.message for record in caplog.records] == [
+        "a: of the env's info, 0 can't travel and is left out"
     ]
 
 

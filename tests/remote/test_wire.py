@@ -94,6 +94,19 @@ def test_what_cannot_travel_is_left_out_and_named() -> None:
     assert lost == ["deep.bad", "big"]
 
 
+def test_keys_that_are_no_strings_are_left_out_and_named() -> None:
+    """At the top, where a reader would refuse the whole message for them; numbers survive below."""
+    info: dict[Any, Any] = {"good": {1: "one", None: "none"}, 0: {"a": 1}, True: 2}
+    with pytest.raises(Untransferable, match="info has the key 0; keys must be strings"):
+        Writer().write(Result(session=1, number=2, info=info))
+    lost: list[str] = []
+    kept = portable(info, lost)
+    assert kept == {"good": {1: "one"}}
+    assert lost == ["good.None", "0", "True"]
+    message, _ = through_wire(Result(session=1, number=2, info=kept))
+    assert message.info == kept
+
+
 def nested(depth: int) -> Any:
     """That many maps and arrays in one another."""
     value: Any = 1

@@ -326,8 +326,7 @@ class Writer:
         """
         self._frames = frames = [] if frames is None else frames
         for name in _OPEN_FIELDS.get(type(message), ()):
-            if nests_too_deep(getattr(message, name)):
-                raise Untransferable(f"{name} is nested more than {MAX_NESTING} deep")
+            _check_open(name, getattr(message, name))
         try:
             header = self._encode(message)
         except Untransferable:
@@ -361,6 +360,16 @@ class Writer:
         return msgspec.msgpack.Ext(_ARRAY_EXTENSION, msgspec.msgpack.encode(reference))
 
 
+def _check_open(name: str, values: dict[Any, Any] | None) -> None:
+    """Raises `Untransferable` if the reader of a field would refuse `values`."""
+    for key in values or ():
+        # Encoded it could be; but it would make the whole message malformed.
+        if not isinstance(key, str):
+            raise Untransferable(f"{name} has the key {key!r}; keys must be strings")
+    if nests_too_deep(values):
+        raise Untransferable(f"{name} is nested more than {MAX_NESTING} deep")
+
+
 def portable(values: Mapping[str, Any], lost: list[str]) -> dict[str, Any]:
     """The part of `values` that can travel; the paths of what can't are appended to `lost`."""
     kept = _portable(dict(values), "", lost, Writer(), depth=0)
@@ -378,10 +387,12 @@ class _Value(Struct):
 def _portable(value: Any, path: str, lost: list[str], writer: Writer, depth: int) -> Any:
     if isinstance(value, dict) and depth < MAX_NESTING:
         kept: dict[Any, Any] = {}
+        # Readers want strings at the top, and take numbers below.
+        kinds = str | int if depth else str
         for key, inner in cast("dict[Any, Any]", value).items():
             place = f"{path}.{key}" if path else str(key)
             portable_inner = _portable(inner, place, lost, writer, depth + 1)
-            if not isinstance(key, str | int):
+            if not isinstance(key, kinds):
                 lost.append(place)
             elif portable_inner is not _Lost:
                 kept[key] = portable_inner
