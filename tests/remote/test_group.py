@@ -19,7 +19,14 @@ from remote.counting import ClientThread, CountingEnv
 
 import rlightning_aio
 from rlightning_aio import sync
-from rlightning_aio.errors import BadAction, ClientRefused, EnvRaised, GroupClosed, UnknownEnv
+from rlightning_aio.errors import (
+    BadAction,
+    ClientRefused,
+    EnvAway,
+    EnvRaised,
+    GroupClosed,
+    UnknownEnv,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -348,6 +355,35 @@ def test_a_client_that_takes_anothers_place_takes_nothing_else_of_it(
         assert after == before | {"requests": before["requests"] + 2}
         group.get_env_stats(reset=True)
         assert group.get_env_stats(by_entry=True)["robots"]["requests"] == 0
+        group.close()
+        other.join()
+
+
+def test_a_client_that_is_forgotten_is_asked_in_vain_and_harms_no_other(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Whoever needed its seat is stepped in the same call."""
+    monkeypatch.setattr("rlightning_aio.protocol.net.server_session._MAX_SEATS", 1)
+    with sync.build_env_group(entry()) as group:
+        address = group["robots-0"].address
+        with clients(group, env := CountingEnv(0)):
+            batch, _ = group.reset()
+            env.on_step = lambda: setattr(env, "finished", True)
+            while "client_lost" not in batch.info()[0]:
+                group.step_async(batch.respond(action=actions(batch)))
+                batch, _ = group.collect_async(deadline=HANG)
+        other = ClientThread(address, "other", CountingEnv(5))
+        joined, _ = group.collect_async(deadline=HANG)
+        env_ids = [*batch.env_ids(), *joined.env_ids()]
+        assert env_ids == ["robots-0/c0", "robots-0/other"]
+        responses = [
+            rlightning_aio.PolicyResponse(env_id, np.zeros(2, np.float32)) for env_id in env_ids
+        ]
+        group.step_async(rlightning_aio.BatchedData(["robots-0"] * 2, responses))
+        batch, _ = group.collect_async(wait_all=True, deadline=HANG)
+        assert batch.observation.tolist() == [[5, -1, 1]]
+        with pytest.raises(EnvAway, match="robots-0/c0"):
+            group.reset(env_ids=["robots-0/c0"])
         group.close()
         other.join()
 

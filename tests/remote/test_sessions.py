@@ -12,6 +12,7 @@ import pytest
 from remote.unreliable import HEARTBEAT, OBSERVATION, Client, World
 
 from rlightning_aio.errors import BadAction, EnvBusy, EnvRaised, UnknownEnv
+from rlightning_aio.protocol.net import server_session
 from rlightning_aio.protocol.net.client_session import ClientSession, Ended, Phase, Refused
 from rlightning_aio.protocol.net.payload import Outcome
 from rlightning_aio.protocol.net.server_session import ServerSessions
@@ -278,6 +279,54 @@ def test_a_client_that_leaves_says_so(world: World) -> None:
     client.flush()
     world.to_server(client)
     assert "it left: battery empty" in only(world.take()).info["client_lost"]
+
+
+def leave(world: World, client: Client) -> None:
+    """The client says goodbye, and is gone."""
+    client.session.leave("enough")
+    client.flush()
+    world.to_server(client)
+    client.kill()
+
+
+def test_who_left_first_is_forgotten_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where others need the seats, it counts who has been away the longest, not who came first."""
+    monkeypatch.setattr(server_session, "_MAX_SEATS", 2)
+    world = World("abc")
+    early, late, other = world.clients.values()
+    for client in (early, late):
+        client.connect()
+        world.settle()
+    for client in (late, early):
+        leave(world, client)
+    other.connect()
+    world.settle()
+    assert world.serving("c")
+    with pytest.raises(UnknownEnv, match="'b' has joined"):
+        world.submit("b", 1)
+    assert world.submit("a", 2)
+
+
+def test_a_loss_that_nobody_has_been_told_of_is_forgotten_last(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One that is known makes room before it, however recent it is."""
+    monkeypatch.setattr(server_session, "_MAX_SEATS", 2)
+    world = World("abc")
+    untold, told, other = world.clients.values()
+    for client in (untold, told):
+        client.connect()
+        world.settle()
+    leave(world, untold)
+    world.submit("b", 1)
+    leave(world, told)
+    world.take()
+    other.connect()
+    world.settle()
+    assert world.serving("c")
+    world.take()
+    assert world.submit("a", 2)
+    assert "it left: enough" in only(world.take()).info["client_lost"]
 
 
 def test_a_second_client_of_a_name_waits_until_the_first_is_gone(world: World) -> None:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from rlightning_aio.errors import UnknownEnv
 from rlightning_aio.hosts.listener import Listener, server_settings
 from rlightning_aio.hosts.messages import (
     NO_ACTION,
@@ -238,16 +239,22 @@ class EnvServerHost:
         self, entries: NDArray[np.int64], arguments: Sequence[Any] | None, now: float
     ) -> None:
         for position, entry in enumerate(cast("list[int]", entries.tolist())):
-            index = slot_of(entry) - self.first_slot
-            place = self._places[index]
-            place.entry = entry
             given = None if arguments is None else arguments[position]
-            if op_of(entry) == Operation.STEP:
-                will_answer = self._step(place, entry, given, now)
-            else:
-                will_answer = self._reset(place, index, entry, given, now)
+            try:
+                will_answer = self._ask(entry, given, now)
+            except UnknownEnv:
+                # It was away, and its seat was needed.
+                will_answer = False
             if not will_answer:
                 self._tell(Withdrawn(self.host_id, entry))
+
+    def _ask(self, entry: int, given: Any, now: float) -> bool:
+        index = slot_of(entry) - self.first_slot
+        place = self._places[index]
+        place.entry = entry
+        if op_of(entry) == Operation.STEP:
+            return self._step(place, entry, given, now)
+        return self._reset(place, index, entry, given, now)
 
     def _step(
         self, place: _Place, entry: int, given: tuple[Any, dict[str, Any]] | None, now: float

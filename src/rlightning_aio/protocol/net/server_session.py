@@ -385,7 +385,8 @@ class ServerSessions:
         seat = self._seats.get(name) or _Seat(name)
         more = num_bytes - seat.num_bytes
         away = [other for other in self._seats.values() if other.session is None]
-        # Those that are away the longest were made first, more or less.
+        # The first to leave go first, and those last of whose loss the trainer hasn't heard yet.
+        away.sort(key=lambda other: other.unreported is not None)
         for other in away:
             if self._has_room(name, more):
                 break
@@ -495,6 +496,8 @@ class ServerSessions:
         seat.session = None
         del self._sessions[session.token]
         self.clients.pop(seat.name, None)
+        # Those that are away stand in the order in which they left.
+        self._seats[seat.name] = self._seats.pop(seat.name)
         if seat.last is None:
             # It never joined, so nobody has heard of it.
             self._forget(seat)
@@ -559,7 +562,7 @@ class ServerSessions:
             trainer knows; what comes next is its first result once it is back.
 
         Raises:
-            UnknownEnv: no client of that name ever joined.
+            UnknownEnv: no client of that name ever joined, or it has been forgotten.
             EnvBusy: it owes a result.
             BadAction: the action doesn't fit, or the response can't travel; nothing was sent.
         """
