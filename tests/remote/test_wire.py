@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import numpy as np
@@ -258,6 +258,9 @@ def test_an_info_that_names_frames_wrongly_is_refused(info: dict[str, Any]) -> N
         Reader[Any](FromClient).read([msgspec.msgpack.encode(header), b"\0" * 8])
 
 
+RESULT_WITH_KEY = b"\x84\xa4type\xa6result\xa7session\x01\xa6number\x01\xa4info\x81\xa1a\x81%b\x01"
+
+
 @pytest.mark.parametrize(
     "parts",
     [
@@ -270,6 +273,8 @@ def test_an_info_that_names_frames_wrongly_is_refused(info: dict[str, Any]) -> N
         [msgspec.msgpack.encode({"type": "result", "session": 1, "number": 2**63})],
         [msgspec.msgpack.encode({"type": "bye", "session": "1"})],
         [b"\x82\xa4type\xa3bye\xa7session\xa1\xff"],
+        [RESULT_WITH_KEY % b"\x80"],  # A map as key.
+        [RESULT_WITH_KEY % b"\xc7\x0a\x01\x93\xa5uint8\x91\x08\0", b"\0" * 8],  # An array as key.
         [b"\0" * (wire.MAX_HEADER_BYTES + 1)],
         [b"\x80"] * (wire.MAX_PARTS + 1),
     ],
@@ -278,6 +283,16 @@ def test_what_is_no_message_is_refused_as_such(parts: list[bytes]) -> None:
     """Every way of being wrong is one kind of error."""
     with pytest.raises(WireError):
         Reader[Any](FromClient).read(parts)
+
+
+def test_a_map_as_key_is_refused_whatever_msgspec_makes_of_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Some of its versions let through what Python says of a key that has no hash."""
+    reader: Reader[Any] = Reader(FromClient)
+    monkeypatch.setattr(reader, "_decode", lambda _: {cast("Any", {}): 1})
+    with pytest.raises(WireError, match="unhashable"):
+        reader.read([b"\x80"])
 
 
 class Bomb:

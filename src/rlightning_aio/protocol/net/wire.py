@@ -294,8 +294,8 @@ class Reader(Generic[Message]):
             return self._decode(header), frames
         except WireError:
             raise
-        # Bad UTF-8 and deep nesting are not msgspec's own errors.
-        except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        # Not msgspec's own: what bad UTF-8 and deep nesting raise, and keys that have no hash.
+        except (msgspec.MsgspecError, TypeError, ValueError, RecursionError) as error:
             raise WireError(f"a header can't be read: {error}") from None
 
     def _array(self, code: int, data: memoryview) -> NDArray[Any]:
