@@ -289,6 +289,39 @@ def leave(world: World, client: Client) -> None:
     client.kill()
 
 
+def test_who_leaves_before_anybody_has_seen_it_may_come_back() -> None:
+    """There is no loss to be told of: nobody would ever ask for it."""
+    world = World("a")
+    client = world.clients["a"]
+    client.connect()
+    world.to_server(client)
+    world.to_client(client)
+    client.execute()
+    client.session.leave("enough")
+    client.flush()
+    for parts in client.outbox:  # Both are there when the trainer looks.
+        world.server.receive(client.route or b"", None, parts, 0.0)
+    client.outbox.clear()
+    world.flush()
+    assert not world.take()
+    client.kill()
+    client.connect()
+    world.settle()
+    assert only(world.take()).observation.tolist() == [1, 2, 0]
+
+
+def test_who_was_sent_away_for_want_of_room_may_come_back(world: World) -> None:
+    """Its first result is told as if it had never been there."""
+    world.take()
+    world.server.dismiss("a", "no place")
+    world.flush()
+    world.settle()
+    world.pass_time(1.0)
+    world.settle()
+    assert world.clients["a"].ended == ["the server ended the session: no place"]
+    assert only(world.take()).number is None
+
+
 def test_who_left_first_is_forgotten_first(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where others need the seats, it counts who has been away the longest, not who came first."""
     monkeypatch.setattr(server_session, "_MAX_SEATS", 2)

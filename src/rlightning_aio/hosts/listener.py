@@ -341,7 +341,7 @@ class Listener:
         return self._sessions.traits(client)
 
     def dismiss(self, client: str, cause: str) -> None:
-        """Send a client away that is here; it is told `cause`."""
+        """Send a client away; see `ServerSessions.dismiss`."""
         self._sessions.dismiss(client, cause)
 
     def check(self, client: str, action: Any, extras: Mapping[str, Any]) -> None:

@@ -505,8 +505,15 @@ class ServerSessions:
             self._report_loss(seat, seat.last, seat.request.number, cause)
         elif seat.early is not None:
             seat.early = None
-        elif session.joined:
+        elif session.joined and not self._drop_first(seat):
             seat.unreported = cause
+
+    def _drop_first(self, seat: _Seat) -> bool:
+        """Take back a first result that nobody has taken out; whether there was one."""
+        kept = [r for r in self._results if r.client != seat.name or r.number is not None]
+        was_there = len(kept) < len(self._results)
+        self._results = kept
+        return was_there
 
     def _report_loss(self, seat: _Seat, last: _Seen, number: int, cause: str) -> None:
         seat.unreported = seat.request = None
@@ -517,10 +524,12 @@ class ServerSessions:
     # Requests
 
     def dismiss(self, client: str, cause: str) -> None:
-        """Send a client away that is here; it is told `cause`."""
-        session = self._seats[client].session
-        if session is not None:
-            self._dismiss(session, cause)
+        """Send a client away whose first result was not taken in; it is told `cause`."""
+        seat = self._seats[client]
+        if seat.session is not None:
+            self._dismiss(seat.session, cause)
+            # There is nobody who would ask for it.
+            seat.unreported = None
 
     def traits(self, client: str) -> ClientTraits:
         """What a client that is here makes of requests."""
@@ -599,7 +608,7 @@ class ServerSessions:
         session = seat.session
         parts = [] if session is None else self._reset_parts(session, seed, options)
         seat.unreported = seat.early = None
-        self._results = [r for r in self._results if r.client != client or r.number is not None]
+        self._drop_first(seat)
         if session is None:
             return False
         session.last_number += 1
