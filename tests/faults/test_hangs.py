@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import os
+import select
 import signal
+import threading
 import time
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+import numpy as np
 import pytest
 from faults.driven import (
     Driven,
@@ -42,6 +45,11 @@ STACKS = {
     "deadlock": "in _deadlock",
     "deadlock with the GIL": "in _deadlock_with_the_gil",
 }
+
+
+def any_killed(group: Any) -> bool:
+    """Whether a worker was, or is to be once it has written its stacks."""
+    return any(record.dying or record.restarts for record in group._core.supervisor._records)
 
 
 @kinds_on_both_drivers("hangs", STACKS)
@@ -163,6 +171,72 @@ def test_trainer_that_comes_late_takes_nobody_for_hung(start: Start) -> None:
         batch, _ = group.collect_async(wait_all=True)
         assert len(batch) == 4
         tokens.check(batch)
+
+
+def test_trainer_that_comes_late_for_megabytes_takes_nobody_for_hung(start: Start) -> None:
+    """A worker can't go on before it is read; that time isn't the env's, either."""
+    group, tokens = start(two_workers(step_timeout=LIMIT)), Tokens()
+    pids = [pid_of(group, env_id) for env_id in ("faulty-0", "faulty-2")]
+    for env_id in group.group.env_ids:
+        group.call(env_id, "answer_with", info=lambda: {"cargo": np.ones(2**23, np.uint8)})
+    group.step_async(tokens.steps(group.group.env_ids))
+    for host in group.group._core.supervisor.hosts:
+        # Its first reply has begun to fill its channel.
+        assert select.select([host._link.fileno()], [], [], HANG)[0]
+    threading.Event().wait(2 * LIMIT)  # The trainer has other things to do.
+    for pid in pids:
+        stop(pid)  # It needs a moment to go on.
+    with pytest.raises(TimeoutError):
+        group.collect_async(deadline=0.05)
+    assert not any_killed(group.group)
+    for pid in pids:
+        os.kill(pid, signal.SIGCONT)
+    batch, _ = group.collect_async(wait_all=True)
+    assert not any_killed(group.group)
+    assert [ret.info["cargo"].sum() for ret in batch.values()] == 4 * [2**23]
+    tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
+
+
+async def test_reply_that_lies_there_while_the_loop_is_busy_is_no_hang() -> None:
+    """The worker was last seen doing nothing, before it was awake, and has answered since."""
+    tokens = Tokens()
+    async with rlightning_aio.build_env_group(entry(1, step_timeout=LIMIT)) as group:
+        batch, _ = await group.reset()
+        pid = int(batch["faulty-0"].observation[1])
+        # No row holds a word, so the reply comes by the channel.
+        await group["faulty-0"].call("answer_with", info=lambda: {"word": "late"})
+        (host,) = group._core.supervisor.hosts
+        while host.executing()[0]:
+            os.sched_yield()
+        stop(pid)
+        group.step_async(tokens.steps(group.env_ids))
+        with pytest.raises(TimeoutError):
+            await group.collect_async(deadline=0.05)
+        os.kill(pid, signal.SIGCONT)
+        assert select.select([host._link.fileno()], [], [], HANG)[0]
+        threading.Event().wait(2 * LIMIT)  # The loop has other things to do.
+        batch, _ = await group.collect_async()
+        assert batch["faulty-0"].info == {"word": "late"}
+        assert not any_killed(group)
+
+
+@pytest.mark.parametrize("stopped", [False, True])
+def test_worker_that_hangs_or_stops_behind_megabytes_is_found(start: Start, stopped: bool) -> None:
+    """The trainer waits and reads; when there is nothing more to read, the time goes on."""
+    group, tokens = start(two_workers(step_timeout=LIMIT)), Tokens()
+    pid = pid_of(group, "faulty-0")
+    group.call("faulty-0", "answer_with", info=lambda: {"cargo": np.ones(2**23, np.uint8)})
+    group.step_async(tokens.steps(["faulty-0", "faulty-1"], {"faulty-1": "sleep"}))
+    host = group.group._core.supervisor.hosts[0]
+    assert select.select([host._link.fileno()], [], [], HANG)[0]
+    if stopped:
+        stop(pid)
+    batch, _ = group.collect_async(wait_all=True)
+    assert marked(batch["faulty-0"]) == stopped
+    assert marked(batch["faulty-1"])
+    cause = batch["faulty-1"].info["worker_restarted"]
+    assert cause == "hung in a step and was killed"
+    tokens.check(group.step(tokens.steps(["faulty-1", "faulty-2"]))[0])
 
 
 def test_start_that_hangs_fails_with_the_stack(build: Start) -> None:

@@ -268,6 +268,7 @@ class FakeWorker(FakeHost):
 
     alive = False
     refusals = 0
+    traffic = 0
 
     def start(self) -> None:
         if self.refusals:
@@ -314,6 +315,11 @@ class FakeWorker(FakeHost):
 
     def executing(self) -> tuple[int, int]:
         return 0, 0
+
+    def catch_up(self) -> bool:
+        found = bool(self.frames or self.reports)
+        self.on_readable()
+        return found
 
     def kill(self, *, dump: bool) -> None:
         self.killed.append(dump)

@@ -53,6 +53,8 @@ class StandIn:
         asked: entries that it was given.
         close_errors: of its envs.
         current: the entry that it executes, and since when (ns).
+        traffic: see `hosts.base.Killable.traffic`.
+        unheard: what it has told, each by a call, and nobody has taken in.
     """
 
     host_id: int
@@ -66,6 +68,8 @@ class StandIn:
     refusal: OSError | None = None
     close_errors: list[tuple[int, ErrorText]] = field(default_factory=list)
     current: tuple[int, int] = (0, 0)
+    traffic: int = 0
+    unheard: list[Callable[[], object]] = field(default_factory=list)
     closing: bool = False
     built: bool = False
     asked: list[int] = field(default_factory=list[int])
@@ -105,6 +109,12 @@ class StandIn:
 
     def executing(self) -> tuple[int, int]:
         return self.current
+
+    def catch_up(self) -> bool:
+        unheard, self.unheard = self.unheard, []
+        for tell in unheard:
+            tell()
+        return bool(unheard)
 
     def kill(self, *, dump: bool) -> None:
         self.log.append(f"dump and kill {self.host_id}" if dump else f"kill {self.host_id}")
@@ -443,6 +453,74 @@ def test_a_stopped_process_is_found_by_its_doing_nothing(fleet: Callable[..., Fl
     assert verdict.error_for(verdict.owed).env_id == "e-1"
 
 
+def test_what_waits_for_the_trainer_to_read_has_its_time_anew_with_each_part(
+    fleet: Callable[..., Fleet],
+) -> None:
+    """However many it takes. One that stops halfway is found, and its env is named."""
+    ours = fleet((2,), step_timeout=5.0)
+    entries = ours.ask(0, 1)
+    ours.hosts[0].current = (entries[1], 0)
+    for part in range(3):
+        ours.hosts[0].traffic = part
+        ours.check()
+        assert ours.supervisor.next_check() == pytest.approx(ours.now + 5)
+        ours.now += 4.9
+        ours.check()
+    assert ours.log == []
+    ours.now += 0.2
+    ours.check()
+    assert ours.log[0] == "dump and kill 0"
+    (verdict,) = ours.verdicts
+    assert isinstance(verdict, Replaced)
+    assert verdict.error_for(verdict.owed).env_id == "e-1"
+
+
+def test_what_has_been_answered_already_is_not_what_hangs(fleet: Callable[..., Fleet]) -> None:
+    """A worker was stopped between two requests: the one that it has yet to begin is named."""
+    ours = fleet((2,), step_timeout=5.0)
+    entries = ours.ask(0, 1)
+    ours.hosts[0].current = (entries[0], 0)
+    ours.reply(0)
+    ours.check()
+    ours.now += 5
+    ours.check()
+    (verdict,) = ours.verdicts
+    assert isinstance(verdict, Replaced)
+    assert verdict.error_for(verdict.owed).env_id == "e-1"
+
+
+def test_a_trainer_that_is_late_hears_a_host_before_it_ends_it(
+    fleet: Callable[..., Fleet],
+) -> None:
+    """One that was seen to do nothing, and one that was seen to execute, have answered since."""
+    ours = fleet((1, 1), step_timeout=5.0)
+    entries = ours.ask(0, 1)
+    ours.hosts[1].current = (entries[1], int(ours.now * 1e9))
+    ours.check()
+    ours.now += 60
+    ours.hosts[0].unheard.append(lambda: ours.reply(0))
+    ours.hosts[1].unheard.append(lambda: ours.reply(1))
+    ours.check()
+    assert ours.requests.in_flight == [0, 0]
+    assert ours.log == []
+
+
+def test_a_death_that_a_late_trainer_has_not_heard_of_costs_no_fork_server(
+    fleet: Callable[..., Fleet],
+) -> None:
+    """The kill has worked; others stand on what would be ended next."""
+    ours = fleet((1,), step_timeout=5.0)
+    (entry,) = ours.ask(0)
+    ours.hosts[0].current = (entry, int(ours.now * 1e9))
+    ours.hosts[0].dies = False
+    ours.now += 5
+    ours.check()
+    ours.hosts[0].unheard.append(ours.hosts[0].end)
+    ours.now += 60
+    ours.check()
+    assert ours.log == ["dump and kill 0", "start 0", "attach 0"]
+
+
 def test_what_has_no_limit_may_take_for_ever(fleet: Callable[..., Fleet]) -> None:
     """So may a call, and a reset where steps alone have a limit."""
     free, limited = fleet(), fleet(step_timeout=5.0)
@@ -647,6 +725,22 @@ def test_a_replacement_that_is_late_is_killed(fleet: Callable[..., Fleet]) -> No
     assert ours.log == ["start 0", "dump and kill 0"]
     assert isinstance(ours.verdicts[1], GivenUp)
     assert "did not start again within 10.0 s" in str(ours.requests.faults[0])
+
+
+def test_a_replacement_that_a_late_trainer_has_not_heard_of_is_not_late(
+    fleet: Callable[..., Fleet],
+) -> None:
+    """It was up in time."""
+    ours = fleet(max_restarts=1)
+    host = ours.hosts[0]
+    host.builds = False
+    ours.ask(0)
+    ours.die(0)
+    host.unheard += [host.build, lambda: ours.told.append(Attached(0))]
+    ours.now += 60
+    ours.check()
+    assert ours.log == ["start 0", "attach 0"]
+    assert len(host.asked) == 2
 
 
 # -- close

@@ -61,6 +61,8 @@ class StandIn(ForkServer):
         self.channels: list[socket.socket] = []
         self.killed: list[bool] = []
 
+    def on_readable(self) -> None: ...
+
     def fork(self, host: ProcessHost, channel: socket.socket, arena: Arena, order: Fork) -> None:
         self.orders.append(order)
         self.channels.append(channel)
@@ -316,6 +318,39 @@ def test_what_the_channel_does_not_take_at_once_is_written_later(started: Scene)
         assert started.rings.has_frame()
         started.rings.frame_seen()
     assert not started.rings.has_frame()
+
+
+def test_who_catches_up_hears_all_and_says_whether_there_was_anything(started: Scene) -> None:
+    """A part of a frame, the rest of it, and a report: none of them had woken the trainer."""
+    frame = encode(FrameKind.RESULT, step(1, 0), b"beside")
+    started.host.submit(steps(1))
+    traffic = started.host.traffic
+    assert not started.host.catch_up()
+    started.channel.send(frame[:20])
+    assert started.host.catch_up()
+    assert started.host.traffic != traffic
+    assert not started.host.catch_up()
+    started.serve(step(1, 1))
+    started.channel.send(frame[20:])
+    started.rings.count_frame()
+    assert started.host.catch_up()
+    assert started.told() == [
+        Result(0, step(1, 0), b"beside"),
+        ("reported", [step(1, 1)]),
+    ]
+    assert not started.host.catch_up()
+
+
+def test_who_catches_up_writes_what_waits(started: Scene) -> None:
+    """As far as it goes: a worker that reads nothing gives no news."""
+    started.received()
+    started.host.submit(steps(1)[:1], [bytes(3 << 20)])
+    assert not started.host.catch_up()
+    traffic = started.host.traffic
+    started.received()
+    assert started.host.catch_up()
+    assert started.host.traffic != traffic
+    assert not started.host.catch_up()
 
 
 # -- life

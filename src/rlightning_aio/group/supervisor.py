@@ -5,6 +5,10 @@ it, and closes them all. What a death means for requests is the core's affair, w
 what to do about them (`GivenUp`, `Replaced`).
 Rule: it waits only by yielding a `Wait`. The time is passed in, except that of a death, which may
 be found at any moment.
+Rule: nobody is ended by force unheard. How long an env takes is measured by its worker, whose clock
+stands still while it waits for the trainer to read. A worker that does nothing is given its time
+anew whenever anything goes through between the two. And a host whose time is up is asked first for
+what the trainer, late itself, has not taken in yet.
 """
 
 from __future__ import annotations
@@ -251,7 +255,7 @@ class Supervisor:
 
     def _check_start_times(self) -> None:
         for record in self._records:
-            if record.start_by is None or self._now < record.start_by:
+            if record.start_by is None or self._now < record.start_by or _has_news(record):
                 continue
             # Its stacks come with its death. A host that can't be killed has no other chance.
             record.start_by = None if record.late else self._now + _DUMP_SECONDS
@@ -442,7 +446,7 @@ class Supervisor:
         entry, since_ns = record.killable.executing()
         limits = (record.config.step_timeout, record.config.reset_timeout)
         shortest = min(limit for limit in limits if limit is not None)
-        if not entry:
+        if not (entry and since_ns):
             # A stopped process does nothing at all, for all that it was asked to.
             idle = record.idle == self._progress(record)
             return (record.idle_since if idle else self._now) + shortest
@@ -452,9 +456,11 @@ class Supervisor:
         return self._now + shortest if limit is None else since_ns / 1e9 + limit
 
     def _progress(self, record: HostRecord) -> tuple[int, ...]:
-        """Changes with every request and with every reply."""
+        """Changes with every request, with every reply, and with every part of one."""
+        assert record.killable is not None
         slots = slice(record.slots.start, record.slots.stop)
-        return self._in_flight(record), int(self._requests.entry[slots].sum())
+        entries = int(self._requests.entry[slots].sum())
+        return self._in_flight(record), entries, record.killable.traffic
 
     def check(self, now: float) -> None:
         """Find what has hung, in steps and in restarts."""
@@ -483,15 +489,16 @@ class Supervisor:
 
     def _check_hung(self, record: HostRecord) -> None:
         assert record.killable is not None
-        entry, _ = record.killable.executing()
-        progress = self._progress(record)
-        if not entry and progress != record.idle:
-            record.idle, record.idle_since = progress, self._now
-            return
+        entry, since_ns = record.killable.executing()
+        if not (entry and since_ns):
+            progress = self._progress(record)
+            if progress != record.idle:
+                record.idle, record.idle_since = progress, self._now
+                return
         expiry = self._expiry(record)
-        if expiry is None or self._now < expiry:
+        if expiry is None or self._now < expiry or _has_news(record):
             return
-        record.hung_slot = slot_of(entry) if entry else self._first_owed(record)
+        record.hung_slot = self._hung_slot(record, entry)
         self.tell_of("hung", record.host.host_id, record.hung_slot, "")
         self._kill(record, dump=True)
 
@@ -510,13 +517,17 @@ class Supervisor:
             if record.die_by is None:
                 # Counted from here: the time may have been an old one when it was killed.
                 record.die_by = self._now + _OBEY_SECONDS
-            elif self._now >= record.die_by and record.killable is not None:
+            elif self._now >= record.die_by and not _has_news(record):
+                assert record.killable is not None
                 record.die_by = None
                 record.killable.destroy()
         self._any_dying = any(record.dying for record in self._records)
 
-    def _first_owed(self, record: HostRecord) -> int:
-        return int(self._requests.owed(np.array(record.slots, np.intp))[0])
+    def _hung_slot(self, record: HostRecord, entry: int) -> int:
+        """The env that hangs; the first that owes a reply, where nothing is executed any more."""
+        owed = self._requests.owed(np.array(record.slots, np.intp))
+        slot = slot_of(entry)
+        return slot if slot in owed else int(owed[0])
 
     def bury(self, told: Died) -> GivenUp | Replaced | None:
         """Decide what becomes of a host whose worker is gone.
@@ -686,6 +697,11 @@ class Supervisor:
             warnings.warn(
                 "an EnvGroup was not closed; its envs were killed", ResourceWarning, stacklevel=1
             )
+
+
+def _has_news(record: HostRecord) -> bool:
+    """Whether a host has told what only waited to be taken in; what it means is judged later."""
+    return record.killable is not None and record.killable.catch_up()
 
 
 def _told_to_nobody(what: Fate, host_id: int, slot: int, cause: str) -> None: ...

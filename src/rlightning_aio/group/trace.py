@@ -240,7 +240,7 @@ class Trace(Scope):
         host = self._core.supervisor.hosts[requests.host_of(slot)]
         # Only a worker with time limits tells what it executes.
         entry, since = host.executing() if isinstance(host, Killable) else (0, 0)
-        if entry != requests.entry.item(slot):
+        if entry != requests.entry.item(slot) or not since:
             since = requests.sent_ns.item(slot)
         name = f"{Operation(requests.op(slot)).name.lower()}, {state}"
         self._mark(name, now, host.host_id, slot, began=since)

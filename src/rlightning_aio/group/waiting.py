@@ -40,12 +40,16 @@ class Waiting:
         self._wanted: list[int] = []
 
     def poll(self) -> None:
-        """Take in what hosts have ready.
+        """Take in what hosts have ready."""
+        self._poller.poll()
+        self._drain()
+
+    def _drain(self) -> None:
+        """Have what hosts have told take effect.
 
         Invariant: a call that waits looks again, and arms the bell anew, after every reply that
         is taken in; here another call takes it.
         """
-        self._poller.poll()
         self._intake.drain()
         if self._requests.answered:
             self._requests.answered = False
@@ -73,7 +77,7 @@ class Waiting:
         if self._supervisor.timed:
             self.poll()  # What is done is not hung.
         self._supervisor.check(now)
-        self._intake.drain()
+        self._drain()
 
     def turn(self, wanted: int, until: float | None) -> Procedure[float]:
         """One turn of waiting for `wanted` more replies; the time after it."""

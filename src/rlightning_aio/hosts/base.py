@@ -142,7 +142,23 @@ class Killable(Protocol):
     """A host that can hang, and be ended by force."""
 
     def executing(self) -> tuple[int, int]:
-        """Entry being executed and since when (monotonic ns); entry 0 if none."""
+        """Entry being executed and since when (monotonic ns); entry 0 if none.
+
+        The time is 0 while it waits for the trainer to read what has come of the entry so far.
+        """
+        ...
+
+    @property
+    def traffic(self) -> int:
+        """Changes whenever a part of a reply has been read, or more of a request been written."""
+        ...
+
+    def catch_up(self) -> bool:
+        """Take in what it has told, and write what it is to be told, without blocking; whether
+        there was anything.
+
+        Called before it is ended by force: the trainer may be the one that is late.
+        """
         ...
 
     def kill(self, *, dump: bool) -> None:

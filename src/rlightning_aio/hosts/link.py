@@ -48,6 +48,7 @@ class Link:
 
     Attributes:
         close_errors: what the worker said when it closed; None before.
+        traffic: see `base.Killable.traffic`.
     """
 
     def __init__(self, place: WorkerPlace, wiring: Wiring, channel: socket.socket) -> None:
@@ -64,6 +65,7 @@ class Link:
         self._outgoing = bytearray()
         self._frames_outgoing = 0
         self.close_errors: list[tuple[int, ErrorText]] | None = None
+        self.traffic = 0
         self._watcher.watch(self)
 
     def fileno(self) -> int:
@@ -124,6 +126,7 @@ class Link:
         """See `base.Source.on_writable`."""
         sent = self._write_some(self._outgoing)
         del self._outgoing[:sent]
+        self.traffic += sent
         if not self._outgoing:
             self._watcher.watch_writable(self, False)
             self._all_written()
@@ -165,11 +168,19 @@ class Link:
                 # tells why it died; there is nothing more to hear from here.
                 self.hang_up()
                 return
+            self.traffic += len(data)
             for frame in self._frames.feed(data):
                 self._frames_received += 1
                 self._receive(frame)
             if len(data) < CHUNK_BYTES:
                 return
+
+    def catch_up(self) -> None:
+        """Write what waits, as far as it can go, and read all that there is."""
+        if self._outgoing:
+            self.on_writable()
+        self.read_channel()
+        self.poll()
 
     def _receive(self, frame: Frame) -> None:
         kind, number, payload = frame

@@ -364,6 +364,19 @@ class ProcessHost:
         """See `base.Killable.executing`."""
         return (0, 0) if self._link is None else self._link.executing()
 
+    @property
+    def traffic(self) -> int:
+        """See `base.Killable.traffic`."""
+        return 0 if self._link is None else self._link.traffic
+
+    def catch_up(self) -> bool:
+        """See `base.Killable.catch_up`."""
+        told, traffic = len(self._wiring.completions), self.traffic
+        self._fork_server.on_readable()
+        if self._link is not None:
+            self._link.catch_up()
+        return (len(self._wiring.completions), self.traffic) != (told, traffic)
+
 
 def _ending(exit_code: int) -> str:
     if exit_code >= 0:

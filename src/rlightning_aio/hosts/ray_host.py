@@ -138,6 +138,8 @@ class RayHost:
         self._started: list[EnvStarted] = []
         self._table: RowTable | None = None
         self._closing = False
+        # How far a batch and its reply have come is Ray's own knowledge.
+        self.traffic = 0
 
     # -- life ---------------------------------------------------------------------
 
@@ -259,6 +261,12 @@ class RayHost:
                 return entry, since_ns
             since_ns += int(limit * 1e9)
         return entries[-1], since_ns
+
+    def catch_up(self) -> bool:
+        """See `base.Killable.catch_up`."""
+        told = len(self._wiring.completions)
+        self.on_readable()
+        return len(self._wiring.completions) != told
 
     # -- replies ------------------------------------------------------------------
 

@@ -276,10 +276,24 @@ class Worker:
         if self._is_child:
             _end_child()
         try:
-            self._channel.sendall(data)
+            try:
+                sent = self._channel.send(data, socket.MSG_DONTWAIT)
+            except BlockingIOError:
+                sent = 0
+            if sent < len(data):
+                self._write_rest(memoryview(data)[sent:])
         except BaseException as error:
             # A part may be out, which nothing can follow; and no env has raised this.
             raise TrainerGone from error
+
+    def _write_rest(self, rest: memoryview) -> None:
+        """Write what the channel had no room for. The trainer may take its time to read it, which
+        is not the env's.
+        """
+        paused_ns = time.monotonic_ns()
+        since_ns = self._rings.pause()
+        self._channel.sendall(rest)
+        self._rings.resume(since_ns + time.monotonic_ns() - paused_ns)
 
     def _send(self, kind: FrameKind, number: int = 0, payload: bytes = b"") -> None:
         self._write(encode(kind, number, payload))

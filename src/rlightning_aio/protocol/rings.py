@@ -146,7 +146,8 @@ class TrainerRings:
     def current(self) -> tuple[int, int]:
         """The entry that the worker is executing (0 if none), and since when.
 
-        The time is in ns of the monotonic clock, which all processes share.
+        The time is in ns of the monotonic clock, which all processes share; 0 while the worker
+        waits for the trainer to read what has come of the entry so far.
         """
         return self._words[_CURRENT], self._words[_CURRENT_SINCE_NS]
 
@@ -190,6 +191,16 @@ class WorkerRings:
         """Say which entry is being executed."""
         self._words[_CURRENT_SINCE_NS] = now_ns
         self._words[_CURRENT] = current
+
+    def pause(self) -> int:
+        """Say that what is being executed waits for the trainer; what `resume` takes."""
+        since_ns = self._words[_CURRENT_SINCE_NS]
+        self._words[_CURRENT_SINCE_NS] = 0
+        return since_ns
+
+    def resume(self, since_ns: int) -> None:
+        """Say that it goes on, and since when it would have been executed without the wait."""
+        self._words[_CURRENT_SINCE_NS] = since_ns
 
     def idle(self) -> None:
         """Say that nothing is being executed."""

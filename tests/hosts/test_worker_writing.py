@@ -1,0 +1,44 @@
+"""A worker that has more to tell than its channel takes."""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+import time
+
+from patience import HANG
+from protocol.memory_of_rings import both_sides
+
+from rlightning_aio.hosts.worker import Worker
+from rlightning_aio.protocol.entries import Operation, entry
+from rlightning_aio.protocol.frames import FrameKind, FrameReader
+
+
+def test_its_clock_stands_still_while_it_waits_to_be_read() -> None:
+    """The trainer sees that it waits, and with what; the clock of what fits at once runs on."""
+    _, trainer, rings = both_sides(1)
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        worker = Worker(theirs, -1, rings, 0)
+        request, began = entry(1, 0, Operation.STEP), time.monotonic_ns()
+        rings.begin(request, began)
+        worker._send(FrameKind.SAVED, 0, b"small")
+        assert trainer.current() == (request, began)
+        large = (FrameKind.SAVED, 0, bytes(1 << 23))
+        writing = threading.Thread(target=worker._send, args=large)
+        writing.start()
+        until = time.monotonic() + HANG
+        while trainer.current() != (request, 0) and time.monotonic() < until:
+            os.sched_yield()
+        waited_at = time.monotonic_ns()
+        assert trainer.current() == (request, 0)
+        reader, sizes = FrameReader(), []
+        read_at = time.monotonic_ns()
+        while len(sizes) < 2:
+            sizes += [len(frame.payload) for frame in reader.feed(ours.recv(1 << 16))]
+        writing.join()
+        assert sizes == [5, 1 << 23]
+        executing, since = trainer.current()
+        assert executing == request
+        assert since - began >= read_at - waited_at > 0
