@@ -1,16 +1,18 @@
-"""The trainer's handle on a fork server: whatever kind of program that turns out to be."""
+"""A fork server, and the trainer's handle on it: whatever kind of program that turns out to be."""
 
 from __future__ import annotations
 
 import os
+import select
 import socket
 import sys
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from rlightning_aio.hosts import fork_server
 from rlightning_aio.hosts.arena import Arena
-from rlightning_aio.hosts.fork_messages import Fork
+from rlightning_aio.hosts.fork_messages import Exited, Fork
 from rlightning_aio.hosts.messages import WorkerPlace
 from rlightning_aio.hosts.process import ForkServer
 
@@ -87,3 +89,38 @@ def test_a_program_that_is_no_interpreter_ends_with_its_exit_code(program: str, 
         f"it exited with code {code} while it was importing gymnasium; is /bin/{program} a Python "
         "with the packages that workers need?"
     )
+
+
+def test_a_death_is_told_though_another_process_goes_on_writing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It was started by the worker, has its stderr, and fills that faster than it is read."""
+    reader, writer = os.pipe()
+    os.set_blocking(reader, False)
+    os.write(writer, b"x" * 50_000 + b"last words")
+    reads: list[int] = []
+    read = os.read
+
+    def read_what_is_refilled(descriptor: int, most: int) -> bytes:
+        data = read(descriptor, most)
+        reads.append(len(data))
+        assert len(reads) < 100, "it reads for ever"
+        os.write(writer, b"y" * len(data))
+        return data
+
+    monkeypatch.setattr(os, "read", read_what_is_refilled)
+    told: list[Any] = []
+    pid = os.posix_spawn("/bin/false", ["false"], {})
+    os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)
+    server: Any = object.__new__(fork_server._ForkServer)
+    server._poll = select.poll()
+    server._outlet = fork_server._Outlet(server._poll)
+    server._trainer = type("Trainer", (), {"send": told.append})
+    channel = os.open(os.devnull, os.O_RDONLY)
+    server._children = {pid: fork_server._Child(7, pid, reader, channel)}
+    server._bury()
+    os.close(writer)
+    (exited,) = told
+    assert isinstance(exited, Exited)
+    assert (exited.host_id, exited.exit_code) == (7, 1)
+    assert exited.stderr_tail.endswith("last words")

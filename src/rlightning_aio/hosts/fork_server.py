@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import faulthandler
+import fcntl
 import gc
 import importlib
 import os
@@ -19,6 +20,7 @@ import select
 import signal
 import socket
 import sys
+import termios
 import threading
 import time
 import traceback
@@ -73,6 +75,7 @@ If that fails, the only packet is `FAILED` and why.
 
 DUMP_SIGNAL: Final = signal.SIGRTMIN + 7
 _TAIL_BYTES: Final = 8192
+_CHUNK_BYTES: Final = 1 << 16
 _GRACE_SECONDS: Final = 1.2
 """How long workers may take to notice that the trainer is gone and stop a robot."""
 _DUMP_SECONDS: Final = 0.3
@@ -291,22 +294,21 @@ class _ForkServer:
             if child.stderr == descriptor:
                 self._drain(child)
 
-    def _drain(self, child: _Child) -> bool:
+    def _drain(self, child: _Child, most: int = _CHUNK_BYTES) -> None:
         try:
-            data = os.read(child.stderr, 1 << 16)
+            data = os.read(child.stderr, most)
         except BlockingIOError:
-            return False
+            return
         if not data:
             child.silent = True
             self._choose_heard()
-            return False
+            return
         child.tail += data
         del child.tail[:-_TAIL_BYTES]
         was_full = self._outlet.full
         self._outlet.write(data)
         if self._outlet.full != was_full:
             self._choose_heard()
-        return True
 
     def _bury(self) -> None:
         for pid in list(self._children):
@@ -314,8 +316,9 @@ class _ForkServer:
             if not ended:
                 continue
             child = self._children.pop(pid)
-            while self._drain(child):
-                pass
+            # No more than lies there now: a process that it has started may go on writing.
+            if unread := _unread(child.stderr):
+                self._drain(child, unread)
             with contextlib.suppress(KeyError):
                 self._poll.unregister(child.stderr)
             os.close(child.stderr)
@@ -347,6 +350,11 @@ class _ForkServer:
         for descriptor, _ in self._poll.poll(max(0.0, until - time.monotonic()) * 1000):
             self._attend(descriptor)
         self._bury()
+
+
+def _unread(pipe: int) -> int:
+    """How many bytes lie in it."""
+    return int.from_bytes(fcntl.ioctl(pipe, termios.FIONREAD, bytes(4)), sys.byteorder)
 
 
 def _run_worker(
