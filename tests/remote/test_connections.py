@@ -17,7 +17,8 @@ from remote.counting import ClientThread, CountingEnv
 
 from rlightning_aio import sync
 from rlightning_aio.hosts import allowance, door, gate, listener
-from rlightning_aio.protocol.net.wire import MAX_PARTS, Ping, Writer
+from rlightning_aio.protocol.net.space_description import describe
+from rlightning_aio.protocol.net.wire import MAX_PARTS, VERSION, Hello, Ping, Writer
 from rlightning_aio.remote import RemoteEnvClient, make_keys
 
 if TYPE_CHECKING:
@@ -147,6 +148,48 @@ def test_whoever_says_nothing_of_use_is_cut_off(said: bytes, most: int) -> None:
                 stranger.send(said)
             step_until_one_is_cut_off(group, listener, batch)
         assert listener.door.num_wasted == most
+        assert friend.env.disconnects == 0
+
+
+def hello() -> list[bytes]:
+    """Of a client that never has a result, beside those of `CountingEnv`."""
+    env = CountingEnv()
+    observation_space = describe(env.get_observation_space(), "observation")
+    action_space = describe(env.get_action_space(), "action")
+    return Writer().write(
+        Hello(
+            version=VERSION,
+            name="greedy",
+            nonce=1,
+            observation_space=observation_space,
+            action_space=action_space,
+        )
+    )
+
+
+def test_a_client_that_speaks_over_ever_new_connections_keeps_the_last_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The others make room, as if it had never been a client there; nobody else is cut off."""
+    monkeypatch.setattr(door, "_MOST", 20)
+    with with_a_client() as (group, listener, friend, first):
+        batch, message = first, hello()
+        with zmq.Context() as context, contextlib.ExitStack() as held:
+            for _ in range(40):
+                greedy = held.enter_context(context.socket(zmq.DEALER))
+                greedy.linger = 0
+                greedy.set(zmq.RECONNECT_IVL, -1)
+                greedy.connect(group["robots-0"].address)
+                greedy.send_multipart(message)
+                while not greedy.poll(0):
+                    batch = step(group, batch)
+                (token,) = [
+                    token
+                    for token, session in listener._sessions._sessions.items()
+                    if session.seat.name == "greedy"
+                ]
+                message = Writer().write(Ping(session=token))
+                assert len(listener.door._open) <= 20
         assert friend.env.disconnects == 0
 
 

@@ -1,7 +1,8 @@
 """`Door`: watches the connections of an env_server's socket, and ends those that are of no use.
 
 Rule: ZMQ accepts whoever comes, and tells by its monitor. Whoever then takes up room or time
-without becoming a client is cut off. While the trainer is away, ZMQ goes on accepting, but stops
+without becoming a client is cut off. A client has one connection, over which it has spoken last;
+others that it holds are of no use. While the trainer is away, ZMQ goes on accepting, but stops
 when some thousand events wait to be read. So no flood takes more descriptors than `ROOM`, which
 is added to what the process may open.
 Absent on purpose: what messages mean, and who is let in.
@@ -25,6 +26,8 @@ from rlightning_aio.protocol.net.server_session import Heard
 from rlightning_aio.remote.parts import is_readable
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from rlightning_aio.hosts.allowance import Allowance
 
 __all__ = ["Connection", "Door"]
@@ -77,6 +80,7 @@ class Door:
         router: a socket that is bound to nothing yet.
         allowance: for strangers, in seconds.
         has_keys: connections have users.
+        spoken_over: tells the routes over which clients speak now.
 
     Attributes:
         num_cut: connections that were cut off.
@@ -91,11 +95,13 @@ class Door:
         allowance: Allowance,
         *,
         has_keys: bool,
+        spoken_over: Callable[[], set[bytes]],
     ) -> None:
         self.num_cut = self.num_wasted = self.num_dropped = 0
         self._allowance = allowance
         self._router = router
         self._has_keys = has_keys
+        self._spoken_over = spoken_over
         self._port = -1
         self._most = _make_room()
         self._by_route: dict[bytes, Connection] = {}
@@ -132,7 +138,8 @@ class Door:
         excess = len(self._open) - self._most
         if excess > 0:
             # Those that have been of no use the longest.
-            useless = [fd for fd, one in self._open.items() if one is None or not one.is_client]
+            used = self._spoken_over()
+            useless = [fd for fd, one in self._open.items() if one is None or one.route not in used]
             for descriptor in useless[:excess]:
                 self._close(descriptor)
         return bool(told)

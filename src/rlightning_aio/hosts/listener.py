@@ -113,6 +113,14 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
+class _Sessions(ServerSessions):
+    """Also knows which connections are in use: each session is spoken over one, its latest."""
+
+    def routes(self) -> set[bytes]:
+        """Of those connections."""
+        return {session.route for session in self._sessions.values()}
+
+
 class Listener:
     """Listens for env clients and speaks with them; never blocks.
 
@@ -141,7 +149,7 @@ class Listener:
     ) -> None:
         self.server_id = server_id
         self.settings = settings
-        self._sessions = ServerSessions(
+        self._sessions = _Sessions(
             server_id,
             heartbeat=settings.heartbeat,
             step_timeout=step_timeout,
@@ -217,7 +225,13 @@ class Listener:
         if ":" in host:
             router.set(zmq.IPV6, 1)
             host = f"[{host}]"
-        door = self.door = Door(context, router, self._allowance, has_keys=self._gate.has_keys)
+        door = self.door = Door(
+            context,
+            router,
+            self._allowance,
+            has_keys=self._gate.has_keys,
+            spoken_over=self._sessions.routes,
+        )
         try:
             router.bind(f"tcp://{host}:{settings.port or '*'}")
         except zmq.ZMQError:
