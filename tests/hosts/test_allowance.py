@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import pytest
+import zmq
 from hypothesis import given
 from hypothesis import strategies as st
+from zmq.utils import z85
 
-from rlightning_aio.hosts.allowance import Allowance, price
-from rlightning_aio.hosts.gate import Question, Turns
+from rlightning_aio.hosts.allowance import CONNECTION, Allowance, price
+from rlightning_aio.hosts.gate import Gate, Question, Turns
 from rlightning_aio.protocol.net.wire import MAX_HELLO_BYTES
+from rlightning_aio.remote import make_keys
+from rlightning_aio.remote.keys import read_client_keys
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 AMOUNTS = st.floats(0.0, 0.5)
 MOST, RATE = 0.1, 0.02
@@ -97,3 +106,49 @@ def test_questions_that_are_too_old_are_forgotten() -> None:
     turns.add(ask(0, 10))
     turns.forget(11)
     assert not turns
+
+
+class Asker:
+    """What ZMQ is to a `Gate`: it asks about connections, which all come from one address."""
+
+    def __init__(self, context: zmq.Context[zmq.Socket[bytes]]) -> None:
+        self._socket = context.socket(zmq.DEALER)
+        self._socket.connect("inproc://zeromq.zap.01")
+
+    def ask(self, number: int, key: bytes) -> None:
+        head = [b"", b"1.0", b"%d" % number, b"", b"10.0.0.1", b""]
+        self._socket.send_multipart([*head, b"CURVE", z85.decode(key)])
+
+    def answers(self) -> list[tuple[int, bytes, bytes]]:
+        """Those that have come: to which question, the verdict, and whose the key is."""
+        found: list[tuple[int, bytes, bytes]] = []
+        while self._socket.poll(0):
+            _, _, number, verdict, _, user, _ = self._socket.recv_multipart()
+            found.append((int(number), verdict, user))
+        return found
+
+
+def test_a_known_key_does_not_wait_behind_strangers(tmp_path: Path) -> None:
+    """Nothing is left for them, and they were there first. A key that is deleted is nobody's."""
+    (arm,) = make_keys(tmp_path, ["arm"])
+    known = read_client_keys(arm).public
+    gate = Gate(tmp_path / "server", Allowance(CONNECTION, 1e-9))
+    context = zmq.Context[zmq.Socket[bytes]]()
+    try:
+        router = context.socket(zmq.ROUTER)
+        gate.open(context, router)
+        asker = Asker(context)
+        for number in range(3):
+            asker.ask(number, zmq.curve_keypair()[0])
+        assert gate.look(1000.0)
+        assert asker.answers() == [(0, b"400", b"")]
+        asker.ask(3, known)
+        assert gate.look(1000.0)
+        assert asker.answers() == [(3, b"200", b"arm")]
+        (tmp_path / "server" / "clients" / "arm.key").unlink()
+        for number in (4, 5):
+            asker.ask(number, known)
+        assert gate.look(1000.0)
+        assert asker.answers() == [(4, b"400", b"")]
+    finally:
+        context.destroy(linger=0)

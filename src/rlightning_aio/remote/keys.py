@@ -215,6 +215,10 @@ class AllowedKeys:
             self._refresh(stamps)
         return self._owners.get(key)
 
+    def knew(self, key: bytes) -> bool:
+        """Whether `key` was somebody's when the files were looked at last."""
+        return key in self._owners
+
     def _stamps(self) -> dict[str, _Stamp]:
         stamps: dict[str, _Stamp] = {}
         try:
