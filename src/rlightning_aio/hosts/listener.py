@@ -113,14 +113,6 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
-class _Sessions(ServerSessions):
-    """Also knows which connections are in use: each session is spoken over one, its latest."""
-
-    def routes(self) -> set[bytes]:
-        """Of those connections."""
-        return {session.route for session in self._sessions.values()}
-
-
 class Listener:
     """Listens for env clients and speaks with them; never blocks.
 
@@ -149,7 +141,7 @@ class Listener:
     ) -> None:
         self.server_id = server_id
         self.settings = settings
-        self._sessions = _Sessions(
+        self._sessions = ServerSessions(
             server_id,
             heartbeat=settings.heartbeat,
             step_timeout=step_timeout,

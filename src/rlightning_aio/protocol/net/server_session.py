@@ -531,6 +531,10 @@ class ServerSessions:
             # There is nobody who would ask for it.
             seat.unreported = None
 
+    def routes(self) -> set[bytes]:
+        """Those over which clients have spoken last, each over one."""
+        return {session.route for session in self._sessions.values()}
+
     def traits(self, client: str) -> ClientTraits:
         """What a client that is here makes of requests."""
         session = self._seats[client].session
