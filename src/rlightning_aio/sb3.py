@@ -157,11 +157,9 @@ class VecEnv(_Base):
         Raises:
             EnvRaised, WorkerDied, EnvHung: an env failed; the others' results are dropped.
         """
-        self._begin()
-        with self._dropping_the_rest():
+        with self._exchange(), self._dropping_the_rest():
             self._rows.send_resets(self._seeds, self._options, range(self.num_envs))
             batch, _ = self.group.collect_async(wait_all=True, ordered=True)
-        self._unfinished = False
         self.reset_infos = self._rows.info_list(batch)
         self._reset_seeds()
         self._reset_options()
@@ -210,6 +208,13 @@ class VecEnv(_Base):
         self._unfinished = True
 
     @contextlib.contextmanager
+    def _exchange(self) -> Generator[None]:
+        """What is sent within is answered within."""
+        self._begin()
+        yield
+        self._unfinished = False
+
+    @contextlib.contextmanager
     def _dropping_the_rest(self) -> Generator[None]:
         """Where an env fails, let the others end what they do, so that all can be reset."""
         try:
@@ -247,9 +252,8 @@ class VecEnv(_Base):
         Raises:
             ValueError: of some envs that are stepped together with others.
         """
-        self._begin()
-        self._rows.set_outermost(attr_name, value, list(self._get_indices(indices)))
-        self._unfinished = False
+        with self._exchange():
+            self._rows.set_outermost(attr_name, value, list(self._get_indices(indices)))
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
@@ -259,10 +263,8 @@ class VecEnv(_Base):
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
         """Whether `wrapper_class` is among the wrappers of envs."""
-        self._begin()
-        found = self._rows.are_wrapped(wrapper_class, list(self._get_indices(indices)))
-        self._unfinished = False
-        return found
+        with self._exchange():
+            return self._rows.are_wrapped(wrapper_class, list(self._get_indices(indices)))
 
     def get_images(self) -> list[Any]:
         """One frame of each env, as it renders it."""
@@ -270,11 +272,9 @@ class VecEnv(_Base):
 
     def _call(self, indices: Any, name: str, /, *args: Any, **kwargs: Any) -> list[Any]:
         chosen: list[int] = list(self._get_indices(indices))
-        self._begin()
-        self._rows.call(name, args, kwargs, chosen)
-        collected = self.group.collect_calls()
-        self._unfinished = False
-        return self._rows.values(collected, chosen)
+        with self._exchange():
+            self._rows.call(name, args, kwargs, chosen)
+            return self._rows.values(self.group.collect_calls(), chosen)
 
 
 def _last_and_first(info: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:

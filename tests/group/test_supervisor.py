@@ -433,6 +433,16 @@ def test_an_env_that_executes_too_long_is_killed(fleet: Callable[..., Fleet]) ->
     assert "took longer than 5.0 s for a step" in str(error)
 
 
+def ended_as_hung(ours: Fleet) -> Replaced:
+    """What becomes of host 0, whose time is up in a moment."""
+    ours.now += 0.2
+    ours.check()
+    assert ours.log[0] == "dump and kill 0"
+    (verdict,) = ours.verdicts
+    assert isinstance(verdict, Replaced)
+    return verdict
+
+
 def test_a_stopped_process_is_found_by_its_doing_nothing(fleet: Callable[..., Fleet]) -> None:
     """It owes a reply and executes none; every reply begins its time anew."""
     ours = fleet((2, 1), step_timeout=5.0)
@@ -444,11 +454,7 @@ def test_a_stopped_process_is_found_by_its_doing_nothing(fleet: Callable[..., Fl
     ours.now += 4.9
     ours.check()
     assert ours.log == []
-    ours.now += 0.2
-    ours.check()
-    assert ours.log[0] == "dump and kill 0"
-    (verdict,) = ours.verdicts
-    assert isinstance(verdict, Replaced)
+    verdict = ended_as_hung(ours)
     assert verdict.owed.tolist() == [1]
     assert verdict.error_for(verdict.owed).env_id == "e-1"
 
@@ -467,11 +473,7 @@ def test_what_waits_for_the_trainer_to_read_has_its_time_anew_with_each_part(
         ours.now += 4.9
         ours.check()
     assert ours.log == []
-    ours.now += 0.2
-    ours.check()
-    assert ours.log[0] == "dump and kill 0"
-    (verdict,) = ours.verdicts
-    assert isinstance(verdict, Replaced)
+    verdict = ended_as_hung(ours)
     assert verdict.error_for(verdict.owed).env_id == "e-1"
 
 

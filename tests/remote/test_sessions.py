@@ -459,8 +459,8 @@ def test_a_session_answers_to_the_key_it_was_opened_with_alone() -> None:
     assert server.take()
 
 
-def test_results_that_never_fit_end_the_session() -> None:
-    """A client that breaks its word three times for one request is sent away."""
+def answered_once() -> tuple[World, Any, bytes, bytes]:
+    """A client that has executed a step, whose result, header and frame, hasn't been sent yet."""
     world = World("a")
     world.join_all()
     world.take()
@@ -468,7 +468,13 @@ def test_results_that_never_fit_end_the_session() -> None:
     world.submit("a", 1)
     world.to_client(client)
     client.execute()
-    (header, _), client.outbox[:] = client.outbox[0], []
+    (header, frame), client.outbox[:] = client.outbox[0], []
+    return world, client, header, frame
+
+
+def test_results_that_never_fit_end_the_session() -> None:
+    """A client that breaks its word three times for one request is sent away."""
+    world, client, header, _ = answered_once()
     for _ in range(3):
         assert not world.results
         world.server.receive(client.route or b"", None, [header, b"short"], 0.0)
@@ -480,14 +486,7 @@ def test_results_that_never_fit_end_the_session() -> None:
 
 def test_results_that_are_nested_too_deep_end_the_session() -> None:
     """They are none: nothing that takes an info apart may run out of stack."""
-    world = World("a")
-    world.join_all()
-    world.take()
-    client = world.clients["a"]
-    world.submit("a", 1)
-    world.to_client(client)
-    client.execute()
-    (header, frame), client.outbox[:] = client.outbox[0], []
+    world, client, header, frame = answered_once()
     deep: dict[str, Any] = {}
     for _ in range(MAX_NESTING):
         deep = {"deep": deep}

@@ -14,6 +14,7 @@ import numpy as np
 
 from rlightning_aio.batch.data import columns_of_responses
 from rlightning_aio.errors import BadAction
+from rlightning_aio.group.slab_layout import rows_in
 from rlightning_aio.hosts.messages import NO_ACTION
 from rlightning_aio.protocol.columns import Leaf, Rows, Tree, as_array, index, out_of_range
 
@@ -58,7 +59,7 @@ def write_actions(
             return out_of_band
     columns = columns_of_responses(batch)
     if columns is not None and len(layout.slabs) == 1 and out_of_band is None:
-        rows = _rows(slots, envs, layout)
+        rows = rows_in(layout, slots, envs.all)
         _write_column(columns.get("action"), layout.slabs[0], slots, rows, envs)
         return None
     _write_one_by_one(batch, slots, envs, layout, out_of_band)
@@ -76,13 +77,6 @@ def _write_column(
         if (unfit := _unfit(source, leaf, slab)) is not None:
             raise _unfit_error(unfit, source, leaf, slots, envs)
         target[rows] = source
-
-
-def _rows(slots: NDArray[np.intp], envs: EnvTable, layout: SlabLayout) -> Rows:
-    """Rows of `slots` in the only slab, which may be that of an env_server behind another."""
-    if slots is envs.all:
-        return slice(None)
-    return slots if layout.row_is_slot else layout.row[slots]
 
 
 def _write_one_by_one(
@@ -196,7 +190,7 @@ def _chosen_out_of_band(
         if _fits(action, layout.slabs[0], len(slots)):
             if not any_extras:
                 return None
-            _write(action, layout.slabs[0], _rows(slots, envs, layout))
+            _write(action, layout.slabs[0], rows_in(layout, slots, envs.all))
             readers = np.flatnonzero(envs.reads_extras[slots])
             contents = [(NO_ACTION, _extras(batch, k)) for k in readers.tolist()]
             return OutOfBandSteps(readers, contents) if contents else None

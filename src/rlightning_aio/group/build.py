@@ -218,7 +218,8 @@ def _assembled(plan: Plan, watcher: Watcher, arena: Arena, *, shares_thread: boo
         [f"{config.name}-{index}" for config in local for index in range(config.num_workers)],
         [(f"{config.name}-0", config, MAX_CLIENTS) for config in servers],
     )
-    orders = _orders(plan, servers)
+    cores = num_cores()
+    orders = _orders(plan, servers, cores)
     bell_offset = arena.append(bell_size(len(orders)))
     bell_memory = map_shared(arena.descriptor, bell_offset, bell_size(len(orders)))
     bell = TrainerBell(bell_memory, len(orders))
@@ -237,10 +238,10 @@ def _assembled(plan: Plan, watcher: Watcher, arena: Arena, *, shares_thread: boo
         arena,
         completions.append,
         mixed_actions=plan.mixed_actions,
-        num_cores=num_cores(),
+        num_cores=cores,
     )
     supervisor.resources["bell"] = bell
-    poller = Poller(requests, bell, num_cores())
+    poller = Poller(requests, bell, cores)
     wiring = Wiring(
         completions=completions,
         watcher=watcher,
@@ -268,14 +269,14 @@ def _assembled(plan: Plan, watcher: Watcher, arena: Arena, *, shares_thread: boo
     return Core(*parts, zero_copy=plan.zero_copy)
 
 
-def _orders(plan: Plan, servers: Sequence[EnvConfig]) -> list[StartOrder]:
+def _orders(plan: Plan, servers: Sequence[EnvConfig], num_cores: int) -> list[StartOrder]:
     """What each host is to build: local ones first, then the env_servers."""
     local = [
         (config, fns)
         for config, fns in zip(plan.configs, plan.preprocess_fns, strict=True)
         if config.backend != ENV_SERVER
     ]
-    nums_hosts = _nums_hosts([config for config, _ in local])
+    nums_hosts = _nums_hosts([config for config, _ in local], num_cores)
     shares = [
         (config, share)
         for (config, fns), num_hosts in zip(local, nums_hosts, strict=True)
@@ -299,7 +300,7 @@ def _orders(plan: Plan, servers: Sequence[EnvConfig]) -> list[StartOrder]:
             env_class=ENVS.registered(config.backend),
             worker_indices=tuple(index for index, _ in share),
             preprocess_fns=tuple(fn for _, fn in share),
-            spins=num_processes <= num_cores(),
+            spins=num_processes <= num_cores,
             core=cores[host_id % len(cores)] if config.cpu_affinity else None,
             tasks=tasks,
         )
@@ -339,7 +340,7 @@ def _own_makers(config: EnvConfig, indices: Sequence[int]) -> EnvConfig:
     return config.model_copy(update={"make_env": tuple(makers[k] for k in indices)})
 
 
-def _nums_hosts(configs: Sequence[EnvConfig]) -> list[int]:
+def _nums_hosts(configs: Sequence[EnvConfig], num_cores: int) -> list[int]:
     """Over how many hosts the envs of each entry are spread.
 
     Entries of CPU-bound simulators that don't say it share the cores, by their numbers of envs;
@@ -357,7 +358,7 @@ def _nums_hosts(configs: Sequence[EnvConfig]) -> list[int]:
             sharing.append(k)
         else:
             nums.append(config.num_workers)
-    for _ in range(num_cores() - len(sharing)):
+    for _ in range(num_cores - len(sharing)):
         # One more worker where most envs share one.
         crowded = max(sharing, key=lambda k: configs[k].num_workers / nums[k], default=None)
         if crowded is None or nums[crowded] == configs[crowded].num_workers:

@@ -9,6 +9,7 @@ import numpy as np
 
 from rlightning_aio.batch.columns import ResultColumns
 from rlightning_aio.batch.sent import kept_columns
+from rlightning_aio.group.slab_layout import rows_in
 from rlightning_aio.protocol.columns import Rows, gather, mapped, stacked
 from rlightning_aio.protocol.info import NO_INFO, PICKLED
 from rlightning_aio.protocol.slab import TRUNCATED
@@ -145,7 +146,8 @@ class Results:
 
     def add_episodes(self, part: ResultColumns) -> None:
         """Copy the sums of the episodes that end in `part`; its rows are as they were."""
-        slab, rows = self._slab_of(part), self._rows(part.slots)
+        slab = self._slab_of(part)
+        rows = rows_in(self._layout, part.slots, self._envs.all)
         part.episode_return = _copy(slab.episode_return, rows)
         part.episode_length = _copy(slab.episode_length, rows)
 
@@ -168,15 +170,11 @@ class Results:
     def _slab_of(self, part: ResultColumns) -> Slab:
         return self._layout.slabs[self._layout.slab.item(part.slots.item(0))]
 
-    def _rows(self, slots: NDArray[np.intp]) -> Rows:
-        if slots is self._envs.all:
-            return slice(0, len(slots))
-        return slots if self._layout.row_is_slot else self._layout.row[slots]
-
     def _part(
         self, slab: Slab, slots: NDArray[np.intp], positions: NDArray[np.intp] | None
     ) -> ResultColumns:
-        rows = self._rows(slots) if positions is None else self._layout.row[slots]
+        layout, everyone = self._layout, self._envs.all
+        rows = rows_in(layout, slots, everyone) if positions is None else layout.row[slots]
         flags = gather(slab.flags, rows)
         restarted = self._restarted[slots] if self._any_restarted else None
         if restarted is not None:

@@ -23,9 +23,17 @@ if TYPE_CHECKING:
 
     from rlightning_aio.hosts.arena import Arena
     from rlightning_aio.hosts.messages import EnvStarted
+    from rlightning_aio.protocol.columns import Rows
     from rlightning_aio.types import EnvMeta
 
-__all__ = ["SlabLayout", "check_actions"]
+__all__ = ["SlabLayout", "check_actions", "rows_in"]
+
+
+def rows_in(layout: SlabLayout, slots: NDArray[np.intp], everyone: NDArray[np.intp]) -> Rows:
+    """Rows of `slots` in the only slab; one slice, where they are `everyone`."""
+    if slots is everyone:
+        return slice(0, len(slots))
+    return slots if layout.row_is_slot else layout.row[slots]
 
 
 def check_actions(metas: Sequence[EnvMeta]) -> None:
