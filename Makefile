@@ -11,21 +11,28 @@ SIMULATORS := .venv-simulators
 ISAAC := .venv-isaac
 # RLlib pins Gymnasium to a version of its own.
 RLLIB := .venv-rllib
+# OpenEnv runs in processes of its own, and brings a hundred packages that nothing else here needs.
+OPENENV := .venv-openenv
+# MetaWorld and LeRobot's tasks need MuJoCo 3, and pygame in place of pygame-ce.
+ROBOTS := .venv-robots
+# What other projects' own tests need, and where `make test-peers PEERS=folder` finds their sources.
+PEERS_VENV := .venv-peers
+PEERS ?= peers
 PIP_INSTALL = $(@D)/bin/python -m pip install --quiet --disable-pip-version-check
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-ray environments test-simulators test-gpu test-pythons check format docs dist bench clean
+.PHONY: help run test test-ray environments test-simulators test-gpu test-peers test-pythons test-site check prose format docs dist bench clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 24
 
-run: $(VENV)/installed ## collect 100,000 steps of HalfCheetah-v5 asynchronously
-	$(VENV)/bin/rlightning-aio rollout configs/halfcheetah.yaml --steps 100000
+run: $(VENV)/installed ## 32 HalfCheetahs, by AsyncVectorEnv and by make_vec: how much faster on this machine
+	@$(PY) benchmarks/demo.py
 
-# Most tests wait for processes of their own, so four at a time suit two cores. Who has none
-# left takes over another's; until then each keeps to its files, which share what they prepare.
+# Most tests wait for processes that they start, so six at a time keep two cores busy. A process
+# without tests takes some from another; until then it has whole files, whose tests share fixtures.
 test: $(VENV)/installed-test ## the tests
-	$(PY) -m pytest --numprocesses 4 --dist worksteal
+	$(PY) -m pytest --numprocesses 6 --dist worksteal
 
 # What is said of every place where envs may live, and what only Ray can be asked.
 test-ray: $(VENV)/installed-ray ## the tests of `placement: ray`, on clusters of this machine
@@ -33,16 +40,18 @@ test-ray: $(VENV)/installed-ray ## the tests of `placement: ray`, on clusters of
 	RLIGHTNING_AIO_ON_RAY=1 $(PY) -m pytest tests/group
 
 # What `make test-simulators` installs; `make -j3 environments` installs the three at once.
-environments: $(SIMULATORS)/installed $(ISAAC)/installed $(RLLIB)/installed
+environments: $(SIMULATORS)/installed $(ISAAC)/installed $(RLLIB)/installed $(OPENENV)/installed $(ROBOTS)/installed
 
 # Kernels that Isaac Lab compiled once are found again, by workers and tests alike.
 test-simulators: export WARP_CACHE_PATH := $(CURDIR)/$(ISAAC)/warp-cache
 test-simulators: export ISAAC_PYTHON := $(CURDIR)/$(ISAAC)/bin/python
+test-simulators: export OPENENV_PYTHON := $(CURDIR)/$(OPENENV)/bin/python
 test-simulators: environments ## the tests of every backend, on the real simulators (7 GB of packages)
 	tests/simulators/install_debian.sh
 	$(ISAAC)/bin/python -m pytest -m simulators -rs tests/envs/test_isaac.py
 	$(SIMULATORS)/bin/python -m pytest --numprocesses 3 --dist worksteal -m simulators -rs tests/benchmarks tests/cli tests/envs tests/examples tests/vector tests/test_docs.py tests/test_wheel.py
 	$(RLLIB)/bin/python -m pytest -m simulators -rs tests/vector/test_pages.py
+	MUJOCO_GL=egl $(ROBOTS)/bin/python -m pytest -m simulators -rs tests/cli/test_robots_page.py tests/envs/test_metaworld.py tests/envs/test_lerobot_tasks.py
 
 # With -rs, each test that is skipped says what it lacks.
 test-gpu: export WARP_CACHE_PATH := $(CURDIR)/$(ISAAC)/warp-cache
@@ -52,16 +61,25 @@ test-gpu: $(SIMULATORS)/installed $(ISAAC)/installed ## the tests of simulators 
 	$(ISAAC)/bin/python -m pytest -m gpu -rs tests/envs/test_gpu.py
 	$(SIMULATORS)/bin/python -m pytest -m gpu -rs tests/envs/test_gpu.py tests/envs/test_maniskill.py
 
+# Their versions are to be those of constraints.txt; a project without a folder in PEERS is not run.
+test-peers: $(PEERS_VENV)/installed ## Gymnasium's, SB3's and RLightning's own tests: make test-peers PEERS=folder
+	$(PEERS_VENV)/bin/python tests/peers/run.py $(PEERS)
+
 # The wheel and the sdist, each as the only thing in an environment of each Python that is found.
 # MuJoCo and the like come anew, so this takes some minutes.
-test-pythons: $(VENV)/installed-release ## wheel and sdist in empty environments of Python 3.11, 3.12 and 3.13
+test-pythons: $(VENV)/installed-release ## wheel and sdist in empty environments of Python 3.11 to 3.14
 	$(PY) -m pytest -m pythons -rs tests/test_wheel.py
 
-check: $(VENV)/installed-check ## the static checks: ruff, pyright, import-linter
+check: $(VENV)/installed-check ## the static checks: ruff, pyright, import-linter, prose, names, sizes
 	$(VENV)/bin/ruff check
 	$(VENV)/bin/ruff format --check
 	PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(VENV)/bin/pyright --pythonpath $(PY)
 	$(VENV)/bin/lint-imports
+	$(PY) tests/style/prose.py
+	$(PY) tests/style/limits.py
+
+prose: $(VENV)/installed-check ## the check of prose and names
+	$(PY) tests/style/prose.py
 
 format: $(VENV)/installed-check ## lay the code out as `make check` wants it
 	$(VENV)/bin/ruff check --fix
@@ -71,6 +89,12 @@ format: $(VENV)/installed-check ## lay the code out as `make check` wants it
 docs: export NO_MKDOCS_2_WARNING := 1
 docs: $(VENV)/installed-docs ## the documentation site, into site/; warnings are errors
 	$(VENV)/bin/mkdocs build
+	@echo 'Open $(CURDIR)/site/index.html in a browser.'
+
+# It skips itself, and says so, where no Chromium is found.
+test-site: export NO_MKDOCS_2_WARNING := 1
+test-site: $(VENV)/installed-docs ## the site in a browser: search, clipped lines; screenshots in build/screenshots
+	$(PY) -m pytest -m site -rs tests/test_site.py
 
 dist: $(VENV)/installed-release ## the wheel and the sdist, into dist/
 	rm -rf dist
@@ -80,7 +104,7 @@ bench: $(VENV)/installed-bench $(VENV)/installed-pufferlib ## every benchmark, p
 	$(PY) benchmarks/run_all.py
 
 clean: ## remove the virtual environments and every cache
-	rm -rf $(VENV) $(SIMULATORS) $(ISAAC) $(RLLIB) build dist site .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) $(SIMULATORS) $(ISAAC) $(RLLIB) $(OPENENV) $(ROBOTS) $(PEERS_VENV) build dist site .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 	find src tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
 
 %/bin/python:
@@ -95,15 +119,17 @@ $(VENV)/installed: extras :=
 $(VENV)/installed-test: extras := [test]
 $(VENV)/installed-check: extras := [test,check]
 $(VENV)/installed-bench: extras := [bench]
-$(VENV)/installed-docs: extras := [docs]
+$(VENV)/installed-docs: extras := [test,docs]
 $(VENV)/installed-ray: extras := [test,ray]
 $(VENV)/installed-release: extras := [test,release]
-$(SIMULATORS)/installed: extras := [test,ale,envpool,examples,maniskill,notebook,pettingzoo,piper,sb3,torchrl]
+# Two libraries whose pages it runs, too.
+$(SIMULATORS)/installed: pages := skrl tianshou
+$(SIMULATORS)/installed: extras := [test,ale,envpool,examples,maniskill,notebook,openenv,pettingzoo,piper,sb3,torchrl]
 STAMPS := $(VENV)/installed $(addprefix $(VENV)/installed-,test check docs bench ray release)
 $(STAMPS): | $(PY)
 $(SIMULATORS)/installed: | $(SIMULATORS)/bin/python
 $(STAMPS) $(SIMULATORS)/installed: pyproject.toml constraints.txt
-	$(PIP_INSTALL) --constraint constraints.txt --editable '.$(extras)'
+	$(PIP_INSTALL) --constraint constraints.txt --editable '.$(extras)' $(pages)
 	@touch $@
 
 # It pins versions that nobody else does, of which its vector environments need none. Where it
@@ -112,9 +138,23 @@ $(VENV)/installed-pufferlib: constraints.txt | $(VENV)/installed-bench
 	-$(PIP_INSTALL) --constraint constraints.txt --no-deps pufferlib-core
 	@touch $@
 
+$(OPENENV)/installed: | $(OPENENV)/bin/python
+	$(PIP_INSTALL) openenv==0.10.0
+	@touch $@
+
+$(ROBOTS)/installed: pyproject.toml constraints.txt | $(ROBOTS)/bin/python
+	grep -vE '^(mujoco|numpy|opencv|pygame-ce)' constraints.txt > $(ROBOTS)/constraints.txt
+	$(PIP_INSTALL) --constraint $(ROBOTS)/constraints.txt --editable '.[metaworld,pusht,aloha]' \
+	    hypothesis imageio-ffmpeg pytest pytest-asyncio pytest-timeout pytest-xdist
+	@touch $@
+
 $(RLLIB)/installed: pyproject.toml constraints.txt | $(RLLIB)/bin/python
 	grep -v '^gymnasium==' constraints.txt > $(RLLIB)/constraints.txt
 	$(PIP_INSTALL) --constraint $(RLLIB)/constraints.txt --editable '.[ray,test]' 'ray[rllib]' torch
+	@touch $@
+
+$(PEERS_VENV)/installed: pyproject.toml constraints.txt | $(PEERS_VENV)/bin/python
+	$(PIP_INSTALL) --constraint constraints.txt --editable '.[ale,examples,sb3,test]' box2d hydra-core moviepy pandas
 	@touch $@
 
 $(ISAAC)/installed: pyproject.toml tests/simulators/isaac.txt | $(ISAAC)/bin/python

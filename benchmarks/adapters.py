@@ -2,13 +2,12 @@
 
 How far ahead is each of ours of the class whose place it takes, and what does it cost beside the
 bare group? Over callables, which make separate envs, and by the task's name, which has each worker,
-and the trainer's process, step its share together. Infos are part of both interfaces, so they are
-made in every step; the bare group makes them when somebody reads them, and nobody does.
+and the trainer's process, step its share together. `VectorEnv` makes
+infos in every step; `sb3.VecEnv` and the bare group when somebody reads them, and nobody does.
 """
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,13 +21,12 @@ from contenders import (
 )
 from harness import Question, Target, main
 
-CORES = len(os.sched_getaffinity(0))
 WORK = Work("HalfCheetah-v5", num_envs=32, backend="mujoco")
 
 
 @dataclass
 class OursVector(GymnasiumVector):
-    """`rlightning_aio.vector.VectorEnv`, its workers kept on their cores as the bare group's."""
+    """`rlightning_aio.vector.VectorEnv`, with its workers pinned to cores like the bare group's."""
 
     package = "rlightning_aio"
 
@@ -54,7 +52,7 @@ class OursSb3(Sb3Vector):
 
 @dataclass
 class OursMadeVector(GymnasiumVector):
-    """`rlightning_aio.vector.make_vec`, which has each worker step its envs together."""
+    """`rlightning_aio.vector.make_vec`, where each worker steps its envs together."""
 
     package = "rlightning_aio"
 
@@ -98,7 +96,7 @@ QUESTION = Question(
         OursSync(BARE, WORK),
         OursMadeVector(MADE_VECTOR, WORK),
         OursMadeSb3(MADE_SB3, WORK),
-        OursSync(BARE_TOGETHER, replace(WORK, together=WORK.num_envs // CORES, placement="split")),
+        OursSync(BARE_TOGETHER, replace(WORK, together=WORK.num_envs, placement="inline")),
         GymnasiumAsync(GYMNASIUM, WORK),
         StableBaselines3(SUBPROC, WORK),
     ],

@@ -1,12 +1,12 @@
-"""How far does a robot arm travel after what drives it is killed or stopped?
+"""How far does a robot arm travel after the process that drives it is killed or stopped?
 
     python benchmarks/arm_stops.py
     python benchmarks/arm_stops.py --signals HUP KILL --places client --json stops.json
 
-Three simulated Piper arms, one for each kind of safe stop, are under way to a far target when
-one process gets a signal: the trainer whose arms are in workers, the workers, a trainer whose
-arms are inline, or the clients of a trainer elsewhere. The arms listen on pseudo-terminals,
-and their own clock tells when they stopped. Needs ``rlightning-aio[piper]``.
+Three simulated Piper arms, one for each kind of safe stop, are moving to a far target when one
+process gets a signal: the trainer whose arms are in workers, the workers, a trainer whose arms are
+inline, or the clients of another trainer. The arms listen on pseudo-terminals, and their own clocks
+give the times of their stops. Needs ``rlightning-aio[piper]``.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def options(stop: str, channel: str) -> dict[str, Any]:
         "speed": SPEED,
         "gripper": False,
         "safe_stop": stop,
-        # The machine may be busy; and it is the watchdog's time that is measured.
+        # Long, because the machine may be busy; the watchdog's time is what is measured.
         "feedback_timeout": 20.0,
         "connect_timeout": 60.0,
     }
@@ -80,7 +80,7 @@ def say(line: str) -> None:
 
 
 def drive(placement: str, channels: list[str]) -> None:
-    """A trainer with an arm on each channel; says when they move, and what becomes of it."""
+    """Run a trainer with an arm on each channel; print when they move, and the outcome."""
     entries = [entry(*pair, placement) for pair in zip(STOPS, channels, strict=True)]
     with sync.build_env_group(entries) as group:
         group.reset()
@@ -94,7 +94,7 @@ def drive(placement: str, channels: list[str]) -> None:
 
 
 def serve() -> None:
-    """A trainer whose arms are clients."""
+    """Run a trainer whose arms are clients."""
     server = {"name": "arms", "backend": "env_server"}
     server["env_kwargs"] = {"min_clients": len(STOPS), "connect_timeout": PATIENCE, "heartbeat": 30}
     with sync.build_env_group(server) as group:
@@ -110,11 +110,11 @@ def serve() -> None:
 
 
 def arms() -> tuple[Any, Any]:
-    """The simulation, which is there where the SDK is."""
-    from rlightning_aio.envs import piper_arm, piper_sim
+    """Return the simulation, with which the SDK can be replaced."""
+    from rlightning_aio.piper import arm, sim
 
-    class TimedArm(piper_arm.SimulatedArm):
-        """Has a clock of its own, and notes how far it has come."""
+    class TimedArm(arm.SimulatedArm):
+        """Has its own clock, and records its travel."""
 
         def __init__(self) -> None:
             super().__init__()
@@ -128,7 +128,7 @@ def arms() -> tuple[Any, Any]:
                 before = self.joints
                 super().advance(seconds)
                 self.clock += seconds
-                # Of the joint that moves most.
+                # Of the joint with the largest travel.
                 self.travelled += float(np.degrees(np.abs(self.joints - before).max()))
                 if self.is_stopped and self.stopped_at is None:
                     self.stopped_at = self.clock
@@ -144,18 +144,18 @@ def arms() -> tuple[Any, Any]:
                 if not self.moved.wait_for(condition, PATIENCE):
                     raise TimeoutError(f"the arm is at {self.joints}, going to {self.targets}")
 
-    return TimedArm, piper_sim
+    return TimedArm, sim
 
 
 @dataclass
 class Stopped:
-    """What became of one arm.
+    """The outcome for one arm.
 
     Attributes:
-        signal, place, stop: what was sent, to whom, and what the arm is to do.
-        seconds: from the signal until it stood, by the arm's clock.
-        degrees: that its fastest joint travelled in that time.
-        moved_again: degrees that it travelled after what was stopped was continued.
+        signal, place, stop: the signal, the processes that got it, and the kind of safe stop.
+        seconds: from the signal to standstill, by the arm's clock.
+        degrees: travel of its fastest joint in that time.
+        moved_again: travel in degrees after a stopped process was continued.
     """
 
     signal: str
@@ -167,7 +167,7 @@ class Stopped:
 
 
 def measure(place: str, name: str) -> list[Stopped]:
-    """Send one signal and see how far each arm goes."""
+    """Send one signal and measure the travel of each arm."""
     timed_arm, sim = arms()
     number = getattr(signal, f"SIG{name}")
     with contextlib.ExitStack() as cleanup:
@@ -210,7 +210,7 @@ def measure(place: str, name: str) -> list[Stopped]:
 
 @contextlib.contextmanager
 def started(place: str, channels: list[str]) -> Iterator[list[psutil.Process]]:
-    """What drives the arms; yields the processes that get the signal."""
+    """Start the processes that drive the arms; yield those that get the signal."""
     environment = {**os.environ, "CAN_CONFIG": '{"sleep_after_open": 0.0}'}
     with contextlib.ExitStack() as cleanup:
 
@@ -223,7 +223,7 @@ def started(place: str, channels: list[str]) -> Iterator[list[psutil.Process]]:
                 stderr=subprocess.DEVNULL,
                 text=True,
                 start_new_session=True,
-                # Whoever started this may ignore some of them, as nohup does.
+                # The parent may ignore some of these signals, as nohup does.
                 preexec_fn=_default_signals,  # noqa: PLW1509  # Sets signals only.
             )
             cleanup.callback(process.stdin.close)
@@ -255,21 +255,21 @@ def started(place: str, channels: list[str]) -> Iterator[list[psutil.Process]]:
             raise RuntimeError(f"the trainer of {place} did not come to move its arms")
         if place == "worker":
             targets = [w for fork_server in targets[0].children() for w in fork_server.children()]
-        # What they go on to say must not fill a pipe.
+        # Their further output must not fill a pipe.
         drained = [threading.Thread(target=p.stdout.read, daemon=True) for p in processes]
         for thread in drained:
             thread.start()
         yield targets
         for process in processes:
             process.kill()
-        # Their workers hold the pipes, too. A worker that outlived its port would stop whatever
-        # arm has the path then.
+        # Their workers hold the pipes, too. A worker that outlives its port would stop the next
+        # arm with that path.
         for thread in drained:
             thread.join()
 
 
 def table(found: list[Stopped]) -> str:
-    """The way of each arm after the signal, in Markdown."""
+    """Return a Markdown table with the travel of each arm after the signal."""
     lines = [
         f"| signal | to | {' | '.join(f'`{stop}`' for stop in STOPS)} |",
         f"|---|---|{'---|' * len(STOPS)}",

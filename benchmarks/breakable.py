@@ -1,9 +1,8 @@
-"""An environment that breaks when its action says so, and shows whose answer is whose.
+"""An environment that fails when its action says so, and identifies each of its answers.
 
-An observation holds the environment's index, its process, its episode, its step in the
-episode and the token of the action that it answers, so that data of another environment,
-of another step or of an earlier life can't pass for what was asked.
-Workers import this module through a config entry's ``imports``.
+An observation has the environment's index, process, episode and step, and the token of the action
+that it answers. So data of another environment, another step or an earlier life can't pass for the
+right answer. Workers import this module through a config entry's ``imports``.
 """
 
 from __future__ import annotations
@@ -27,20 +26,20 @@ NOTHING, RAISE, EXIT, HANG, KILL, RAISE_ODDLY, WAIT_FOR_GATE = range(7)
 
 
 class OddError(Exception):
-    """Can't be made anew from its text, as many exceptions of simulators can't."""
+    """Can't be rebuilt from its text, like many exceptions of simulators."""
 
     def __init__(self, *, code: int) -> None:
         super().__init__(f"the simulator failed with code {code}")
 
 
 class Breakable(gym.Env[Any, Any]):
-    """Steps in a few microseconds, or breaks; see the module.
+    """Steps in a few microseconds, or fails; see the module's docstring.
 
     Args:
-        index: what it calls itself.
+        index: its number in observations.
         clock: a file of one float64 for each environment, where it writes the monotonic
             time at which it begins to die or hang.
-        gate: a FIFO that `WAIT_FOR_GATE` waits for until somebody has opened and closed it.
+        gate: a FIFO; `WAIT_FOR_GATE` waits until another process has opened and closed it.
     """
 
     observation_space = Box(-np.inf, np.inf, (5,), np.float64)

@@ -1,6 +1,6 @@
-"""CartPole-v1, 64 envs: does a runtime pay for an env that steps in a few microseconds?
+"""CartPole-v1, 64 envs: is a runtime worth its cost for an env that steps in microseconds?
 
-It has to beat not only Gymnasium's processes but the same 64 envs stepped in a plain loop.
+It is compared with Gymnasium's processes, and with the same 64 envs stepped in a plain loop.
 """
 
 from __future__ import annotations

@@ -1,14 +1,14 @@
-"""A thousand random faults under load: does every request end once, and with the truth?
+"""A thousand random faults under load: does every request end once, with the right result?
 
     python benchmarks/chaos.py
     python benchmarks/chaos.py --faults 100 --seed 7 --json chaos.json
     python benchmarks/chaos.py --groups 8 --faults 100000
 
 8 environments in 4 workers step as fast as they can while workers are killed, stopped and
-continued, and while environments hang, raise and exit; collects are cancelled and cut short
-meanwhile. What comes back is held against what was asked. Exit code 1: a promise was broken.
-How fast deaths are noticed is shown, and decides nothing: a busy machine is no fault.
-What hangs leaves its stack on stderr; ``2>/dev/null`` hides that.
+continued, and while environments hang, raise and exit; meanwhile, collects are cancelled and cut
+short. Results are compared with the requests. Exit code 1: a promise was broken. The time to notice
+deaths is printed but not judged, because the machine may be busy. Hanging environments write their
+stacks to stderr; ``2>/dev/null`` hides them.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ LONGEST_STOP = 0.1
 LONGEST_WAIT = 60.0
 """Seconds after which a request counts as lost."""
 TARGET = 0.1
-"""Seconds within which 99 of 100 deaths are to be noticed."""
+"""Seconds within which 99 of 100 deaths should be noticed."""
 FAULTS = ("killed", "stopped", "hung", "raised", "exited")
 DEADLY = ("killed", "hung", "exited")
 SENT = {"hung": HANG, "raised": RAISE, "exited": EXIT}
@@ -65,7 +65,7 @@ class Broken(Exception):
 
 @dataclass
 class Doom:
-    """A deadly fault that the group hasn't told of yet: which, and since when."""
+    """A deadly fault that the group hasn't reported yet: its kind and its time."""
 
     fault: str
     env: int
@@ -74,7 +74,7 @@ class Doom:
 
 @dataclass
 class Findings:
-    """What has happened."""
+    """The events of a run."""
 
     requests: Counter[str] = field(default_factory=Counter)
     ends: Counter[str] = field(default_factory=Counter)
@@ -86,7 +86,7 @@ class Findings:
 
 
 class Deaths(logging.Handler):
-    """Hears when the group notices a death: it says so at that moment, in its log."""
+    """Records when the group notices a death, from its log."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
@@ -109,7 +109,7 @@ class Deaths(logging.Handler):
 
 @dataclass
 class Request:
-    """One that was sent to an environment and hasn't ended."""
+    """A request to an environment that hasn't ended."""
 
     kind: str
     token: float = 0.0
@@ -118,7 +118,7 @@ class Request:
 
 @dataclass
 class Env:
-    """What has been seen of an environment, and what it owes."""
+    """What has been observed of an environment, and the requests that it owes."""
 
     pid: int = 0
     episode: int = 0
@@ -166,7 +166,7 @@ class Chaos:
                 self._note_deaths()
             while any(env.open for env in self._envs):
                 await self._collect()
-            await self._check_that_all_go_on()
+            await self._check_that_all_are_usable()
         finally:
             for task in (*self._stopped.values(), *self._resets):
                 task.cancel()
@@ -175,7 +175,7 @@ class Chaos:
                 os.close(descriptor)
 
     def _send(self) -> None:
-        """Ask some of the idle envs for a step; those that raised for a reset, meanwhile."""
+        """Step some of the idle envs; reset those that raised."""
         for k, env in enumerate(self._envs):
             if env.to_reset:
                 env.to_reset = False
@@ -197,10 +197,10 @@ class Chaos:
         self._group.step_async(rl.BatchedData([f"e-{k}" for k in chosen], responses))
 
     def _fault_for(self, env: int) -> int:
-        """What the next step of an env is to do: mostly nothing but step."""
+        """Return the fault for the next step of an env: mostly none."""
         worker = env // SHARE
         busy = worker in self._dooms or worker in self._stopped
-        # An env that was replaced tells so first, whatever its step was to do.
+        # An env that was replaced reports that first, whatever fault its step has.
         if busy or self._pids.get(worker) != self._envs[env].pid:
             return NOTHING
         if not self._due() or self._plan[-1] not in SENT:
@@ -233,12 +233,12 @@ class Chaos:
             del self._stopped[worker]
 
     def _signal(self, worker: int, number: int) -> None:
-        # Gone already: it hung for too long in the eyes of the group.
+        # Gone already: the group found that it hung for too long.
         with suppress(ProcessLookupError):
             signal.pidfd_send_signal(self._processes[worker], number)
 
     def _due(self) -> bool:
-        """Faults come at random, after a few peaceful collects on average."""
+        """Return True if a fault is due: at random, after a few peaceful collects on average."""
         return bool(self._plan) and self._rng.random() < 0.02
 
     def _next_fault(self) -> str:
@@ -249,7 +249,7 @@ class Chaos:
     # -- answers ------------------------------------------------------------------
 
     async def _collect(self) -> None:
-        """Collect in one of the ways there are; some calls are given up on purpose."""
+        """Collect in one of the possible ways; some calls are cancelled on purpose."""
         if not any(env.open and env.open.kind == "step" for env in self._envs):
             await asyncio.wait(self._resets, return_when=asyncio.FIRST_COMPLETED)
             self._reap()
@@ -277,7 +277,7 @@ class Chaos:
         self._reap()
 
     def _reset(self, envs: Iterable[int]) -> Coroutine[Any, Any, None]:
-        """Reset envs; whoever awaits it waits for the results. Others collect meanwhile."""
+        """Reset envs; the awaiting task waits for the results, while others collect."""
         for k in envs:
             self._open(k, Request("reset"))
         return self._await_reset(list(envs))
@@ -292,8 +292,8 @@ class Chaos:
             self._resets.discard(task)
             task.result()
 
-    async def _check_that_all_go_on(self) -> None:
-        """Afterwards every env takes a reset and a step as if nothing had been."""
+    async def _check_that_all_are_usable(self) -> None:
+        """Check that every env can be reset and stepped at the end."""
         await self._reset(range(ENVS))
         self._step(list(range(ENVS)))
         async with asyncio.timeout(LONGEST_WAIT):
@@ -322,7 +322,7 @@ class Chaos:
                 self.findings.broken.append(f"e-{env}, {request}: {wrong} in {ret}")
 
     def _wrong(self, k: int, request: Request, ret: Any, *, marked: bool) -> str | None:
-        """What is not as it must be in the result of an env, if anything."""
+        """Return what is wrong with the result of an env, or None."""
         env, seen = self._envs[k], ret.observation
         pid, episode, steps = int(seen[PID]), int(seen[EPISODE]), int(seen[STEPS])
         if ret.env_id != f"e-{k}" or seen[INDEX] != k:
@@ -346,7 +346,7 @@ class Chaos:
         return "a result where it should have raised" if request.raises else None
 
     def _failed(self, fault: EnvFault) -> None:
-        """A typed error ends the requests that it names."""
+        """End the requests that a typed error names."""
         names = getattr(fault, "env_ids", None) or (fault.env_id,)
         for name in names:
             env = int(name.removeprefix("e-"))
@@ -361,11 +361,11 @@ class Chaos:
     # -- deaths -------------------------------------------------------------------
 
     def _know(self, worker: int, pid: int) -> None:
-        """Hold on to the process that a worker is now: its number may be given away."""
+        """Keep a descriptor of a worker's current process, because its number may be reused."""
         if self._pids.get(worker) == pid:
             return
         self._forget(worker)
-        with suppress(ProcessLookupError):  # It has answered, and died since.
+        with suppress(ProcessLookupError):  # It has replied, and died since.
             self._processes[worker] = os.pidfd_open(pid)
             self._pids[worker] = pid
 
@@ -375,7 +375,7 @@ class Chaos:
             os.close(self._processes.pop(worker))
 
     def _note_deaths(self) -> None:
-        """Take in of which deaths the group has told, and how long it took to notice them."""
+        """Record the deaths that the group has reported, and the time it took to notice them."""
         for worker, when in self._deaths.heard:
             self._forget(worker)
             doom = self._dooms.pop(worker, None)
@@ -390,7 +390,7 @@ class Chaos:
 
 
 def held() -> set[str]:
-    """Child processes, descriptors and shared memory that this process has."""
+    """Return the child processes, descriptors and shared memory of this process."""
     children = {
         f"process {pid}"
         for path in Path("/proc/self/task").glob("*/children")
@@ -398,17 +398,17 @@ def held() -> set[str]:
     }
     descriptors = set()
     for path in Path("/proc/self/fd").iterdir():
-        with suppress(FileNotFoundError):  # The one that the listing itself needs.
+        with suppress(FileNotFoundError):  # The descriptor of the listing itself.
             descriptors.add(f"descriptor {path.name}: {path.readlink()}")
     return children | descriptors | {f"shared memory {name}" for name in shared_memory()}
 
 
 async def nothing() -> None:
-    """The first event loop opens descriptors that stay for good."""
+    """Do nothing, in the first event loop, which opens descriptors that are kept."""
 
 
 async def chaos(faults: int, seed: int, clock: str) -> Findings:
-    """Run it; what has happened."""
+    """Run it; return the findings."""
     entry = {
         "name": "e",
         "backend": "breakable",
@@ -433,7 +433,7 @@ async def chaos(faults: int, seed: int, clock: str) -> Findings:
 
 
 def report_of(findings: Findings, seconds: float, left: set[str]) -> dict[str, Any]:
-    """What is told of a run."""
+    """Return the report of a run."""
     deaths = findings.noticed["killed"] + findings.noticed["exited"]
     return {
         "seconds": seconds,
@@ -461,7 +461,7 @@ def _percentiles(times: list[float]) -> dict[str, float]:
 
 
 def table(report: dict[str, Any]) -> str:
-    """The report as Markdown."""
+    """Return the report as Markdown."""
     requests, ends = sum(report["requests"].values()), sum(report["ends"].values())
     listed = {
         f"{sum(report['faults'].values())} faults": _counts(report["faults"]),

@@ -1,8 +1,8 @@
-"""What was asked of one group's envs, and what has come of it.
+"""The requests to one group's envs, and their ends.
 
-`Books` opens a request when it is about to be sent, and closes it with the result or the
-error that ends it; a second end, an end that nobody asked for, or none within
-`LONGEST_WAIT` breaks a promise, as does what `chaos_judge` takes for a lie.
+`Books` opens a request before it is sent, and closes it with the result or the error that ends it.
+A second end, an end without a request, or none within `LONGEST_WAIT` breaks a promise; so does a
+result that `chaos_judge` finds to be false.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ SERVER = "far-0"
 
 
 class Broken(Exception):
-    """A promise was broken, and nothing can be told from here on."""
+    """A promise was broken, and later checks would mean nothing."""
 
 
 def require(right: Any, otherwise: str, *details: Any) -> None:
-    """Raise `Broken` if something isn't right."""
+    """Raise `Broken` if a condition is false."""
     if not right:
         raise Broken(f"{otherwise} {details or ''}")
 
 
 @dataclass
 class Tally:
-    """What has happened in groups' lives."""
+    """The numbers of events in groups' lives."""
 
     requests: Counter[str] = field(default_factory=Counter)
     ends: Counter[str] = field(default_factory=Counter)
@@ -54,7 +54,7 @@ class Tally:
     broken: list[str] = field(default_factory=list)
 
     def add(self, other: Tally) -> None:
-        """Sum up."""
+        """Add another tally."""
         for name, value in vars(self).items():
             if isinstance(value, Counter):
                 value.update(getattr(other, name))
@@ -64,18 +64,18 @@ class Tally:
 
 
 class Books:
-    """See the module.
+    """The requests of one group; see the module's docstring.
 
     Args:
         entries: of the group.
-        client_names: of those that may dial in.
-        waits: what counts the results: ``asyncio``, ``uvloop`` or ``sync``.
+        client_names: of clients that may connect.
+        waits: the driver: ``asyncio``, ``uvloop`` or ``sync``.
         zero_copy: results are views, which may be overwritten.
 
     Attributes:
         envs: by id; clients as they come.
         limit: of `auto_reset`, while that is on.
-        doomed: processes that something was done to of which they may die.
+        doomed: processes, and lives of awaitable envs, that may end because of a fault.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class Books:
         self.envs: dict[str, Env] = {}
         self.processes = Processes()
         self.limit: int | None = None
-        self.doomed: set[int] = set()
+        self.doomed: set[float] = set()
         self._tally = tally
         self._rng = rng
         self._client_names = client_names
@@ -111,25 +111,26 @@ class Books:
                 entry.get("placement", "process"),
                 entry["env_kwargs"].get("layout", "vector"),
                 brittle=entry.get("on_worker_death") == "raise",
+                awaitable=entry["backend"] == "awaitable witness",
             )
 
     def idle(self, *, clients: bool = True) -> list[Env]:
-        """Envs that can be asked."""
+        """Return the envs that can get a request."""
         return [e for e in self.envs.values() if e.idle and (clients or e.place != "client")]
 
     def owed(self) -> list[Env]:
-        """Envs whose answer the collector is to have."""
+        """Return the envs whose reply a collect will return."""
         return [e for e in self.envs.values() if e.request and e.request.to_collector]
 
     def open(self, env: Env, kind: str, **fields: Any) -> Request:
-        """It is about to be asked."""
+        """Record a request that is about to be sent."""
         require(env.request is None, "the chaos itself has asked twice", env.env_id)
         env.request = Request(kind, time.monotonic(), is_due=env.due, **fields)
         self._tally.requests[f"{kind} ({env.place})"] += 1
         return env.request
 
     def close(self, env: Env, how: str) -> Request:
-        """It has answered, or been refused."""
+        """Record the reply to a request, or its refusal."""
         request, env.request = env.request, None
         if request is None:
             raise Broken(f"{env} answered ({how}) although nothing was asked of it")
@@ -139,7 +140,7 @@ class Books:
         return request
 
     def check_waits(self) -> None:
-        """Nobody waits for too long, and what was handed out has stayed as it was."""
+        """Check that no request waits for too long, and that earlier results are unchanged."""
         now = time.monotonic()
         for env in self.envs.values():
             since = env.limbo if env.request is None else env.request.since
@@ -149,7 +150,7 @@ class Books:
             require(np.array_equal(given, copied), "a result was overwritten")
 
     def end(self) -> None:
-        """The group is closed."""
+        """Record that the group is closed."""
         for env in self.envs.values():
             if env.request is not None:
                 self.close(env, "closed with its group")
@@ -158,7 +159,7 @@ class Books:
     # -- results ------------------------------------------------------------------
 
     def take(self, batch: Any, call: str, flags: list[bool] | None = None) -> None:
-        """Hold each result against what was asked."""
+        """Compare each result with its request."""
         if flags is not None:
             require(flags == batch.limit_reached.tolist(), "flags", call, flags)
         self._hold(batch)
@@ -180,7 +181,7 @@ class Books:
             require(sent == tokens, "another request was sent", sent, tokens)
 
     def _rows(self, batch: Any) -> list[Row]:
-        """Results by column, which must be what they are one by one."""
+        """Return results by column, and check that they equal the single results."""
         columns = (batch.reward, batch.terminated, batch.truncated, batch.is_reset)
         columns = (*columns, batch.restarted, batch.limit_reached)
         found: list[Row] = []
@@ -212,7 +213,7 @@ class Books:
             how = "a lie"
         if env.life != life:
             self.processes.forget(before[0])
-        if how == "marked" and self.doomed.isdisjoint(before):
+        if how == "marked" and self.doomed.isdisjoint((life, *before)):
             self._tally.unasked += 1
         if request is None:
             self._tally.drivers["unasked, of a client"] += 1
@@ -225,7 +226,7 @@ class Books:
                 self.processes.hold(env.parent, os.getpid())
 
     def _hold(self, batch: Any) -> None:
-        """Look later whether it has stayed as it was."""
+        """Keep a result, to check later that it is unchanged."""
         if self._zero_copy or self._rng.random() > 0.3 or len(batch.by_name()) > 1:
             return
         observation = batch.observation
@@ -235,7 +236,7 @@ class Books:
     # -- errors -------------------------------------------------------------------
 
     def failed(self, fault: EnvFault, asked: list[Env] | None = None) -> None:
-        """A typed error ends the requests that it names, and carries the others' results."""
+        """End the requests that a typed error names, and take the results that it has."""
         faults = [fault, *fault.others]
         named = [(one, env_id) for one in faults for env_id in _ids(one)]
         if asked is not None:

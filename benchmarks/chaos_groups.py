@@ -1,13 +1,12 @@
-"""Faults of every kind against several groups in one trainer: no hang, no lie, no leak?
+"""Faults of every kind in several groups of one trainer: no hang, no false result, no leak?
 
     python benchmarks/chaos.py --groups 8 --faults 100000
 
-Run by `chaos.py`. Written from the contract alone: of the library it uses what a user has.
-Every result names itself (see `witness`), so each is held against what was asked; each
-request must end exactly once (`chaos_books`); what a group leaves behind is looked for after
-each, and at the end of all. Groups live for some hundred faults and are built anew.
-What nobody would notice from inside is a watchdog's affair: a thread that shows the stacks of
-all, and an alarm without Python behind it.
+Run by `chaos.py`. Based on the contract only: it uses the public interface of the library. Every
+result identifies itself (see `witness`), so it can be compared with its request. Each request must
+end exactly once (`chaos_books`). Leftovers are looked for after each group, and at the end. Groups
+live for some hundred faults and are then replaced. A watchdog finds hangs: a thread that prints
+all stacks, and an alarm that needs no Python.
 """
 
 from __future__ import annotations
@@ -60,23 +59,23 @@ STEP_TIMEOUT = 1.0
 """Seconds; long enough for a worker that merely waits for its turn on a busy machine."""
 START_TIMEOUT = 20.0
 LONGEST_END = 10.0
-"""Seconds within which what a closed group had must be gone."""
+"""Seconds within which the resources of a closed group must be released."""
 ALLOWED_MIB = 48.0
-"""Growth of memory after the first quarter that the allocator may keep."""
+"""Allowed growth of memory after the first quarter, for the allocator."""
 SECONDS_BETWEEN_SAMPLES = 15.0
 LOOPS = ("asyncio", "uvloop", "sync", "asyncio")
-"""How group k waits; those on asyncio share a loop, and so do those on uvloop."""
+"""The driver of group k; groups on asyncio share a loop, and so do those on uvloop."""
 
 
 def run_without_loop(coroutine: Coroutine[Any, Any, None]) -> None:
-    """Run what never suspends."""
+    """Run a coroutine that never suspends."""
     with contextlib.suppress(StopIteration):
         coroutine.send(None)
         raise AssertionError("it suspended")
 
 
 class Trainer:
-    """One group after the other, each waited for in the same way."""
+    """Runs one group after the other, all with the same driver."""
 
     def __init__(self, chaos: Chaos, number: int) -> None:
         self.number = number
@@ -88,16 +87,16 @@ class Trainer:
         self.take_fault = chaos.take_fault
         self.is_over = chaos.is_over
         self.after = chaos.after
-        self.tell_keeper = chaos.tell_keeper
+        self.command_keeper = chaos.command_keeper
         self._chaos = chaos
         self._rng = random.Random(f"{chaos.seed} {number}")
 
     def beat(self) -> None:
-        """It goes on."""
+        """Record progress, for the watchdog."""
         self.last_beat = time.monotonic()
 
     async def run(self) -> None:
-        """Build groups, have them live, and see what they leave, until there is enough."""
+        """Build groups, run them, and check their leftovers, until there were enough faults."""
         lives = 0
         try:
             while not self.is_over():
@@ -139,6 +138,13 @@ class Trainer:
         if rng.random() < 0.5:
             here = {"name": "here", "placement": "inline", "num_workers": 2, "env_kwargs": {}}
             entries.append({**witness, **here})
+        if rng.random() < 0.5:
+            awaited = entry("awaited", 4, "vector", envs_per_process=2)
+            entries.append(awaited | {"backend": "awaitable witness"})
+        if self.waits != "sync":
+            loop = {"name": "loop", "placement": "loop", "num_workers": 4, "env_kwargs": {}}
+            loop |= {"backend": "awaitable witness", "max_restarts": 10**6}
+            entries.append({**witness, **limits, **loop, "max_concurrency": rng.choice((2, 4))})
         if rng.random() < 0.4:
             entries.append(entry("brittle", 1, "vector", on_worker_death="raise"))
         if rng.random() < 0.5:
@@ -210,7 +216,7 @@ class Trainer:
             await task
 
     async def _check_that_nothing_is_left(self, mark: str) -> None:
-        """What the group had is gone, soon after it is closed."""
+        """Check that the group's resources are released soon after its close."""
         until = time.monotonic() + LONGEST_END
         while left := processes_marked(f"CHAOS_GROUP={mark}\0"):
             if time.monotonic() > until:
@@ -226,7 +232,7 @@ class Trainer:
 
 
 class Chaos:
-    """All groups, the keeper of clients and of time, and the watchdog over them."""
+    """All groups, the keepers of clients and of time, and the watchdog."""
 
     def __init__(self, groups: int, faults: int, seed: int, folder: Path, log: Any) -> None:
         self.seed = seed
@@ -249,7 +255,7 @@ class Chaos:
         self._trainers = [Trainer(self, k) for k in range(groups)]
 
     def take_fault(self) -> bool:
-        """One fault more; False if there have been enough."""
+        """Count another fault; return False if there were enough."""
         with self._lock:
             if self._done >= self._faults:
                 return False
@@ -257,17 +263,17 @@ class Chaos:
             return True
 
     def is_over(self) -> bool:
-        """Whether there have been enough."""
+        """Return True if there were enough faults."""
         return self._done >= self._faults
 
     def after(self, seconds: float, doing: Callable[[], object]) -> None:
-        """Do it then, whoever waits for what meanwhile."""
+        """Call a function later, whatever waits meanwhile."""
         with self._sooner:
             heapq.heappush(self._later, (time.monotonic() + seconds, next(self._count), doing))
             self._sooner.notify()
 
     def _keep_time(self) -> None:
-        """Do what is due, in a thread of its own, until there is nothing more to be expected."""
+        """Call due functions, in a separate thread, until nothing more is expected."""
         while True:
             with self._sooner:
                 if not self._later and all(trainer.over for trainer in self._trainers):
@@ -279,8 +285,8 @@ class Chaos:
                 doing = heapq.heappop(self._later)[2]
             doing()
 
-    def tell_keeper(self, order: str) -> None:
-        """Have the clients' keeper do something."""
+    def command_keeper(self, order: str) -> None:
+        """Send a command to the keeper of clients."""
         with self._lock:
             assert self._keeper is not None
             assert self._keeper.stdin is not None
@@ -288,7 +294,7 @@ class Chaos:
             self._keeper.stdin.flush()
 
     def run(self) -> None:
-        """Until the faults are done, and everything is closed."""
+        """Run until the faults are done and everything is closed."""
         keeper = Path(__file__).with_name("client_keeper.py")
         env = {**os.environ, "CHAOS": self.mark}
         with subprocess.Popen(
@@ -317,6 +323,8 @@ class Chaos:
             async def together() -> None:
                 await asyncio.gather(*(trainer.run() for trainer in mine))
                 left = asyncio.all_tasks() - {asyncio.current_task()}
+                if left:  # Envs that ignored their cancellation end some time later.
+                    _, left = await asyncio.wait(left, timeout=LONGEST_END)
                 self._strays += [f"task left: {task}" for task in left]
 
             runner.run(together())
@@ -329,14 +337,14 @@ class Chaos:
         self._strays.append(f"an event loop says: {context} {trace}")
 
     def tally(self) -> Tally:
-        """What has happened so far."""
+        """Return the numbers of events so far."""
         tally = Tally(broken=list(self._strays))
         for trainer in self._trainers:
             tally.add(trainer.tally)
         return tally
 
     def _watch(self, threads: list[threading.Thread]) -> None:
-        """Tell how far it has come; if a group does nothing for too long, show why, and end."""
+        """Print the progress; if a group does nothing for too long, print stacks and exit."""
         told = time.monotonic()
         while any(thread.is_alive() for thread in threads):
             faulthandler.dump_traceback_later(2 * LONGEST_WAIT, exit=True, file=self._log)
@@ -380,7 +388,7 @@ class Chaos:
 
 
 def warm_up() -> None:
-    """The first loops open descriptors that stay for good."""
+    """Run the first loops, which open descriptors that are kept."""
 
     async def nothing() -> None: ...
 
@@ -390,7 +398,7 @@ def warm_up() -> None:
 
 
 def silence() -> tuple[Any, Any]:
-    """Let what envs write by the megabyte go nowhere; what was standard output, and error."""
+    """Discard the megabytes of output of envs; return the original stdout and stderr."""
     streams = [os.fdopen(os.dup(k), "w", errors="backslashreplace") for k in (1, 2)]
     null = os.open(os.devnull, os.O_WRONLY)
     for descriptor in (1, 2):
@@ -403,7 +411,7 @@ def silence() -> tuple[Any, Any]:
 
 
 def hear_unraisable() -> list[str]:
-    """What goes wrong where nobody could catch it, from now on."""
+    """Record exceptions that can't be caught, from now on."""
     heard: list[str] = []
     sys.unraisablehook = lambda found: heard.append(
         f"unraisable: {found.err_msg} {found.object!r}: {found.exc_value!r}"
@@ -415,14 +423,14 @@ def hear_unraisable() -> list[str]:
 
 
 def growth(samples: list[dict[str, float]]) -> float:
-    """MiB by which memory has grown since the first quarter of the faults."""
+    """Return the growth of memory in MiB since the first quarter of the faults."""
     last = samples[-1]
     first = next(found for found in samples if found["faults"] >= last["faults"] / 4)
     return last["rss_mib"] - first["rss_mib"]
 
 
 def table(report: dict[str, Any]) -> str:
-    """The report as Markdown."""
+    """Return the report as Markdown."""
     requests, ends = sum(report["requests"].values()), sum(report["ends"].values())
     rows = {
         f"{sum(report['faults'].values()):,} faults": _counts(report["faults"]),
@@ -484,7 +492,7 @@ def run(groups: int, faults: int, seed: int, log: Any) -> dict[str, Any]:
 
 
 def main(groups: int, faults: int, seed: int, json_path: Path | None) -> int:
-    """Run it and tell; 0 if all promises were kept."""
+    """Parse arguments, run, and print; return 0 if all promises were kept."""
     out, log = silence()
     faulthandler.enable(log)
     report = run(groups, faults, seed, log)

@@ -1,7 +1,7 @@
-"""What was asked of an env, what came back, and whether that can be true.
+"""Compares the results of an env with its requests, and decides if they can be true.
 
-An env's results are followed through its lives, episodes and steps; see `witness` for how
-they name themselves. Nothing here knows a group: rows come in, and a `Lie` is raised.
+An env's results are followed through its lives, episodes and steps; `witness` describes how they
+identify themselves. This module knows no group: it takes rows, and raises `Lie`.
 """
 
 from __future__ import annotations
@@ -28,28 +28,30 @@ from witness import (
 RAISING = tuple(name for name in NAMES if name.startswith("raise"))
 DYING = ("exit", "crash")
 HANGING = ("sleep", "compute", "deadlock", "stop itself", "close descriptors")
-# One that has stopped itself may have been continued.
-ENDLESS = {*RAISING, *DYING, *HANGING} - {"stop itself"}
+AWAITING = ("await forever", "ignore cancellation")
+"""An awaitable env does not finish its step; its event loop continues."""
+# A process that has stopped itself may have been continued.
+ENDLESS = {*RAISING, *DYING, *HANGING, *AWAITING} - {"stop itself"}
 
 
 class Lie(Exception):
-    """A result says what is not so."""
+    """A result contradicts its request."""
 
 
 def lie(wrong: Any, what: str, *details: Any) -> None:
-    """Raise `Lie` if something is wrong."""
+    """Raise `Lie` if a condition is true."""
     if wrong:
         raise Lie(f"{what} {details or ''}")
 
 
 @dataclass
 class Request:
-    """One that was sent to an env and has not ended.
+    """A request to an env that has not ended.
 
     Attributes:
-        to_collector: `collect_async` is to have the answer.
-        given_up: whoever waited for it may have been cancelled.
-        is_due: it was a step in whose place `auto_reset` was to reset.
+        to_collector: `collect_async` will return the reply.
+        given_up: its call may have been cancelled.
+        is_due: it was a step that `auto_reset` replaces by a reset.
     """
 
     kind: str
@@ -64,16 +66,17 @@ class Request:
 
 @dataclass
 class Env:
-    """What has been seen of an env, and what it owes.
+    """What has been observed of an env, and the request that it owes.
 
     Attributes:
-        place: ``process``, ``inline`` or ``client``.
-        brittle: its worker is not to be replaced.
-        lives: those that are over.
-        limbo: since when a call that was given up may keep it busy.
-        gone: it is in the hands of an error for good.
-        due: `auto_reset` is to reset it in place of its next step.
-        count: of steps, for the step limit.
+        place: ``process``, ``inline``, ``loop`` or ``client``.
+        brittle: its worker is not replaced.
+        awaitable: it shares an event loop, that of a worker or of the trainer.
+        lives: its previous lives.
+        limbo: the time since when a cancelled call may keep it busy.
+        gone: it only raises from now on.
+        due: `auto_reset` will reset it in place of its next step.
+        count: number of steps, for the step limit.
     """
 
     env_id: str
@@ -81,6 +84,7 @@ class Env:
     place: str
     layout: str
     brittle: bool = False
+    awaitable: bool = False
     life: float = 0.0
     pid: int = 0
     parent: int = 0
@@ -95,11 +99,11 @@ class Env:
 
     @property
     def idle(self) -> bool:
-        """It can be asked."""
+        """Return True if it can get a request."""
         return self.request is None and self.limbo is None and not self.gone
 
     def note(self, row: Row) -> None:
-        """Take over where it is now."""
+        """Record its current position."""
         seen = row.named
         if self.life and seen[LIFE] != self.life:
             self.lives.add(self.life)
@@ -107,13 +111,13 @@ class Env:
         self.episode, self.steps = row.now
 
     def begin_count(self) -> None:
-        """Its steps are counted from here."""
+        """Count its steps from here."""
         self.due, self.count = False, 0
 
 
 @dataclass
 class Row:
-    """One result, told apart; `now` is its episode and step."""
+    """The parts of one result; `now` is its episode and step."""
 
     named: np.ndarray
     reward: float
@@ -126,17 +130,17 @@ class Row:
 
     @property
     def now(self) -> tuple[int, int]:
-        """Its episode and step."""
+        """Return its episode and step."""
         return int(self.named[EPISODE]), int(self.named[STEPS])
 
 
 def judge(env: Env, request: Request | None, row: Row, limit: int | None) -> str:
-    """How a result ends a request; takes over in `env` where that env is now.
+    """Decide how a result ends a request; record the env's new position in `env`.
 
     Args:
-        env: as it was seen last.
-        request: what it owes, if anything.
-        row: what has come.
+        env: its last known position.
+        request: the one that it owes, if any.
+        row: the result.
         limit: of `auto_reset`, if that is on.
 
     Raises:
@@ -163,7 +167,7 @@ def judge(env: Env, request: Request | None, row: Row, limit: int | None) -> str
 
 
 def _judge_marked(env: Env, row: Row) -> str:
-    lie(env.place != "process", "an env in the trainer's process was replaced")
+    lie(env.place == "inline", "an env in the trainer's process was replaced")
     lie(env.brittle, "what is not to be replaced was")
     lie(not row.info.get("worker_restarted"), "no cause")
     _check_marks(row)
@@ -188,9 +192,10 @@ def _judge_local(env: Env, request: Request, row: Row, limit: int | None) -> str
         lie(not row.is_reset or row.terminated or row.limit, "not a plain reset")
         lie(row.reward != 0 or row.named[TOKEN] != 0, "the answer to a step")
         lie(row.info.get("seed") != request.seed, "another seed")
-        # Of one that died while nothing was asked of it, a reset tells nothing; a step does.
+        # A death without a request is reported by a step, but not by a reset.
         lie(new and request.kind != "reset", "a new life, and not marked")
-        lie(new and env.place == "inline" and before[0], "a new life in the trainer's process")
+        here = env.place in ("inline", "loop")
+        lie(new and here and before[0], "a new life in the trainer's process")
         lie(row.now != (1 if new else before[0] + 1, 0), "not that reset", before)
         env.begin_count()
         return "reset" if request.kind == "reset" else "reset in place of a step"
@@ -221,7 +226,7 @@ def _judge_step(request: Request, row: Row) -> None:
 
 
 def _judge_client(env: Env, request: Request | None, row: Row) -> str:
-    """A client may come and go by itself, and comes back in a new episode."""
+    """Decide for a client, which may leave by itself, and comes back in a new episode."""
     new, before = row.named[LIFE] != env.life, (env.episode, env.steps)
     if row.restarted:
         lie(request is None, "a loss that nobody asked for")

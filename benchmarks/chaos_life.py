@@ -1,7 +1,7 @@
-"""One group from its first reset to its end: what is asked of it, and how it is collected.
+"""One group from its first reset to its end: its requests, and how they are collected.
 
-Whatever an asynchronous group is asked may be cancelled at a random moment, or go on beside
-everything else; the requests are handed over to the collector then.
+Any operation of an asynchronous group may be cancelled at a random moment, or run in parallel with
+others; a collect then returns its results.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from chaos_books import LONGEST_WAIT, SERVER, Books, Broken, Tally, require
-from chaos_judge import DYING, HANGING, RAISING, Env
+from chaos_judge import AWAITING, DYING, HANGING, RAISING, Env
 from chaos_strikes import Strikes
 from witness import CODES
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 HEARTBEAT = 1.0
 CLIENTS = 2
 PATIENCE = 0.5
-"""Seconds; so long may a collect take before whoever else there is gets a turn."""
+"""Seconds that a collect may take before other tasks get a turn."""
 FORKING = ("fork, child exits", "fork, child raises", "fork, child leaves")
 NOISY = ("flood stderr", "big info", "nested info")
 STEP_FAULTS = {
@@ -47,14 +47,23 @@ STEP_FAULTS = {
     **dict.fromkeys(NOISY, 2.0),
     "lag": 2.0,
 }
-"""Faults that an action carries, and how often."""
+"""Faults of actions, and their frequencies."""
 INLINE_FAULTS = (*(n for n in RAISING if n != "raise KeyboardInterrupt"), *NOISY)
-"""What an env in the trainer's own process may do: the rest would be the trainer's end."""
+"""Faults for an env in the trainer's process: the others would end the trainer."""
+AWAITED_FAULTS = {
+    "await forever": 3.0,
+    "ignore cancellation": 1.0,
+    "leave a task": 3.0,
+    "block": 1.0,
+}
+"""Faults that only awaitable envs have, and their frequencies."""
+LOOP_FAULTS = {**dict.fromkeys((*INLINE_FAULTS, "lag"), 2.0), **AWAITED_FAULTS}
+"""Faults for an awaitable env on the trainer's event loop, and their frequencies."""
 CLIENT_FAULTS = ("raise", "raise oddly", "exit", "crash", "nap", *NOISY, "lag")
 
 
 class Awaited:
-    """A synchronous group under the asynchronous one's interface; nothing suspends."""
+    """A synchronous group with the asynchronous interface; nothing suspends."""
 
     def __init__(self, group: Any) -> None:
         self._group = group
@@ -74,7 +83,7 @@ class Awaited:
 
 
 class AwaitedHandle:
-    """Likewise."""
+    """A handle of such a group."""
 
     def __init__(self, handle: Any) -> None:
         self._handle = handle
@@ -94,13 +103,13 @@ class AwaitedHandle:
 
 
 class Life:
-    """See the module.
+    """The life of one group; see the module's docstring.
 
     Args:
         group: initialised.
-        world: the rest of the chaos: `take_fault`, `after`, `tell_keeper`, `beat`, `is_over`.
-        orders: what the next build of each env is to do.
-        client_names: of those that are to dial in; empty without an env_server.
+        world: the rest of the chaos: `take_fault`, `after`, `command_keeper`, `beat`, `is_over`.
+        orders: the faults of the next build of each env.
+        client_names: of clients that must connect; empty without an env_server.
         waits: ``asyncio``, ``uvloop`` or ``sync``.
     """
 
@@ -133,7 +142,7 @@ class Life:
     # -- the life -----------------------------------------------------------------
 
     async def run(self, quota: int) -> None:
-        """Until its share of faults is done; closes the group in one way or another."""
+        """Run until its share of faults is done; then close the group in one way or another."""
         try:
             await self._begin()
             while quota > 0 and not self._world.is_over():
@@ -150,7 +159,7 @@ class Life:
 
     async def _begin(self) -> None:
         for name in self._client_names:
-            self._world.tell_keeper(f"keep {name} {self._address()} {HEARTBEAT}")
+            self._world.command_keeper(f"keep {name} {self._address()} {HEARTBEAT}")
         seed = self.rng.randrange(1000)
         for k, env in enumerate(self._local):
             self.books.open(env, "reset", to_collector=False, seed=seed + k)
@@ -163,21 +172,21 @@ class Life:
         return f"{host} {port}"
 
     def _flood(self) -> None:
-        self._world.tell_keeper(f"flood {self._address()} {self.rng.randrange(10**9)}")
+        self._world.command_keeper(f"flood {self._address()} {self.rng.randrange(10**9)}")
 
     async def _turn(self) -> None:
         rng = self.rng
         self._world.beat()
         self.books.check_waits()
         if rng.random() < 0.02 and not self._client_names:
-            # What a client's coming and going does to its counter is another matter.
+            # The effect of a client's connections on its counter is not checked here.
             await self._switch_auto_reset()
         if rng.random() < 0.05:
             await self._misuse()
         if rng.random() < 0.15:
             struck = self._strikes.strike()
             if struck is not None:
-                # One more than there were to be does no harm.
+                # One fault too many does no harm.
                 self._world.take_fault()
                 self._tally.faults[struck] += 1
         await self._ask()
@@ -194,7 +203,7 @@ class Life:
             await asyncio.sleep(seconds)
 
     async def _settle(self) -> None:
-        """Have all requests end; then all envs must take a reset and a step."""
+        """Let all requests end; then check that all envs can be reset and stepped."""
         await self._quiet()
         if self._auto is not None:
             self._leave_auto_reset()
@@ -204,7 +213,7 @@ class Life:
         await self._quiet()
 
     async def _quiet(self) -> None:
-        """Until nothing is asked of any env."""
+        """Wait until no env has a request."""
         while True:
             self._world.beat()
             self.books.check_waits()
@@ -221,7 +230,7 @@ class Life:
         if self._auto is not None:
             self._leave_auto_reset()
         for name in self._client_names:
-            self._world.tell_keeper(f"drop {name}")
+            self._world.command_keeper(f"drop {name}")
         try:
             if not self._is_sync and self.rng.random() < 0.15:
                 await self._cancel_close()
@@ -259,7 +268,7 @@ class Life:
         kind = rng.random()
         if kind < 0.80:
             chosen = [env for env in idle if rng.random() < 0.8] or idle
-            # One that is gone for good refuses the whole batch, which is its right.
+            # An env that is gone for good makes the group refuse the whole batch, as it should.
             for env in chosen:
                 if env.brittle:
                     self._send([env])
@@ -279,7 +288,7 @@ class Life:
                 await self._beside(self._call(some[0]))
 
     async def _beside(self, doing: Coroutine[Any, Any, None]) -> None:
-        """Do it, in an asynchronous group beside everything else."""
+        """Run it; in an asynchronous group, in parallel with everything else."""
         if self._is_sync:
             await doing
             return
@@ -303,7 +312,10 @@ class Life:
         if rng.random() > 0.6:
             return "end" if rng.random() < 0.05 else "nothing"
         if env.place == "process":
-            name = rng.choices(list(STEP_FAULTS), list(STEP_FAULTS.values()))[0]
+            faults = STEP_FAULTS | AWAITED_FAULTS if env.awaitable else STEP_FAULTS
+            name = rng.choices(list(faults), list(faults.values()))[0]
+        elif env.place == "loop":
+            name = rng.choices(list(LOOP_FAULTS), list(LOOP_FAULTS.values()))[0]
         else:
             name = rng.choice(INLINE_FAULTS if env.place == "inline" else CLIENT_FAULTS)
         if not self._world.take_fault():
@@ -311,6 +323,8 @@ class Life:
         self._tally.faults[f"{name} ({env.place})"] += 1
         if name in (*DYING, *HANGING, *FORKING):
             self.books.doomed.add(env.pid)
+        elif name in AWAITING:
+            self.books.doomed.add(env.life)
         return name
 
     def _send(self, envs: list[Env], *, allow_faults: bool = True) -> None:
@@ -325,8 +339,8 @@ class Life:
             envs[0].gone = True
 
     async def _step(self, envs: list[Env]) -> None:
-        """`step`: for the results of all of them, in their order."""
-        envs = [env for env in envs if env.idle]  # Some may have been asked meanwhile.
+        """Call `step`, for the results of all envs in their order."""
+        envs = [env for env in envs if env.idle]  # Some may have got requests meanwhile.
         if not envs:
             return
         batch = self._steps(envs, allow_faults=True, to_collector=False)
@@ -338,7 +352,7 @@ class Life:
             self.books.take(results, "step", flags)
 
     async def _answer(self, doing: Coroutine[Any, Any, Any], envs: list[Env], what: str) -> Any:
-        """What a call returns, if it does; what becomes of its requests otherwise."""
+        """Return the result of a call; record the outcome of its requests if it raises."""
         try:
             return await self._cut(doing, envs, f"{what} cancelled")
         except asyncio.CancelledError:
@@ -350,7 +364,7 @@ class Life:
         return None
 
     async def _cut(self, doing: Coroutine[Any, Any, Any], envs: list[Env], what: str) -> Any:
-        """What `doing` returns; cancels it at a random moment, now and then."""
+        """Return the result of `doing`; sometimes cancel it at a random moment."""
         if self._is_sync or self.rng.random() < 0.8:
             return await doing
         begun = False
@@ -367,7 +381,7 @@ class Life:
         except asyncio.CancelledError:
             self._tally.interrupted[what] += 1
             if not begun:
-                doing.close()  # It was given up before it had sent anything.
+                doing.close()  # It was cancelled before it had sent anything.
                 for env in envs:
                     self.books.close(env, "never sent")
             raise
@@ -458,12 +472,12 @@ class Life:
     # -- calls --------------------------------------------------------------------
 
     async def _call(self, env: Env) -> None:
-        """A call: of a value, an attribute or a fault."""
+        """Make a call: of a value, an attribute or a fault."""
         rng = self.rng
         if self._strikes.muted(env) or not env.idle:
             return
         self._token += 1.0
-        kind = rng.choice(("tell", "tell", "get", "set", "fault"))
+        kind = rng.choice(("describe", "describe", "get", "set", "fault"))
         fault = self._fault_for_call(env) if kind == "fault" else "nothing"
         self.books.open(env, "call", token=self._token, fault=fault, to_collector=False)
         echo = {"token": self._token, "blob": b"x" * rng.choice((1, 99999))}
@@ -485,7 +499,7 @@ class Life:
         else:
             self.books.close(env, "value")
             require(fault == "nothing", "it returned", fault, env, value)
-            if kind == "tell":
+            if kind == "describe":
                 _check_told(env, value, echo)
 
     def _fault_for_call(self, env: Env) -> str:
@@ -505,10 +519,10 @@ class Life:
             return handle.get_attr("life")
         if kind == "set":
             return handle.set_attr("note", echo["token"])
-        return handle.call("tell", echo)
+        return handle.call("describe", echo)
 
     def _free_limbo(self) -> None:
-        """See whether envs whose call was given up can be asked again."""
+        """Find out if envs whose call was cancelled can be used again."""
         for env in self.books.envs.values():
             if env.limbo is None:
                 continue
@@ -522,11 +536,11 @@ class Life:
     # -- misuse -------------------------------------------------------------------
 
     async def _misuse(self) -> None:
-        """What is refused must have sent nothing: the next results will tell."""
+        """Make invalid requests, which must send nothing: later results show it."""
         group, good = self._group, np.array([0.0, 1.0])
         idle = [env for env in self.books.idle(clients=False) if not env.brittle]
-        # What is not for the collector may be on its way still; one whose error waits to be
-        # collected can be asked again.
+        # Requests of other calls may still be in flight; an env whose error waits to be collected
+        # can get a new request.
         busy = [
             env
             for env in self.books.owed()
@@ -571,7 +585,7 @@ class Life:
     # -- collecting ---------------------------------------------------------------
 
     async def _collect(self, *, kindly: bool = False) -> None:
-        """Collect in one of the ways there are; some are given up on purpose."""
+        """Collect in one of the possible ways; some are cancelled on purpose."""
         rng = self.rng
         owed = self.books.owed()
         local = [env for env in owed if env.place != "client"]
@@ -653,6 +667,6 @@ def _hand_to_collector(envs: list[Env]) -> None:
 
 
 def _same(envs: Iterable[Env], action: Any) -> Any:
-    """A batch in which all get one action."""
+    """Return a batch with the same action for all."""
     ids = [env.env_id for env in envs]
     return rl.BatchedData(ids, [rl.PolicyResponse(env_id, action=action) for env_id in ids])

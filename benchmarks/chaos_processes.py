@@ -1,4 +1,4 @@
-"""Processes and what they hold, seen from outside: through /proc and descriptors alone."""
+"""Processes and their resources, observed from outside through /proc and descriptors."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from harness import shared_memory
 
 
 class Processes:
-    """Other processes, held by descriptors so that nobody else's number is hit."""
+    """Other processes, held by descriptors, so that a reused number can't be hit."""
 
     def __init__(self) -> None:
         self._held: dict[int, int] = {}
         self._lock = threading.RLock()
 
     def hold(self, pid: int, parent: int) -> None:
-        """Know this process, if it is still that parent's child."""
+        """Keep a descriptor of this process, if it is still that parent's child."""
         if pid in self._held:
             return
         with self._lock, contextlib.suppress(ProcessLookupError, FileNotFoundError):
@@ -34,7 +34,7 @@ class Processes:
                     os.close(descriptor)
 
     def signal(self, pid: int, number: int) -> bool:
-        """Send a signal to it; whether it was there."""
+        """Send a signal to it; return True if it existed."""
         with self._lock:
             descriptor = self._held.get(pid)
             if descriptor is None:
@@ -47,20 +47,20 @@ class Processes:
             return True
 
     def forget(self, pid: int) -> None:
-        """It is gone."""
+        """Drop a process that is gone."""
         with self._lock:
             descriptor = self._held.pop(pid, None)
             if descriptor is not None:
                 os.close(descriptor)
 
     def close(self) -> None:
-        """Let go of all."""
+        """Close all descriptors."""
         for pid in list(self._held):
             self.forget(pid)
 
 
 def processes_marked(text: str) -> list[int]:
-    """Processes that were started with `text` in their environment."""
+    """Return the processes that were started with `text` in their environment."""
     wanted, found = text.encode(), []
     for path in Path("/proc").iterdir():
         if path.name.isdigit() and int(path.name) != os.getpid():
@@ -71,7 +71,7 @@ def processes_marked(text: str) -> list[int]:
 
 
 def process_state(pid: int) -> str:
-    """What there is to be known of a process."""
+    """Describe a process."""
     with contextlib.suppress(OSError):
         folder = Path(f"/proc/{pid}")
         state = (folder / "stat").read_text().rpartition(")")[2].split()[:2]
@@ -81,7 +81,7 @@ def process_state(pid: int) -> str:
 
 
 def resources() -> dict[str, float]:
-    """What this process has now, in numbers."""
+    """Return the numbers of this process's resources."""
     status = Path("/proc/self/status").read_text()
     return {
         "rss_mib": int(status.partition("VmRSS:")[2].split()[0]) / 1024,
@@ -92,13 +92,13 @@ def resources() -> dict[str, float]:
 
 
 def processor_seconds() -> float:
-    """Of this process and all that it has outlived."""
+    """Return the processor time of this process and its finished children."""
     found = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(one.ru_utime + one.ru_stime for one in found)
 
 
 def held() -> set[str]:
-    """Child processes, descriptors, threads and shared memory that this process has."""
+    """Return the child processes, descriptors, threads and shared memory of this process."""
     children = {
         f"process {pid}"
         for path in Path("/proc/self/task").glob("*/children")
@@ -106,7 +106,7 @@ def held() -> set[str]:
     }
     descriptors: set[str] = set()
     for path in Path("/proc/self/fd").iterdir():
-        with contextlib.suppress(FileNotFoundError):  # The one that the listing itself needs.
+        with contextlib.suppress(FileNotFoundError):  # The descriptor of the listing itself.
             descriptors.add(f"descriptor {path.name}: {path.readlink()}")
     maps = {
         f"map {line}"

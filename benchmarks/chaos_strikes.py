@@ -1,7 +1,7 @@
-"""Faults from outside: signals to processes, broken builds, floods of connections.
+"""Faults from outside: signals to processes, failing builds, floods of connections.
 
-Nothing is stopped for good while a call is under way in it: calls have no time limit, so
-waiting for one is right. `muted` tells to whom no call may be sent either.
+No process is stopped for good while it executes a call: calls have no time limit, so waiting for
+one is correct. `muted` says which envs must not get calls.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ FAULTS = {
     "stop client for long": 0.5,
     "flood the env_server": 2.0,
 }
-"""How often each of them comes."""
+"""The frequency of each fault."""
 CLIENT_STOP = 4.0
 """Seconds; longer than a heartbeat."""
 
 
 class Strikes:
-    """Does them to one group.
+    """Injects faults into one group.
 
     Args:
-        orders: what the next build of each env is to do.
-        after: has something done so many seconds later, whoever waits for what meanwhile.
-        flood: has many connections made to the env_server; None if there is none.
+        orders: the faults of the next build of each env.
+        after: calls a function some seconds later, whatever waits meanwhile.
+        flood: opens many connections to the env_server; None if there is none.
     """
 
     def __init__(
@@ -78,11 +78,11 @@ class Strikes:
         }
 
     def muted(self, env: Env) -> bool:
-        """Whether its worker or fork server is stopped."""
+        """Return True if its worker or fork server is stopped."""
         return env.pid in self._muted or env.parent in self._muted
 
     def strike(self) -> str | None:
-        """Do one of them; which, if it could be done."""
+        """Inject one fault; return its name, or None if it was not possible."""
         name = self._rng.choices(list(FAULTS), list(FAULTS.values()))[0]
         if name == "flood the env_server":
             if self._flood is None:
@@ -129,7 +129,7 @@ class Strikes:
         return self._signal(parent, signal.SIGSTOP)
 
     def _mute(self, env: Env, pid: int) -> bool:
-        """Have no calls sent to a process; False if one is under way, or it is so already."""
+        """Send no calls to a process; return False if it has a call or is muted already."""
         mates = [mate for mate in self._books.envs.values() if mate.parent == env.parent]
         calling = any(m.limbo or (m.request and m.request.kind == "call") for m in mates)
         if calling or self.muted(env):

@@ -1,4 +1,4 @@
-"""HalfCheetah-v5, 32 envs: how near to the machine's limit, and how far ahead of Gymnasium?
+"""HalfCheetah-v5, 32 envs: compared with the machine's limit, and with Gymnasium.
 
 The limit is one bare loop on each core. EnvPool steps the same task written in C++.
 """

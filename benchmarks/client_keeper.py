@@ -1,10 +1,10 @@
-"""``client_keeper.py``: keeps env clients alive, whatever ends them, as told on stdin.
+"""``client_keeper.py``: starts env clients again whenever they end, by commands on stdin.
 
     keep NAME HOST PORT HEARTBEAT    start that client, and again whenever it ends
     drop NAME                        kill it for good
-    flood HOST PORT SEED             many connections at once that are no clients
+    flood HOST PORT SEED             open many connections at once that are no clients
 
-It loads what clients need once and forks them. They end with it, and it ends with its stdin.
+It imports the clients' modules once and forks them. They end with it, and it ends with its stdin.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from rlightning_aio.remote import RemoteEnvClient
 CONNECTIONS = 60
 FLOOD_SECONDS = 0.3
 PAUSE = 0.05
-"""Seconds until one that has ended is started again."""
+"""Seconds until a client that has ended is started again."""
 
 
 @dataclass
 class Kept:
-    """A client: its arguments, and its process or when there shall be one."""
+    """A client: its arguments, and its process or the time of its next start."""
 
     name: str
     host: str
@@ -45,7 +45,7 @@ class Kept:
 
 
 def fork() -> int:
-    """Like `os.fork`; the child dies with this process, and has nothing of its signals."""
+    """Like `os.fork`, but the child dies with this process and has default signal handlers."""
     pid = os.fork()
     if not pid:
         signal.set_wakeup_fd(-1)
@@ -57,7 +57,7 @@ def fork() -> int:
 
 
 def serve(kept: Kept) -> None:
-    """Be the client until it is over."""
+    """Run the client until it ends."""
     env = WitnessEnv(EnvConfig(name="client", backend="witness", task="t"), int(kept.name[1:]))
     with RemoteEnvClient(
         env, kept.host, kept.port, name=kept.name, heartbeat=kept.heartbeat
@@ -66,7 +66,7 @@ def serve(kept: Kept) -> None:
 
 
 def flood(host: str, port: int, seed: int) -> None:
-    """Connect many times at once; some say nothing, some nonsense, some nonsense in ZMQ."""
+    """Connect many times at once; some peers send nothing, some nonsense, some nonsense in ZMQ."""
     rng = random.Random(seed)
     held: list[socket.socket] = []
     context = zmq.Context()
@@ -100,7 +100,7 @@ class Keeper:
         signal.signal(signal.SIGCHLD, lambda *_: None)
 
     def run(self) -> None:
-        """Until stdin ends."""
+        """Execute commands until stdin ends."""
         waiting = b""
         while True:
             self._start_due()

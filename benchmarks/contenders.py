@@ -1,9 +1,9 @@
 """The contenders that several questions share: this library, its peers, and the limit.
 
-Rule: everybody gets the same single env from `gymnasium.make`, steps it with actions
-sampled beforehand, and resets finished episodes, each in its own way. What counts is
-results handed to the trainer; where an env is reset in place of a step (Gymnasium,
-EnvPool, this library, the in-process loops), that result counts as well.
+Rule: all contenders get the same single env from `gymnasium.make`, step it with actions sampled
+beforehand, and reset finished episodes, each in its own way. They are measured by the results
+handed to the trainer; where an env is reset in place of a step (Gymnasium, EnvPool, this library,
+the in-process loops), that result counts as well.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import multiprocessing as mp
 import os
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import import_module
 from itertools import cycle
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -23,24 +23,24 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from multiprocessing.connection import Connection
 
-# Batches of actions that are sampled beforehand and used in turn.
+# Number of batches of actions, sampled beforehand and used in turn.
 NUM_ACTIONS = 64
-# Steps between two looks at the clock, in loops so bare that a look would show.
+# Steps between two readings of the clock, in loops where a reading would take noticeable time.
 STEPS_PER_LOOK = 64
 
 
 @dataclass(frozen=True)
 class Work:
-    """What is stepped.
+    """The workload.
 
     Attributes:
         task: Gymnasium id.
-        num_envs: how many, for contenders that run many.
-        modules: imported wherever the env is made.
+        num_envs: number of envs, for contenders that run several.
+        modules: imported before the env is made.
         backend: this library's name for the simulator.
-        max_episode_steps: limit for tasks that have none of their own.
-        together: how many of them this library steps with one request (its `num_envs`).
-        placement: where this library has them.
+        max_episode_steps: limit for tasks without one.
+        together: number of envs that this library steps with one request (its `num_envs`).
+        placement: of this library's envs.
     """
 
     task: str
@@ -53,11 +53,11 @@ class Work:
 
     @property
     def num_requests(self) -> int:
-        """How many requests a step of all takes."""
+        """Return the number of requests for a step of all envs."""
         return self.num_envs // self.together
 
     def make(self) -> Any:
-        """One env, as bare as `gymnasium.make` makes it."""
+        """Return one env, as bare as `gymnasium.make` makes it."""
         import gymnasium as gym
 
         for module in self.modules:
@@ -67,7 +67,9 @@ class Work:
         )
 
     def episode_limit(self) -> int | None:
-        """Steps after which an episode of it ends, by its own or the registered limit."""
+        """Return the number of steps after which an episode ends: its own or the
+        registered limit.
+        """
         import gymnasium as gym
 
         for module in self.modules:
@@ -79,7 +81,7 @@ class Work:
 
 
 def sampled(space: Any, num_envs: int) -> Iterator[Any]:
-    """Batches of sampled actions, in turn and without end."""
+    """Return an endless iterator over batches of sampled actions."""
     space.seed(0)
     batches = [
         np.stack([np.asarray(space.sample()) for _ in range(num_envs)]) for _ in range(NUM_ACTIONS)
@@ -89,7 +91,7 @@ def sampled(space: Any, num_envs: int) -> Iterator[Any]:
 
 @dataclass
 class Stepped(Contender):
-    """Whatever is driven by a blocking call that brings some results."""
+    """A contender whose steps are one blocking call that returns some results."""
 
     name: str
     work: Work
@@ -102,7 +104,7 @@ class Stepped(Contender):
         return (self.package, *self.work.modules)
 
     def step(self) -> int:
-        """Bring some results; how many."""
+        """Step; return the number of results."""
         raise NotImplementedError
 
     def round(self, seconds: float) -> float:
@@ -117,10 +119,10 @@ class Stepped(Contender):
 
 
 def group_config(work: Work, envs_per_process: int | str) -> dict[str, Any]:
-    """One config entry for all envs of `work`."""
+    """Return one config entry for all envs of `work`."""
     workers: dict[str, Any] = {}
     if work.placement != "inline":
-        # One worker on each core is best kept there.
+        # With one worker on each core, pinning is best.
         workers = {
             "envs_per_process": envs_per_process,
             "cpu_affinity": envs_per_process == "auto",
@@ -144,8 +146,7 @@ class OursSync(Stepped):
 
     Attributes:
         envs_per_process: as in a config entry.
-        auto_reset: whether finished episodes are looked for at all; envs that never end
-            one need not.
+        auto_reset: whether finished episodes are reset; not needed if episodes never end.
     """
 
     envs_per_process: int | str = "auto"
@@ -172,7 +173,7 @@ class OursSync(Stepped):
 
 @dataclass
 class OursAsync(Contender):
-    """`rlightning_aio.EnvGroup`: whoever is ready is collected and sent on.
+    """`rlightning_aio.EnvGroup`: ready envs are collected and stepped again.
 
     Attributes:
         envs_per_process, auto_reset: see `OursSync`.
@@ -210,14 +211,14 @@ class OursAsync(Contender):
         self.begin()
 
     def begin(self) -> None:
-        """Have every env step, so that there is something to collect."""
+        """Step every env, so that there is something to collect."""
         self._send(self._first)
 
     def _send(self, batch: Any) -> None:
         self._envs.step_async(batch.respond(action=next(self._actions)[: len(batch)]))
 
     async def collect(self, seconds: float) -> int:
-        """Collect and send on for that long; how many results came."""
+        """Collect and step for that long; return the number of results."""
         clock = time.perf_counter
         count = 0
         until = clock() + seconds
@@ -231,7 +232,7 @@ class OursAsync(Contender):
         return count * self.work.together
 
     async def measure(self, seconds: float) -> float:
-        """One round, within the event loop."""
+        """Measure one round within the event loop."""
         await self.collect(0.1 * seconds)
         began = time.perf_counter()
         count = await self.collect(0.9 * seconds)
@@ -251,10 +252,10 @@ class OursAsync(Contender):
 
 @dataclass
 class GymnasiumVector(Stepped):
-    """What has Gymnasium's vector interface."""
+    """A contender with Gymnasium's vector interface."""
 
     def make(self) -> Any:
-        """All envs."""
+        """Make all envs."""
         raise NotImplementedError
 
     def setup(self) -> None:
@@ -289,12 +290,12 @@ class GymnasiumSync(GymnasiumVector):
 
 @dataclass
 class Sb3Vector(Stepped):
-    """What has Stable-Baselines3's vector interface."""
+    """A contender with Stable-Baselines3's vector interface."""
 
     package = "stable_baselines3"
 
     def make(self) -> Any:
-        """All envs."""
+        """Make all envs."""
         raise NotImplementedError
 
     def setup(self) -> None:
@@ -315,14 +316,14 @@ class StableBaselines3(Sb3Vector):
     def make(self) -> Any:
         from stable_baselines3.common.vec_env import SubprocVecEnv
 
-        # By default each of its processes imports torch anew, for minutes in all; how fast
+        # By default each of its processes imports torch, which takes minutes in all; how fast
         # they step afterwards is the same.
         return SubprocVecEnv(self.work.makers(), start_method="fork")
 
 
 @dataclass
 class Tianshou(Stepped):
-    """`ShmemVectorEnv` of Tianshou: one process for each env; its user resets."""
+    """`ShmemVectorEnv` of Tianshou: one process for each env; the user resets."""
 
     package = "tianshou"
 
@@ -344,11 +345,11 @@ class Tianshou(Stepped):
 
 @dataclass
 class EnvPool(Stepped):
-    """EnvPool: the same tasks written anew in C++, stepped by its threads.
+    """EnvPool: the same tasks rewritten in C++, stepped by its threads.
 
     Attributes:
         batch_size: results it hands out at a time; all envs if None (synchronous).
-        thread_affinity_offset: the core that its first thread is kept on; -1 for any.
+        thread_affinity_offset: the core to which its first thread is pinned; -1 for any.
     """
 
     batch_size: int | None = None
@@ -380,14 +381,16 @@ class EnvPool(Stepped):
 
 
 class InLine:
-    """Envs stepped one after the other in a plain loop, each reset where it has ended."""
+    """Envs stepped one after the other in a plain loop; each is reset when its episode
+    has ended.
+    """
 
     def __init__(self, work: Work, num_envs: int, steps_per_look: int = STEPS_PER_LOOK) -> None:
         self._envs = [work.make() for _ in range(num_envs)]
         for seed, env in enumerate(self._envs):
             env.reset(seed=seed)
         batches = sampled(self._envs[0].action_space, num_envs)
-        # As a policy's output would be split: Python numbers for Discrete, arrays for Box.
+        # Split like the output of a policy: Python numbers for Discrete, arrays for Box.
         self._actions = cycle(
             [
                 [row.item() if row.ndim == 0 else row for row in np.array(next(batches))]
@@ -430,9 +433,9 @@ class Limit(Contender):
     """Bare in-process loops around one env each, all running at once; nothing around them.
 
     Attributes:
-        processes: how many; as many as there are cores if None.
+        processes: number of processes; one for each core if None.
         num_envs: of each process, stepped in turn.
-        steps_per_look: steps between two looks at the clock.
+        steps_per_look: steps between two readings of the clock.
     """
 
     name: str
@@ -460,7 +463,7 @@ class Limit(Contender):
             connection.recv()
 
     def _loop(self, connection: Connection) -> None:
-        """Run in each process: a round for each number of seconds that comes."""
+        """Run in each process: one round for each number of seconds that is received."""
         for inherited in self._connections:
             inherited.close()
         envs = self.envs()
@@ -472,7 +475,7 @@ class Limit(Contender):
             envs.close()
 
     def envs(self) -> Any:
-        """What each process steps."""
+        """Make the envs of each process."""
         return InLine(self.work, self.num_envs, self.steps_per_look)
 
     def round(self, seconds: float) -> float:
@@ -487,35 +490,77 @@ class Limit(Contender):
             process.join()
 
 
-class Together:
-    """Simulations that are stepped with one call, as this library's workers step them."""
+@dataclass
+class BareBatch(Stepped):
+    """Bare `mujoco.batch`: controls in, positions and velocities out; no rewards, no infos.
 
-    def __init__(self, work: Work, num_envs: int) -> None:
-        from rlightning_aio.envs.mujoco_batch import MujocoBatch
+    A simulation whose body leaves the heights that its task calls healthy is put back to its first
+    state, for one that lies on the ground takes up to twice as long a step.
 
-        self._num_envs = num_envs
-        self._envs = MujocoBatch(work.make(), num_envs)
-        self._envs.reset(seed=0)
-        self._actions = sampled(self._envs.single_action_space, num_envs)
+    Attributes:
+        half: half of the simulations are stepped at a time.
+    """
+
+    half: bool = False
+
+    package = "mujoco.batch"
+
+    def setup(self) -> None:
+        import mujoco
+        from mujoco.batch import Batch
+
+        env, count = self.work.make(), self.work.num_envs
+        model, data, size = env.unwrapped.model, env.unwrapped.data, mujoco.mjtState
+        self._batch = Batch(model, count, len(os.sched_getaffinity(0)))
+        for seed in range(count):
+            env.reset(seed=seed)
+            state = self._batch.state[seed]
+            mujoco.mj_getState(model, data, state, size.mjSTATE_INTEGRATION)
+        self._first = self._batch.state.copy()
+        self._heights = getattr(env.unwrapped, "_healthy_z_range", None)
+        # A planar body's first position is its x, and its second one its height.
+        self._height = 1 if model.nq < 10 else 2
+        self._fields = [self._batch.bind(name) for name in ("ctrl", "qpos", "qvel")]
+        self._num_steps = env.unwrapped.frame_skip
+        self._actions = sampled(env.action_space, count)
+        halves = np.split(np.arange(count, dtype=np.int32), 2)
+        self._ids = cycle(halves if self.half else [np.arange(count, dtype=np.int32)])
 
     def step(self) -> int:
-        self._envs.step(next(self._actions))
-        return self._num_envs
+        ids, (controls, *observed) = next(self._ids), self._fields
+        controls[ids] = next(self._actions)[ids]
+        self._batch.step(ids, nstep=self._num_steps)
+        if self._heights is not None:
+            low, high = self._heights
+            heights = observed[0][:, self._height]
+            fallen = np.flatnonzero((heights < low) | (heights > high))
+            self._batch.state[fallen] = self._first[fallen]
+        _ = np.concatenate([field[ids] for field in observed], axis=1)
+        return len(ids)
 
-    def close(self) -> None:
-        self._envs.close()
+    def teardown(self) -> None:
+        """Do nothing: there is nothing to close."""
 
 
 @dataclass
-class Ceiling(Limit):
-    """On each core simulations that are stepped together; no trainer.
+class MakeVec(GymnasiumVector):
+    """`rlightning_aio.vector.make_vec`.
 
     Attributes:
-        num_envs: of each process.
+        entry: its `vector_kwargs`.
+        num_threads: of MuJoCo's; one per core if None.
     """
 
-    def envs(self) -> Any:
-        return Together(self.work, self.num_envs)
+    entry: dict[str, Any] = field(default_factory=dict)
+    num_threads: int | None = None
+
+    package = "rlightning_aio"
+
+    def make(self) -> Any:
+        from rlightning_aio.vector import make_vec
+
+        threads = {} if self.num_threads is None else {"num_threads": self.num_threads}
+        return make_vec(self.work.task, self.work.num_envs, vector_kwargs=self.entry, **threads)
 
 
 @dataclass

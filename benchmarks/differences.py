@@ -1,10 +1,10 @@
-"""What becomes of a step that is late, a worker that is killed, an error that is odd?
+"""The effects of a late step, a killed worker and an error that can't be rebuilt.
 
     python benchmarks/differences.py
 
-The same environment, the same actions, in Gymnasium's AsyncVectorEnv and in rlightning_aio:
-two environments, of which the second one goes wrong. Each answer is the token of the action
-that it belongs to, so that one that belongs to another step shows.
+The same two environments with the same actions, in Gymnasium's AsyncVectorEnv and in
+rlightning_aio; the second environment fails. Each answer is the token of its action, so an
+answer to another step is noticed.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 FIRST, SECOND = 1.0, 2.0
 """Tokens of the two steps."""
 LIMIT = 0.1
-"""Seconds that the caller waits for a step; the late one takes until the gate opens."""
+"""Seconds that the caller waits for a step; the late step takes until the gate opens."""
 ROWS = {
     "raised": "the caller gets",
     "marked": "marks the result",
@@ -49,23 +49,23 @@ LATE, KILLED, ODD = "a step that comes late", "a killed worker", "an error that 
 
 
 def actions(fault: int, token: float) -> np.ndarray:
-    """A batch of which the second one is at fault."""
+    """Return a batch whose second action causes the fault."""
     return np.array([[NOTHING, token], [fault, token]])
 
 
-def told(error: BaseException) -> str:
-    """An error as one line."""
+def text_of(error: BaseException) -> str:
+    """Return an error as one line."""
     text = " ".join(str(error).split("\n", maxsplit=1)[0].split())
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
 def answers(rewards: np.ndarray) -> str:
-    """What a step after the fault has brought."""
+    """Return the results of a step after the fault."""
     return f"answers {rewards.tolist()}"
 
 
 def open_gate(gate: str) -> None:
-    """Let the late step go on; returns when it does."""
+    """Let the late step continue; return when it does."""
     Path(gate).write_bytes(b"")
 
 
@@ -73,7 +73,7 @@ def open_gate(gate: str) -> None:
 
 
 def gymnasium_late(gate: str) -> dict[str, Any]:
-    """Time out on the first step, then ask for the second."""
+    """Time out on the first step, then request the second."""
     envs = AsyncVectorEnv([partial(Breakable, index, gate=gate) for index in range(2)])
     envs.reset()
     envs.step_async(actions(WAIT_FOR_GATE, FIRST))
@@ -81,7 +81,7 @@ def gymnasium_late(gate: str) -> dict[str, Any]:
         envs.step_wait(timeout=LIMIT)
         raised = None
     except multiprocessing.TimeoutError as error:
-        raised = told(error)
+        raised = text_of(error)
     open_gate(gate)
     answered = envs.step(actions(NOTHING, SECOND))[1]
     end(envs)
@@ -89,24 +89,24 @@ def gymnasium_late(gate: str) -> dict[str, Any]:
 
 
 def gymnasium_fault(fault: int) -> dict[str, Any]:
-    """Have the second environment go wrong in a step, then go on."""
+    """Let the second environment fail in a step, then continue."""
     envs = AsyncVectorEnv([partial(Breakable, index) for index in range(2)])
     envs.reset()
     raised = afterwards = None
     try:
         envs.step(actions(fault, FIRST))
     except Exception as error:  # noqa: BLE001  # Whatever it is, it is what we look for.
-        raised = told(error)
+        raised = text_of(error)
     try:
         afterwards = answers(envs.step(actions(NOTHING, SECOND))[1])
     except Exception as error:  # noqa: BLE001
-        afterwards = told(error)
+        afterwards = text_of(error)
     end(envs)
     return {"raised": raised, "afterwards": afterwards}
 
 
 def end(envs: AsyncVectorEnv) -> None:
-    """End its processes: after these faults its own `close` raises or waits for ever."""
+    """End its processes: after these faults its own `close` raises or never returns."""
     for process in envs.processes:
         process.terminate()
         process.join()
@@ -117,7 +117,7 @@ def end(envs: AsyncVectorEnv) -> None:
 
 
 def group_of(gate: str | None = None) -> sync.EnvGroup:
-    """Two environments, each in a worker of its own as over there."""
+    """Return a group of two environments, each in its own worker, as in Gymnasium."""
     entry = {
         "name": "e",
         "backend": "breakable",
@@ -131,7 +131,7 @@ def group_of(gate: str | None = None) -> sync.EnvGroup:
 
 
 def ours_late(gate: str) -> dict[str, Any]:
-    """Time out on the first step, collect it late, then ask for the second."""
+    """Time out on the first step, collect it late, then request the second."""
     with group_of(gate) as group:
         batch, _ = group.reset()
         group.step_async(batch.respond(action=actions(WAIT_FOR_GATE, FIRST)))
@@ -139,7 +139,7 @@ def ours_late(gate: str) -> dict[str, Any]:
         try:
             group.collect_async(wait_all=True, deadline=LIMIT)
         except TimeoutError as error:
-            raised = told(error)
+            raised = text_of(error)
         open_gate(gate)
         late, _ = group.collect_async(wait_all=True)
         batch, _ = group.step(batch.respond(action=actions(NOTHING, SECOND)))
@@ -152,18 +152,18 @@ def ours_late(gate: str) -> dict[str, Any]:
 
 
 def ours_killed() -> dict[str, Any]:
-    """Have the second environment's worker killed in a step, then go on."""
+    """Kill the second environment's worker in a step, then continue."""
     with group_of() as group:
         batch, _ = group.reset()
         results, _ = group.step(batch.respond(action=actions(KILL, FIRST)))
-        told_of = results["e-1"].info["worker_restarted"]
+        cause = results["e-1"].info["worker_restarted"]
         unhurt = results["e-0"].last_reward
         batch, _ = group.step(batch.respond(action=actions(NOTHING, SECOND)))
-        return {"marked": told_of, "unhurt": unhurt, "afterwards": answers(batch.reward)}
+        return {"marked": cause, "unhurt": unhurt, "afterwards": answers(batch.reward)}
 
 
 def ours_odd() -> dict[str, Any]:
-    """Have the second environment raise in a step, then go on."""
+    """Let the second environment raise in a step, then continue."""
     with group_of() as group:
         batch, _ = group.reset()
         found: dict[str, Any] = {}
@@ -171,7 +171,7 @@ def ours_odd() -> dict[str, Any]:
             group.step(batch.respond(action=actions(RAISE_ODDLY, FIRST)))
         except EnvRaised as error:
             found = {
-                "raised": told(error),
+                "raised": text_of(error),
                 "env_id": error.env_id,
                 "traceback": error.traceback_text,
                 "unhurt": error.results["e-0"].last_reward,
@@ -185,7 +185,7 @@ def ours_odd() -> dict[str, Any]:
 
 
 def with_gate(work: Callable[[str], dict[str, Any]]) -> dict[str, Any]:
-    """Do work that needs a FIFO."""
+    """Run work that needs a FIFO."""
     with tempfile.TemporaryDirectory() as folder:
         gate = str(Path(folder) / "gate")
         os.mkfifo(gate)
@@ -193,7 +193,7 @@ def with_gate(work: Callable[[str], dict[str, Any]]) -> dict[str, Any]:
 
 
 def differences() -> dict[str, dict[str, dict[str, Any]]]:
-    """By situation and library, what happened."""
+    """Return the outcomes by situation and library."""
     return {
         LATE: {"gymnasium": with_gate(gymnasium_late), "ours": with_gate(ours_late)},
         KILLED: {"gymnasium": gymnasium_fault(KILL), "ours": ours_killed()},
@@ -202,7 +202,7 @@ def differences() -> dict[str, dict[str, dict[str, Any]]]:
 
 
 def table(found: dict[str, dict[str, dict[str, Any]]]) -> str:
-    """What happened as Markdown."""
+    """Return the outcomes as Markdown."""
     title = f"Gymnasium {gym.__version__} AsyncVectorEnv"
     lines = [f"| situation | | {title} | rlightning_aio |", "|---|---|---|---|"]
     for situation, sides in found.items():

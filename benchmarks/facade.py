@@ -1,7 +1,6 @@
 """One env without work in one worker: what does the synchronous facade add to its core?
 
-Beside `sync.EnvGroup.step` the same core is driven by the barest loop that can: poll, read,
-go on.
+The same core is driven by `sync.EnvGroup.step` and by a minimal loop: poll, read, resume.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ RAW = "its core, driven raw"
 
 
 class RawDriver:
-    """Blocks in `poll` and goes on; no time limits, no writing, no tidying up."""
+    """Blocks in `poll` and resumes; without time limits, writing and cleaning up."""
 
     def __init__(self) -> None:
         self._poll = select.poll()
@@ -49,7 +48,7 @@ class RawDriver:
         assert not wanted, f"a request of one env fits the channel of {source}"
 
     def wake(self) -> None:
-        """Nobody to wake: `run` goes on after every read."""
+        """Do nothing: `run` resumes after every read."""
 
     def run(self, procedure: Procedure[Any]) -> Any:
         try:
@@ -68,7 +67,8 @@ class Raw(Stepped):
     package = "rlightning_aio"
 
     def setup(self) -> None:
-        from rlightning_aio.group.build import assemble, plan_group
+        from rlightning_aio.group.build import assemble
+        from rlightning_aio.group.plan import plan_group
 
         self._driver = RawDriver()
         config = group_config(self.work, "auto")

@@ -1,9 +1,9 @@
 """What does a film cost the envs that aren't filmed (`video` of an entry)?
 
-Beside the envs whose steps are counted there is one more, in a worker of its own, whose every
-episode is filmed, or not. Whoever is ready is collected and stepped again. Envs that wait, as
-those do whose simulator runs on a GPU or whose arm moves, leave the cores to the film; those that
-compute share the cores with it, and with its ffmpeg.
+In addition to the envs whose steps are counted there is another one, in its own worker, whose every
+episode is filmed, or not. Ready envs are collected and stepped again. Envs that wait, for example
+for a GPU or a robot, leave the cores to the film; envs that compute share the cores with it, and
+with its ffmpeg.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ RATE = 0.97
 
 @dataclass
 class Beside(Contender):
-    """`NUM_ENVS` envs of a task beside one more, and the steps of these per second.
+    """`NUM_ENVS` envs of a task and another one, and the steps of the former per second.
 
     Attributes:
-        share: how many of them have a worker together.
-        filmed: the one more is.
+        share: number of them in one worker.
+        filmed: the other one is filmed.
     """
 
     name: str
@@ -37,11 +37,11 @@ class Beside(Contender):
 
     @property
     def requires(self) -> tuple[str, ...]:
-        """Filming's own; rendering is the same either way."""
+        """Return the packages for filming; rendering is the same in either case."""
         return ("rlightning_aio", "imageio_ffmpeg", "pygame")
 
     def setup(self) -> None:
-        """Build the envs, and send them their first steps."""
+        """Build the envs and send them their first steps."""
         from rlightning_aio import sync
 
         self._stack = ExitStack()
@@ -58,18 +58,18 @@ class Beside(Contender):
         self._actions = np.random.default_rng(0).integers(2, size=NUM_ENVS + 1)
 
     def step(self) -> int:
-        """Answer whoever was ready; how many of the others are then."""
+        """Step the ready envs again; return the number of counted ones."""
         action = self._actions[: len(self._batch)]
         self._group.step_async(self._batch.respond(action=action))
         self._batch, _ = self._group.collect_async(min_results=1)
         return int(np.count_nonzero(self._batch.index < NUM_ENVS))
 
     def round(self, seconds: float) -> float:
-        """Their steps per second."""
+        """Return the counted steps per second."""
         return throughput(self.step, seconds)
 
     def teardown(self) -> None:
-        """Close the envs; a film under way ends."""
+        """Close the envs, which ends a film in progress."""
         self._stack.close()
 
 

@@ -1,16 +1,16 @@
-"""Spoilt messages, hellos and keys against env_server, and what strangers cost a trainer.
+"""Corrupted messages, hellos and keys for env_server, and the cost of unauthenticated peers.
 
     python benchmarks/fuzz_remote.py
 
-First what the short form in the tests asserts, without sockets: every request between spoilt
-messages was answered, how memory grew over the second half, and that spoilt key files keep
-nobody out. Then a trainer with one honest client, and strangers in a process of their own who
-send as many messages over ever new connections, to a server with keys and to one without.
-Rounds of 2 s alternate: strangers stopped or not (by signal), the trainer stepping its client
-or only waiting. Measured are the steps of a round, and the processor time of the trainer's
-process, ZMQ's thread included, while it only waits. Strangers wait for the other end's part of the
-handshake, so an env_server that makes them wait hears less than they would say: how much they have
-sent, and what became of it, is told beside.
+First, without sockets, the assertions of the short form in the tests: every request between
+corrupted messages is answered, memory doesn't grow over the second half, and corrupted key files
+lock out no client. Then a trainer with one honest client, and peers in another process that send
+as many messages as they can over new connections, to a server with keys and to one without.
+Rounds of 2 s alternate: peers stopped or not (by signal), the trainer stepping its client
+or only waiting. The figures are the steps of a round, and the processor time of the trainer's
+process, including ZMQ's thread, while it only waits. Unauthenticated peers wait for the other
+end's part of the handshake, so an env_server that makes them wait receives less. The numbers of
+messages that were sent, read and dropped are printed, too.
 """
 
 from __future__ import annotations
@@ -30,29 +30,29 @@ sys.path[0] = str(Path(__file__).resolve().parents[1] / "tests")
 
 from remote.disturbed import disturbed  # noqa: E402  (they lie beside their short form)
 from remote.fuzz import fuzz, fuzz_keys  # noqa: E402
-from remote.strangers import BATCH  # noqa: E402
+from remote.unauthenticated_peers import BATCH  # noqa: E402
 
 GROWTH = 200_000
-"""Bytes that the noted messages which are spoilt next may differ by."""
+"""Largest difference in bytes of the recorded messages that are corrupted next."""
 ROUND_SECONDS = 2.0
 MOST_OF_A_CORE = 0.05
 LEAST_RATE = 0.9
 MOST_KEPT = 4 << 20
-"""Bytes that a process may grow by from the first quarter of a run to its end."""
+"""Largest growth of a process in bytes from the first quarter of a run to its end."""
 
 
 @dataclass
 class Cost:
-    """What strangers cost.
+    """The cost of unauthenticated peers.
 
     Attributes:
-        shares: of a core, that a waiting trainer takes, one for each round: without, with.
+        shares: of a core that a waiting trainer uses, for each round: without peers, with peers.
         rates: steps a second, likewise.
         grown: bytes, since the first quarter.
-        cut: connections that were cut off.
-        sent: messages, over connections that were not broken off before.
-        read: messages of which somebody found out what they say.
-        dropped: messages that were taken in and thrown away unread.
+        cut: closed connections.
+        sent: messages, over connections that were open at that time.
+        read: messages whose content was read.
+        dropped: messages that were received and dropped unread.
     """
 
     shares: tuple[list[float], list[float]] = field(default_factory=lambda: ([], []))
@@ -70,7 +70,7 @@ def resident() -> int:
 
 
 def wait(group, seconds: float) -> float:
-    """Processor time, as a share of a core, of a trainer that waits for its clients."""
+    """Return the processor time, as a share of a core, of a trainer that waits for its clients."""
     began, before = time.monotonic(), time.process_time()
     while (left := began + seconds - time.monotonic()) > 0:
         try:
@@ -81,7 +81,7 @@ def wait(group, seconds: float) -> float:
 
 
 def step(group, batch, seconds: float):
-    """Steps a second, and the last batch."""
+    """Return the steps per second, and the last batch."""
     began, steps = time.monotonic(), 0
     while time.monotonic() < began + seconds:
         group.step_async(batch.respond(action=[0]))
@@ -95,31 +95,35 @@ def cost(messages: int, rate: int, seed: int, *, curve: bool) -> Cost:
     with disturbed(curve=curve, messages=messages, rate=rate, seed=seed) as (
         group,
         listener,
-        strangers,
+        peers,
     ):
-        strangers.send_signal(signal.SIGSTOP)
+        peers.send_signal(signal.SIGSTOP)
         batch, _ = group.reset()
         with group.auto_reset(max_episode_steps=1000):
             step(group, batch, 1.0)
             first = 0
-            while strangers.poll() is None and found.seconds < 10 * messages / rate:
+            while peers.poll() is None and found.seconds < 10 * messages / rate:
                 for disturbance in (False, True):
                     if disturbance:
-                        strangers.send_signal(signal.SIGCONT)
+                        peers.send_signal(signal.SIGCONT)
                     reached, batch = step(group, batch, ROUND_SECONDS)
                     found.rates[disturbance].append(reached)
                     found.shares[disturbance].append(wait(group, ROUND_SECONDS))
                     if disturbance:
-                        strangers.send_signal(signal.SIGSTOP)
+                        peers.send_signal(signal.SIGSTOP)
                         found.seconds += 2 * ROUND_SECONDS
                 if not first and found.seconds >= messages / rate / 4:
                     first = resident()
         found.grown = resident() - first
-        door = listener.door
-        found.cut, found.read, found.dropped = door.num_cut, door.num_wasted, door.num_dropped
-        strangers.kill()
-        strangers.wait()
-        found.sent = BATCH * len(strangers.stdout.read())
+        limiter = listener.connections
+        found.cut, found.read, found.dropped = (
+            limiter.num_cut,
+            limiter.num_wasted,
+            limiter.num_dropped,
+        )
+        peers.kill()
+        peers.wait()
+        found.sent = BATCH * len(peers.stdout.read())
     return found
 
 
@@ -128,7 +132,7 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--frames", type=int, default=100_000, help="against each end")
-    parser.add_argument("--messages", type=int, default=100_000, help="of strangers, each time")
+    parser.add_argument("--messages", type=int, default=100_000, help="of peers, each time")
     parser.add_argument("--rate", type=int, default=2500, help="messages a second, at most")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
@@ -150,7 +154,7 @@ def main() -> int:
         quiet, loud = (median(shares) for shares in found.shares)
         rate = median(b / a for a, b in zip(*found.rates, strict=True))
         print(
-            f"{given.messages:,} messages of strangers at {given.rate:,} a second, "
+            f"{given.messages:,} messages of peers at {given.rate:,} a second, "
             f"{'keys' if curve else 'no keys'}: after {found.seconds:.0f} s {found.sent:,} sent, "
             f"{found.read:,} read, {found.dropped:,} dropped; {loud - quiet:.1%} of a core more "
             f"({loud:.1%} against {quiet:.1%}); the client steps at "

@@ -2,7 +2,7 @@
 
 Rule: the loop, the wrappers around each environment and the hyperparameters are CleanRL's
 (ppo.py, ppo_continuous_action.py, with SAME_STEP as its change to Gymnasium 1 has it). The
-network and the learner are those of `examples/ppo.py`, so what differs is how experience comes.
+network and the learner are those of `examples/ppo.py`, so only the source of experience differs.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
 
-from ppo import Agent, advantages, learn  # Examples are no package.
+from ppo import Agent, advantages, learn  # The examples are not a package.
 from training_run import Run
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ KINDS = {"AsyncVectorEnv": AsyncVectorEnv, "SyncVectorEnv": SyncVectorEnv}
 
 
 def make_env(args: Args) -> gym.Env[Any, Any]:
-    """One environment in CleanRL's wrappers."""
+    """Make one environment in CleanRL's wrappers."""
     env = gym.make(args.task)
     if not args.normalize:
         return gym.wrappers.RecordEpisodeStatistics(env)

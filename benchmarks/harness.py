@@ -1,9 +1,9 @@
-"""Alternating rounds of contenders in one run, and what is told of them.
+"""Alternating rounds of contenders in one run, and their reports.
 
-Rule: contenders take turns (A B C A B C …), each in a process of its own that sleeps
-while others have theirs, and a ratio is the median over pairs of the same round. So a
-machine that slows down for a while slows all of them down.
-Absent on purpose: any work to measure; that is in the scripts, one question each.
+Rule: contenders take turns (A B C A B C …), each in its own process, which sleeps during the
+turns of others, and a ratio is the median over pairs of the same round. So a machine that slows
+down for a while slows all of them down.
+Left out on purpose: the work to measure, which is in the scripts, one question each.
 """
 
 from __future__ import annotations
@@ -22,24 +22,25 @@ import time
 import traceback
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
+from functools import cache
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from multiprocessing.connection import Connection
 
-# One math thread for everybody: none of the contenders gains by more, and some would
+# One math thread for each contender: none is faster with more, and some would
 # start one for each core in each of their processes.
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-# Modules whose versions are told, beside those of the peers that take part.
+# Modules whose versions are reported, in addition to those of the peers that take part.
 ALWAYS_USED = ("rlightning_aio", "gymnasium", "mujoco", "numpy", "uvloop")
 NAME_WIDTH = 34
 
 
 class Contender:
-    """One way to do the work; subclasses are dataclasses that pickle.
+    """One way to do the work; subclasses are dataclasses that can be pickled.
 
     Everything but the constructor runs in the contender's own process.
     """
@@ -48,26 +49,26 @@ class Contender:
 
     @property
     def requires(self) -> tuple[str, ...]:
-        """Modules without which it is left out."""
+        """Return the modules without which it is left out."""
         return ()
 
     def setup(self) -> None:
-        """Called once, before the first round; not measured."""
+        """Prepare the first round; called once, not measured."""
 
     def round(self, seconds: float) -> Any:
-        """One round of about that length; the figure that was measured.
+        """Run one round of about that length; return the measured figure.
 
-        What isn't one figure but pickles is for a script that tells its results itself.
+        Any other value that can be pickled is for a script with its own report.
         """
         raise NotImplementedError
 
     def teardown(self) -> None:
-        """Called once, after the last round, also if a round has failed."""
+        """Clean up after the last round; called once, also if a round has failed."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """What is asked of `subject` in comparison to `reference`, both contenders' names.
+    """A bound for `subject` in comparison to `reference`, both contenders' names.
 
     Attributes:
         bound: of the ratio (or difference) of their figures in the same round.
@@ -90,15 +91,15 @@ class Target:
 
 @dataclass(frozen=True)
 class Question:
-    """What a script asks.
+    """The question that a script answers.
 
     Attributes:
         name: of the result files.
         title: one line, with the workload.
         unit: of the contenders' figures.
         seconds: length of a round; None where the work itself gives the length.
-        counts_steps: the figures are env steps per second, so that processor time can be
-            told by env step as well.
+        counts_steps: the figures are env steps per second, so processor time can be reported by
+            env step, too.
     """
 
     name: str
@@ -113,11 +114,11 @@ class Question:
 
 @dataclass
 class Figures:
-    """What was measured: one value for each round, in order.
+    """The measured values, one for each round, in order.
 
     Attributes:
-        cores: processors that the contender kept busy, all its processes together. Well
-            below what it could use, it was kept waiting, by others or by itself.
+        cores: number of processors that all processes of the contender kept busy. If it is well
+            below the possible number, the contender waited, for others or for itself.
     """
 
     values: list[float] = field(default_factory=list)
@@ -136,7 +137,9 @@ class Figures:
         }
 
     def processor_time(self) -> dict[str, float]:
-        """What a step costs all processes together, and how many processors were busy."""
+        """Return the processor time of all processes for a step, and the number of busy
+        processors.
+        """
         pairs = zip(self.cores, self.values, strict=True)
         return {
             "cpu_us_per_step": statistics.median(1e6 * cores / rate for cores, rate in pairs),
@@ -145,10 +148,10 @@ class Figures:
 
 
 def throughput(step: Callable[[], int], seconds: float) -> float:
-    """Results per second of `step`, which returns how many one call has brought.
+    """Return the results per second of `step`, which returns the number of its results.
 
-    The first tenth of the time is not counted: caches that other contenders have used
-    meanwhile fill, and work that the last round left behind is used up.
+    The first tenth of the time is not counted: caches fill again after other contenders, and
+    leftover work of the last round is used up.
     """
     clock = time.perf_counter
     until = clock() + 0.1 * seconds
@@ -179,7 +182,7 @@ class Stage:
         return self
 
     def round(self, seconds: float) -> tuple[Any, float]:
-        """What one round has brought, and how many processors it kept busy."""
+        """Run a round; return its value, and the number of busy processors."""
         busy, began = self._busy_seconds(), time.perf_counter()
         self._connection.send(seconds)
         value = self._answer()
@@ -187,7 +190,7 @@ class Stage:
         return value, (self._busy_seconds() - busy) / wall
 
     def _busy_seconds(self) -> float:
-        """Processor time of the contender's processes so far."""
+        """Return the processor time of the contender's processes so far."""
         assert self._process.pid is not None
         return sum(_busy_ns(thread) for pid in family(self._process.pid) for thread in pid) / 1e9
 
@@ -210,12 +213,12 @@ class Stage:
 
 
 def family(pid: int) -> Iterator[list[Path]]:
-    """A process and all that come from it: the threads of each."""
+    """Yield the threads of a process, and of each of its descendants."""
     try:
         threads = list(Path(f"/proc/{pid}/task").iterdir())
         children = [thread.joinpath("children").read_text().split() for thread in threads]
     except (FileNotFoundError, ProcessLookupError):
-        return  # It has just ended.
+        return  # The process has just ended.
     yield threads
     for child in chain.from_iterable(children):
         yield from family(int(child))
@@ -229,7 +232,7 @@ def _busy_ns(thread: Path) -> int:
 
 
 def shared_memory() -> set[str]:
-    """What this process maps of memory that others may map, with and without a name."""
+    """Return the mappings of memory that can be shared, with and without a name."""
     found: set[str] = set()
     for line in Path("/proc/self/maps").read_text().splitlines():
         _, _, _, _, inode, *path = line.split(maxsplit=5)
@@ -239,13 +242,13 @@ def shared_memory() -> set[str]:
 
 
 class ContenderFailed(Exception):
-    """A contender raised or died; the text says how."""
+    """A contender raised or died; the text has the reason."""
 
 
 def _perform(connection: Connection, contender: Contender) -> None:
-    """Run in the contender's process: rounds as they are asked for, until the pipe ends."""
+    """Run in the contender's process: rounds on request, until the pipe ends."""
     with tempfile.TemporaryDirectory() as folder, (Path(folder) / "output").open("w+b") as output:
-        # What a script of the user's would find; a spawned process would go on by spawning.
+        # The default of a user's script; a spawned process would spawn its children, too.
         mp.set_start_method(mp.get_all_start_methods()[0], force=True)
         # Simulators print, and MuJoCo writes a log into the working directory.
         os.chdir(folder)
@@ -268,12 +271,12 @@ def _perform(connection: Connection, contender: Contender) -> None:
 
 
 def missing(contender: Contender) -> list[str]:
-    """Modules that the contender needs and that aren't installed."""
+    """Return the modules that the contender needs and that aren't installed."""
     return [name for name in contender.requires if importlib.util.find_spec(name) is None]
 
 
 def measure(question: Question, rounds: int, seconds: float, only: Sequence[str]) -> dict[str, Any]:
-    """Run a question; its report as plain data."""
+    """Run a question; return its report as plain data."""
     machine = machine_facts(modules_of(question.contenders))
     turns, skipped = take_turns(question.contenders, rounds, seconds, only)
     figures = {
@@ -305,19 +308,19 @@ def take_turns(
     rounds: int,
     seconds: float,
     only: Sequence[str],
-    told: Callable[[Any], str] | None = None,
+    text_of: Callable[[Any], str] | None = None,
 ) -> tuple[dict[str, list[tuple[Any, float]]], dict[str, str]]:
-    """Have contenders take turns, each in a process of its own.
+    """Let contenders take turns, each in its own process.
 
     Args:
         contenders: in the order of their turns.
-        rounds: how many turns each of them has.
+        rounds: number of turns of each.
         seconds: about the length of a turn.
         only: parts of the names of those that take part; all if empty.
-        told: puts what a round has brought into words.
+        text_of: returns the value of a round as text.
 
-    Returns by contender what its rounds have brought and how many processors they kept
-    busy, and why others were left out.
+    Returns the values and busy processors of each contender's rounds, and the reasons why others
+    were left out.
     """
     found: dict[str, list[tuple[Any, float]]] = {}
     skipped: dict[str, str] = {}
@@ -334,7 +337,7 @@ def take_turns(
                     skipped[name] = _last_line(name, error)
                     continue
                 found.setdefault(name, []).append((value, cores))
-                text = (told or number_text)(value)
+                text = (text_of or number_text)(value)
                 say(f"  round {number + 1}/{rounds}  {name:{NAME_WIDTH}} {text}")
     return found, skipped
 
@@ -372,19 +375,21 @@ def _judged(target: Target, figures: dict[str, Figures]) -> dict[str, Any]:
 
 
 def modules_of(contenders: Iterable[Contender]) -> set[str]:
-    """All that any of them needs."""
+    """Return the modules that any of them needs."""
     return {name for contender in contenders for name in contender.requires}
 
 
 def machine_facts(modules: Iterable[str]) -> dict[str, Any]:
-    """What the figures depend on beside the code; `modules` are those that take part."""
+    """Return facts on which the figures depend besides the code; `modules` are those that take
+    part.
+    """
     versions: dict[str, str] = {}
-    distributions = importlib.metadata.packages_distributions()
+    distributions = _distributions()
     for name in (*ALWAYS_USED, *sorted(set(modules) - set(ALWAYS_USED))):
         try:
             versions[name] = importlib.metadata.version(distributions.get(name, [name])[0])
         except importlib.metadata.PackageNotFoundError:
-            continue  # Not installed, or a module beside this one.
+            continue  # Not installed, or a module in this folder.
     return {
         "cores": len(os.sched_getaffinity(0)),
         "cpu": _cpu_model(),
@@ -392,9 +397,16 @@ def machine_facts(modules: Iterable[str]) -> dict[str, Any]:
         "system": platform.system(),
         "python": platform.python_version(),
         "versions": versions,
-        # What others did on the machine when the run began.
+        "date": time.strftime("%Y-%m-%d"),
+        # Other work on the machine when the run began.
         "load_average": round(os.getloadavg()[0], 2),
     }
+
+
+@cache
+def _distributions() -> Mapping[str, list[str]]:
+    """Return the distributions of each module. It reads the list of every installed file."""
+    return importlib.metadata.packages_distributions()
 
 
 def _cpu_model() -> str:
@@ -404,7 +416,7 @@ def _cpu_model() -> str:
     return platform.machine()
 
 
-# ---- telling
+# ---- reports
 
 
 def say(text: str) -> None:
@@ -412,7 +424,7 @@ def say(text: str) -> None:
 
 
 def number_text(value: float) -> str:
-    """Three significant digits, thousands apart."""
+    """Format a number with three significant digits and thousands separators."""
     if abs(value) >= 1000:
         digits = len(str(int(abs(value)))) - 3
         return f"{round(value, -digits):,.0f}"
@@ -420,7 +432,7 @@ def number_text(value: float) -> str:
 
 
 def tables(report: dict[str, Any]) -> str:
-    """The report as Markdown."""
+    """Return the report as Markdown."""
     results = report["results"]
     counts_steps = any("cores_used" in found for found in results.values())
     lines = [
@@ -440,12 +452,13 @@ def tables(report: dict[str, Any]) -> str:
             "| compared | median | lowest to highest | target | |",
             "|---|---:|---:|---:|---|",
         ]
-        lines += [_target_row(target, report["unit"]) for target in report["targets"]]
+        lines += [target_row(target, report["unit"]) for target in report["targets"]]
     lines += [f"\n{name}: {why}" for name, why in report["skipped"].items()]
     return "\n".join(lines)
 
 
-def _target_row(target: dict[str, Any], unit: str) -> str:
+def target_row(target: dict[str, Any], unit: str) -> str:
+    """A target as a row of a table."""
     sign, suffix = ("minus", f" {unit}") if target["difference"] else ("/", "")
     bound = f"{'≤' if target['at_most'] else '≥'} {target['bound']:g}{suffix}"
     spread = f"{number_text(target['low'])} to {number_text(target['high'])}"
@@ -455,16 +468,17 @@ def _target_row(target: dict[str, Any], unit: str) -> str:
 
 
 def machine_text(machine: dict[str, Any]) -> str:
-    """The machine in one sentence."""
+    """Describe the machine in one sentence."""
     versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items())
+    when = f"{machine['date']}: " if "date" in machine else "An earlier version: "
     return (
-        f"{machine['cores']} cores ({machine['cpu']}), {machine['memory_gib']} GiB, "
+        f"{when}{machine['cores']} cores ({machine['cpu']}), {machine['memory_gib']} GiB, "
         f"{machine['system']}, Python {machine['python']}; {versions}."
     )
 
 
 def plot(report: dict[str, Any], path: Path) -> None:
-    """A bar for each contender's median, a dot for each round."""
+    """Plot a bar for each contender's median, and a dot for each round."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -490,7 +504,7 @@ def plot(report: dict[str, Any], path: Path) -> None:
 
 
 def arguments(description: str | None, rounds: int, seconds: float | None) -> argparse.Namespace:
-    """What every script takes; `seconds` is None where the work itself gives a round's length.
+    """Return a parser for every script; `seconds` is None if the work defines a round's length.
 
     Math libraries are kept to one thread from here on.
     """
@@ -517,7 +531,7 @@ def arguments(description: str | None, rounds: int, seconds: float | None) -> ar
 
 
 def main(question: Question, description: str | None) -> None:
-    """Parse the arguments, run the question, tell the outcome."""
+    """Parse the arguments, run the question, print the report."""
     given = arguments(description, question.rounds, question.seconds)
     report = measure(question, given.rounds, getattr(given, "seconds", 0.0), given.only)
     print(f"{tables(report)}\n\n{machine_text(report['machine'])}")

@@ -1,6 +1,7 @@
-"""Humanoid-v5, 16 envs: what is lost around a heavier simulator?
+"""Humanoid-v5, 16 envs: the overhead for a heavier simulator.
 
-Its step takes about ten times HalfCheetah's, and its observations are twenty times as large.
+Its step takes about ten times as long as HalfCheetah's, and its observations are twenty times as
+large.
 """
 
 from __future__ import annotations

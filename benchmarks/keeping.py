@@ -1,8 +1,8 @@
-"""What `on_worker_death: resume` costs while nothing dies, by processor time.
+"""The cost of `on_worker_death: resume` while no worker dies, in processor time.
 
-Steps a task in workers, with and without `snapshot_every`, in alternating rounds in one run, and
-tells the processor time of the trainer and all that it has started, per step, and the ratio: the
-median over pairs of the same round.
+Steps a task in workers, with and without `snapshot_every`, in alternating rounds in one run. Prints
+the processor time per step of the trainer and all its descendants, and the ratio: the median over
+pairs of the same round.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from rlightning_aio import sync
 
 
 def processor_seconds() -> float:
-    """Of this process and of all below it."""
+    """Return the processor time of this process and its descendants."""
     me = psutil.Process()
     times = [process.cpu_times() for process in (me, *me.children(recursive=True))]
     return sum(own.user + own.system for own in times)
@@ -44,7 +44,7 @@ def main() -> None:
     spent: list[list[float]] = [[] for _ in range(1 + len(keeping))]
     for _ in range(arguments.rounds):
         for figures, fields in zip(spent, [{}, *keeping], strict=True):
-            # A group each time: others would take processor time, too, where they spin.
+            # One group at a time: other groups would use processor time, too, if they spin.
             with ExitStack() as stack:
                 group = stack.enter_context(sync.build_env_group({**entry, **fields}))
                 batch, _ = group.reset(seed=0)
@@ -57,7 +57,7 @@ def main() -> None:
                         batch, _ = group.step(batch.respond(action=action))
                 seconds = processor_seconds() - began
             figures.append(1e6 * seconds / arguments.steps / arguments.envs)
-    told = {
+    found = {
         str(every): {
             "us_per_step": statistics.median(figures),
             "ratio": statistics.median(a / b for a, b in zip(figures, spent[0], strict=True)),
@@ -65,10 +65,10 @@ def main() -> None:
         for every, figures in zip(["never", *arguments.every], spent, strict=True)
     }
     if arguments.json:
-        print(json.dumps(told))
+        print(json.dumps(found))
         return
     print(f"{arguments.task}, {arguments.envs} envs: processor time of all processes")
-    for every, figures in told.items():
+    for every, figures in found.items():
         print(
             f"kept every {every:>6} steps: {figures['us_per_step']:8.1f} µs a step, "
             f"{figures['ratio']:.3f} times that without"

@@ -1,6 +1,7 @@
-"""CartPole: how much memory does one env more take?
+"""CartPole: how much memory does an additional env need?
 
-The proportional set size of all processes together, with many envs and with one, by env.
+The difference in proportional set size of all processes together, between many envs and one,
+divided by the number of envs.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from harness import Question, Target, family, main
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-# Ours take so little that it needs many to be seen beside what else moves.
+# Our envs need so little memory that only many of them show against the noise.
 OURS_MANY, GYMNASIUM_MANY = 1025, 65
 TASK = "CartPole-v1"
 
@@ -25,7 +26,7 @@ GYMNASIUM = "Gymnasium AsyncVectorEnv"
 
 
 def resident_kib() -> int:
-    """What this process and all that come from it hold, shared pages shared out."""
+    """Return the memory of this process and its descendants; shared pages count in part."""
     gc.collect()
     total = 0
     for threads in family(os.getpid()):
@@ -36,8 +37,8 @@ def resident_kib() -> int:
 
 
 def kib_per_env(measure: Callable[[int], int], many: int) -> float:
-    """By how much `measure` grows with each env."""
-    measure(many)  # Not counted: what is imported and allocated at first use.
+    """Return the growth of `measure` with each env."""
+    measure(many)  # Imports and allocations at first use are not counted.
     return (measure(many) - measure(1)) / (many - 1)
 
 

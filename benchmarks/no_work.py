@@ -1,6 +1,4 @@
-"""Environments that do nothing, or nothing but let time pass.
-
-So what is left to measure is the runtime around them.
+"""Environments that do nothing, or only let time pass, to measure the runtime around them.
 
 Workers import this module through a config entry's ``imports``.
 """
@@ -23,14 +21,14 @@ WORKS_30_US = "benchmarks/Works30us-v0"
 
 
 def work(seconds: float) -> None:
-    """Keep a core busy for that long, as a simulation does."""
+    """Keep a core busy for that long, like a simulation."""
     until = time.perf_counter() + seconds
     while time.perf_counter() < until:
         pass
 
 
 class NoWork(gym.Env[Any, Any]):
-    """Returns the same four numbers for ever."""
+    """Returns the same four numbers each time."""
 
     observation_space = Box(-1.0, 1.0, (4,), np.float32)
     action_space = Box(-1.0, 1.0, (2,), np.float32)
@@ -52,8 +50,8 @@ class NoWork(gym.Env[Any, Any]):
 class Sleeps(NoWork):
     """Sleeps in each step for a log-normal time: median 2 ms, sigma 1.5.
 
-    The times are quantiles of the distribution in an order of the seed's, over and over:
-    every 256 steps take the same time in all, so that rounds of a second can be compared.
+    The times are quantiles of the distribution, in an order that the seed gives, repeated: every
+    256 steps take the same total time, so that rounds of a second can be compared.
     """
 
     MEDIAN, SIGMA, TIMES = 2e-3, 1.5, 256
@@ -90,9 +88,9 @@ class Works(NoWork):
 
 
 class Spends(NoWork):
-    """Works and then sleeps for the seconds that its action tells it; observes when it was done.
+    """Works and then sleeps for the seconds in its action; observes the time at its end.
 
-    The observation is the monotonic clock's, which all processes of a machine share.
+    The time is that of the monotonic clock, which all processes of a machine share.
     """
 
     observation_space = Box(-np.inf, np.inf, (1,), np.float64)

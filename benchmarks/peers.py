@@ -1,10 +1,10 @@
-"""HalfCheetah-v5, 32 envs: everybody in turn within one run.
+"""HalfCheetah-v5, 32 envs: all contenders in turn within one run.
 
 Gymnasium's AsyncVectorEnv with shared memory and its SyncVectorEnv, Stable-Baselines3's
 SubprocVecEnv, Tianshou's ShmemVectorEnv, TorchRL's ParallelEnv and AsyncEnvPool, PufferLib's
 multiprocessing backend, EnvPool, a plain loop in one process, and this library. Peers that aren't
 installed are left out: pip install 'rlightning-aio[bench]' brings all but PufferLib, which `make
-bench` adds. Gymnasium is always there. How they fare where step times differ, `stragglers.py` asks.
+bench` adds. Gymnasium is always there. `stragglers.py` compares them with uneven step times.
 """
 
 from __future__ import annotations

@@ -14,9 +14,9 @@ from xml.sax.saxutils import escape
 RESULTS = Path(__file__).resolve().parent / "results"
 PICTURE = RESULTS.parent.parent / "docs" / "pictures" / "speed.svg"
 THEIRS = "Gymnasium AsyncVectorEnv"
-# Title, results, and our contender that it holds against Gymnasium's.
+# Title, results, and our contender, which is compared with Gymnasium's.
 PANELS = (
-    ("32 x HalfCheetah-v5, make_vec", "adapters", "rlightning_aio make_vec, together"),
+    ("32 x HalfCheetah-v5, make_vec", "headline", "rlightning_aio make_vec"),
     ("64 x CartPole-v1, step", "cartpole", "rlightning_aio sync"),
     ("64 envs of uneven speed, first ready", "stragglers", "rlightning_aio async, first ready"),
 )
@@ -26,7 +26,7 @@ OURS_COLOUR, THEIRS_COLOUR = "#3f51b5", "#b0b4c3"
 
 
 def drawn(results: Path) -> str:
-    """The picture as SVG: a pair of bars for each of `PANELS`, env steps per second."""
+    """Return the picture as SVG: a pair of bars for each of `PANELS`, env steps per second."""
     height = TOP + PANEL * len(PANELS)
     size = f'viewBox="0 0 {WIDTH} {height}" width="{WIDTH}" height="{height}"'
     parts = [
@@ -65,7 +65,7 @@ def _text(x: float, y: int, text: str, *, anchor: str = "start", weight: str = "
 
 
 def _rounded(rate: float) -> str:
-    """To three digits, as the tables have it."""
+    """Round to three digits, as in the tables."""
     return f"{float(f'{rate:.3g}'):,.0f}"
 
 

@@ -1,6 +1,6 @@
 """ALE/Pong-v5, 8 envs, raw frames of 210x160x3 bytes: what do large observations cost?
 
-Every contender hands out frames that nobody writes to later.
+Every contender hands out frames that are not overwritten later.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """HalfCheetah-v5 by EnvPool, 32 envs: what does a group around a batched simulator cost?
 
-EnvPool alone, and as a backend in the trainer's own process (``placement: inline``), all 32
-at a time and 16 of 32, by ``step`` and by ``step_async`` and ``collect_async``. Its threads
-are kept on cores of their own in all cases: else the figure tells where the system happens
-to put them.
+EnvPool alone, and as a backend in the trainer's own process (``placement: inline``), all 32 at a
+time and 16 of 32, by ``step`` and by ``step_async`` and ``collect_async``. Its threads are pinned
+to cores in all cases; otherwise the figures would depend on where the system puts them.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """PufferLib's multiprocessing backend as a contender.
 
-Rule: as in `contenders`; it resets what has ended in place of the next step. Its wrapper for
+Rule: as in `contenders`; a reset replaces the step after the end of an episode. Its wrapper for
 statistics keeps infos until an episode ends, as PufferLib's own recipes do; without it each step's
 are pickled.
 """
@@ -34,7 +34,7 @@ class PufferLib(Stepped):
 
     Attributes:
         batch_size: results it hands out at a time; all envs if None.
-        num_workers: processes; as many as there are cores if None.
+        num_workers: processes; one for each core if None.
     """
 
     batch_size: int | None = None
@@ -51,8 +51,8 @@ class PufferLib(Stepped):
             num_envs=self.work.num_envs,
             num_workers=self.num_workers or len(os.sched_getaffinity(0)),
             batch_size=self.batch_size or self.work.num_envs,
-            overwork=True,  # It refuses more workers than cores that are no threads of others.
-            zero_copy=False,  # Results of whichever workers are ready first.
+            overwork=True,  # It refuses more workers than physical cores.
+            zero_copy=False,  # Results of the first ready workers.
             sync_traj=False,
         )
         single = self.work.make()
@@ -66,7 +66,7 @@ class PufferLib(Stepped):
         return len(rewards)
 
     def round(self, seconds: float) -> float:
-        # Its workers go on spinning for half a second, at the expense of whoever is next.
+        # Its workers spin for another half second, at the expense of the next contender.
         self._signal(signal.SIGCONT)
         try:
             return super().round(seconds)

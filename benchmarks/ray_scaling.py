@@ -1,13 +1,13 @@
-"""How much can one trainer take in from Ray actors, beside the same from worker processes?
+"""How many results can one trainer read from Ray actors, compared with worker processes?
 
     python benchmarks/ray_scaling.py
     python benchmarks/ray_scaling.py --actors 1 4 --envs 8 --floats 16 --seconds 1
 
-Envs without work, so that the trainer is what limits: whoever is ready is collected and asked
-anew. For each number of actors, envs in each, and size of an observation: env steps per second,
-processor time of the trainer's process (Ray's threads included) for one result, and megabytes of
-observations per second. All actors are on this machine and share its cores with the trainer, so
-steps per second are a lower bound; the processor time is what goes over to other machines.
+Envs do no work, so that the trainer is the limit: ready envs are collected and stepped again. For
+each number of actors, envs in each, and size of an observation: env steps per second, processor
+time of the trainer's process (Ray's threads included) for one result, and megabytes of observations
+per second. All actors are on this machine and share its cores with the trainer, so steps per second
+are a lower bound; the processor time also holds for actors on other machines.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ WARM_UP_SECONDS = 0.3
 
 
 def no_work(num_floats: int) -> type[gym.Env[Any, Any]]:
-    """An env whose steps do nothing; made here, so that it travels with its code."""
+    """Make an env whose steps do nothing; defined here, so that it is pickled with its code."""
 
     class NoWork(gym.Env[Any, Any]):
         observation_space = gym.spaces.Box(-1, 1, (num_floats,), np.float32)
@@ -49,7 +49,7 @@ def no_work(num_floats: int) -> type[gym.Env[Any, Any]]:
 def measured(
     placement: str, num_actors: int, num_envs: int, num_floats: int, seconds: float
 ) -> dict[str, Any]:
-    """One round of one setting."""
+    """Measure one round of one setting."""
     entry = {
         "name": "none",
         "make_env": no_work(num_floats),

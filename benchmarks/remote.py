@@ -1,9 +1,8 @@
 """What does an env server add to the network? Steps of 1 and of 8 clients without work.
 
-Beside it, what ZMQ asks for the same messages: a ROUTER and as many DEALERs in processes
-of their own that send each other messages of the same sizes and look at none of them;
-with and without encryption. The figure is the time per step: with one client a round
-trip, with eight the share of each while all are kept busy.
+It is compared with bare ZMQ: a ROUTER and as many DEALERs in other processes that send each other
+messages of the same sizes without reading them; with and without encryption. The figure is the time
+per step: with one client a round trip, with eight the share of each while all are busy.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ import rlightning_aio
 from rlightning_aio import sync
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.envs.gymnasium import GymnasiumEnv
-from rlightning_aio.protocol.net.wire import Result, Step, Writer
+from rlightning_aio.protocol.net.wire import ClientResult, Step, Writer
 from rlightning_aio.remote import RemoteEnvClient, make_keys
 from rlightning_aio.remote.keys import read_client_keys, read_server_keys
 
@@ -51,13 +50,13 @@ gym.register(TASK, CheetahSized, disable_env_checker=True, order_enforce=False)
 
 
 def request() -> list[bytes]:
-    """A message of a step's size."""
+    """Return a message with the size of a step."""
     return Writer().write(Step(session=2**62, number=2**20), [bytes(6 * 4)])
 
 
 def reply() -> list[bytes]:
-    """A message of a result's size."""
-    result = Result(
+    """Return a message with the size of a result."""
+    result = ClientResult(
         session=2**62, number=2**20, busy_ns=2**15, reward=0.0, terminated=False, truncated=False
     )
     return Writer().write(result, [bytes(17 * 8)])
@@ -96,7 +95,7 @@ class _Clients(Contender):
         raise NotImplementedError
 
     def call(self) -> int:
-        """One turn; how many steps it has brought."""
+        """Run one turn; return the number of its steps."""
         raise NotImplementedError
 
     def round(self, seconds: float) -> float:

@@ -1,6 +1,6 @@
 """One env in one worker, with no work in it: how long does a call of `step` take?
 
-Beside it, what the operating system asks for the same wake-ups: two processes that send
+It is compared with the operating system's time for the same wake-ups: two processes that send
 each other one byte through a socket pair and block in between. Only the call is timed,
 and the figure of a round is the median over its calls.
 """
@@ -55,7 +55,7 @@ class SyncCalls(OursSync):
 @dataclass
 class AsyncCalls(OursAsync):
     def begin(self) -> None:
-        """Nothing is sent ahead: a call is a request and its reply."""
+        """Do nothing: a call is a request and its reply."""
 
     async def measure(self, seconds: float) -> float:
         clock = time.perf_counter_ns

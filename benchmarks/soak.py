@@ -1,12 +1,12 @@
-"""Millions of steps in hundreds of groups, one after the other: does anything pile up?
+"""Millions of steps in hundreds of groups, one after the other: does anything leak?
 
     python benchmarks/soak.py
     python benchmarks/soak.py --cycles 20 --steps 100000
 
-Every cycle builds a group of CartPole envs, steps it and closes it, by turns with and
-without an event loop. Descriptors, child processes and resident memory are shown as time
-goes by. Exit code 1: more descriptors or processes than after the first cycles, or memory
-that has grown on by more than a few MiB.
+Every cycle builds a group of CartPole envs, steps it and closes it, alternately with and without
+an event loop. Descriptors, child processes and resident memory are printed over time. Exit code
+1: more descriptors or processes than after the first cycles, or memory that has grown by more
+than a few MiB.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from rlightning_aio import sync
 
 ENVS = 16
 ALLOWED_MIB = 8.0
-"""Growth of memory, after the first tenth of the cycles, that the allocator may keep."""
+"""Allowed growth of memory after the first tenth of the cycles, for the allocator."""
 SAMPLES = 20
 ENTRY = {
     "name": "pole",
@@ -43,7 +43,7 @@ def actions(rng: np.random.Generator, count: int) -> np.ndarray:
 
 
 def cycle_sync(steps: int, rng: np.random.Generator) -> int:
-    """Step a group synchronously; how many steps it were."""
+    """Step a group synchronously; return the number of steps."""
     done = 0
     with sync.build_env_group(ENTRY) as group, group.auto_reset(500):
         batch, _ = group.reset(seed=0)
@@ -54,7 +54,7 @@ def cycle_sync(steps: int, rng: np.random.Generator) -> int:
 
 
 async def cycle_async(steps: int, rng: np.random.Generator) -> int:
-    """Step a group by whichever half is ready first; how many steps it were."""
+    """Step the half of a group that is ready first; return the number of steps."""
     done = 0
     async with rl.build_env_group(ENTRY) as group:
         with group.auto_reset(500):
@@ -67,7 +67,7 @@ async def cycle_async(steps: int, rng: np.random.Generator) -> int:
 
 
 def sample() -> dict[str, float]:
-    """What this process holds now, without any help to the garbage collector."""
+    """Return the resources of this process, without a forced garbage collection."""
     children = [
         pid
         for path in Path("/proc/self/task").glob("*/children")
@@ -75,7 +75,7 @@ def sample() -> dict[str, float]:
     ]
     descriptors = 0
     for path in Path("/proc/self/fd").iterdir():
-        with suppress(FileNotFoundError):  # The one that the listing itself needs.
+        with suppress(FileNotFoundError):  # The descriptor of the listing itself.
             descriptors += bool(path.readlink())
     rss_kib = next(
         int(line.split()[1])
@@ -91,7 +91,7 @@ def sample() -> dict[str, float]:
 
 
 def soak(cycles: int, steps: int) -> dict[str, Any]:
-    """Run the cycles; samples over time."""
+    """Run the cycles; return samples over time."""
     rng = np.random.default_rng(0)
     samples: list[dict[str, float]] = []
     began, done = time.monotonic(), 0
@@ -113,7 +113,7 @@ def soak(cycles: int, steps: int) -> dict[str, Any]:
 
 
 def growth(samples: list[dict[str, float]], cycles: int) -> dict[str, float]:
-    """What has been added since the first tenth of the cycles, when all was warm."""
+    """Return the growth since the first tenth of the cycles, which warms up caches."""
     first = next(found for found in samples if found["cycle"] >= min(cycles, max(2, cycles // 10)))
     return {name: samples[-1][name] - first[name] for name in sample()}
 

@@ -1,7 +1,7 @@
-"""64 envs that sleep for log-normal times, one in each worker: does anybody wait for the slow?
+"""64 envs that sleep for log-normal times, one in each worker: who waits for slow envs?
 
-The ideal is as many processes that do nothing but sleep in turn, with no runtime around. The pool
-of TorchRL and PufferLib hand out who is ready first, too; Gymnasium and ParallelEnv wait for all.
+The ideal is as many processes that only sleep, without a runtime. The pool of TorchRL and PufferLib
+also hand out the first ready results; Gymnasium and ParallelEnv wait for all.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ QUESTION = Question(
         Target(ASYNC, PUFFER, 1.0),
     ],
     rounds=5,
-    # Several times the 1.6 seconds in which an env has slept every one of its times.
+    # Several times the 1.6 seconds of a full cycle of an env's times.
     seconds=5.0,
 )
 

@@ -1,6 +1,6 @@
 """TorchRL's environments as contenders: `ParallelEnv`, and `AsyncEnvPool` with shared memory.
 
-Rule: as in `contenders`; TorchRL resets what has ended within the step that ends it.
+Rule: as in `contenders`; TorchRL resets in the step that ends an episode.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
 
 @contextmanager
 def forking() -> Iterator[None]:
-    """Processes that are started meanwhile are forks.
+    """Start processes by forking in this context.
 
-    TorchRL would have each of them import torch anew, for minutes in all; how fast they step
+    By default each of TorchRL's processes imports torch, which takes minutes in all; their speed
     afterwards is the same.
     """
     import torch
     import torchrl  # noqa: F401  It sets the method when it is imported.
 
-    # Threads of torch's don't survive a fork.
+    # Torch's threads don't survive a fork.
     threads, method = torch.get_num_threads(), mp.get_start_method()
     torch.set_num_threads(1)
     mp.set_start_method("fork", force=True)
@@ -51,12 +51,12 @@ class Wrapped:
 
 @dataclass
 class TorchRL(Stepped):
-    """What has TorchRL's interface."""
+    """A contender with TorchRL's interface."""
 
     package = "torchrl"
 
     def make(self) -> Any:
-        """All envs."""
+        """Make all envs."""
         raise NotImplementedError
 
     def setup(self) -> None:
@@ -97,7 +97,7 @@ class TorchRLAsync(TorchRL):
     """`AsyncEnvPool` of processes.
 
     Attributes:
-        min_results: how many a receive waits for; all envs if None.
+        min_results: number of results that a receive waits for; all envs if None.
         envs_per_worker: in each process, a thread for each of them.
     """
 

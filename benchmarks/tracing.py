@@ -1,9 +1,8 @@
 """What does a timeline cost while it is recorded (`group.trace`)?
 
-A group is stepped by turns with a trace running and without, for a moment each. So what makes one
-group faster than another like it, or one moment than another, is the same for both. A control
-takes the same turns and records nothing. The file is written when a recording ends, between the
-turns.
+A group is stepped alternately with a trace and without, for a moment each, so differences between
+groups and between moments affect both alike. A control has the same turns and records nothing. The
+file is written at the end of a recording, between the turns.
 """
 
 from __future__ import annotations
@@ -25,13 +24,13 @@ TURNS = 16
 
 
 class _ByTurns:
-    """The median of one moment's rate over that of the moment beside it."""
+    """The median of one moment's rate divided by that of the moment next to it."""
 
     traced = False
     _envs: Any
 
     def round(self, seconds: float) -> float:
-        """`TURNS` pairs of moments; every other pair begins with the second."""
+        """Run `TURNS` pairs of moments; every other pair begins with the second."""
         with tempfile.TemporaryDirectory() as folder:
             ratios: list[float] = []
             for turn in range(TURNS):
@@ -61,7 +60,7 @@ class AsyncByTurns(_ByTurns, OursAsync):
 
 
 def _pairs() -> list[tuple[Contender, Contender]]:
-    """Each group's control, and with a trace."""
+    """Return each group's contenders: the control, and the one with a trace."""
     pairs: list[tuple[Contender, Contender]] = []
     for work, name in ((CHEETAHS, "HalfCheetah x 32"), (POLES, "CartPole x 64")):
         half = work.num_envs // 2

@@ -1,8 +1,8 @@
 """4 workers, envs without work: does the trainer's processor time per step grow with the envs?
 
-Processor time of the trainer's process by env step, for 8 and for 1,024 envs: all of them
-by `step`, whoever is ready by `collect_async`, and `collect_async` limited to 8 results,
-where 1,016 envs that nobody asks for must cost nothing.
+Processor time of the trainer's process by env step, for 8 and for 1,024 envs: all of them by
+`step`, ready ones by `collect_async`, and `collect_async` limited to 8 results, where the
+other 1,016 envs must cost nothing.
 """
 
 from __future__ import annotations

@@ -1,13 +1,13 @@
-"""PPO on three workloads: how soon does it learn, and how much of that is waiting for envs?
+"""PPO on three workloads: how fast does it learn, and how much of the time is waiting for envs?
 
     python benchmarks/training.py --json training.json --plot training.png
     python benchmarks/training.py --only cheetah --seeds 1 --steps 20000
 
 The baseline is CleanRL's loop on Gymnasium's vector environments (gymnasium_ppo.py); ours are
 `examples/ppo*.py`, with the same network, hyperparameters, seeds and number of transitions.
-Contenders take turns, seed by seed, each turn in a process of its own; a ratio is the median over
-seeds. *Outside* is wall-clock less the learner's own time. A turn that has ended is kept in the
-folder and isn't run again, so a run that was stopped goes on. All of it takes hours.
+Contenders take turns, seed by seed, each turn in its own process; a ratio is the median over seeds.
+*Outside* is wall-clock less the learner's own time. A finished turn is saved in the folder and
+isn't run again, so an interrupted run continues. All of it takes hours.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ if TYPE_CHECKING:
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent / "examples"))
 
-# Episodes that ended in the last tenth of a run tell what it has come to.
+# Episodes that ended in the last tenth of a run give its final return.
 LAST = 0.1
-# Points of a curve that the report keeps.
+# Number of points of a curve in the report.
 POINTS = 40
 CURVE = ("steps", "seconds", "return")
 
@@ -58,7 +58,7 @@ def turn(workload: Workload, contender: Contender, seed: int, steps: int, folder
     rows = run.rows
     wall, learner = rows[-1]["seconds"], rows[-1]["learner_seconds"]
     late = [row["return"] for row in rows if row["steps"] > (1 - LAST) * rows[-1]["steps"]]
-    # The environments of a run that has none of its own account aren't told.
+    # A run without an account of its environments has no share of busy time.
     stepping = [row["stepping"] for row in rows if "stepping" in row]
     found = {
         "wall": wall,
@@ -67,7 +67,7 @@ def turn(workload: Workload, contender: Contender, seed: int, steps: int, folder
         "rate": rows[-1]["steps"] / wall,
         "return": statistics.fmean(late),
         "busy": statistics.fmean(stepping) / workload.num_envs if stepping else None,
-        # Before the first episode has ended there is no return.
+        # There is no return before the end of the first episode.
         "curve": [
             [row[name] for name in CURVE]
             for row in rows[:: 1 + len(rows) // POINTS]
@@ -80,7 +80,7 @@ def turn(workload: Workload, contender: Contender, seed: int, steps: int, folder
 def turns(
     workload: Workload, only: Sequence[str], seeds: int, steps: int, kept: Path
 ) -> dict[str, list[dict[str, Any]]]:
-    """What each contender's turns have brought, seed by seed; those that are missing are run."""
+    """Return the results of each contender's turns, seed by seed; run the missing ones."""
     found: dict[str, list[dict[str, Any]]] = {}
     asked = [
         contender
@@ -104,11 +104,13 @@ def turns(
     return found
 
 
-# ---- what is asked
+# ---- targets
 
 
 def judged(target: Target, found: dict[str, list[dict[str, Any]]]) -> dict[str, Any] | None:
-    """The target's figure for each seed and whether it is met; None if somebody is missing."""
+    """Return the target's figure for each seed and True if it is met; None if a contender is
+    missing.
+    """
     own = found.get(target.subject)
     baselines = [found[name] for name in BASELINES if name in found]
     if own is None or (not baselines and target.reference in (BETTER, SPREAD)):
@@ -152,7 +154,7 @@ def report_of(workload: Workload, found: dict[str, list[dict[str, Any]]]) -> dic
     }
 
 
-# ---- telling
+# ---- reports
 
 
 def tables(report: dict[str, Any]) -> str:
@@ -160,7 +162,7 @@ def tables(report: dict[str, Any]) -> str:
 
 
 def _lines(part: dict[str, Any]) -> Iterator[str]:
-    """One workload's two tables."""
+    """Return one workload's two tables."""
     yield f"| {part['title']} | wall-clock, s | learner, s | outside, s | steps/s | return |"
     yield "|---|---:|---:|---:|---:|---:|"
     for name, turns in part["results"].items():
@@ -186,7 +188,7 @@ def _lines(part: dict[str, Any]) -> Iterator[str]:
 
 
 def plot(report: dict[str, Any], path: Path) -> None:
-    """Return against steps and against wall-clock; a line for each seed."""
+    """Plot return against steps and against wall-clock time, with a line for each seed."""
     import matplotlib as mpl
 
     mpl.use("Agg")

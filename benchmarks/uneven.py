@@ -1,14 +1,14 @@
-"""8 envs whose steps take unlike times: how late do collects return?
+"""8 envs with different step times: how late do collects return?
 
-`collect_async(min_results=k)` is to return when the k-th result is ready, however long other
-envs take and in whichever workers they live. Lateness is the time from then (or from the
-call, if that many were ready before) to its return. What counts as ready is told by the
-envs themselves: an observation is the time at which its step was done. The k-th is taken
-among all results that were outstanding or left over, not among those that were handed out.
+`collect_async(min_results=k)` should return when the k-th result is ready, however long other envs
+take and in whichever workers they live. Lateness is the time from then (or from the call, if that
+many were ready before) to its return. The envs themselves report when a result is ready: an
+observation is the time at which its step was done. The k-th result is the k-th of all that were
+outstanding or left over, not of those that were handed out.
 
-Beside each mixture of step times bare processes, one for each worker but no more than there
-are cores, tell the time through a pipe: what that takes is the machine's own part. And as
-nobody should pay for this with speed, env steps per second of even step times come with it.
+For each mixture of step times, bare processes, one for each worker but no more than there are
+cores, also report times through a pipe: their lateness is the machine's own part. Env steps per
+second at even step times are measured, too, because this must not cost speed.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 NUM_ENVS = 8
-# One, a half, and all but the slow where two of them are slow.
+# One, a half, and all but the slow ones if two are slow.
 LEAST = (1, 4, 6)
 SLOW = 0.1
 CALM = 256
@@ -60,10 +60,10 @@ WORKS, SLEEPS = 0, 1
 
 @dataclass(frozen=True)
 class Mixture:
-    """Step times, and how the envs are spread over workers.
+    """Step times, and the distribution of envs over workers.
 
     Attributes:
-        times: ``[steps, envs, 2]``, used over and over: seconds of work and of sleep.
+        times: ``[steps, envs, 2]``, repeated: seconds of work and of sleep.
         busy: its workers hardly ever sleep.
         rare: all envs are stepped again when all are done, not each when it was collected,
             and before each such turn come `CALM` others of `CALM_STEP`, which aren't counted.
@@ -87,7 +87,7 @@ def even(kind: int, seconds: float) -> NDArray[np.float64]:
 
 
 def log_normal(median: float, sigma: float, steps: int = 64) -> NDArray[np.float64]:
-    """Quantiles of the distribution, in an order of each env's own."""
+    """Return quantiles of the distribution, in a different order for each env."""
     normal = NormalDist(math.log(median), sigma)
     quantiles = np.exp([normal.inv_cdf((k + 0.5) / steps) for k in range(steps)])
     rng = np.random.default_rng(0)
@@ -97,7 +97,7 @@ def log_normal(median: float, sigma: float, steps: int = 64) -> NDArray[np.float
 
 
 def slow_are(*turns: tuple[int, int], others: float = 0.0) -> NDArray[np.float64]:
-    """These envs sleep long, in turns; the others work for so many seconds."""
+    """Return times in which these envs sleep long, in turns; the others work for some seconds."""
     times = np.repeat(even(WORKS, others), len(turns), axis=0)
     for turn, envs in zip(times, turns, strict=True):
         turn[list(envs)] = 0.0, SLOW
@@ -111,7 +111,7 @@ MIXTURES = (
     Mixture("all work 1 ms, 1 to a worker", even(WORKS, 1e-3), 1, busy=True),
     Mixture("log-normal sleeps, 4 to a worker", log_normal(2e-3, 1.5), 4),
     Mixture("log-normal sleeps, 1 to a worker", log_normal(2e-3, 1.5), 1),
-    # The third, then the last of each worker: just four are done before a slow one, then six.
+    # The third, then the last of each worker: exactly four are done before a slow one, then six.
     Mixture(
         "all work 50 µs, 2 of 8 rarely take 100 ms, 4 to a worker",
         slow_are((2, 6), (3, 7), others=CALM_STEP),
@@ -127,15 +127,15 @@ MIXTURES = (
 
 
 class Calls:
-    """Collects in order, and what was outstanding at each of them."""
+    """The collects in order, with the outstanding requests of each."""
 
     def __init__(self) -> None:
         self._called: list[float] = []
         self._returned: list[float] = []
         self._wanted: list[int] = []
-        # By env, the first collect at which its request is outstanding.
+        # By env, the first collect during which its request is outstanding.
         self._first = [0] * NUM_ENVS
-        # Of each result its env, that first collect, the one that has brought it, and when
+        # For each result its env, that first collect, the one that returned it, and the time when
         # it was done.
         self._results: list[tuple[int, int, int, float]] = []
 
@@ -156,12 +156,12 @@ class Calls:
         return batch
 
     def came(self, envs: Sequence[int], done: Sequence[float]) -> None:
-        """These are the results of the last collect."""
+        """Record the results of the last collect."""
         for env, when in zip(envs, done, strict=True):
             self._results.append((env, self._first[env], len(self) - 1, when))
 
     def late_ms(self) -> list[float]:
-        """How late each collect has returned; all results must have come."""
+        """Return the lateness of each collect; all results must have come."""
         done = np.full((len(self), NUM_ENVS), np.inf)
         for env, first, last, when in self._results:
             done[first : last + 1, env] = when
@@ -170,7 +170,7 @@ class Calls:
 
 
 class Collector:
-    """Steps a group through a mixture; its caller does the waiting."""
+    """Steps a group through a mixture; its caller waits."""
 
     def __init__(self, group: Any, everyone: Any, mixture: Mixture) -> None:
         self._group = group
@@ -180,7 +180,7 @@ class Collector:
         self._steps = np.zeros(NUM_ENVS, np.intp)
 
     def collects(self, least: int, seconds: float) -> Generator[int, Any, list[float]]:
-        """Yield the `min_results` of each collect and be sent its batch; how late they were.
+        """Yield the `min_results` of each collect and get its batch; return the latenesses.
 
         Nothing is outstanding afterwards.
         """
@@ -206,7 +206,7 @@ class Collector:
             outstanding -= len(batch)
 
     def _stream(self, least: int, until: float, calls: Calls) -> Generator[int, Any, None]:
-        """Each env is sent on when it was collected, until all are waited for at last."""
+        """Step each env again when it was collected; at the end, wait for all."""
         batch = self._everyone
         while not calls or time.monotonic() < until:
             self._send(batch, calls)
@@ -230,7 +230,7 @@ class Collector:
 
 @dataclass
 class Asyncio(OursAsync):
-    """A round brings the latenesses for each of `LEAST`."""
+    """A round measures the latenesses for each of `LEAST`."""
 
     mixture: Mixture = field(kw_only=True)
 
@@ -253,7 +253,7 @@ class Asyncio(OursAsync):
 
 @dataclass
 class Blocking(OursSync):
-    """A round brings the latenesses for each of `LEAST`."""
+    """A round measures the latenesses for each of `LEAST`."""
 
     mixture: Mixture = field(kw_only=True)
 
@@ -277,10 +277,10 @@ class Blocking(OursSync):
 
 @dataclass
 class BarePipe(Contender):
-    """Processes tell the time through one pipe, each after a millisecond of work or sleep.
+    """Processes report times through one pipe, each after a millisecond of work or sleep.
 
-    They are as many as the mixture has workers, but no more than there are cores. A round
-    brings how late each telling was read.
+    There are as many as workers in the mixture, but no more than cores. A round measures how late
+    each report was read.
     """
 
     name: str
@@ -290,21 +290,21 @@ class BarePipe(Contender):
         reading, writing = os.pipe()
         context = mp.get_context("fork")
         processes = [
-            context.Process(target=self._tell, args=(writing, seconds / len(LEAST)))
+            context.Process(target=self._report, args=(writing, seconds / len(LEAST)))
             for _ in range(min(self.mixture.workers, len(os.sched_getaffinity(0))))
         ]
         for process in processes:
             process.start()
         os.close(writing)
         late_ms: list[float] = []
-        while told := os.read(reading, 8):
-            late_ms.append((time.monotonic_ns() - int.from_bytes(told)) / 1e6)
+        while report := os.read(reading, 8):
+            late_ms.append((time.monotonic_ns() - int.from_bytes(report)) / 1e6)
         os.close(reading)
         for process in processes:
             process.join()
         return late_ms
 
-    def _tell(self, writing: int, seconds: float) -> None:
+    def _report(self, writing: int, seconds: float) -> None:
         """Run in each of the processes."""
         wait = no_work.work if self.mixture.busy else time.sleep
         until = time.monotonic() + seconds
@@ -314,7 +314,7 @@ class BarePipe(Contender):
 
 
 def contenders(mixture: Mixture) -> list[Contender]:
-    """Both drivers and the machine's own."""
+    """Return both drivers and the bare pipe."""
     work = Work(no_work.SPENDS, NUM_ENVS, modules=("no_work",))
     ours = [
         kind(
@@ -334,7 +334,7 @@ def contenders(mixture: Mixture) -> list[Contender]:
 
 @dataclass
 class BlockingHalf(OursSync):
-    """`sync.EnvGroup`: whoever is in the first half is sent on."""
+    """`sync.EnvGroup`: the envs of the first half are stepped again."""
 
     def setup(self) -> None:
         super().setup()
@@ -371,11 +371,11 @@ RATES = Question(
 )
 
 
-# ---- telling
+# ---- reports
 
 
 def summary(late_ms: Sequence[float]) -> dict[str, float]:
-    """Of latenesses; `p99` is one of them."""
+    """Return statistics of latenesses; `p99` is one of them."""
     return {
         "count": len(late_ms),
         "median": float(np.median(late_ms)),
@@ -385,13 +385,13 @@ def summary(late_ms: Sequence[float]) -> dict[str, float]:
 
 
 def _p99_text(brought: Any) -> str:
-    """What a round has brought, by `min_results` or all alike."""
+    """Format the values of a round, by `min_results` or all alike."""
     found = brought if isinstance(brought, dict) else {0: brought}
     return "p99 " + ", ".join(number_text(summary(late)["p99"]) for late in found.values()) + " ms"
 
 
 def rows_of(mixture: Mixture, turns: dict[str, list[tuple[Any, float]]]) -> list[dict[str, Any]]:
-    """The report's rows of one mixture: one for each `min_results`, with what took part."""
+    """Return the report's rows of one mixture: one for each `min_results`, with what took part."""
     brought = {name: [value for value, _ in found] for name, found in turns.items()}
     pipe = brought.get(f"{PIPE}, {mixture.name}")
     machine = pipe and summary([late for values in pipe for late in values])
@@ -409,7 +409,7 @@ def rows_of(mixture: Mixture, turns: dict[str, list[tuple[Any, float]]]) -> list
 
 
 def tables(rows: Sequence[dict[str, Any]]) -> str:
-    """The rows as Markdown."""
+    """Return the rows as Markdown."""
     target = f"p99 ≤ {ALLOWED_MS:g} ms + the pipe's"
     lines = [
         f"| {TITLE}; median / p99 / worst, ms | k | asyncio | blocking | bare pipe | {target} |",
@@ -429,7 +429,7 @@ def _cell(found: dict[str, float] | None) -> str:
 
 
 def plot(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """A line from median to p99 for each driver and the pipe, a dot for the worst."""
+    """Plot a line from median to p99 for each driver and the pipe, and a dot for the worst."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -460,7 +460,7 @@ def plot(rows: Sequence[dict[str, Any]], path: Path) -> None:
 
 
 def run(rounds: int, seconds: float, only: Sequence[str]) -> dict[str, Any]:
-    """Both questions; the report as plain data."""
+    """Answer both questions; return the report as plain data."""
     machine = machine_facts(modules_of(contenders(MIXTURES[0])))
     rows: list[dict[str, Any]] = []
     skipped: dict[str, str] = {}

@@ -1,6 +1,6 @@
-"""CartPole whose steps take unevenly long, as a simulator's with contacts or a robot's do.
+"""CartPole with uneven step times, like those of a simulator with contacts or of a robot.
 
-Named to `gymnasium.make` and to config entries as ``uneven_pole:benchmarks/UnevenCartPole-v0``,
+The id for `gymnasium.make` and config entries is ``uneven_pole:benchmarks/UnevenCartPole-v0``,
 which imports this module where the environment is made.
 """
 

@@ -1,14 +1,15 @@
-"""An environment that names itself in all that it says, and breaks in every way there is.
+"""An environment that identifies itself in all its values, and fails in every possible way.
 
-An observation holds the environment's index, its process and that one's parent, its life (a
-number of its own for each time that it is built), its episode, its step, the token of the
-action that it answers, and a checksum of all these: no row can be another environment's,
-another step's, another life's, or half of one and half of another, and pass.
-Workers import this module through a config entry's ``imports``.
+An observation has the environment's index, its process and the parent process, its life (a
+different number for each time that it is built), its episode, its step, the token of the action
+that it answers, and a checksum of all these. So a row of another environment, step or life, or a
+mixture of two rows, is noticed. Workers import this module through a config entry's ``imports``.
 """
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import ctypes
 import os
 import signal
@@ -32,15 +33,17 @@ if TYPE_CHECKING:
 INDEX, PID, PARENT, LIFE, EPISODE, STEPS, TOKEN, CHECK = range(8)
 BLOB_BYTES = 1 << 18
 FLOOD_LINES = 200
+DEAF_SECONDS = 2.5
+"""How long an awaitable environment ignores that it is cancelled: longer than its step may take."""
 
 
 def checksum(named: np.ndarray) -> float:
-    """What ties the numbers of an observation together."""
+    """Return a checksum of an observation's numbers."""
     return float(zlib.crc32(np.ascontiguousarray(named[:CHECK], np.float64).tobytes()))
 
 
 class OddError(Exception):
-    """Can't be made anew from its arguments, holds what no pickle takes."""
+    """Can't be rebuilt from its arguments, and holds an object that can't be pickled."""
 
     def __init__(self, *, code: int) -> None:
         super().__init__()
@@ -51,14 +54,14 @@ class OddError(Exception):
 
 
 class Unprintable(Exception):
-    """Can't even be shown."""
+    """Has no usable repr."""
 
     def __str__(self) -> str:
         raise RuntimeError("no words")
 
 
 class NotAnException(BaseException):
-    """What ``except Exception`` lets through."""
+    """An exception that ``except Exception`` doesn't catch."""
 
 
 def _raise(kind: type[BaseException], *args: Any, **kwargs: Any) -> Callable[[], None]:
@@ -92,7 +95,7 @@ def _stop() -> None:
 
 
 def _nap() -> None:
-    """Hang, as far as anybody can tell, and go on: a client's process is its own to end."""
+    """Hang as far as the group can see, then continue: a client's process is not killed."""
     time.sleep(2.5)
 
 
@@ -124,6 +127,10 @@ def _lag() -> None:
     time.sleep(0.02)
 
 
+def _block() -> None:
+    time.sleep(0.15)
+
+
 def _nothing() -> None: ...
 
 
@@ -131,7 +138,7 @@ FAULTS: dict[str, Callable[[], None]] = {
     "nothing": _nothing,
     "end": _nothing,
     "lag": _lag,
-    # It raises.
+    # Raise.
     "raise": _raise(ValueError, "as asked for"),
     "raise oddly": _raise(OddError, code=7),
     "raise unprintably": _raise(Unprintable),
@@ -141,33 +148,65 @@ FAULTS: dict[str, Callable[[], None]] = {
     "raise StopIteration": _raise(StopIteration, 1),
     "raise GeneratorExit": _raise(GeneratorExit),
     "raise surrogates": _raise(ValueError, "\udcff"),
-    # It dies.
+    "raise CancelledError": _raise(asyncio.CancelledError, "its own"),
+    # Die.
     "exit": _exit,
     "crash": _segfault,
-    # It hangs.
+    # Hang.
     "sleep": _sleep_long,
     "compute": _compute_long,
     "deadlock": _deadlock,
     "stop itself": _stop,
     "close descriptors": _close_descriptors,
     "nap": _nap,
-    # It forks.
+    # Fork.
     "fork, child exits": _fork(_exit),
     "fork, child raises": _fork(_raise(ValueError, "in a child")),
     "fork, child leaves": _fork(_raise(SystemExit, 0)),
-    # It is noisy.
+    # Print.
     "flood stderr": _flood_stderr,
     "big info": _nothing,
     "nested info": _nothing,
+    # It holds the event loop, if it is on one.
+    "block": _block,
+    # It is awaitable: see `AWAITED`.
+    "await forever": _nothing,
+    "ignore cancellation": _nothing,
+    "leave a task": _nothing,
 }
+
+
+async def _await_forever() -> None:
+    await asyncio.Event().wait()
+
+
+async def _ignore_cancellation() -> None:
+    until = time.monotonic() + DEAF_SECONDS
+    while (left := until - time.monotonic()) > 0:
+        with contextlib.suppress(asyncio.CancelledError):
+            await asyncio.sleep(left)
+
+
+async def _leave_task() -> None:
+    _left.add(task := asyncio.create_task(_await_forever(), name="left by a witness"))
+    task.add_done_callback(_left.discard)
+
+
+_left: set[asyncio.Task[None]] = set()
+AWAITED = {
+    "await forever": _await_forever,
+    "ignore cancellation": _ignore_cancellation,
+    "leave a task": _leave_task,
+}
+"""What an awaitable environment does before its step."""
 CODES = {name: code for code, name in enumerate(FAULTS)}
 NAMES = list(FAULTS)
 BUILD_FAULTS = ("nothing", "raise", "exit", "sleep")
-"""What the next build of an environment may be ordered to do, by number."""
+"""Faults of the next build of an environment, by number."""
 
 
 def extra_info(name: str, token: float) -> dict[str, Any]:
-    """What an info holds beside the names when its action asked for more."""
+    """Return the additional info that an action may request."""
     if name == "big info":
         return {"blob": bytes([int(token) % 251]) * BLOB_BYTES}
     if name == "nested info":
@@ -191,7 +230,7 @@ SPACES: dict[str, gym.Space[Any]] = {
 
 
 def vector_of(layout: str, observation: Any) -> np.ndarray:
-    """The numbers of an observation, however it is laid out."""
+    """Return the numbers of an observation of any layout."""
     if layout == "vector":
         return observation
     if layout == "halves":
@@ -203,12 +242,12 @@ def vector_of(layout: str, observation: Any) -> np.ndarray:
 
 
 class Witness(gym.Env[Any, Any]):
-    """See the module.
+    """The environment; see the module's docstring.
 
     Args:
-        index: what it calls itself.
+        index: its number in observations.
         layout: of its observations, see `SPACES`.
-        orders: a file with a byte for each environment: what its next build is to do.
+        orders: a file with a byte for each environment: the fault of its next build.
     """
 
     action_space = Box(-np.inf, np.inf, (2,), np.float64)
@@ -271,12 +310,12 @@ class Witness(gym.Env[Any, Any]):
         observation, info = self._result(token, name)
         return observation, float(token), name == "end", False, info
 
-    def tell(self, echo: Any) -> tuple[int, float, int, int, Any]:
-        """Who it is and how far it has come, and what it was told."""
+    def describe(self, echo: Any) -> tuple[int, float, int, int, Any]:
+        """Return the identity, the progress and the argument."""
         return self._index, self.life, self._episode, self._steps, echo
 
     def do(self, fault: str) -> None:
-        """Break in a call."""
+        """Fail in a call."""
         FAULTS[fault]()
 
 
@@ -286,3 +325,26 @@ class WitnessEnv(GymnasiumEnv):
 
     def _make(self) -> Any:
         return Witness(self.worker_index, **self.config.env_kwargs)
+
+
+@ENVS.register("awaitable witness")
+class AwaitableWitness(WitnessEnv):
+    """The same with `async def`."""
+
+    async def reset(self, **kwargs: Any) -> Any:  # type: ignore[override]
+        await asyncio.sleep(0)
+        return super().reset(**kwargs)
+
+    async def step(self, policy_resp: Any) -> Any:  # type: ignore[override]
+        await asyncio.sleep(0)
+        name = NAMES[int(policy_resp.action[0])]
+        if name in AWAITED:
+            await AWAITED[name]()
+        return super().step(policy_resp)
+
+    def bare_step(self) -> None:
+        return None
+
+    async def close(self) -> None:  # type: ignore[override]
+        await asyncio.sleep(0)
+        super().close()

@@ -7,8 +7,10 @@ page links to among them, and links are turned to where their files are on the s
 
 from __future__ import annotations
 
+import json
 import posixpath
 import re
+import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,16 +23,22 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = {
-    "README.md": "index.md",
     "ARCHITECTURE.md": "architecture.md",
     "CHANGELOG.md": "changelog.md",
     "CONTRIBUTING.md": "contributing.md",
+    "RELEASING.md": "releasing.md",
     "SECURITY.md": "security.md",
     "benchmarks/README.md": "benchmarks.md",
+    "benchmarks/tables.md": "benchmark_tables.md",
+    "benchmarks/faults.md": "benchmark_faults.md",
     "examples": "docs/examples.md",
 }
 LINK = re.compile(r"(?<=\])\(([^)\s#:]+)(#[^)\s]*)?\)|(?<=src=)\"([^\"#:]+)\"")
 SHOWN = {".py", ".ipynb", ".yaml", ".toml", ".txt", ".cff"}
+
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+HOME_WORDS = {"VERSION": PROJECT["version"], "https://REPOSITORY": PROJECT["urls"]["Repository"]}
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -52,6 +60,9 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 def on_page_markdown(markdown: str, page: Page, files: Files, **_: object) -> str:
     """Turn each link to a file of the checkout to where that is on the site."""
     uri = page.file.src_uri
+    if uri == "index.md":
+        for word, meaning in HOME_WORDS.items():
+            markdown = markdown.replace(word, meaning)
 
     def turned(match: re.Match[str]) -> str:
         target = site_path(checkout_path(uri, match[1] or match[3]))
@@ -86,7 +97,22 @@ def site_path(path: str) -> str:
 def _added(config: MkDocsConfig, path: str, target: str) -> File:
     if not target.startswith("source/"):
         return File.generated(config, target, abs_src_path=str(ROOT / path))
-    language = {".py": "python", ".ipynb": "json"}.get(Path(path).suffix, Path(path).suffix[1:])
     text = (ROOT / path).read_text()
-    content = f"---\nsearch: {{exclude: true}}\n---\n# {path}\n\n````{language}\n{text}````\n"
+    if path.endswith(".ipynb"):
+        shown = _notebook(text)
+    else:
+        language = {".py": "python"}.get(Path(path).suffix, Path(path).suffix[1:])
+        shown = f"````{language}\n{text}````\n"
+    content = f"---\nsearch: {{exclude: true}}\n---\n# {path}\n\n{shown}"
     return File.generated(config, target, content=content)
+
+
+def _notebook(text: str) -> str:
+    """The cells of a notebook as Markdown, without outputs."""
+    shown: list[str] = []
+    for cell in json.loads(text)["cells"]:
+        source = "".join(cell["source"])
+        # A page has one title, and that is the file's path.
+        plain = re.sub(r"^#", "##", source, flags=re.MULTILINE)
+        shown.append(f"````python\n{source}\n````" if cell["cell_type"] == "code" else plain)
+    return "\n\n".join(shown) + "\n"

@@ -12,15 +12,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import ppo
 import torch
-from normalizer import Normalizer
 from torch.distributions import Categorical
 from training_run import arguments
 
 import rlightning_aio as rl
 from rlightning_aio.evaluation import Evaluation, evaluate
+from rlightning_aio.normalize import Normalizer
 
 
 @dataclass
@@ -33,7 +32,7 @@ class Args:
 
 
 async def evaluation(args: Args) -> Evaluation:
-    """All episodes."""
+    """Play all episodes."""
     saved = torch.load(Path(args.folder) / "checkpoint.pt", weights_only=True)
     trained = saved["args"]
     task = trained["task"] if args.task == "as trained" else args.task
@@ -44,13 +43,11 @@ async def evaluation(args: Args) -> Evaluation:
         observations, actions = group.get_observation_spaces()[0], group.get_action_spaces()[0]
         agent = ppo.Agent(observations, actions)
         agent.load_state_dict(saved["agent"])
-        each = len(saved["normalizer"]["sums"])
-        normalizer = Normalizer(each, observations.shape, trained["gamma"], trained["normalize"])
-        normalizer.load(saved["normalizer"])
-        normalizer = normalizer.merged()
+        normalizer = Normalizer(observations=trained["normalize"])
+        normalizer.load_state_dict(saved["normalizer"])
 
         def act(batch: rl.BatchedData) -> Any:
-            seen = normalizer.known(np.zeros(len(batch), np.intp), batch.observation)
+            seen = normalizer.normalized(batch.observation)
             with torch.inference_mode():
                 policy = agent.policy(torch.from_numpy(seen))
             if isinstance(policy, Categorical):

@@ -12,22 +12,22 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete
 
 if TYPE_CHECKING:
-    from normalizer import Normalizer
     from numpy.typing import NDArray
     from ppo import Agent
 
     from rlightning_aio import BatchedData
+    from rlightning_aio.normalize import Normalizer
 
 
 def single(space: Any) -> Any:
-    """The space of one of those whose space it is together."""
+    """The space of one sub-environment, from that of a batch."""
     if isinstance(space, Box):
         return Box(space.low[0], space.high[0], dtype=space.dtype.type)
     return Discrete(space.nvec[0])
 
 
 class Player:
-    """What acts: a copy of the agent's actor, which learning doesn't change, and the normaliser.
+    """The acting policy: a copy of the agent's actor, fixed during learning, and the normaliser.
 
     It is in NumPy, which takes a quarter of torch's time for a few rows, or less.
     """
@@ -35,12 +35,10 @@ class Player:
     def __init__(self, agent: Agent, normalizer: Normalizer, actions: Any, seed: int) -> None:
         self.normalizer, self.actions = normalizer, actions
         self.random = np.random.default_rng(seed)
-        self.sums = np.zeros(len(normalizer.returns.mean))
-        self.returns: list[float] = []
         self.take(agent)
 
     def take(self, agent: Agent) -> None:
-        """Act as `agent` does now."""
+        """Copy the current weights of `agent`."""
         layers = [part for part in agent.actor if hasattr(part, "weight")]
         self.layers = [
             (part.weight.detach().numpy().T.copy(), part.bias.detach().numpy().copy())
@@ -49,39 +47,11 @@ class Player:
         self.log_std = None if agent.log_std is None else agent.log_std.detach().numpy().copy()
 
     def __call__(self, batch: BatchedData) -> dict[str, Any]:
-        """Actions for the envs of a batch, and what the learner will want to know of them."""
-        index = batch.index
-        shape, index = index.shape, index.reshape(-1)
-        is_reset, reward = batch.is_reset.reshape(-1), batch.reward.reshape(-1)
-        self._note(index, reward, batch.terminated.reshape(-1), batch.done.reshape(-1), is_reset)
-        seen = self.normalizer.observed(index, batch.observation.reshape(len(index), -1))
-        chosen = self.chosen(seen)
+        """Actions for the envs of a batch, and columns for the learner."""
+        shape = batch.index.shape
+        seen = self.normalizer.observe(batch)
+        chosen = self.chosen(seen.reshape(batch.index.size, -1))
         return {name: column.reshape(*shape, *column.shape[1:]) for name, column in chosen.items()}
-
-    def _note(
-        self,
-        index: NDArray[np.int64],
-        reward: NDArray[Any],
-        terminated: NDArray[np.bool_],
-        done: NDArray[np.bool_],
-        is_reset: NDArray[np.bool_],
-    ) -> None:
-        """Take in what the last actions have brought; rows that are resets have brought nothing."""
-        self.sums[index] += reward
-        if is_reset.any():
-            stepped = ~is_reset
-            self.sums[index[is_reset]] = 0.0
-            index, reward, terminated = index[stepped], reward[stepped], terminated[stepped]
-            done = done[stepped]
-        self.normalizer.rewarded(index, reward, terminated)
-        if done.any():
-            self.returns += self.sums[index[done]].tolist()
-            self.sums[index[done]] = 0.0
-
-    def ended(self) -> list[float]:
-        """Returns of the episodes that have ended since it was called last."""
-        returns, self.returns = self.returns, []
-        return returns
 
     def chosen(self, seen: NDArray[np.float32]) -> dict[str, Any]:
         found = seen

@@ -10,19 +10,19 @@ as a terminated one; ppo_async.py does better.
 
 from __future__ import annotations
 
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from gymnasium.spaces import Box
-from normalizer import Normalizer
 from torch import Tensor, nn
 from torch.distributions import Categorical, Normal
-from training_run import Run, arguments
+from training_run import Run, arguments, tensors
 
-from rlightning_aio.sync import build_env_group
+from rlightning_aio.normalize import Normalizer
+from rlightning_aio.vector import make_vec
 
 
 @dataclass
@@ -106,7 +106,7 @@ class Agent(nn.Module):
 
 
 def advantages(rewards: Tensor, values: Tensor, ended: Tensor, last: Tensor, args: Args) -> Tensor:
-    """GAE over a block ``[T, N]``; `last` is the value of what follows it."""
+    """GAE over a block ``[T, N]``; `last` is the value after it."""
     found, following = torch.zeros_like(rewards), torch.zeros_like(last)
     for t in reversed(range(len(rewards))):
         goes_on = 1.0 - ended[t]
@@ -156,22 +156,21 @@ def learn(
 
 def train(args: Args) -> Run:
     torch.manual_seed(args.seed)
-    # While it waits for all, this process steps a share of them itself.
-    entry = {
-        "name": "env", "backend": args.backend, "task": args.task, "num_workers": args.num_envs,
-        "placement": "split",
-    }  # fmt: skip
+    # MuJoCo's threads step its simulations in this process; of others it steps a share itself.
+    entry = {} if args.backend == "mujoco" else {"placement": "split"}
     run = Run(args.total_steps, args.folder, args.resume)
-    with build_env_group(entry) as group:
-        observations, actions = group.get_observation_spaces()[0], group.get_action_spaces()[0]
+    envs = make_vec(args.task, args.num_envs, vector_kwargs={"autoreset_mode": "SameStep", **entry})
+    with closing(envs):
+        group = envs.group
+        observations, actions = envs.single_observation_space, envs.single_action_space
         agent = Agent(observations, actions)
         optimizer = torch.optim.Adam(agent.parameters(), args.learning_rate, eps=1e-5, fused=True)
         everyone = np.arange(args.num_envs)
-        normalizer = Normalizer(args.num_envs, observations.shape, args.gamma, args.normalize)
+        normalizer = Normalizer(args.gamma, observations=args.normalize, rewards=args.normalize)
         if run.saved:
             agent.load_state_dict(run.saved["agent"])
             optimizer.load_state_dict(run.saved["optimizer"])
-            normalizer.load(run.saved["normalizer"])
+            normalizer.load_state_dict(run.saved["normalizer"])
             torch.set_rng_state(run.saved["random"])
 
         def state() -> dict[str, Any]:
@@ -179,7 +178,7 @@ def train(args: Args) -> Run:
                 "args": asdict(args),
                 "agent": agent.state_dict(),
                 "optimizer": optimizer.state_dict(),
-                "normalizer": normalizer.state(),
+                "normalizer": tensors(normalizer.state_dict()),
                 "random": torch.get_rng_state(),
                 "envs": group.snapshot(),
                 "observation": observation,
@@ -189,11 +188,12 @@ def train(args: Args) -> Run:
         block = (args.num_steps, args.num_envs)
         with run, group.trace(args.trace) if args.trace else nullcontext():
             if run.saved:
-                batch, _ = group.restore(run.saved["envs"])
+                group.restore(run.saved["envs"])
                 observation, sums = run.saved["observation"], run.saved["sums"].numpy().copy()
             else:
-                batch, _ = group.reset(seed=args.seed)
-                observation = torch.from_numpy(normalizer.observed(everyone, batch.observation))
+                first, _ = envs.reset(seed=args.seed)
+                shown = normalizer.update_observations(everyone, first)
+                observation = torch.from_numpy(shown)
                 sums = np.zeros(args.num_envs)
             while run.goes_on():
                 returns: list[float] = []
@@ -210,18 +210,21 @@ def train(args: Args) -> Run:
                     chosen = action.numpy()
                     if isinstance(actions, Box):
                         chosen = chosen.clip(actions.low, actions.high)
-                    batch, _ = group.step(batch.respond(action=chosen))
-                    reward, done = batch.reward, batch.done
-                    scaled = normalizer.rewarded(everyone, reward, batch.terminated)
-                    shown = normalizer.observed(everyone, batch.observation)
+                    result, reward, terminated, truncated, infos = envs.step(chosen)
+                    done = terminated | truncated
+                    over = np.flatnonzero(done)
+                    first = result[over]
+                    for k in over:  # The last observations of episodes come before the first.
+                        result[k] = infos["final_obs"][k]
+                    # Gymnasium's wrapper starts the return again with the reward that terminates.
+                    scaled = normalizer.update_rewards(everyone, reward, terminated)
+                    shown = normalizer.update_observations(everyone, result)
                     rewards[t], ended[t] = torch.from_numpy(scaled), torch.from_numpy(done)
                     sums += reward
                     if done.any():
-                        over = np.flatnonzero(done)
                         returns += sums[over].tolist()
                         sums[over] = 0.0
-                        first, _ = group.reset(env_ids=[group.env_ids[k] for k in over])
-                        shown[over] = normalizer.observed(over, first.observation)
+                        shown[over] = normalizer.update_observations(over, first)
                     observation = torch.from_numpy(shown)
                 with run.learning(), group.span("learner"):
                     optimizer.param_groups[0]["lr"] = args.learning_rate * run.remaining

@@ -17,12 +17,12 @@ from typing import Any
 
 import ppo
 import torch
-from normalizer import Normalizer
 from player import Player, single
-from training_run import Run, arguments
+from training_run import Run, arguments, tensors
 
 import rlightning_aio as rl
 from rlightning_aio.collecting import Collector, Rollout
+from rlightning_aio.normalize import Normalizer
 
 
 @dataclass
@@ -31,12 +31,12 @@ class Collecting:
     placement: str = "process"
     envs_per_process: int = 0  # As many as there are cores for workers.
     envs_each: int = 1
-    min_batch: int = 8
+    min_results: int = 8
 
 
 @dataclass
 class Args(Collecting, ppo.Args):
-    """As CleanRL's, and how to collect."""
+    """CleanRL's hyperparameters, and options of collecting."""
 
 
 @dataclass
@@ -45,29 +45,29 @@ class CartPole(Collecting, ppo.CartPole):
     placement: str = "inline"
     num_envs: int = 1
     envs_each: int = 4
-    min_batch: int = 1
+    min_results: int = 1
 
 
 class Learner:
-    """What learns, and all that a checkpoint keeps."""
+    """The learner, and the contents of a checkpoint."""
 
     def __init__(self, args: Args | CartPole, group: rl.EnvGroup, run: Run) -> None:
         observations, actions = (
             get()[0] for get in (group.get_observation_spaces, group.get_action_spaces)
         )
-        if args.envs_each > 1:  # These spaces are those of all sub-environments.
+        if args.envs_each > 1:  # Spaces of all sub-environments.
             observations, actions = single(observations), single(actions)
         self.args = args
         self.agent = ppo.Agent(observations, actions)
         self.optimizer = torch.optim.Adam(
             self.agent.parameters(), args.learning_rate, eps=1e-5, fused=True
         )
-        count = args.num_envs * args.envs_each
-        self.normalizer = Normalizer(count, observations.shape, args.gamma, args.normalize)
+        normalize = args.normalize
+        self.normalizer = Normalizer(args.gamma, observations=normalize, rewards=normalize)
         if run.saved:
             self.agent.load_state_dict(run.saved["agent"])
             self.optimizer.load_state_dict(run.saved["optimizer"])
-            self.normalizer.load(run.saved["normalizer"])
+            self.normalizer.load_state_dict(run.saved["normalizer"])
             torch.set_rng_state(run.saved["random"])
         self.player = Player(self.agent, self.normalizer, actions, args.seed + run.steps)
 
@@ -76,18 +76,18 @@ class Learner:
             "args": asdict(self.args),
             "agent": self.agent.state_dict(),
             "optimizer": self.optimizer.state_dict(),
-            "normalizer": self.normalizer.state(),
+            "normalizer": tensors(self.normalizer.state_dict()),
             "random": torch.get_rng_state(),
         }
 
     def columns(self, rollout: Rollout) -> dict[str, torch.Tensor]:
-        """What `learn` wants to know of a rollout; the normaliser stands still meanwhile."""
-        after = rollout.end_observation.reshape(len(rollout.ends), -1)
-        after = self.normalizer.known(rollout.at_ends("index"), after)
-        rollout.reward[:] = self.normalizer.scaled(rollout.index, rollout.reward)
+        """Columns for `learn`, with a fixed normaliser."""
+        after = self.normalizer.normalized(rollout.end_observation, rollout.at_ends("index"))
+        after = torch.from_numpy(after).flatten(1)
+        rollout.reward[:] = self.normalizer.scaled(rollout.reward, rollout.index)
         seen = torch.from_numpy(rollout.seen)
         with torch.no_grad():
-            value, next_value = self.agent.value(seen), self.agent.value(torch.from_numpy(after))
+            value, next_value = self.agent.value(seen), self.agent.value(after)
         gains = rollout.advantages(value, next_value, self.args.gamma, self.args.gae_lambda)
         advantage = torch.from_numpy(gains)
         return {
@@ -119,7 +119,7 @@ def entry_of(args: Args | CartPole) -> dict[str, Any]:
 
 
 def waiting(rollout: Rollout) -> dict[str, float]:
-    """How many environments at a time stepped, waited for the policy, or for the learner."""
+    """Average numbers of environments that stepped, waited for the policy, or for the learner."""
     seconds = rollout.seconds
     return {
         "stepping": seconds.env_busy / seconds.elapsed,
@@ -138,11 +138,10 @@ async def train(args: Args | CartPole) -> Run:
             group,
             player,
             num_transitions=args.num_envs * args.envs_each * args.num_steps,
-            min_batch=args.min_batch,
+            min_results=args.min_results,
             seed=args.seed + run.steps,
         )
-        trace = group.trace(args.trace) if args.trace else nullcontext()
-        with group.auto_reset(), run, trace:
+        with group.auto_reset(), run, group.trace(args.trace) if args.trace else nullcontext():
             while run.goes_on():
                 rollout = await collector.collect()
                 with run.learning(), group.span("learner"):
@@ -151,7 +150,8 @@ async def train(args: Args | CartPole) -> Run:
                     player.take(learner.agent)
                 collector.policy_version += 1
                 figures |= waiting(rollout) | {"lag": rollout.lag.mean}
-                run.record(len(rollout), player.ended(), **figures)
+                returns = [episode.total_reward for episode in rollout.episodes]
+                run.record(len(rollout), returns, **figures)
                 if len(run.rows) % args.save_every == 0:
                     run.save(learner.state())
             run.save(learner.state())

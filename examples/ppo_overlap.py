@@ -1,4 +1,4 @@
-"""PPO that learns in a process of its own, while the next rollout is being collected.
+"""PPO that learns in a separate process, while the next rollout is collected.
 
     python examples/ppo_overlap.py                          # HalfCheetah-v5, 16 environments
     python examples/ppo_overlap.py --task CartPole-v1
@@ -72,7 +72,7 @@ class LearnerProcess:
         return await self._ask(({name: column.numpy() for name, column in columns.items()}, rate))
 
     async def state(self) -> dict[str, Any]:
-        """What of a checkpoint is there: the optimiser and the random numbers."""
+        """The learner process's part of a checkpoint: optimiser and random numbers."""
         return torch.load(io.BytesIO(await self._ask(None)), weights_only=True)
 
     async def _ask(self, what: Any) -> Any:
@@ -85,15 +85,15 @@ class LearnerProcess:
                 await answered.wait()
             finally:
                 loop.remove_reader(descriptor)
-                os.set_blocking(descriptor, True)  # uvloop has changed that.
+                os.set_blocking(descriptor, True)  # uvloop has made it non-blocking.
             return self._pipe.recv()
         except (EOFError, OSError):
             raise RuntimeError("the learner's process has ended; it says above why") from None
 
 
 def _learn(learner: Learner, random: torch.Tensor, pipe: Connection) -> None:
-    """What the process does: an update for each rollout that comes, until nobody sends any."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the trainer's to decide about.
+    """Run in the process: make an update for each rollout, until the connection ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # The trainer handles Ctrl-C.
     torch.set_rng_state(random)
     with suppress(EOFError):
         while True:
@@ -119,7 +119,7 @@ async def train(args: Args | CartPole) -> Run:
             group,
             player,
             num_transitions=args.num_envs * args.envs_each * args.num_steps,
-            min_batch=args.min_batch,
+            min_results=args.min_results,
             seed=args.seed + run.steps,
         )
         trace = group.trace(args.trace) if args.trace else nullcontext()
@@ -129,20 +129,21 @@ async def train(args: Args | CartPole) -> Run:
                 while run.goes_on():
                     columns = learner.columns(rollout)
                     lag = collector.policy_version - rollout.policy_version
-                    # What was in flight while the learner was slow can be older: left out.
+                    # Leave out older transitions, in flight while the learner was slow.
                     if lag.max() > MOST_LAG:
                         young = torch.from_numpy(np.flatnonzero(lag <= MOST_LAG))
                         columns = {name: column[young] for name, column in columns.items()}
                     rate = args.learning_rate * run.remaining
                     async with asyncio.TaskGroup() as both:
-                        # Arrays of a rollout are its own until the next one but one.
+                        # Arrays of a rollout are valid until the second one after it.
                         collecting = both.create_task(collector.collect())
                         with run.learning(), group.span("learner"):
                             figures = await apart.learn(columns, rate)
                         player.take(learner.agent)
                         collector.policy_version += 1
                     figures |= waiting(rollout) | {"lag": lag.clip(max=MOST_LAG).mean()}
-                    run.record(len(rollout), player.ended(), **figures)
+                    returns = [episode.total_reward for episode in rollout.episodes]
+                    run.record(len(rollout), returns, **figures)
                     rollout = collecting.result()
                     if len(run.rows) % args.save_every == 0:
                         run.save(learner.state() | await apart.state())

@@ -137,7 +137,7 @@ class Learner(nn.Module):
         self.optimizers[name].step()
 
     def learn(self, replay: Replay) -> dict[str, float]:
-        """One update of the critics; every now and then some of the actor."""
+        """Update the critics; and the actor at intervals."""
         self.updates += 1
         part = replay.sample(self.args.batch_size)
         reward, terminated = part["reward"].squeeze(-1), part["terminated"].squeeze(-1)
@@ -150,7 +150,7 @@ class Learner(nn.Module):
         critic_loss = mse_loss(values[0], goal) + mse_loss(values[1], goal)
         self._step("critics", critic_loss)
         if self.updates % self.args.policy_every == 0:
-            # As many updates as were left out in between.
+            # Makes up for the updates left out in between.
             for _ in range(self.args.policy_every):
                 action, log_prob = self.actor(part["observation"])
                 value = torch.min(*self.values(self.critics, part["observation"], action))
@@ -206,11 +206,12 @@ async def train(args: Args) -> Run:
 
         with group.auto_reset(), run:
             batch, _ = await group.reset(seed=args.seed + run.steps)
-            before = batch.observation.copy()  # What each environment showed last.
+            before = batch.observation.copy()  # The last observation of each environment.
             figures, fresh, returns = {"critic_loss": 0.0, "alpha": 1.0}, 0, list[float]()
             saved_at = run.steps
             group.step_async(batch.respond(action=act(batch.observation)))
             while run.goes_on():
+                # The second value says of each result whether the step limit cut its episode.
                 batch, _ = await group.collect_async(min_results=args.min_results)
                 group.step_async(batch.respond(action=act(batch.observation)))
                 steps = ~batch.is_reset

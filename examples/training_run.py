@@ -29,14 +29,14 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-# Networks of this size gain nothing by more, and the environments need the other cores.
+# Networks of this size gain nothing from more threads, and environments need the other cores.
 torch.set_num_threads(1)
-# Arguments of distributions come from networks; looking at each takes as long as using it.
+# Arguments of distributions come from networks; checking them takes as long as using them.
 torch.distributions.Distribution.set_default_validate_args(False)
 
 
 def arguments(*presets: type[T]) -> T:
-    """The command line's arguments, as a dataclass; `--task` picks the preset for that task."""
+    """Parse arguments into a dataclass; `--task` selects the preset of that task."""
     chosen = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     chosen.add_argument("--task", default=presets[0]().task)  # type: ignore[attr-defined]
     task = chosen.parse_known_args()[0].task
@@ -54,8 +54,13 @@ def arguments(*presets: type[T]) -> T:
     return preset(**vars(parser.parse_args()))
 
 
+def tensors(arrays: dict[str, Any]) -> dict[str, torch.Tensor]:
+    """Convert arrays to tensors, which a checkpoint may contain."""
+    return {name: torch.from_numpy(array) for name, array in arrays.items()}
+
+
 class Run:
-    """One training run: how far it is, what has come of it, and where it is kept.
+    """One training run: progress, results, and files.
 
     Args:
         total_steps: transitions after which it ends.
@@ -80,7 +85,7 @@ class Run:
         self._spent, self._learned, self._stopped = 0.0, 0.0, False
         self._returns: list[float] = []
         if resume:
-            # Written by `save`: tensors, plain containers, and nothing that runs when it is read.
+            # `save` writes only tensors and plain containers, so loading runs no code.
             self.saved = torch.load(self.folder / "checkpoint.pt", weights_only=True)
             run = self.saved["run"]
             self.steps, self.rows, self._returns = run["steps"], run["rows"], run["returns"]
@@ -110,23 +115,23 @@ class Run:
         signal.signal(signal.SIGINT, self._before)
 
     def goes_on(self) -> bool:
-        """Whether there is anything left to do, and nobody has asked to stop."""
+        """True until the run is complete or interrupted."""
         return self.steps < self.total_steps and not self._stopped
 
     @property
     def remaining(self) -> float:
-        """What is left of the run, from 1 to 0; learning rates shrink with it."""
+        """Remaining share of the run, from 1 to 0; learning rates are proportional to it."""
         return 1.0 - self.steps / self.total_steps
 
     @contextmanager
     def learning(self) -> Iterator[None]:
-        """What takes place within is the learner's own time."""
+        """Context that measures the time of learning."""
         began = time.perf_counter()
         yield
         self._learned += time.perf_counter() - began
 
     def record(self, steps: int, returns: Sequence[float], **figures: float) -> None:
-        """An update has ended: a row of the curve.
+        """Record the end of an update: a row of the curve.
 
         Args:
             steps: transitions since the last one.
@@ -152,7 +157,7 @@ class Run:
                 self._writer.add_scalar(name, value, self.steps)
 
     def save(self, state: dict[str, Any]) -> None:
-        """Write the checkpoint and the curve; a run that ends meanwhile leaves the old ones."""
+        """Write the checkpoint and the curve atomically."""
         run = {
             "steps": self.steps,
             "rows": self.rows,

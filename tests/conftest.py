@@ -1,15 +1,18 @@
-"""What holds for every test: nothing outlives it, and async tests run on both loops.
+"""Checks of every test: it leaves nothing behind, and async tests run on both loops.
 
-Rule: a test that passes its assertions and leaves a process, a descriptor, shared
-memory or a task behind has failed.
+Rule: a test whose assertions pass fails if it leaves a process, a descriptor, shared memory or a
+task behind.
 """
 
 from __future__ import annotations
 
 import asyncio
 import gc
+import importlib.util
 import os
+import shutil
 import signal
+import subprocess
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,20 +25,34 @@ from hypothesis import HealthCheck, settings
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator
 
-# For the loops that tests make themselves; pytest-asyncio has an option for its own.
+# The first loop of a process opens pipes that libuv keeps, so it is made before the tests.
+uvloop.new_event_loop().close()
+
+# For loops that tests make themselves; pytest-asyncio has an option for its own loops.
 os.environ["PYTHONASYNCIODEBUG"] = "1"
 
-# A thousand interpreters start for the tests; none of them shall compile everything anew.
+# Every group that a test builds checks what happens to its requests (`group/checked.py`).
+os.environ["RLIGHTNING_AIO_DEBUG"] = "1"
+
+# The tests start a thousand interpreters; they must not compile all modules again.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
-# What tests start is to heed signals that whoever started the tests ignores, as nohup does: a
-# handler, unlike that, is not passed on.
+# MuJoCo imports glfw, which starts an interpreter to ask its library for the version, unless this
+# variable names the library.
+_glfw = importlib.util.find_spec("glfw")
+if _glfw is not None and _glfw.origin is not None:
+    _library = Path(_glfw.origin).parent / "x11" / "libglfw.so"
+    if _library.exists():
+        os.environ.setdefault("PYGLFW_LIBRARY", str(_library))
+
+# Child processes must react to signals even if the tests were started with these ignored, as by
+# nohup. A handler, unlike an ignored signal, is not inherited.
 for _number in (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT):
     if signal.getsignal(_number) is signal.SIG_IGN:
         signal.signal(_number, lambda *_: None)
 
-# How fast examples come says something of the machine, and nothing of the code.
+# The speed of examples depends on the machine, so it must fail no test.
 settings.register_profile(
     "any machine",
     deadline=None,
@@ -55,22 +72,22 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     items[:] = [item for item in items if item not in repeated]
     for item in items:
         if pytest_asyncio.is_async_test(item):
-            # First in, last out: the tasks of other fixtures have ended by then.
+            # The first fixture is torn down last, when the tasks of other fixtures have ended.
             item.fixturenames.insert(0, no_task_left_behind.__name__)
 
 
 def pytest_collection_finish() -> None:
-    # What is imported stays: sparing the collector from walking it saves time in every test.
+    # Exempt the imported modules from garbage collection, which saves time in every test.
     gc.collect()
     gc.freeze()
 
 
 def _repeats(item: pytest.Item) -> bool:
-    """Whether a test shows with one driver what it shows with another as well.
+    """Return True if a test with one driver repeats the same test with another.
 
-    A synchronous group doesn't know what loop it runs in. Where who waits has no part in what
-    is shown (`one_driver_for_each_place`), inline envs are in a synchronous group, and workers
-    in one on uvloop.
+    A synchronous group doesn't depend on the running loop. If the driver doesn't matter
+    (`one_driver_for_each_place`), inline envs are in a synchronous group, and workers in one on
+    uvloop.
     """
     params = item.callspec.params if hasattr(item, "callspec") else {}
     place = params.get("place")
@@ -82,8 +99,8 @@ def _repeats(item: pytest.Item) -> bool:
 
 
 def _children() -> dict[str, str]:
-    """Child processes, zombies included, with what they run: one that has only just been started
-    may still run what this one does.
+    """Return child processes, zombies included, with their commands. A process that has just been
+    forked may still have the command of this one.
     """
     found: dict[str, str] = {}
     for children in Path("/proc/self/task").glob("*/children"):
@@ -107,16 +124,16 @@ def _descriptors() -> set[str]:
         try:
             found.add(f"descriptor {descriptor.name}: {descriptor.readlink()}")
         except FileNotFoundError:
-            continue  # The one that the listing itself needed.
+            continue  # The descriptor of the listing itself.
     return found
 
 
 def _shared_memory() -> set[str]:
-    """What this process maps of memory that others may map, with and without a name.
+    """Return the mappings of memory that can be shared, with and without a name.
 
-    The library gives its memory no name, so it lasts as long as somebody holds it: this
-    process, in a descriptor or a mapping, or one that it has started, which would itself be
-    left behind. /dev/shm is not listed: what is there may belong to anybody.
+    The library's memory has no name, so it lasts as long as a descriptor or a mapping of this
+    process, or of a child process, which would itself be left behind. /dev/shm is not listed,
+    because other programs use it, too.
     """
     found: set[str] = set()
     for line in Path("/proc/self/maps").read_text().splitlines():
@@ -127,7 +144,7 @@ def _shared_memory() -> set[str]:
 
 
 def _held() -> dict[str, str]:
-    """What this process holds, and how each of it is told."""
+    """Return descriptions of this process's resources, by a unique key."""
     return _children() | {name: name for name in _descriptors() | _shared_memory()}
 
 
@@ -136,8 +153,8 @@ def nothing_left_behind() -> Iterator[None]:
     before = _held()
     yield
     if _held().keys() - before:
-        gc.collect()  # What merely awaits collection is in nobody's hands.
-    left = [told for name, told in _held().items() if name not in before]
+        gc.collect()  # Ignore garbage.
+    left = [shown for name, shown in _held().items() if name not in before]
     assert not left, f"the test left behind {sorted(left)}"
 
 
@@ -146,3 +163,16 @@ async def no_task_left_behind() -> AsyncIterator[None]:
     yield
     left = asyncio.all_tasks() - {asyncio.current_task()}
     assert not left, f"the test left behind {left}"
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """Mount a file system of one mebibyte and yield its folder."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(folder)]
+    if shutil.which("mount") is None or subprocess.run(mount, check=False).returncode:
+        pytest.skip("only root mounts file systems")
+    yield folder
+    # Lazily, because it may be the working directory of a test.
+    subprocess.run(["umount", "--lazy", str(folder)], check=True)

@@ -1,9 +1,9 @@
-"""How long tests wait for what must come."""
+"""How long tests wait for an event that must come."""
 
 from __future__ import annotations
 
 HANG = 200.0
-"""Seconds past which something will never come; no measure of speed.
+"""Seconds after which a test counts as hung; no measure of speed.
 
-A machine that is busy with other things may take its time for whatever a test does.
+On a busy machine, anything may take long.
 """

@@ -1,4 +1,4 @@
-"""Runs a program in an interpreter of its own, as a reader of the documents would."""
+"""Runs a program in a new interpreter, as a reader of the documents does."""
 
 from __future__ import annotations
 
@@ -18,13 +18,12 @@ __all__ = ["output_of"]
 def output_of(
     *arguments: str | Path, folder: Path | None = None, asyncio_debug: bool = True
 ) -> str:
-    """What Python prints that is given these arguments, and that has to end well.
+    """Run Python with these arguments and return its output; it must exit with code 0.
 
     Args:
         arguments: of the interpreter.
         folder: to run it in.
-        asyncio_debug: keep asyncio's debug mode, which holds for tests, and logs what takes
-            longer than a blink.
+        asyncio_debug: keep the debug mode of the tests, which logs every slow callback.
     """
     left_out = () if asyncio_debug else ("PYTHONASYNCIODEBUG",)
     done = subprocess.run(

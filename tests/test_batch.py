@@ -1,4 +1,4 @@
-"""`BatchedData`: RLightning's interface over columns that nobody has to unpack."""
+"""`BatchedData`: RLightning's interface over columns."""
 
 from __future__ import annotations
 
@@ -17,16 +17,15 @@ from hypothesis import strategies as st
 
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.batch.columns import ResultColumns
-from rlightning_aio.batch.data import (
-    Origin,
-    batch_of_results,
+from rlightning_aio.batch.contents import (
     columns_of_responses,
     parts_of,
     reported_info_list,
     slots_of,
 )
+from rlightning_aio.batch.data import batch_of_results
 from rlightning_aio.batch.infos import vector_infos
-from rlightning_aio.batch.sent import columns_of_values, kept_columns
+from rlightning_aio.batch.sent import UNASKED, columns_of_values, copied
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.errors import BadAction
 from rlightning_aio.group.env_table import EnvTable
@@ -44,7 +43,7 @@ NAMES.index_offset[:] = range(5)
 
 
 def flags(head: tuple[int, ...], **which: Any) -> Any:
-    """A column of flags with the given ones set, by the names of their places."""
+    """Return a column of flags with the named ones set."""
     column = np.zeros((*head, 4), bool)
     for name, values in which.items():
         column[..., FLAGS[name]] = values
@@ -62,7 +61,7 @@ def columns(
     agents: tuple[str, ...] = (),
     **fields: Any,
 ) -> ResultColumns:
-    """Results of `slots` with rewards 0.5, 1.5, …, nothing ended and no infos."""
+    """Return results of `slots` with rewards 0.5, 1.5, …, without ends and infos."""
     n = len(slots)
     head = (n, len(agents)) if agents else (n,)
     values: dict[str, Any] = {
@@ -90,11 +89,11 @@ def results(*parts: ResultColumns, sources: Any = None, group: object = "a group
     for part in parts:
         slots[range(size) if part.positions is None else part.positions] = part.slots
     names = parts[0].names if parts else NAMES
-    return batch_of_results(parts, Origin(group, slots, names), sources)
+    return batch_of_results(parts, group, slots, names, sources)
 
 
 def mixed() -> BatchedData:
-    """Envs of two entries whose observations have different shapes, interleaved."""
+    """Return results of envs of two entries with different observation shapes, interleaved."""
     pendulums = columns([0, 2], np.array([[0.0, 1.0], [2.0, 3.0]]), [0, 2])
     grids = columns([4, 3], np.array([7, 8]), [1, 3])
     return results(pendulums, grids)
@@ -105,7 +104,7 @@ def mixed() -> BatchedData:
 
 @given(pairs=st.lists(st.tuples(st.sampled_from("abc"), st.integers())))
 def test_ids_and_values_keep_their_order(pairs: list[tuple[str, int]]) -> None:
-    """An id may come more than once; looked up by id, its first value is found."""
+    """Ids may repeat; a look-up by id returns the first value."""
     batch = BatchedData([id_ for id_, _ in pairs], [value for _, value in pairs])
     assert batch.items() == list(batch) == pairs
     assert (batch.ids(), batch.values(), len(batch)) == (
@@ -122,20 +121,20 @@ def test_ids_and_values_keep_their_order(pairs: list[tuple[str, int]]) -> None:
                 batch[id_]
 
 
-def test_a_batch_is_made_of_a_mapping() -> None:
-    """In the mapping's order."""
+def test_a_batch_can_be_made_from_a_mapping() -> None:
+    """In the order of the mapping."""
     batch = BatchedData.from_dict({"b": 1, "a": 2})
     assert list(batch) == [("b", 1), ("a", 2)]
 
 
 def test_every_value_has_an_id() -> None:
-    """What can't be paired is refused."""
+    """Otherwise it raises."""
     with pytest.raises(ValueError, match="2 ids for 1 values"):
         BatchedData(["a", "b"], [1])
 
 
 def test_an_empty_batch_is_a_batch() -> None:
-    """There is nothing in it."""
+    """It has no ids, values or columns."""
     batch = BatchedData()
     assert (len(batch), batch.ids(), batch.values(), list(batch)) == (0, [], [], [])
 
@@ -143,8 +142,8 @@ def test_an_empty_batch_is_a_batch() -> None:
 # -- columns of results
 
 
-def test_columns_are_there_before_any_value_is() -> None:
-    """They are the very arrays that came, and each value is a row of them."""
+def test_columns_need_no_values() -> None:
+    """They are the given arrays, and each value is a row of them."""
     observation = np.arange(6.0).reshape(3, 2)
     batch = results(columns([2, 0, 1], observation))
     assert batch.observation is observation
@@ -160,7 +159,7 @@ def test_columns_are_there_before_any_value_is() -> None:
 
 
 def test_dict_and_tuple_observations_are_trees_of_columns() -> None:
-    """Whole and one by one."""
+    """As a whole and by value."""
     tree = {"a": np.array([1, 2]), "b": (np.zeros((2, 3)), np.ones((2, 1)))}
     batch = results(columns([0, 1], tree))
     assert batch.observation is tree
@@ -170,7 +169,7 @@ def test_dict_and_tuple_observations_are_trees_of_columns() -> None:
 
 
 def test_different_observation_spaces_do_not_stack() -> None:
-    """All else does, in the batch's order; the error says what to do."""
+    """Other columns do, in the order of the batch; the error says what to do."""
     batch = mixed()
     assert batch.ids() == ["pendulum-0", "grid-world-1", "pendulum-2", "grid-world-0"]
     assert batch.reward.tolist() == [0.5, 0.5, 1.5, 1.5]
@@ -180,7 +179,7 @@ def test_different_observation_spaces_do_not_stack() -> None:
 
 
 def test_each_entry_of_a_mixed_batch_stacks() -> None:
-    """Names may hold dashes; order is kept; responses find their way."""
+    """Names may contain dashes; the order is kept; responses go to their envs."""
     split = mixed().by_name()
     assert list(split) == ["pendulum", "grid-world"]
     assert split["pendulum"].observation.tolist() == [[0.0, 1.0], [2.0, 3.0]]
@@ -196,8 +195,8 @@ def test_each_entry_of_a_mixed_batch_stacks() -> None:
     }
 
 
-def test_infos_are_decoded_for_the_env_they_are_of() -> None:
-    """From the row by its worker's schema, from the channel, or empty."""
+def test_infos_are_decoded_with_the_schemas_of_their_env() -> None:
+    """From the row by the worker's schema, out of band, or empty."""
     schema = InfoSchema.of({"x": 1.5})
     assert schema is not None
     rows = np.zeros((3, schema.size), np.uint8)
@@ -216,8 +215,8 @@ def test_infos_are_decoded_for_the_env_they_are_of() -> None:
     assert [value.info for value in batch.values()] == batch.info()
 
 
-def test_an_episode_that_ended_is_told_with_its_last_result() -> None:
-    """Its return and length lie in the info of that result alone."""
+def test_the_last_result_of_an_episode_has_its_sums() -> None:
+    """Return and length are in the info of that result only."""
     batch = results(
         columns(
             [0, 1],
@@ -246,8 +245,8 @@ def test_a_multi_agent_batch_has_columns_by_agent() -> None:
     assert value.observation["bob"].tolist() == [1.0]
 
 
-def test_observations_that_came_one_by_one_stack_where_they_can() -> None:
-    """Strings stay a list, arrays of one shape become an array."""
+def test_observations_out_of_band_stack_if_possible() -> None:
+    """Strings stay a list; arrays with the same shape become an array."""
     texts = results(
         columns([0, 1], None, out_of_band={0: {"observation": "a"}, 1: {"observation": "b"}})
     )
@@ -258,8 +257,8 @@ def test_observations_that_came_one_by_one_stack_where_they_can() -> None:
     assert arrays.observation.tolist() == [[0, 0], [1, 1]]
 
 
-def test_a_batch_of_plain_results_has_columns_too() -> None:
-    """Made by hand, as in tests of a policy."""
+def test_a_batch_of_plain_results_has_columns() -> None:
+    """As made by hand in tests of a policy."""
     batch = BatchedData.from_dict(
         {
             f"a-{k}": EnvRet(
@@ -281,8 +280,8 @@ def test_a_batch_of_plain_results_has_columns_too() -> None:
 # -- responses
 
 
-def test_columns_become_the_matching_responses() -> None:
-    """Each row goes to the env whose result stood there, with everything attached."""
+def test_columns_become_responses() -> None:
+    """Each row goes to the env of the result in that row, with all extras."""
     batch = mixed()
     responses = batch.respond(action=np.arange(4), log_prob=np.arange(4) / 2, tag=list("abcd"))
     assert responses.ids() == batch.ids()
@@ -305,7 +304,7 @@ def test_columns_become_the_matching_responses() -> None:
     ids=["dict", "tuple"],
 )
 def test_actions_may_be_trees_of_columns(space: Any) -> None:
-    """One of n rows for each array of the space."""
+    """With one column of n rows for each array of the space."""
     from gymnasium.vector.utils import batch_space
 
     batch = results(columns([0, 1, 2], np.zeros((3, 1))))
@@ -316,23 +315,23 @@ def test_actions_may_be_trees_of_columns(space: Any) -> None:
 
 @pytest.mark.parametrize("bad", [np.zeros(3), np.zeros((1, 4)), {"a": np.zeros(5)}, 7, [1]])
 def test_a_column_has_a_row_for_each_result(bad: Any) -> None:
-    """The column at fault is named."""
+    """The error names the column."""
     with pytest.raises(BadAction, match=r"'action' (has \d rows|is 7) for a batch of 2"):
         results(columns([0, 1], np.zeros((2, 1)))).respond(action=bad)
     with pytest.raises(BadAction, match=r"'value' (has|is)"):
         results(columns([0, 1], np.zeros((2, 1)))).respond(action=np.zeros(2), value=bad)
 
 
-def test_plain_batches_are_answered_alike() -> None:
-    """By the ids of the envs in them."""
+def test_plain_batches_can_be_answered() -> None:
+    """By the ids of their envs."""
     batch = BatchedData(
         ["server", "server"], [EnvRet(env_id=f"s/{k}", observation=k) for k in (1, 2)]
     )
     assert [r.env_id for r in batch.respond(action=[1, 2]).values()] == ["s/1", "s/2"]
 
 
-def test_values_without_a_fixed_size_come_as_a_list() -> None:
-    """However long each is, also where they happen to be of one length."""
+def test_values_without_a_fixed_size_are_a_list() -> None:
+    """Of any lengths, even if they are equal."""
     space = spaces.Dict(
         items=spaces.Sequence(spaces.Discrete(9)), pair=spaces.Tuple([spaces.Discrete(9)] * 2)
     )
@@ -354,8 +353,8 @@ def test_values_without_a_fixed_size_come_as_a_list() -> None:
         (np.zeros(2), np.zeros(3)),
     ],
 )
-def test_what_differs_in_structure_does_not_stack(one: Any, other: Any) -> None:
-    """It is said what to do, whatever the difference."""
+def test_values_of_different_structure_do_not_stack(one: Any, other: Any) -> None:
+    """The error says what to do, for any difference."""
     batch = BatchedData(
         ["a-0", "b-0"],
         [EnvRet(env_id="a-0", observation=one), EnvRet(env_id="b-0", observation=other)],
@@ -364,7 +363,7 @@ def test_what_differs_in_structure_does_not_stack(one: Any, other: Any) -> None:
         batch.observation  # noqa: B018
 
 
-# -- what each row is
+# -- flags of rows
 
 
 HEADS = st.sampled_from([((), ()), ((2,), ()), ((3,), ("a", "b", "c")), ((2, 3), ("a", "b"))])
@@ -372,7 +371,8 @@ HEADS = st.sampled_from([((), ()), ((2,), ()), ((3,), ("a", "b", "c")), ((2, 3),
 
 @st.composite
 def any_results(draw: st.DrawFn) -> tuple[BatchedData, list[dict[str, Any]]]:
-    """A batch of several parts whose rows have one shape, and what each of its rows says.
+    """Return a batch of several parts with rows of the same shape, and the expected flags of each
+    row.
 
     Envs 0 to 4 in any order, the first three of one entry; a part without positions is alone.
     """
@@ -436,8 +436,8 @@ def any_results(draw: st.DrawFn) -> tuple[BatchedData, list[dict[str, Any]]]:
     return results(*parts, sources=sources), rows
 
 
-def said(batch: BatchedData, name: str) -> list[Any]:
-    """A column row by row, agents on the first axis."""
+def by_rows(batch: BatchedData, name: str) -> list[Any]:
+    """Return a column by rows, agents on the first axis."""
     column = batch.sent.place if name == "place" else getattr(batch, name)
     if isinstance(column, dict):
         return np.stack(list(column.values()), axis=1).tolist()
@@ -445,28 +445,28 @@ def said(batch: BatchedData, name: str) -> list[Any]:
 
 
 @given(drawn=any_results())
-def test_each_row_says_what_it_is(drawn: tuple[BatchedData, list[dict[str, Any]]]) -> None:
-    """In the batch's order, whatever parts it consists of, and in those of its entries alone."""
+def test_each_row_has_its_flags(drawn: tuple[BatchedData, list[dict[str, Any]]]) -> None:
+    """In the order of the batch, for any parts, and in the batches of its entries."""
     batch, rows = drawn
     for name in rows[0]:
-        assert said(batch, name) == [row[name] for row in rows], name
+        assert by_rows(batch, name) == [row[name] for row in rows], name
     ids = batch.ids()
     for entry, part in batch.by_name().items():
         mine = [row for row, id_ in zip(rows, ids, strict=True) if id_.startswith(entry)]
         for name in rows[0]:
-            assert said(part, name) == [row[name] for row in mine], name
+            assert by_rows(part, name) == [row[name] for row in mine], name
 
 
-def test_what_each_row_says_is_the_readers_own() -> None:
-    """Whoever masks rows may write to the columns."""
+def test_columns_of_flags_belong_to_the_reader() -> None:
+    """Writing to them changes nothing else."""
     batch = results(columns([0, 1], np.zeros((2, 1))))
     for name in ("limit_reached", "restarted"):
         getattr(batch, name)[:] = True
         assert not getattr(batch, name).any()
 
 
-def test_sub_environments_that_take_turns_say_which_they_are() -> None:
-    """Each result holds some of them; their own numbers lie in the infos."""
+def test_results_of_some_sub_environments_have_their_indices() -> None:
+    """Each result has some of them; their numbers are in the infos."""
     names = replace(NAMES, turns=np.array([True] * 5), index_offset=np.arange(5) * 4)
     batch = results(
         columns(
@@ -483,8 +483,8 @@ def test_sub_environments_that_take_turns_say_which_they_are() -> None:
     assert batch.index.tolist() == [[7, 5], [0, 2]]
 
 
-def test_rows_of_different_shape_do_not_make_one_column() -> None:
-    """It is said what to do."""
+def test_rows_of_different_shapes_have_no_common_column() -> None:
+    """The error says what to do."""
     batch = results(
         columns([0], np.zeros((1, 1)), [0]),
         columns([3], np.zeros((1, 1)), [1], reward=np.zeros((1, 2)), flags=flags((1, 2))),
@@ -495,15 +495,15 @@ def test_rows_of_different_shape_do_not_make_one_column() -> None:
 
 
 @pytest.mark.parametrize("name", ["is_reset", "limit_reached", "restarted", "index", "sent"])
-def test_plain_values_tell_nothing_of_a_group(name: str) -> None:
-    """Neither do responses."""
+def test_plain_values_have_no_columns_of_a_group(name: str) -> None:
+    """Neither have responses."""
     for batch in (BatchedData(["a"], [1]), mixed().respond(action=np.zeros(4))):
         with pytest.raises(AttributeError, match="only results of a group"):
             getattr(batch, name)
 
 
-def test_the_step_limit_makes_an_episode_done_that_has_not_ended() -> None:
-    """Its sums are told all the same, and the flags of the env stay its own."""
+def test_an_episode_cut_by_the_step_limit_is_done() -> None:
+    """It has its sums, and the flags of the env are unchanged."""
     batch = results(
         columns(
             [0, 1, 2],
@@ -519,8 +519,8 @@ def test_the_step_limit_makes_an_episode_done_that_has_not_ended() -> None:
     assert batch.info("episode", None) == [{"r": 1.0, "l": 4}, {"r": 2.0, "l": 5}, None]
 
 
-def test_results_handed_over_whole_are_done_as_others_are() -> None:
-    """What an inline env has returned is not taken apart, and its ends count."""
+def test_results_passed_as_objects_can_be_done() -> None:
+    """Results of an inline env stay whole, and their ends count."""
     rets = [
         EnvRet(env_id=id_, observation=0.0, last_reward=1.0, last_terminated=k == 0)
         for k, id_ in enumerate(IDS[:2])
@@ -540,12 +540,14 @@ def test_results_handed_over_whole_are_done_as_others_are() -> None:
     assert batch.is_reset.tolist() == [False, False]
 
 
-# -- what was sent for the rows
+# -- sent columns
 
 
 @st.composite
 def any_sources(draw: st.DrawFn) -> tuple[Any, Any, list[Any]]:
-    """Columns of several requests, or none, that rows came from; with each row's values."""
+    """Return columns of several requests, or none, for the rows of a batch, and the values of each
+    row.
+    """
     requests: list[Any] = [None]
     for number in range(draw(st.integers(0, 3))):
         rows = 4
@@ -570,10 +572,10 @@ def any_sources(draw: st.DrawFn) -> tuple[Any, Any, list[Any]]:
 
 
 @given(drawn=any_sources())
-def test_what_was_sent_comes_back_in_the_order_of_the_results(
+def test_sent_columns_are_in_the_order_of_the_results(
     drawn: tuple[Any, Any, list[Any]],
 ) -> None:
-    """From whatever requests; rows that answer none, or one without the column, say nothing."""
+    """From any requests; rows without a request, or without the column, have no value."""
     of_rows, rows, expected = drawn
     batch = results(columns([k % 5 for k in range(len(rows))], None), sources=(of_rows, rows))
     sent = batch.sent
@@ -608,14 +610,14 @@ def test_what_was_sent_comes_back_in_the_order_of_the_results(
 
 
 def sent_for(n: int, *requests: Any, of_rows: list[int], rows: list[int]) -> Any:
-    """What was sent for `n` results that answer these requests."""
+    """Return the sent columns of `n` results that answer these requests."""
     of_each = np.empty(n, object)
     of_each[:] = [requests[k] for k in of_rows]
     return results(columns(list(range(n)), None), sources=(of_each, np.array(rows))).sent
 
 
-def test_tensors_that_were_sent_come_back_as_tensors() -> None:
-    """On their device; rows that answer nothing hold NaN, or 0 where there is none."""
+def test_sent_tensors_stay_tensors() -> None:
+    """On their device; rows without a request have NaN, or 0 if the dtype has no NaN."""
     torch = pytest.importorskip("torch")
     sent = sent_for(
         3,
@@ -629,27 +631,27 @@ def test_tensors_that_were_sent_come_back_as_tensors() -> None:
     assert torch.equal(sent.choice, torch.tensor([6, 0, 4]))
 
 
-def test_what_is_kept_does_not_change_with_what_was_sent() -> None:
-    """A policy may go on writing to its arrays."""
+def test_sent_columns_are_copies() -> None:
+    """A policy may change its arrays afterwards."""
     action, tags = {"a": (np.zeros(2),)}, ["x", "y"]
-    kept = kept_columns({"action": action, "tag": tags})
+    kept = {"action": copied(action), "tag": copied(tags)}
     action["a"][0][:] = 9
     tags[0] = "z"
     assert kept["action"]["a"][0].tolist() == [0, 0]
     assert kept["tag"] == ["x", "y"]
 
 
-def test_what_is_kept_of_tensors_is_a_copy() -> None:
-    """As of arrays."""
+def test_sent_tensors_are_copies() -> None:
+    """Like arrays."""
     torch = pytest.importorskip("torch")
     tensor = torch.zeros(2)
-    kept = kept_columns({"action": tensor})
+    kept = copied(tensor)
     tensor += 1
-    assert kept["action"].tolist() == [0, 0]
+    assert kept.tolist() == [0, 0]
 
 
-def test_responses_that_came_one_by_one_are_columns_too() -> None:
-    """Where they stack; else lists, with None where one lacks what others have."""
+def test_single_responses_become_columns() -> None:
+    """If they stack; otherwise lists, with None for missing values."""
     responses = [
         PolicyResponse("a-0", np.zeros(2), log_prob=0.5, thought="x"),
         PolicyResponse("a-1", np.ones(2), log_prob=1.5),
@@ -662,8 +664,8 @@ def test_responses_that_came_one_by_one_are_columns_too() -> None:
     assert [np.shape(action) for action in ragged["action"]] == [(2,), ()]
 
 
-def test_an_unknown_name_says_what_was_sent() -> None:
-    """Also where nothing was."""
+def test_the_error_for_an_unknown_name_lists_the_sent_ones() -> None:
+    """Also if nothing was sent."""
     sent = sent_for(1, {"action": np.zeros(1), "value": np.zeros(1)}, of_rows=[0], rows=[0])
     with pytest.raises(AttributeError, match=r"no 'logprob' was sent.*action, value"):
         sent.logprob  # noqa: B018
@@ -671,8 +673,33 @@ def test_an_unknown_name_says_what_was_sent() -> None:
         sent_for(1, None, of_rows=[0], rows=[0])["action"]
 
 
-def test_what_was_sent_can_be_copied_and_pickled() -> None:
-    """As a batch can that goes to another thread or process."""
+def test_a_batch_without_requests_has_the_columns_sent_last() -> None:
+    """With their shapes and dtypes; other names are columns of NaN."""
+    example = {"action": np.zeros((3, 2), int), "log_prob": np.zeros(3), "thought": ["x"] * 3}
+    of_each = np.full(2, None, object)
+    of_each[:] = [example] * 2
+    sent = results(columns([0, 1], None), sources=(of_each, np.full(2, UNASKED))).sent
+    assert list(sent) == ["action", "log_prob", "thought"]
+    assert sent.action.tolist() == [[0, 0], [0, 0]]
+    assert sent.action.dtype == int
+    assert np.isnan(sent.log_prob).tolist() == [True, True]
+    assert sent.thought == [None, None]
+    assert np.isnan(sent.value).tolist() == [True, True]
+
+
+def test_a_name_without_values_raises_even_with_rows_without_requests() -> None:
+    """So a typo is found, although the other row would accept any name."""
+    of_each = np.full(2, None, object)
+    of_each[:] = [{"action": np.ones(1)}, {"action": np.ones(1), "value": np.ones(1)}]
+    sent = results(columns([0, 1], None), sources=(of_each, np.array([0, UNASKED]))).sent
+    assert sent.action[0] == 1
+    assert np.isnan(sent.action[1])
+    with pytest.raises(AttributeError, match=r"no 'valeu' was sent"):
+        sent.valeu  # noqa: B018
+
+
+def test_sent_columns_can_be_copied_and_pickled() -> None:
+    """With their batch, for another thread or process."""
     sent = sent_for(2, {"action": np.arange(2)}, of_rows=[0, 0], rows=[1, 0])
     for one in (copy.copy(sent), copy.deepcopy(sent), pickle.loads(pickle.dumps(sent))):
         assert one.action.tolist() == [1, 0]
@@ -698,7 +725,7 @@ def test_what_was_sent_can_be_copied_and_pickled() -> None:
     )
 )
 def test_infos_are_columns_with_masks(infos: list[dict[str, Any]]) -> None:
-    """Typed where they can be; the mask tells which rows have the key, in nested dicts, too."""
+    """Typed if possible; masks show the rows with the key, also in nested dicts."""
     batch = results(
         columns(
             list(range(len(infos))),
@@ -736,16 +763,17 @@ plain_infos = st.fixed_dictionaries(
         "sure": st.booleans().map(np.bool_),
         "position": st.lists(st.integers(0, 9), min_size=2, max_size=2).map(np.array),
         "odd": st.one_of(st.integers(0, 9), st.floats(0, 1)),
+        "_count": st.integers(0, 9),
         "episode": st.integers(0, 9),
     },
 )
 
 
 @given(st.lists(st.lists(plain_infos, min_size=1, max_size=4), min_size=1, max_size=3))
-def test_infos_in_rows_make_the_columns_that_they_make_one_by_one(
+def test_infos_in_rows_become_the_same_columns_as_single_infos(
     workers: list[list[dict[str, Any]]],
 ) -> None:
-    """Types and all, however the envs are spread over workers, which number schemas themselves."""
+    """With types, for any distribution of envs over workers, which number schemas on their own."""
     infos = [info for own in workers for info in own]
     rows, marks = np.zeros((len(infos), INFO_BYTES), np.uint8), np.zeros(len(infos), np.uint8)
     schemas: list[dict[int, InfoSchema]] = []
@@ -767,18 +795,132 @@ def test_infos_in_rows_make_the_columns_that_they_make_one_by_one(
         np.testing.assert_array_equal(found[key], column)
 
 
-without_odd = plain_infos.map(lambda info: {k: v for k, v in info.items() if k != "odd"})
-"""Where the first value doesn't give its type to the column."""
+any_value = st.one_of(
+    st.integers(),
+    st.integers(-9, 9),
+    st.floats(allow_nan=False),
+    st.booleans(),
+    st.booleans().map(np.bool_),
+    st.integers(0, 9).map(np.uint8),
+    st.floats(0, 1, width=32).map(np.float32),
+    st.integers(0, 9).map(lambda value: np.array([value, 1])),
+    st.floats(0, 1).map(lambda value: np.array([value, 1.0])),
+    st.text(max_size=2),
+    st.text("ab", min_size=1, max_size=3).map(lambda value: np.array([value, "a"])),
+    st.none(),
+)
+any_key = st.sampled_from(["a", "_a", "__a", "b", "final_obs", 1, None, ("c", 2)])
+any_infos = st.dictionaries(any_key, any_value | st.dictionaries(any_key, any_value, max_size=2))
+
+
+def infos_of(infos: list[dict[Any, Any]]) -> dict[Any, Any]:
+    contents = {k: {"info": info} for k, info in enumerate(infos)}
+    return results(columns(list(range(len(infos))), None, out_of_band=contents)).infos
+
+
+def check_columns(found: dict[Any, Any], infos: list[dict[Any, Any]]) -> None:
+    """Check that each value is in its row, under its key, and that masks are correct."""
+    keys = {key for info in infos for key in info}
+    masks = {f"_{key}" for key in keys}
+    assert found.keys() == keys | masks
+    for mask in masks:
+        has = [any(f"_{key}" == mask for key in info) for info in infos]
+        assert found[mask].dtype == np.bool_
+        assert found[mask].tolist() == has
+    for key in keys - masks:
+        own = {k: info[key] for k, info in enumerate(infos) if key in info}
+        if isinstance(found[key], dict):
+            assert key != "final_obs"
+            check_columns(found[key], [info.get(key, {}) for info in infos])
+            continue
+        for k, value in own.items():
+            np.testing.assert_array_equal(found[key][k], value)
+
+
+@given(st.lists(any_infos, min_size=1, max_size=4))
+def test_no_info_changes_or_hides_another(infos: list[dict[Any, Any]]) -> None:
+    """With any types and keys, in any order."""
+    found = infos_of(infos)
+    check_columns(found, infos)
+    reverse = infos_of(infos[::-1])
+
+    def check_reverse(one: Any, other: Any) -> None:
+        if isinstance(one, dict):
+            assert one.keys() == other.keys()
+            for key in one:
+                check_reverse(one[key], other[key])
+        else:
+            assert one.dtype == other.dtype
+            assert repr(one.tolist()) == repr(other[::-1].tolist())
+
+    check_reverse(found, reverse)
+
+
+def test_the_dtype_of_a_column_holds_its_widest_value() -> None:
+    """Not only the first value."""
+    infos = [{"a": 3, "b": True, "c": 1}, {"a": 3.5, "b": 3, "c": "one"}, {"a": 2}]
+    found = infos_of(infos)
+    assert found["a"].tolist() == [3.0, 3.5, 2.0]
+    assert (found["b"].dtype, found["b"].tolist()) == (np.int64, [1, 3, 0])
+    assert (found["c"].dtype, found["c"].tolist()) == (object, [1, "one", None])
+
+
+alike = {
+    "a": st.integers(-9, 9),
+    1: st.floats(allow_nan=False),
+    ("b", 2): st.integers(0, 9).map(lambda value: np.array([value, 1])),
+    "c": st.text(max_size=2),
+    "sure": st.booleans().map(np.bool_),
+    "won": st.booleans(),
+    "final_obs": st.integers(0, 3) | st.just({"place": 1}),
+}
+
+
+@given(
+    st.lists(
+        st.fixed_dictionaries(
+            {}, optional={**alike, "nested": st.fixed_dictionaries({}, optional=alike)}
+        ),
+        min_size=1,
+        max_size=4,
+    )
+)
+def test_values_of_one_type_become_gymnasiums_columns(infos: list[dict[Any, Any]]) -> None:
+    """Compared with Gymnasium's code."""
+    from gymnasium.vector import VectorEnv
+
+    vector, expected = VectorEnv[Any, Any, Any](), dict[Any, Any]()
+    vector.num_envs = len(infos)
+    for k, info in enumerate(infos):
+        expected = vector._add_info(expected, info, k)
+    assert_same_infos(infos_of(infos), expected)
+
+
+def assert_same_infos(found: Any, expected: Any) -> None:
+    """Check for equal keys, dtypes and values."""
+    assert type(found) is type(expected)
+    if isinstance(expected, dict):
+        assert found.keys() == expected.keys()
+        for key in expected:
+            assert_same_infos(found[key], expected[key])
+    else:
+        assert (found.dtype, repr(found)) == (expected.dtype, repr(expected))
+
+
+without_odd = plain_infos.map(
+    lambda info: {k: v for k, v in info.items() if k not in ("odd", "_count")}
+)
+"""Infos with one type for each key, and no key with the name of a mask."""
 
 
 @given(
     infos=st.lists(st.lists(without_odd, min_size=3, max_size=3), min_size=1, max_size=3),
     in_rows=st.booleans(),
 )
-def test_infos_of_sub_environments_have_masks_of_their_own(
+def test_infos_of_sub_environments_have_their_own_masks(
     infos: list[list[dict[str, Any]]], in_rows: bool
 ) -> None:
-    """As all of them in one vector environment have, with an axis more."""
+    """Like those of one vector environment, with another axis."""
     of_envs = [vector_infos(own) for own in infos]
     slots = list(range(len(infos)))
     rows, marks = np.zeros((len(slots), INFO_BYTES), np.uint8), np.zeros(len(slots), np.uint8)
@@ -804,7 +946,7 @@ def test_infos_of_sub_environments_have_masks_of_their_own(
 
 
 def test_infos_are_those_of_gymnasiums_vector_envs() -> None:
-    """A loop written for one reads these."""
+    """So a loop written for one can read them."""
     import gymnasium as gym
 
     class Telling(gym.Env[Any, Any]):
@@ -831,7 +973,7 @@ def test_infos_are_those_of_gymnasiums_vector_envs() -> None:
 
 
 def test_one_key_of_all_infos_is_a_column() -> None:
-    """A list where its values differ in shape; a default stands in where the key is missing."""
+    """A list if its values differ in shape; missing keys have the default."""
     infos = [{"a": 1.5, "b": [1]}, {"a": 2.5, "b": [1, 2]}, {"b": [], "c": None}]
     batch = results(
         columns([0, 1, 2], None, out_of_band={k: {"info": info} for k, info in enumerate(infos)})
@@ -852,8 +994,8 @@ def test_one_key_of_all_infos_is_a_column() -> None:
 # -- copies
 
 
-def told(batch: BatchedData) -> str:
-    """All that a batch of results tells."""
+def contents(batch: BatchedData) -> str:
+    """Return all contents of a batch of results."""
     columns = (batch.reward, batch.terminated, batch.truncated, batch.done)
     rows = (batch.is_reset, batch.limit_reached, batch.restarted, batch.index)
     sent = {name: batch.sent[name] for name in batch.sent}
@@ -868,7 +1010,7 @@ COPIES = (copy.copy, copy.deepcopy, lambda batch: pickle.loads(pickle.dumps(batc
 @pytest.mark.parametrize("copied", COPIES)
 @pytest.mark.parametrize("read", [False, True])
 def test_a_batch_can_be_copied_and_pickled(copied: Any, read: bool) -> None:
-    """Whatever of it was read before, and without the group, which then goes by the ids."""
+    """After any reads, and without the group, which then uses the ids."""
     schema = InfoSchema.of({"speed": 1.5})
     assert schema is not None
     speeds = np.arange(2.0).view(np.uint8).reshape(2, 8)
@@ -882,12 +1024,12 @@ def test_a_batch_can_be_copied_and_pickled(copied: Any, read: bool) -> None:
         sources=(np.full(4, {"action": np.arange(4)}), np.arange(4)[::-1]),
         group=group,
     )
-    expected = told(copy.deepcopy(batch))
+    expected = contents(copy.deepcopy(batch))
     assert "'speed': 1.0" in expected
     if read:
-        assert told(batch) == expected
+        assert contents(batch) == expected
     found = copied(batch)
-    assert told(found) == expected
+    assert contents(found) == expected
     assert slots_of(found, group) is None
     response = copied(batch.respond(action=np.arange(4), value=[1, None, 2, 3]))
     assert response.env_ids() == batch.env_ids()
@@ -896,11 +1038,11 @@ def test_a_batch_can_be_copied_and_pickled(copied: Any, read: bool) -> None:
     assert plain.items() == [("a", 1), ("a", 2)]
 
 
-# -- what only groups ask, and what people see
+# -- the group of a batch, and its text
 
 
-def test_only_its_own_group_knows_a_batch() -> None:
-    """Another one goes by the ids."""
+def test_only_the_group_of_a_batch_uses_its_slots() -> None:
+    """Another group uses the ids."""
     group = object()
     batch = results(columns([2, 0], np.zeros((2, 1))), group=group)
     slots = slots_of(batch, group)
@@ -917,8 +1059,8 @@ def test_only_its_own_group_knows_a_batch() -> None:
     assert parts_of(responses) == parts_of(BatchedData()) == ()
 
 
-def test_what_a_batch_looks_like_is_said_without_its_contents() -> None:
-    """Ids of the first, dtype and shape of every column."""
+def test_the_text_of_a_batch_has_shapes_and_no_contents() -> None:
+    """The first ids, and dtype and shape of each column."""
     shown = repr(mixed())
     assert shown.startswith("BatchedData(4 results of pendulum-0, grid-world-1, pendulum-2, …,")
     assert "observation: float64[2, 2], reward: float64[2]" in shown
@@ -930,18 +1072,18 @@ def test_what_a_batch_looks_like_is_said_without_its_contents() -> None:
     assert repr(BatchedData(["a", "b"], [1, 2])) == "BatchedData(2 values of a, b)"
 
 
-# -- found by looking for it
+# -- special batches
 
 
 def test_an_empty_batch_of_results_has_columns() -> None:
-    """As a step of no env at all gives in a group of several layouts."""
+    """Such as a step of no envs in a group of several layouts."""
     batch = results()
     for name in ("done", "is_reset", "limit_reached", "restarted", "index"):
         assert len(getattr(batch, name)) == 0
 
 
-def test_the_step_limit_cuts_results_of_tensors_too() -> None:
-    """Envs whose results are handed over whole reach it one by one."""
+def test_the_step_limit_cuts_results_of_tensors() -> None:
+    """Envs with results passed as objects reach it one by one."""
     torch = pytest.importorskip("torch")
     no = torch.zeros(3, dtype=torch.bool)
     rets = [
@@ -970,7 +1112,7 @@ def test_the_step_limit_cuts_results_of_tensors_too() -> None:
 
 
 def test_tensors_that_do_not_stack_can_be_attached_to_responses() -> None:
-    """They are kept as a list, as arrays are."""
+    """They are kept as a list, like arrays."""
     torch = pytest.importorskip("torch")
     found = columns_of_values(
         [

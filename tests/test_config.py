@@ -1,4 +1,4 @@
-"""Configuration: what is accepted, and what a wrong one says."""
+"""Configurations: accepted forms, and messages for wrong ones."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ CARTPOLE: dict[str, Any] = {"name": "cartpole", "backend": "gymnasium", "task": 
 
 @pytest.fixture
 def write(tmp_path: Path) -> Write:
-    """Writes a document (or the text of one) to a file."""
+    """Return a function that writes a document, or its text, to a file."""
 
     def write(document: object) -> Path:
         path = tmp_path / "config.yaml"
@@ -49,7 +49,7 @@ def problems_of(cfgs: object) -> str:
     return str(caught.value)
 
 
-# ---- what is accepted
+# ---- accepted configurations
 
 
 def test_a_file_gives_its_entries_in_order(write: Write) -> None:
@@ -61,8 +61,8 @@ def test_a_file_gives_its_entries_in_order(write: Write) -> None:
     ]
 
 
-def test_env_means_envs(write: Write) -> None:
-    """RLightning's files say either word."""
+def test_env_is_another_name_for_envs(write: Write) -> None:
+    """RLightning's files use either."""
     assert load_config(write({"env": [HOPPER]})) == load_config(write({"envs": [HOPPER]}))
 
 
@@ -84,7 +84,7 @@ def test_env_means_envs(write: Write) -> None:
         lambda fields: dict(OmegaConf.create(fields).items()),
     ],
 )
-def test_every_way_to_hand_over_an_entry_means_the_same(wrap: Callable[[Any], object]) -> None:
+def test_every_form_of_an_entry_means_the_same(wrap: Callable[[Any], object]) -> None:
     """An entry may come alone or listed, as a model, a dict or an OmegaConf node."""
     fields = HOPPER | {"env_kwargs": {"frame_skip": 3, "nested": [{"a": 1}]}}
     (config,) = parse_configs(wrap(fields))
@@ -92,8 +92,8 @@ def test_every_way_to_hand_over_an_entry_means_the_same(wrap: Callable[[Any], ob
     assert type(config.env_kwargs["nested"]) is list
 
 
-def test_imports_of_the_file_come_before_an_entry_s_own(write: Write) -> None:
-    """Shared imports reach every entry, first, and no module is listed twice."""
+def test_shared_imports_precede_an_entrys_own(write: Write) -> None:
+    """Every entry has them, and no module is listed twice."""
     document = {"imports": ["json", "os.path"], "envs": [HOPPER, CARTPOLE]}
     document["envs"][1] = CARTPOLE | {"imports": ["re", "json"]}
     first, second = load_config(write(document))
@@ -116,11 +116,11 @@ env:
     num_cpus: 0
     imports: [re]
 """
-"""A whole experiment's file."""
+"""The file of a complete experiment."""
 
 
-def test_an_experiment_s_other_sections_are_left_alone(write: Write) -> None:
-    """Entries may refer to them and overrides reach them; what they lack is no problem here."""
+def test_other_sections_of_a_file_are_ignored(write: Write) -> None:
+    """Entries may refer to them, and overrides may change them."""
     path = write(EXPERIMENT)
     (config,) = load_config(path)
     assert (config.num_workers, config.num_cpus, config.imports) == (3, 0, ("json", "re"))
@@ -131,8 +131,8 @@ def test_an_experiment_s_other_sections_are_left_alone(write: Write) -> None:
         load_config(write(EXPERIMENT.replace("imports: [json]", "import: [json]")))
 
 
-def test_a_part_of_an_experiment_has_its_imports(write: Write) -> None:
-    """However the entries are taken out of a document that OmegaConf has read."""
+def test_a_node_of_a_document_has_its_imports(write: Write) -> None:
+    """This holds for any way of taking entries out of an OmegaConf document."""
     config: Any = OmegaConf.load(write(EXPERIMENT))
     for part in (config, config.env, config.env[0], [config.env[0]]):
         (entry,) = parse_configs(part)
@@ -140,7 +140,7 @@ def test_a_part_of_an_experiment_has_its_imports(write: Write) -> None:
 
 
 def test_one_entry_needs_no_list(write: Write) -> None:
-    """A section may be the entry itself; problems and overrides then name no position."""
+    """A section may be the entry itself; messages and overrides then have no position."""
     (config,) = load_config(write({"env": HOPPER}), ["env.num_workers=2"])
     assert config == EnvConfig(**HOPPER, num_workers=2)
     with pytest.raises(ConfigError, match=r"env \('hopper'\), num_worker: unknown field"):
@@ -148,7 +148,7 @@ def test_one_entry_needs_no_list(write: Write) -> None:
 
 
 def test_interpolations_are_resolved(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
-    """OmegaConf's references work, to other fields and to the environment."""
+    """OmegaConf's references may name other fields and environment variables."""
     monkeypatch.setenv("HOPPER_TASK", "Hopper-v5")
     entry = HOPPER | {"task": "${oc.env:HOPPER_TASK}", "num_workers": 4}
     other = CARTPOLE | {"num_workers": "${envs.0.num_workers}"}
@@ -156,14 +156,14 @@ def test_interpolations_are_resolved(write: Write, monkeypatch: pytest.MonkeyPat
     assert (first.task, second.num_workers) == ("Hopper-v5", 4)
 
 
-def test_numbers_in_env_vars_are_written_out() -> None:
-    """YAML reads a thread count as a number; the environment holds text."""
+def test_numbers_in_env_vars_become_text() -> None:
+    """YAML reads a thread count as a number."""
     (config,) = parse_configs(HOPPER | {"env_vars": {"OMP_NUM_THREADS": 1, "SHARE": 0.5}})
     assert config.env_vars == {"OMP_NUM_THREADS": "1", "SHARE": "0.5"}
 
 
-def test_an_interpreter_is_looked_up_as_a_shell_would() -> None:
-    """A name on the PATH, a path, and a home directory all work."""
+def test_an_interpreter_is_found_as_by_a_shell() -> None:
+    """It may be a name on the PATH, a path, or begin with a home directory."""
     for interpreter in (sys.executable, Path(sys.executable).name):
         (config,) = parse_configs(HOPPER | {"interpreter": interpreter})
         assert config.interpreter == interpreter
@@ -173,29 +173,29 @@ def test_an_interpreter_is_looked_up_as_a_shell_would() -> None:
 
 
 def test_an_env_server_needs_no_task() -> None:
-    """Its clients bring the task; every other backend must be told."""
+    """Its clients choose the task; every other backend requires one."""
     if "env_server" not in ENVS.names():
         pytest.skip("no env_server yet")
     (config,) = parse_configs({"name": "robots", "backend": "env_server"})
     assert config.task == ""
 
 
-def test_another_environment_s_modules_are_not_judged_from_here() -> None:
-    """Under another interpreter, imports and backends are that interpreter's affair."""
+def test_names_for_another_interpreter_are_not_checked() -> None:
+    """Its imports and backends may differ from those of this one."""
     fields = HOPPER | {"interpreter": sys.executable, "imports": ["no_such_module"]}
     assert parse_configs(fields)[0].imports == ("no_such_module",)
     parse_configs(HOPPER | {"interpreter": sys.executable, "backend": "theirs"})
     check_installed(parse_configs(fields))
 
 
-def test_an_imported_module_may_bring_the_backend() -> None:
-    """With imports, an unknown backend is left for the worker to find."""
+def test_an_imported_module_may_register_the_backend() -> None:
+    """With imports, an unknown backend is left to the worker."""
     (config,) = parse_configs(HOPPER | {"backend": "brought", "imports": ["json"]})
     assert config.backend == "brought"
 
 
-def test_looking_for_modules_imports_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A module, its package and a namespace package above it are found without being run."""
+def test_checking_imports_runs_no_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A module, its package and a namespace package around it are found without being run."""
     package = tmp_path / "space" / "package"
     package.mkdir(parents=True)
     (package / "__init__.py").write_text("raise RuntimeError")
@@ -248,8 +248,8 @@ words = st.text(st.characters(categories=["L", "N", "P"], exclude_characters="?"
     )
 )
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
-def test_a_file_says_what_python_says(fields: dict[str, Any], write: Write) -> None:
-    """Writing an entry to YAML and reading it back gives the entry, through pickle too."""
+def test_an_entry_survives_yaml_and_pickle(fields: dict[str, Any], write: Write) -> None:
+    """Reading back what was written gives the same entry."""
     config = EnvConfig(**fields)
     path = write(json.dumps({"envs": [fields]}, ensure_ascii=False))
     assert load_config(path) == parse_configs(fields) == [config]
@@ -259,8 +259,8 @@ def test_a_file_says_what_python_says(fields: dict[str, Any], write: Write) -> N
 # ---- overrides
 
 
-def test_overrides_reach_fields_by_dotted_keys(write: Write) -> None:
-    """Values are YAML, later ones win, and what is missing on the way is made."""
+def test_overrides_have_dotted_keys(write: Write) -> None:
+    """Values are YAML, later ones win, and missing sections are created."""
     path = write({"envs": [HOPPER, CARTPOLE | {"env_kwargs": {"a": 1, "b": 2}}]})
     first, second = load_config(
         path,
@@ -280,8 +280,8 @@ def test_overrides_reach_fields_by_dotted_keys(write: Write) -> None:
 
 @pytest.mark.parametrize("in_file", ["env", "envs"])
 @pytest.mark.parametrize("in_override", ["env", "envs"])
-def test_overrides_may_say_env_or_envs(write: Write, in_file: str, in_override: str) -> None:
-    """Either word reaches the entries, whichever the file uses."""
+def test_overrides_may_use_env_or_envs(write: Write, in_file: str, in_override: str) -> None:
+    """Both work, whichever of them the file uses."""
     path = write({in_file: [HOPPER]})
     assert load_config(path, [f"{in_override}.0.num_workers=8"])[0].num_workers == 8
 
@@ -301,7 +301,7 @@ def test_overrides_may_say_env_or_envs(write: Write, in_file: str, in_override: 
     ],
 )
 def test_an_override_that_fits_nothing_is_named(write: Write, override: str) -> None:
-    """The message has the file and the override, whatever is wrong with it."""
+    """The message has the file and the override."""
     path = write({"envs": [HOPPER]})
     with pytest.raises(ConfigError) as caught:
         load_config(path, ["envs.0.num_workers=2", override])
@@ -310,14 +310,14 @@ def test_an_override_that_fits_nothing_is_named(write: Write, override: str) -> 
 
 
 def test_an_overridden_field_is_checked_like_any_other(write: Write) -> None:
-    """An override can't smuggle in a field or a type that the file may not have."""
+    """It can't have a field or type that a file may not have."""
     with pytest.raises(ConfigError, match=r"envs\.0 \('hopper'\), num_worker: .*'num_workers'"):
         load_config(write({"envs": [HOPPER]}), ["envs.0.num_worker=8"])
     with pytest.raises(ConfigError, match=r"num_workers: should be a valid integer, got 'many'"):
         load_config(write({"envs": [HOPPER]}), ["envs.0.num_workers=many"])
 
 
-# ---- what is refused
+# ---- refused configurations
 
 
 @pytest.mark.parametrize(
@@ -333,7 +333,11 @@ def test_an_overridden_field_is_checked_like_any_other(write: Write) -> None:
         ("max_episode_steps", 0, "should be greater than or equal to 1, got 0"),
         ("step_timeout", -1, "should be greater than 0, got -1"),
         ("start_timeout", math.nan, "should be greater than 0, got nan"),
-        ("placement", "inlin", "should be 'process', 'inline', 'split' or 'ray', got 'inlin'"),
+        (
+            "placement",
+            "inlin",
+            "should be 'process', 'loop', 'inline', 'split' or 'ray', got 'inlin'",
+        ),
         ("on_worker_death", "ignore", "should be 'restart', 'raise' or 'resume', got 'ignore'"),
         ("envs_per_process", "many", "should be a valid integer or 'auto', got 'many'"),
         ("envs_per_process", 0, "should be greater than or equal to 1 or 'auto', got 0"),
@@ -360,7 +364,7 @@ def test_an_overridden_field_is_checked_like_any_other(write: Write) -> None:
 def test_a_wrong_field_is_named_with_file_and_entry(
     write: Write, field: str, value: object, said: str
 ) -> None:
-    """One problem makes one line: file, entry by index and name, field, what and why."""
+    """One problem is one line with file, entry (index and name), field and reason."""
     path = write({"envs": [CARTPOLE, HOPPER | {field: value}]})
     with pytest.raises(ConfigError) as caught:
         load_config(path)
@@ -371,24 +375,24 @@ def test_a_wrong_field_is_named_with_file_and_entry(
     assert caught.value.__cause__ is None
 
 
-def test_a_wrong_field_is_all_that_a_program_is_told_of() -> None:
-    """Defaults that depend on others add nothing."""
+def test_a_wrong_field_causes_no_further_messages() -> None:
+    """Defaults that depend on it are not checked."""
     with pytest.raises(ValidationError) as caught:
         EnvConfig(name="pole", backend="gymnasium", task="CartPole-v1", num_workers=0)
     assert [fault["loc"] for fault in caught.value.errors()] == [("num_workers",)]
 
 
-def test_backends_of_single_envs_take_several_workers_instead() -> None:
-    """What to write instead is said."""
+def test_num_envs_of_a_backend_with_single_envs_is_refused() -> None:
+    """The message has the field to use instead."""
     arm = {"name": "arm", "backend": "piper", "task": "can0", "num_envs": 4}
     said = "envs.0 ('arm'), num_envs: backend 'piper' makes single envs; use num_workers: 4"
     assert said in problems_of(arm)
 
 
-def test_more_results_than_envs_are_not_waited_for() -> None:
-    """Such a number is a mistake, and named; clients of a server are as many as come."""
+def test_min_results_above_the_number_of_envs_is_refused() -> None:
+    """An env_server has no such bound, because any number of clients may connect."""
     said = problems_of({**CARTPOLE, "num_workers": 4, "min_results": 5})
-    assert "envs.0 ('cartpole'), min_results: is 5, and num_workers: 4" in said
+    assert "envs.0 ('cartpole'), min_results: is 5, more than num_workers: 4" in said
     parse_configs({**CARTPOLE, "num_workers": 4, "min_results": 4})
     parse_configs({"name": "robots", "backend": "env_server", "min_results": 9})
 
@@ -400,15 +404,15 @@ def test_a_missing_field_is_named(missing: str) -> None:
     assert f", {missing}: is required" in problems_of([fields])
 
 
-def test_a_name_is_not_empty() -> None:
-    """Envs are called after their entry, so there must be something to call them."""
+def test_a_name_must_not_be_empty() -> None:
+    """Env ids begin with it."""
     assert "envs.0, name: " in problems_of(HOPPER | {"name": ""})
 
 
-def test_two_entries_can_t_share_a_name() -> None:
+def test_two_entries_must_not_share_a_name() -> None:
     """Their envs would have the same ids."""
     message = problems_of([HOPPER, CARTPOLE, CARTPOLE | {"name": "hopper"}])
-    assert "envs.2 ('hopper'), name: is the name of envs.0 too" in message
+    assert "envs.2 ('hopper'), name: is also the name of envs.0" in message
 
 
 VALUES: dict[str, Any] = {
@@ -425,6 +429,7 @@ VALUES: dict[str, Any] = {
     "interpreter": sys.executable,
     "env_vars": {"A": "1"},
     "cpu_affinity": True,
+    "max_concurrency": 3,
     "ray_options": {"max_restarts": 0},
     "video": {"folder": "films"},
 }
@@ -438,14 +443,15 @@ SERVER = {"name": "robots", "backend": "env_server"}
     [
         (INLINE, PLACEMENTS["inline"].refuses),
         (HOPPER | {"placement": "split"}, PLACEMENTS["split"].refuses),
+        (HOPPER | {"placement": "loop"}, PLACEMENTS["loop"].refuses),
         (SERVER, placement_of("env_server", "").refuses),
     ],
-    ids=["inline", "split", "env_server"],
+    ids=["inline", "split", "loop", "env_server"],
 )
-def test_what_has_no_meaning_where_the_envs_live_is_refused(
+def test_a_field_without_meaning_for_the_placement_is_refused(
     entry: dict[str, Any], refuses: Mapping[str, str]
 ) -> None:
-    """Each field by its name, with the reason, once; its default as well, if that says anything."""
+    """Each is named once, with the reason; so is a default that asks for something."""
     for name, why in refuses.items():
         message = problems_of(entry | {name: VALUES[name]})
         place, _, text = message.partition(": ")[2].partition(": ")
@@ -454,8 +460,8 @@ def test_what_has_no_meaning_where_the_envs_live_is_refused(
         assert text.endswith(f": {why}")
 
 
-def test_what_a_place_can_honour_is_no_problem_there() -> None:
-    """Nor is a field that asks for nothing: no limit, no variables, one."""
+def test_other_fields_are_accepted_for_the_placement() -> None:
+    """So is a field that asks for nothing: no limit, no variables, one."""
     asks_nothing = {
         "step_timeout": None,
         "interpreter": None,
@@ -468,16 +474,16 @@ def test_what_a_place_can_honour_is_no_problem_there() -> None:
         parse_configs(SERVER | limits | {"num_workers": 1, "num_envs": 1})
 
 
-def test_an_entry_can_be_moved_where_some_of_its_fields_have_no_meaning() -> None:
-    """They are left out, and the rest is what it was."""
+def test_moving_an_entry_drops_fields_without_meaning() -> None:
+    """All other fields are kept."""
     (config,) = parse_configs(HOPPER | {"step_timeout": 1.0, "num_workers": 3})
     assert moved(config, "inline") == parse_configs(INLINE | {"num_workers": 3})[0]
     parse_configs(moved(config, "inline"))
     assert moved(config, "process") == config
 
 
-def test_every_problem_of_a_file_is_in_the_one_message(write: Write) -> None:
-    """A user mends a file once, not once for each mistake."""
+def test_one_message_lists_every_problem_of_a_file(write: Write) -> None:
+    """So a user can fix all of them at once."""
     path = write(
         {
             "import": ["json"],
@@ -518,8 +524,8 @@ def test_every_problem_of_a_file_is_in_the_one_message(write: Write) -> None:
     ],
     ids=str,
 )
-def test_an_entry_of_a_callable_has_its_own_problems_alone(entry: Any, said: str) -> None:
-    """The backend that goes without saying is none of them."""
+def test_an_entry_of_a_callable_has_no_message_about_its_backend(entry: Any, said: str) -> None:
+    """The backend follows from the callable."""
     with pytest.raises(ConfigError, match=rf"configuration: envs\.0 \('e'\), {said}$"):
         parse_configs({"name": "e", **entry})
 
@@ -543,8 +549,10 @@ def test_an_entry_of_a_callable_has_its_own_problems_alone(entry: Any, said: str
         ("evns: []", "evns: unknown field; did you mean 'envs'?"),
     ],
 )
-def test_a_file_without_entries_says_why(write: Write, text: str, said: str) -> None:
-    """Whether it doesn't parse, is empty, or holds something else."""
+def test_a_file_without_entries_is_refused_with_the_reason(
+    write: Write, text: str, said: str
+) -> None:
+    """It may not parse, be empty, or hold something else."""
     path = write(text)
     with pytest.raises(ConfigError) as caught:
         load_config(path)
@@ -552,8 +560,8 @@ def test_a_file_without_entries_says_why(write: Write, text: str, said: str) -> 
     assert said in str(caught.value)
 
 
-def test_a_file_that_can_t_be_read_is_named(tmp_path: Path) -> None:
-    """Missing, a directory, or not text."""
+def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    """It may be missing, a directory, or not text."""
     (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\xfa")
     for name in ("missing.yaml", "", "binary.yaml"):
         with pytest.raises(ConfigError) as caught:
@@ -562,19 +570,19 @@ def test_a_file_that_can_t_be_read_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("cfgs", [None, 3, [], (), {}, [None], [[HOPPER]], object()])
-def test_what_is_no_configuration_is_refused(cfgs: object) -> None:
-    """Nothing but entries is taken for one."""
+def test_other_values_are_refused(cfgs: object) -> None:
+    """Only entries are accepted."""
     assert problems_of(cfgs).startswith("environment configuration: ")
 
 
-def test_a_path_is_sent_to_load_config() -> None:
-    """A likely slip gets its answer."""
+def test_a_path_in_place_of_entries_is_refused_with_a_hint() -> None:
+    """The message names load_config."""
     assert "load_config reads files" in problems_of("configs/hopper.yaml")
     assert "load_config reads files" in problems_of(CONFIGS / "hopper.yaml")
 
 
-def test_the_model_itself_suggests_the_nearest_name() -> None:
-    """Who makes an EnvConfig in Python is told as well."""
+def test_env_config_suggests_the_nearest_field() -> None:
+    """It does so when it is made in Python, too."""
     with pytest.raises(ValidationError, match=r"num_worker: .* did you mean 'num_workers'"):
         EnvConfig(**HOPPER, num_worker=3)
 
@@ -582,8 +590,8 @@ def test_the_model_itself_suggests_the_nearest_name() -> None:
 @given(text=st.text() | st.text("envs:[]{}-, \n\tab'\"&*!?|>%#0.$"))
 @example(text="[" * 1000)
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
-def test_no_text_escapes_as_another_exception(text: str, write: Write) -> None:
-    """Whatever a file holds, it is entries or a ConfigError."""
+def test_any_text_gives_entries_or_a_config_error(text: str, write: Write) -> None:
+    """No other exception is raised."""
     try:
         configs = load_config(write(text))
     except ConfigError:
@@ -606,8 +614,8 @@ values = st.recursive(
 
 @given(cfgs=values)
 @settings(deadline=None)
-def test_no_value_escapes_as_another_exception(cfgs: object) -> None:
-    """Whatever Python hands over, it is entries or a ConfigError."""
+def test_any_value_gives_entries_or_a_config_error(cfgs: object) -> None:
+    """No other exception is raised."""
     try:
         configs = parse_configs(cfgs)
     except ConfigError:
@@ -627,8 +635,8 @@ def absent(monkeypatch: pytest.MonkeyPatch) -> Backend:
     return backend
 
 
-def test_a_missing_simulator_comes_with_its_command(absent: Backend) -> None:
-    """Every entry that lacks one is named, with what to type."""
+def test_a_missing_simulator_is_named_with_its_install_command(absent: Backend) -> None:
+    """The message names every entry that lacks one."""
     configs = parse_configs([HOPPER, CARTPOLE | {"backend": "absent"}])
     with pytest.raises(ConfigError) as caught:
         check_installed(configs)
@@ -637,23 +645,23 @@ def test_a_missing_simulator_comes_with_its_command(absent: Backend) -> None:
 
 
 def test_installed_simulators_pass() -> None:
-    """What the package itself depends on is there."""
+    """Core dependencies are installed."""
     check_installed(parse_configs([HOPPER, CARTPOLE]))
 
 
-# ---- what comes with the project
+# ---- configurations of the project
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
-def test_the_project_s_own_configs_are_right(path: Path) -> None:
-    """Each file in configs/ parses and names entries; who has the other Python is not asked."""
+def test_the_projects_configs_are_valid(path: Path) -> None:
+    """Each file in configs/ is read; other interpreters need not exist."""
     document = yaml.safe_load(path.read_text())
     elsewhere = [k for k, entry in enumerate(document["envs"]) if "interpreter" in entry]
     assert load_config(path, [f"envs.{k}.interpreter={sys.executable}" for k in elsewhere])
 
 
 def test_the_multi_task_example_is_two_tasks_of_one_action_shape() -> None:
-    """It is there to show two tasks under one policy."""
+    """One policy can act in both."""
     import gymnasium as gym
 
     configs = load_config(CONFIGS / "multi_task.yaml")
@@ -664,7 +672,7 @@ def test_the_multi_task_example_is_two_tasks_of_one_action_shape() -> None:
         env.close()
 
 
-def test_importing_the_module_does_not_load_omegaconf() -> None:
-    """Workers import it too, and have no YAML to read."""
+def test_importing_config_does_not_load_omegaconf() -> None:
+    """Workers import it, too, and read no YAML."""
     code = "import rlightning_aio.config, sys; sys.exit('omegaconf' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,4 +1,4 @@
-"""The guards that every other test relies on can themselves fail a test."""
+"""Tests of the fixtures that check every other test."""
 
 from __future__ import annotations
 
@@ -66,8 +66,8 @@ def pytest_sessionfinish():
 """
 
 
-def test_what_a_test_leaves_behind_fails_it(pytester: pytest.Pytester) -> None:
-    """A process, a zombie, a descriptor, shared memory or a task each make an error."""
+def test_leftovers_of_a_test_fail_it(pytester: pytest.Pytester) -> None:
+    """A process, a zombie, a descriptor, shared memory and a task are each an error."""
     pytester.makeconftest(Path(__file__).with_name("conftest.py").read_text() + CLEAN_UP)
     pytester.makepyfile(test_leaks=LEAKS)
     pytester.makeini("[pytest]\nasyncio_mode = auto\nasyncio_default_fixture_loop_scope=function")
@@ -80,7 +80,7 @@ def test_what_a_test_leaves_behind_fails_it(pytester: pytest.Pytester) -> None:
 
 
 async def test_async_tests_run_on_both_loops_in_debug_mode(request: pytest.FixtureRequest) -> None:
-    """The loop is the one that the test's id names, with asyncio's own checks on."""
+    """On the loop in the test's id, with asyncio's debug mode."""
     import asyncio
 
     loop = asyncio.get_running_loop()

@@ -1,4 +1,4 @@
-"""What pages say of arguments, settings and other libraries' programs.
+"""Tables of arguments and settings, and programs for other libraries, in the documents.
 
 The other programs of the documents are in test_examples.py.
 """
@@ -15,7 +15,7 @@ from run_python import output_of
 
 from rlightning_aio import EnvGroup, build_env_group
 from rlightning_aio.config import VideoConfig
-from rlightning_aio.hosts.listener import ServerSettings
+from rlightning_aio.hosts.server_settings import ServerSettings
 
 DOCS = Path(__file__).parent.parent / "docs"
 PROGRAMS = Path(__file__).with_name("programs.py")
@@ -26,7 +26,7 @@ def table_rows(page: str) -> set[str]:
 
 
 def test_every_argument_and_setting_has_its_row() -> None:
-    """No row is missing, and none names what isn't there."""
+    """No row is missing, and no row is superfluous."""
     collecting = inspect.signature(EnvGroup.collect_async).parameters.keys() - {"self"}
     building = inspect.signature(build_env_group).parameters.keys() - {"env_cfgs"}
     assert table_rows("collecting.md") == collecting | building
@@ -46,8 +46,8 @@ def run_programs(programs: list[str], folder: Path) -> str:
     return output_of(PROGRAMS, *files, folder=folder, asyncio_debug=False)
 
 
-def test_programs_come_over_from_rlightning(tmp_path: Path) -> None:
-    """The script runs by the page's command, and the others in turn; rows name what is there."""
+def test_the_programs_for_rlightning_run(tmp_path: Path) -> None:
+    """The script runs by the page's command, the others in turn; rows name existing things."""
     script, *programs = blocks("python", "rlightning.md")
     (command,) = blocks("sh", "rlightning.md")
     (tmp_path / "steps.py").write_text(script)
@@ -58,7 +58,7 @@ def test_programs_come_over_from_rlightning(tmp_path: Path) -> None:
 
 
 @pytest.mark.simulators
-def test_programs_come_over_from_envpool(tmp_path: Path) -> None:
-    """Each runs as it stands."""
+def test_the_programs_for_envpool_run(tmp_path: Path) -> None:
+    """Each runs unchanged."""
     pytest.importorskip("envpool")
     run_programs(blocks("python", "envpool.md"), tmp_path)

@@ -1,4 +1,4 @@
-"""The documents as a whole: links, configurations, the site's parts, and what has no example."""
+"""All documents: links, configurations, parts of the site, and completeness of the examples."""
 
 from __future__ import annotations
 
@@ -7,17 +7,20 @@ import json
 import re
 from pathlib import Path
 
+import pytest
 from omegaconf import OmegaConf
 
 from rlightning_aio import load_config
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
-PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md"), ROOT / "benchmarks" / "README.md"])
+PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md"), *(ROOT / "benchmarks").glob("*.md")])
 PACKAGE = ROOT / "src" / "rlightning_aio"
-# Internal packages. The package itself or another module offers what users need from them.
+# Internal packages; other modules export what users need.
 INTERNAL = {"batch", "cli", "config", "envs", "group", "hosts", "protocol", "registry", "sharing"}
-INTERNAL |= {"types", "video", "__init__"}
+INTERNAL |= {"files", "piper", "sealing", "types", "video", "__init__"}
+# "The words" of ARCHITECTURE.md.
+WORDS = {"config", "errors", "files", "registry", "sealing", "sharing", "spaces", "types"}
 
 
 def named(page: Path) -> str:
@@ -25,18 +28,18 @@ def named(page: Path) -> str:
 
 
 def prose(page: Path) -> str:
-    """Without blocks of code, in which brackets mean something else."""
+    """Return the text without blocks of code, in which brackets have another meaning."""
     return re.sub(r"^ *```.*?^ *```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
 
 
 def anchors(page: Path) -> set[str]:
-    """What headings of the page are called in links, by GitHub's rule, which is the site's, too."""
+    """Return the anchors of the page's headings, by GitHub's rule, which the site also uses."""
     titles = re.findall(r"^#+ (.+)$", prose(page), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
 
 
 def links(page: Path) -> list[str]:
-    """Those to files and headings of ours."""
+    """Return the links to files and headings of this project."""
     found = re.findall(r"\]\(([^)\s]+)\)|src=\"([^\"]+)\"", prose(page))
     return [a or b for a, b in found if not re.match(r"https?:|mailto:", a or b)]
 
@@ -47,8 +50,8 @@ def leads_somewhere(page: Path, link: str) -> bool:
     return file.exists() and file.is_relative_to(ROOT) and (not anchor or anchor in anchors(file))
 
 
-def test_every_link_leads_somewhere() -> None:
-    """To a file that is there, and to a heading that it has."""
+def test_every_link_has_a_target() -> None:
+    """An existing file, and an existing heading."""
     lost = [
         f"{page}: {link}"
         for page in PAGES
@@ -58,8 +61,78 @@ def test_every_link_leads_somewhere() -> None:
     assert lost == []
 
 
+def members() -> dict[str, set[str]]:
+    """Return, by class in `src`, its attributes and methods, including those of its bases."""
+    own: dict[str, set[str]] = {}
+    bases: dict[str, list[str]] = {}
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ClassDef):
+                names = re.findall(
+                    r"\bself\.(\w+)|^    (?:async )?(?:def )?(\w+)", ast.unparse(node), re.MULTILINE
+                )
+                own.setdefault(node.name, set()).update(a or b for a, b in names)
+                bases.setdefault(node.name, []).extend(map(ast.unparse, node.bases))
+
+    def all_of(name: str) -> set[str]:
+        return own.get(name, set()).union(*(all_of(base) for base in bases.get(name, ())))
+
+    return {name: all_of(name) for name in own}
+
+
+@pytest.mark.parametrize("page", ["ARCHITECTURE.md", "CONTRIBUTING.md"])
+def test_names_in_pages_on_the_code_exist(page: str) -> None:
+    """Files, and methods as ``Class.method``."""
+    spans = re.findall(r"`([^`\n]+)`", prose(ROOT / page))
+    known = members()
+    roots = (ROOT, PACKAGE)
+    lost = [
+        span
+        for span in spans
+        if re.fullmatch(r"[\w/]+(/|\.py)", span)
+        and "/" in span
+        and not any((root / span).exists() for root in roots)
+    ]
+    for span in spans:
+        kind, _, name = span.partition(".")
+        if kind in known and name.isidentifier() and name not in known[kind]:
+            lost.append(span)
+    assert [span for span in lost if span not in ("dist/", "site/")] == []
+
+
+def imports_of(package: str) -> set[str]:
+    """Return the modules and packages of this project that a package imports; `WORDS`
+    count as one.
+    """
+    found: set[str] = set()
+    files = [*(PACKAGE / package).rglob("*.py"), *PACKAGE.glob(f"{package}.py")]
+    for path in files:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(
+                f"{PACKAGE.name}."
+            ):
+                top = (node.module or "").split(".")[1]
+                found.add("the words" if top in WORDS else top)
+    return found - {package}
+
+
+def test_the_table_of_packages_has_their_imports() -> None:
+    """In ARCHITECTURE.md, each row has exactly the imports of its packages."""
+    table = (ROOT / "ARCHITECTURE.md").read_text().partition("| package | contents | imports |")[2]
+    rows = [line.split("|")[1:4:2] for line in table.partition("\n\n")[0].splitlines()[2:]]
+    for packages, imports in rows:
+        names = [name.rstrip("/") for name in re.findall(r"`([\w/]+)`", packages)]
+        if set(names) <= WORDS or names in (["cli"], ["protocol"], ["protocol/net"]):
+            continue
+        found = set.union(*map(imports_of, names)) - set(names)
+        said = set(re.findall(r"`([\w/]+)`", imports)) | (
+            {"the words"} & {imports.split(", ")[-1].strip()}
+        )
+        assert found == said, packages
+
+
 def test_every_configuration_loads(tmp_path: Path) -> None:
-    """A block of YAML with `envs` is a configuration; its backends needn't be installed."""
+    """A block of YAML with `envs` is a configuration; its backends don't have to be installed."""
     text = "\n".join(page.read_text() for page in PAGES)
     for block in re.findall(r"^```yaml\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
         if "envs:" not in block:
@@ -67,13 +140,25 @@ def test_every_configuration_loads(tmp_path: Path) -> None:
         file = tmp_path / "file.yaml"
         file.write_text(block)
         entries = OmegaConf.load(file)["envs"]
-        # An interpreter is somewhere else on each machine.
+        # Paths of interpreters differ between machines.
         here = [f"envs.{k}.interpreter=null" for k, e in enumerate(entries) if "interpreter" in e]
         assert len(load_config(file, here)) == len(entries)
 
 
+def test_the_documented_versions_are_the_installed_ones() -> None:
+    """RLlib has its own Gymnasium, and LeRobot is in none of the environments."""
+    constraints, page = (ROOT / "constraints.txt").read_text(), (DOCS / "migrating.md").read_text()
+    pinned = dict(re.findall(r"^([\w-]+)==(\S+)", constraints, re.MULTILINE))
+    rows = re.findall(r"\]\((\w+)\.md\) \| (\w.*) \|$", page, re.MULTILINE)
+    assert len(rows) == 10
+    for name, tested in rows:
+        for library, version in re.findall(r"(\w+) ([\d.]+)", tested):
+            if (name, library) not in {("rllib", "gymnasium"), ("lerobot", "lerobot")}:
+                assert pinned[library] == version, (name, library)
+
+
 def test_lists_are_lists_on_the_site() -> None:
-    """By Markdown's older rules: after an empty line, and with code indented by four blanks."""
+    """By older rules of Markdown: after an empty line, and with code indented by four spaces."""
     for page in PAGES:
         assert not re.search(r"^ {1,3}```", page.read_text(), re.MULTILINE), named(page)
         before = ""
@@ -84,14 +169,14 @@ def test_lists_are_lists_on_the_site() -> None:
 
 
 def test_each_item_of_a_list_begins_a_line() -> None:
-    """One that follows another within a line is lost on the site."""
+    """The site ignores an item that begins within a line."""
     within = re.compile(r"^(?!\|).*[.;:)`] (-|\d\.)( [A-Z`*].*)?$", re.MULTILINE)
     for page in PAGES:
         assert not within.search(re.sub(r"`[^`]+`", "`", prose(page))), named(page)
 
 
 def test_every_page_has_its_place_in_the_navigation() -> None:
-    """And no place is without a page."""
+    """And every entry has a page."""
     nav = (ROOT / "mkdocs.yml").read_text().partition("\nnav:\n")[2].partition("\n\n")[0]
     listed = set(re.findall(r": ([\w/-]+\.md)$", nav, re.MULTILINE))
     written = {page.relative_to(DOCS).as_posix() for page in DOCS.rglob("*.md")}
@@ -100,7 +185,9 @@ def test_every_page_has_its_place_in_the_navigation() -> None:
 
 
 def public_names() -> dict[str, set[str]]:
-    """By module: what it says is public, read rather than imported, as some need more packages."""
+    """Return the public names by module, parsed rather than imported, because some need more
+    packages.
+    """
     files = {"rlightning_aio": PACKAGE / "__init__.py"}
     files["rlightning_aio.envs.contract"] = PACKAGE / "envs" / "contract.py"
     for path in (*PACKAGE.glob("*.py"), *PACKAGE.glob("*/__init__.py")):
@@ -119,7 +206,7 @@ def public_names() -> dict[str, set[str]]:
 
 
 def examples() -> str:
-    """All code that is shown: in pages and docs, in the examples and the notebook."""
+    """Return all code that is shown: in pages, docstrings, examples and the notebook."""
     shown = [path.read_text() for path in (ROOT / "examples").glob("*.py")]
     for page in PAGES:
         shown += re.findall(r"^```python\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
@@ -129,13 +216,13 @@ def examples() -> str:
 
 
 def test_every_public_name_has_an_example() -> None:
-    """It is used in a program of a page or in an example; all of them run."""
+    """It is used in a program of a page or in an example; all of them are run by tests."""
     words = set(re.findall(r"\w+", examples()))
     assert {name for names in public_names().values() for name in names} - words == set()
 
 
 def test_every_public_name_is_in_the_reference() -> None:
-    """By itself or with its module; the package's errors with those of their own module."""
+    """By itself or with its module; errors of the package with those of their own module."""
     pages = "\n".join(page.read_text() for page in (DOCS / "reference").glob("*.md"))
     described = set(re.findall(r"^::: ([\w.]+)$", pages, re.MULTILINE))
     names = public_names()
@@ -146,8 +233,8 @@ def test_every_public_name_is_in_the_reference() -> None:
         assert module in described or not missing, (module, missing)
 
 
-def test_one_version_is_told() -> None:
-    """By the package, the project, the changelog and the citation."""
+def test_all_files_have_the_same_version() -> None:
+    """The package, the project, the changelog and the citation."""
     (version,) = re.findall(
         r'^version = "(.+)"$', (ROOT / "pyproject.toml").read_text(), re.MULTILINE
     )
@@ -164,7 +251,7 @@ def make_targets() -> set[str]:
     return set(re.findall(r"^([a-z-]+):.*## ", (ROOT / "Makefile").read_text(), re.MULTILINE))
 
 
-def test_workflows_run_what_a_contributor_types() -> None:
+def test_workflows_run_existing_make_targets() -> None:
     """Each `make` in them has a target."""
     workflows = list((ROOT / ".github" / "workflows").glob("*.yml"))
     used = re.findall(r"run: make ([a-z-]+)", "\n".join(file.read_text() for file in workflows))
@@ -173,8 +260,21 @@ def test_workflows_run_what_a_contributor_types() -> None:
 
 
 def test_every_make_target_is_described() -> None:
-    """Those that `make help` lists are in CONTRIBUTING.md."""
+    """Targets in `make help` are in CONTRIBUTING.md."""
     text = (ROOT / "CONTRIBUTING.md").read_text()
     assert {
         target for target in make_targets() - {"help"} if f"`make {target}`" not in text
     } == set()
+
+
+def test_each_page_explains_the_second_value_of_collect_async_where_it_first_ignores_it() -> None:
+    """So does each example."""
+    pages = [*PAGES, *(ROOT / "examples").glob("*.py"), *(ROOT / "examples").glob("*.ipynb")]
+    texts = {
+        named(page): found[0]
+        for page in pages
+        if (found := re.split(r"_ = .*collect_async\(", page.read_text(), maxsplit=1))[1:]
+    }
+    assert len(texts) > 8
+    unexplained = [page for page, text in texts.items() if "second" not in text]
+    assert unexplained == []

@@ -1,7 +1,8 @@
-"""The tree of errors, as it crosses processes."""
+"""Errors are copied and pickled with their contents."""
 
 from __future__ import annotations
 
+import builtins
 import copy
 import inspect
 import pickle
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 KINDS = [kind for name in errors.__all__ if issubclass(kind := getattr(errors, name), Exception)]
 VALUES: dict[str, Any] = {"str": "some text", "int | None": -9}
-"""For parameters, by their annotation."""
+"""Arguments by annotation."""
 COPIES: list[Callable[[Any], Any]] = [
     *(lambda error, p=p: pickle.loads(pickle.dumps(error, p)) for p in range(6)),
     copy.copy,
@@ -26,7 +27,7 @@ COPIES: list[Callable[[Any], Any]] = [
 
 
 def made(kind: Any, message: str = "what went wrong") -> Any:
-    """An error of a kind, each parameter of its constructor given."""
+    """Return an error of a class, with an argument for each parameter."""
     constructor = kind.__init__
     if not inspect.isfunction(constructor):  # Python's own.
         return kind(message)
@@ -35,7 +36,7 @@ def made(kind: Any, message: str = "what went wrong") -> Any:
 
 
 def state(error: BaseException) -> tuple[Any, ...]:
-    """All that can be told of an error but its results."""
+    """Return all contents of an error except its results."""
     attributes = {k: v for k, v in vars(error).items() if k not in ("results", "others")}
     others = [state(other) for other in vars(error).get("others", ())]
     return type(error), str(error), error.args, attributes, others
@@ -57,8 +58,52 @@ def test_every_error_can_be_copied_and_pickled(kind: Any) -> None:
             assert found.results.items() == [("a-0", 7)]
 
 
+def raised(type_name: str) -> errors.EnvRaised:
+    """Return the error for an exception that a worker reports."""
+    return errors.EnvRaised.of(
+        "what went wrong",
+        env_id="a-0",
+        exception_type=type_name,
+        exception_text="some text",
+        traceback_text="the remote traceback",
+    )
+
+
+BUILTINS = [
+    kind for kind in vars(builtins).values()
+    if isinstance(kind, type) and issubclass(kind, BaseException)
+    and kind.__module__ == "builtins"  # MuJoCo adds its own when it is imported.
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("builtin", sorted({*BUILTINS}, key=lambda kind: kind.__name__))
+def test_an_error_of_an_env_can_be_caught_by_its_builtin_class(
+    builtin: type[BaseException],
+) -> None:
+    """With any constructor; except for classes that Python itself handles."""
+    acted_on = BaseExceptionGroup | StopIteration | StopAsyncIteration
+    error = raised(builtin.__name__)
+    if issubclass(builtin, Exception) and not issubclass(builtin, acted_on):
+        assert isinstance(error, builtin)
+    else:
+        assert type(error) is errors.EnvRaised
+    assert str(error) == "what went wrong"
+    for copied in COPIES:
+        found = copied(error)
+        assert state(found) == state(error)
+        assert str(found.__cause__) == str(error.__cause__)
+    text = "".join(traceback.format_exception(error))
+    assert "what went wrong" in text
+    assert "the remote traceback" in text
+
+
+@pytest.mark.parametrize("name", ["no_such", "mine.KeyError", "print", "__name__", ""])
+def test_other_exceptions_only_have_our_class(name: str) -> None:
+    assert type(raised(name)) is errors.EnvRaised
+
+
 class Unpicklable(Exception):
-    """Can't be made from a message alone, and holds what no pickle takes."""
+    """Needs more than a message, and has an attribute that can't be pickled."""
 
     def __init__(self, text: str, *, held: Any) -> None:
         super().__init__(text)
@@ -66,8 +111,8 @@ class Unpicklable(Exception):
 
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind is not errors.RemoteTraceback])
-def test_a_cause_arrives_as_text_at_least(kind: Any) -> None:
-    """Ours as what they are; whatever others there are, with their tracebacks."""
+def test_a_cause_is_transferred_at_least_as_text(kind: Any) -> None:
+    """Our errors as themselves; others as their tracebacks."""
     try:
         try:
             raise Unpicklable("the cause", held=lambda: None)
@@ -76,8 +121,8 @@ def test_a_cause_arrives_as_text_at_least(kind: Any) -> None:
     except errors.RLightningError as error:
         found = pickle.loads(pickle.dumps(error))
     assert isinstance(found.__cause__, errors.RemoteTraceback)
-    told = "".join(traceback.format_exception(found))
-    assert "Unpicklable: the cause" in told
-    assert 'raise Unpicklable("the cause"' in told
+    text = "".join(traceback.format_exception(found))
+    assert "Unpicklable: the cause" in text
+    assert 'raise Unpicklable("the cause"' in text
     found.__cause__ = made(kind, "ours")
     assert type(pickle.loads(pickle.dumps(found)).__cause__) is kind

@@ -1,4 +1,4 @@
-"""`evaluate`: equally many episodes of each env, and honest figures of them."""
+"""`evaluate`: an equal number of episodes of each env, and unbiased statistics."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import rlightning_aio as rl
 from rlightning_aio import sync
+from rlightning_aio.errors import EnvBusy
 from rlightning_aio.evaluation import Episode, Evaluation, evaluate
 from rlightning_aio.evaluation.estimates import mean_estimate, wilson_estimate
 
@@ -22,9 +23,9 @@ SHORT, LONG = 2, 8
 
 
 class Scripted(gym.Env[Any, Any]):
-    """Succeeds soon or fails late, as ``succeeds`` says of the seed of the episode.
+    """Succeeds soon or fails late, as ``succeeds`` says for the seed of the episode.
 
-    Its reward is 1 in each step; with action 1 its process ends.
+    Its reward is 1 in each step; action 1 ends its process.
     """
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
@@ -70,7 +71,7 @@ def evaluated(group: sync.EnvGroup, episodes: int, **kwargs: Any) -> Evaluation:
 
 
 def first_come(group: sync.EnvGroup, total: int) -> list[bool]:
-    """Whether each of the episodes succeeded that end first."""
+    """Return the success of the episodes that end first."""
     found: list[bool] = []
     with group, group.auto_reset(1000):
         batch, _ = group.reset()
@@ -84,8 +85,8 @@ HALF_SUCCEED = [scripted(lambda _: True)] * 2 + [scripted(lambda _: False)] * 2
 
 
 def test_a_fixed_number_of_each_is_unbiased_where_first_come_is_not() -> None:
-    """Half of the envs succeed, in 2 + 1 calls; the others fail in 8 + 1. Of those that end
-    first three in four succeed.
+    """Half of the envs succeed, in 2 + 1 calls; the others fail in 8 + 1. Of the episodes that end
+    first, three in four succeed.
     """
     assert np.mean(first_come(group_of(*HALF_SUCCEED), 24)) == 0.75
     found = evaluated(group_of(*HALF_SUCCEED), 6)
@@ -96,7 +97,7 @@ def test_a_fixed_number_of_each_is_unbiased_where_first_come_is_not() -> None:
 
 
 def test_the_first_episodes_are_unbiased_where_first_come_is_not() -> None:
-    """Of episodes alike in all envs three in ten succeed; of the first three to end all do."""
+    """In all envs, three in ten episodes succeed; the first three to end all succeed."""
     envs = [scripted(lambda seed: seed % 10 < 3)] * 10
     with (group := group_of(*envs)), group.auto_reset(1000):
         batch, _ = group.reset(seed=0)
@@ -112,22 +113,22 @@ def by_number(episodes: Sequence[Episode]) -> list[Episode]:
     return sorted(episodes, key=lambda one: (one.env_id, one.sub_env, one.number))
 
 
-def test_episodes_are_told_of() -> None:
-    """Each with its env and number, what it gave, and what its last info says of it."""
-    told: list[Episode] = []
+def test_episodes_are_listed() -> None:
+    """Each with its env, number, return and length, and values of its last info."""
+    listed: list[Episode] = []
     group = group_of(scripted(lambda seed: seed % 2 == 0, key="is_success"))
-    found = evaluated(group, 2, seed=4, on_episode=told.append)
-    assert found.episodes == told
-    assert told == [
+    found = evaluated(group, 2, seed=4, on_episode=listed.append)
+    assert found.episodes == listed
+    assert listed == [
         Episode("env-0", 0, 0, float(SHORT), SHORT, True),
         Episode("env-0", 0, 1, float(LONG), LONG, False),
     ]
 
 
 @pytest.mark.parametrize("mode", [None, AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-def test_episode_n_has_a_seed_of_its_own(mode: AutoresetMode | None) -> None:
-    """``seed + n * N + k``, with N sub-environments in the group, whoever ends first; where
-    sub-environments reset themselves, that of their first.
+def test_episode_n_has_its_own_seed(mode: AutoresetMode | None) -> None:
+    """``seed + n * N + k``, with N sub-environments in the group, in any order of ends; if
+    sub-environments reset themselves, the seed is that of the first.
     """
     seen: set[int] = set()
 
@@ -152,8 +153,8 @@ def test_episode_n_has_a_seed_of_its_own(mode: AutoresetMode | None) -> None:
     assert set(counts.values()) == {3}
 
 
-def test_an_evaluation_that_goes_on_is_one_that_was_not_interrupted() -> None:
-    """Finished episodes aren't played again, and all come out as if nothing had been."""
+def test_a_resumed_evaluation_equals_an_uninterrupted_one() -> None:
+    """Finished episodes aren't played again."""
     envs = [scripted(lambda seed: seed % 3 == 0)] * 3
     whole = evaluated(group_of(*envs), 4, seed=5)
     kept: list[Episode] = []
@@ -171,8 +172,8 @@ def test_an_evaluation_that_goes_on_is_one_that_was_not_interrupted() -> None:
     assert by_number(rest.episodes) == by_number(whole.episodes)
 
 
-def test_an_episode_that_is_lost_with_its_worker_is_begun_anew() -> None:
-    """With its seed, so the figures are those of an evaluation in which none died."""
+def test_an_episode_that_is_lost_with_its_worker_is_repeated() -> None:
+    """With its seed, so the statistics equal those without a death."""
     calls = 0
 
     def dies_once(batch: rl.BatchedData) -> Any:
@@ -187,16 +188,16 @@ def test_an_episode_that_is_lost_with_its_worker_is_begun_anew() -> None:
     assert [one.length for one in found.episodes] == [SHORT, LONG, SHORT]
 
 
-def test_an_env_whose_worker_always_ends_is_told() -> None:
-    """It would never have its episodes."""
+def test_an_env_whose_worker_always_ends_is_an_error() -> None:
+    """It would never finish its episodes."""
     group = group_of(scripted(lambda _: True), placement="process", max_restarts=10)
     with pytest.raises(rl.RLightningError, match=r"'env-0' has lost .* 3 times in a row"):
         evaluated(group, 1, policy=lambda batch: np.ones(len(batch), np.int64))
 
 
 def test_entries_may_differ() -> None:
-    """In what they show, and in how many sub-environments theirs have; a policy may answer with
-    several batches.
+    """In their observations and their number of sub-environments; a policy may answer with several
+    batches.
     """
     pair = {
         "name": "pair", "placement": "inline",
@@ -212,7 +213,7 @@ def test_entries_may_differ() -> None:
 
 
 async def test_it_is_awaited_over_an_asynchronous_group() -> None:
-    """So may its policy be."""
+    """The policy may be awaitable, too."""
 
     async def policy(batch: rl.BatchedData) -> Any:
         return nothing(batch)
@@ -227,8 +228,18 @@ async def test_it_is_awaited_over_an_asynchronous_group() -> None:
 # -- errors -----------------------------------------------------------------------------
 
 
-def test_it_needs_a_context_and_envs_of_its_own() -> None:
-    """Nothing is sent before that is known."""
+def test_a_group_with_steps_in_flight_is_refused_with_what_to_do() -> None:
+    """A Collector leaves some after a rollout; an evaluation needs another group."""
+    with group_of(scripted(lambda _: True)) as group, group.auto_reset(9):
+        batch, _ = group.reset()
+        group.step_async(batch.respond(action=nothing(batch)))
+        with pytest.raises(EnvBusy, match="second group of the same entries"):
+            evaluate(group, nothing, episodes=1)
+        group.collect_async()
+
+
+def test_it_needs_a_context_and_its_own_envs() -> None:
+    """These are checked before anything is sent."""
     with group_of(scripted(lambda _: True)) as group:
         with pytest.raises(RuntimeError, match=r"evaluate inside `with group.auto_reset\(\):`"):
             evaluate(group, nothing, 1)
@@ -242,7 +253,7 @@ def test_it_needs_a_context_and_envs_of_its_own() -> None:
                 evaluate(group, nothing, 1, played=[other])
 
 
-# -- figures ----------------------------------------------------------------------------
+# -- statistics -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -255,8 +266,8 @@ def test_it_needs_a_context_and_envs_of_its_own() -> None:
     ],
 )
 def test_wilson_interval(successes: int, count: int, low: float, high: float) -> None:
-    """Worked out by hand with z = 1.96: (p + z²/2n ± z √(p(1-p)/n + z²/4n²)) / (1 + z²/n); the
-    last is Newcombe's example (Statistics in Medicine 17, 1998).
+    """Calculated by hand with z = 1.96: (p + z²/2n ± z √(p(1-p)/n + z²/4n²)) / (1 + z²/n); the last
+    case is Newcombe's example (Statistics in Medicine 17, 1998).
     """
     found = wilson_estimate(successes, count)
     assert found is not None
@@ -264,7 +275,9 @@ def test_wilson_interval(successes: int, count: int, low: float, high: float) ->
 
 
 def test_interval_of_a_mean() -> None:
-    """Of 1, 2, 3, 4: 2.5 ± 3.182 · 1.29099 / 2; wider tables have 2.0860 at 20 degrees."""
+    """Of 1, 2, 3, 4: 2.5 ± 3.182 · 1.29099 / 2; larger tables have 2.0860 at 20 degrees
+    of freedom.
+    """
     found = mean_estimate([1.0, 2.0, 3.0, 4.0])
     assert found is not None
     assert (found.mean, found.low, found.high) == pytest.approx((2.5, 0.44603, 4.55397), abs=1e-4)

@@ -1,6 +1,6 @@
-"""What the README promises, executed.
+"""Checks of the README and the page on configuration.
 
-Its commands are in cli/test_documentation.py, its programs in test_examples.py.
+Commands are tested in cli/test_documentation.py, programs in test_examples.py.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ from patience import HANG
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
+CONFIGURATION = (ROOT / "docs" / "configuration.md").read_text()
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+def blocks(language: str, page: str = README) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
 
 
 def commands() -> list[str]:
@@ -28,7 +29,7 @@ def commands() -> list[str]:
 
 @pytest.mark.parametrize("command", [c for c in commands() if c.startswith("make")])
 def test_every_make_target_exists(command: str) -> None:
-    """Make knows what to do for each target that the README names."""
+    """Make has a target for each one in the README."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith("MAKE")}
     done = subprocess.run(
         [*shlex.split(command), "--dry-run"],
@@ -43,11 +44,11 @@ def test_every_make_target_exists(command: str) -> None:
 
 
 def test_the_configuration_block_loads(tmp_path: Path) -> None:
-    """The YAML block is a configuration."""
+    """The YAML block is a valid configuration."""
     from rlightning_aio import load_config
 
     path = tmp_path / "file.yaml"
-    path.write_text(blocks("yaml")[0])
+    path.write_text(blocks("yaml", CONFIGURATION)[0])
     configs = load_config(path, ["envs.0.num_workers=16"])
     assert [config.num_workers for config in configs] == [16, 8]
 
@@ -56,12 +57,17 @@ def test_the_configuration_table_names_every_field() -> None:
     """Each field of `EnvConfig` has its row, and no row names another."""
     from rlightning_aio import EnvConfig
 
-    rows = re.findall(r"^\| ((?:`\w+`(?:, )?)+) \|", README, re.MULTILINE)
+    rows = re.findall(r"^\| ((?:`\w+`(?:, )?)+) \|", CONFIGURATION, re.MULTILINE)
     named = {name for row in rows for name in re.findall(r"`(\w+)`", row)}
     assert named == set(EnvConfig.model_fields)
 
 
+def test_it_is_short() -> None:
+    """A reader sees the whole README before reading on."""
+    assert len(README.splitlines()) <= 160
+
+
 def test_every_linked_file_exists() -> None:
-    """No relative link of the README leads nowhere."""
+    """Every relative link of the README has a target."""
     targets = re.findall(r"\]\((?!http)([^)#]+)\)", README)
     assert [target for target in targets if not (ROOT / target).exists()] == []

@@ -1,9 +1,10 @@
-"""Backends: how a name becomes an env class, and what is imported on the way."""
+"""How a backend's name is resolved to an env class, and which modules that imports."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
+from functools import cache
 from importlib.metadata import EntryPoint, EntryPoints
 from typing import TYPE_CHECKING
 
@@ -13,43 +14,47 @@ from rlightning_aio import registry
 from rlightning_aio.envs.base import BaseEnv
 from rlightning_aio.envs.gymnasium import GymnasiumEnv, MujocoEnv
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.registry import BACKENDS, ENTRY_POINT_GROUP, Backend, Registry
+from rlightning_aio.registry import BACKENDS, ENTRY_POINT_GROUP, ROWS_GROUP, Backend, Registry
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    Announce = Callable[[str, str], None]
+    Announce = Callable[..., None]
 
 
 class OwnEnv(GymnasiumEnv):
-    """Stands for a user's class."""
+    """A user's class."""
+
+
+ROW = Backend("arm", f"{__name__}:OwnEnv", "no_such_sdk", "no-such-sdk", hardware=True)
 
 
 @pytest.fixture
 def announce(monkeypatch: pytest.MonkeyPatch) -> Announce:
-    """Has an installed package announce a backend."""
+    """Return a function that adds an entry point, as an installed package does."""
     announced: list[EntryPoint] = []
 
     def entry_points(*, group: str, **wanted: str) -> EntryPoints:
         return EntryPoints(announced).select(group=group, **wanted)
 
-    def announce(name: str, target: str) -> None:
-        announced.append(EntryPoint(name, target, ENTRY_POINT_GROUP))
+    def announce(name: str, target: str, group: str = ENTRY_POINT_GROUP) -> None:
+        announced.append(EntryPoint(name, target, group))
 
-    monkeypatch.setattr(registry.importlib.metadata, "entry_points", entry_points)
+    monkeypatch.setattr("importlib.metadata.entry_points", entry_points)
+    monkeypatch.setattr(registry, "_plugged_in", cache(registry._plugged_in.__wrapped__))
     return announce
 
 
-def test_a_registered_class_answers_to_its_name() -> None:
-    """The decorator hands the class back unchanged and makes it known."""
+def test_a_registered_class_is_found_by_its_name() -> None:
+    """The decorator returns the class unchanged."""
     envs = Registry()
     assert envs.register("own")(OwnEnv) is OwnEnv
     assert envs.resolve("own") is envs.registered("own") is OwnEnv
     assert envs.knows("own")
 
 
-def test_a_later_registration_wins() -> None:
-    """A notebook cell that is run twice, or a reloaded module, is no error."""
+def test_a_later_registration_replaces_an_earlier_one() -> None:
+    """A notebook cell can be run twice, and a module reloaded."""
 
     class Again(OwnEnv):
         pass
@@ -60,8 +65,8 @@ def test_a_later_registration_wins() -> None:
     assert envs.resolve("own") is Again
 
 
-def test_a_registration_says_whether_envs_may_share_a_worker() -> None:
-    """What it leaves open is as the built-in backend of that name; the last one counts."""
+def test_a_registration_may_declare_an_env_cpu_bound() -> None:
+    """Its default is that of the built-in backend of the same name."""
     envs = Registry()
     assert (envs.is_cpu_bound("mujoco"), envs.is_cpu_bound("piper")) == (True, False)
     assert envs.is_cpu_bound("own") is False
@@ -73,57 +78,69 @@ def test_a_registration_says_whether_envs_may_share_a_worker() -> None:
     assert envs.is_cpu_bound("own") is envs.is_cpu_bound("mujoco") is False
 
 
-def test_the_decorator_wants_a_name() -> None:
+def test_the_decorator_requires_a_name() -> None:
     """Used bare, it would silently replace the class with a function."""
     with pytest.raises(TypeError, match=r"@ENVS\.register\('my_backend'\)"):
         Registry().register(OwnEnv)  # type: ignore[arg-type]
 
 
-def test_built_in_backends_are_there_without_registration() -> None:
-    """Their classes are imported when they are asked for."""
+def test_built_in_backends_need_no_registration() -> None:
+    """Their classes are imported when they are resolved."""
     envs = Registry()
     assert envs.registered("mujoco") is None
     assert envs.resolve("mujoco") is MujocoEnv
     assert envs.resolve("gymnasium") is GymnasiumEnv
 
 
-def test_a_registered_class_goes_before_a_built_in_one() -> None:
-    """A user may replace a backend by their own."""
+def test_a_registered_class_replaces_a_built_in_one() -> None:
+    """So a user can replace a backend."""
     envs = Registry()
     envs.register("mujoco")(OwnEnv)
     assert envs.resolve("mujoco") is OwnEnv
 
 
-def test_installed_packages_announce_backends(announce: Announce) -> None:
-    """An entry point of the group is enough; nothing needs to be imported by hand."""
+def test_an_entry_point_adds_an_env_class(announce: Announce) -> None:
+    """The user need not import the package."""
     announce("theirs", f"{__name__}:OwnEnv")
     envs = Registry()
     assert envs.knows("theirs")
     assert issubclass(envs.resolve("theirs"), BaseEnv)
 
 
-def test_an_announced_backend_can_t_shadow_a_built_in_one(announce: Announce) -> None:
-    """Installing a package must not change what an existing config means."""
+def test_an_entry_point_never_replaces_a_built_in_backend(announce: Announce) -> None:
+    """Installing a package must not change the meaning of a config."""
     announce("mujoco", f"{__name__}:OwnEnv")
     assert Registry().resolve("mujoco") is MujocoEnv
 
 
-def test_naming_backends_imports_none_of_them(announce: Announce) -> None:
-    """A broken package is no trouble until somebody wants its env."""
+def test_a_plug_in_can_describe_its_backend(announce: Announce) -> None:
+    """The trainer then knows that it is hardware before its class is imported."""
+    announce("arm", f"{__name__}:ROW", ROWS_GROUP)
+    envs = Registry()
+    assert envs.described("arm") is not None
+    assert envs.is_hardware("arm")
+    assert not envs.is_cpu_bound("arm")
+    assert envs.names() == sorted({*BACKENDS, "arm"})
+    assert issubclass(envs.resolve("arm"), BaseEnv)
+
+
+def test_naming_a_backend_imports_nothing(announce: Announce) -> None:
+    """A broken package raises an error only when its env is resolved."""
     announce("broken", "no_such_module:Env")
     assert Registry().knows("broken")
     with pytest.raises(ModuleNotFoundError, match="no_such_module"):
         Registry().resolve("broken")
     code = (
-        "import sys, rlightning_aio.registry as r; r.ENVS.names();"
+        "import sys, rlightning_aio.registry as r; r.ENVS.names(); r.ENVS.described('piper');"
         "[b.installed_version() for b in r.BACKENDS.values()];"
-        "sys.exit(bool({'gymnasium', 'mujoco', 'rlightning_aio.envs'} & sys.modules.keys()))"
+        "heavy = {'gymnasium', 'mujoco', 'piper_sdk', 'rlightning_aio.envs'};"
+        "sys.exit(bool(heavy & sys.modules.keys()))"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_an_unknown_backend_is_met_with_the_nearest_name() -> None:
-    """The message lists what there is."""
+def test_an_unknown_backend_raises_with_the_nearest_name() -> None:
+    """The message lists all known names."""
     envs = Registry()
     envs.register("own")(OwnEnv)
     with pytest.raises(ConfigError, match=r"unknown backend 'mujco'; did you mean 'mujoco'\?"):
@@ -133,16 +150,16 @@ def test_an_unknown_backend_is_met_with_the_nearest_name() -> None:
 
 
 @pytest.mark.parametrize("backend", BACKENDS.values(), ids=lambda backend: backend.name)
-def test_every_built_in_backend_can_be_pointed_to(backend: Backend) -> None:
-    """Its row names a class of this package, and the extra that brings its simulator."""
+def test_each_built_in_backend_has_a_class_and_an_install_command(backend: Backend) -> None:
+    """The class belongs to this package."""
     module, _, name = backend.target.partition(":")
     assert module.startswith("rlightning_aio.")
     assert name.isidentifier()
     assert backend.install_command.startswith("pip install ")
 
 
-def test_core_simulators_are_installed_and_a_missing_one_is_none() -> None:
-    """The version shown is the distribution's, and looking never raises."""
+def test_the_version_of_a_missing_simulator_is_none() -> None:
+    """The version of an installed one is that of its distribution."""
     import mujoco
 
     assert BACKENDS["mujoco"].installed_version() == mujoco.__version__

@@ -1,4 +1,4 @@
-"""Simulations over workers: all of them, evenly, and in few batches."""
+"""Division of simulations over workers: evenly, and in few batches."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @given(total=st.integers(1, 3000), workers=st.integers(1, 128))
 def test_no_worker_has_much_more_than_its_share(total: int, workers: int) -> None:
-    """And batches are of one size, with no fewer of them that would do."""
+    """Batches have equal sizes, and their number is minimal."""
     count = num_batches(total, workers)
     assert total % count == 0
     best = -(-total // workers)
@@ -30,13 +30,13 @@ def test_no_worker_has_much_more_than_its_share(total: int, workers: int) -> Non
 @pytest.mark.parametrize(
     ("total", "workers", "count"), [(256, 2, 2), (32, 2, 2), (100, 16, 25), (31, 2, 31), (3, 8, 3)]
 )
-def test_a_batch_for_each_worker_where_that_goes(total: int, workers: int, count: int) -> None:
-    """Else some more; a number that can't be divided leaves each alone."""
+def test_one_batch_for_each_worker_if_possible(total: int, workers: int, count: int) -> None:
+    """Otherwise more; a prime number makes batches of one."""
     assert num_batches(total, workers) == count
 
 
-def test_an_entry_is_laid_over_the_cores_where_it_asks_for_it() -> None:
-    """Simulators that compute many at once by themselves, and this process, have one env."""
+def test_an_entry_is_divided_over_the_cores_on_request() -> None:
+    """Simulators that are parallel themselves, and this process, have one env."""
     entry = {"name": "a", "backend": "mujoco", "task": "Hopper-v5", "num_workers": "auto"}
     total = 8 * num_cores()
 
@@ -53,7 +53,7 @@ def test_an_entry_is_laid_over_the_cores_where_it_asks_for_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("told", "cores"),
+    ("limits", "cores"),
     [
         ({}, 8),
         ({"cpu.max": "max 100000\n"}, 8),
@@ -66,10 +66,10 @@ def test_an_entry_is_laid_over_the_cores_where_it_asks_for_it() -> None:
     ],
 )
 def test_a_container_s_limit_counts_as_cores(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: dict[str, str], cores: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limits: dict[str, str], cores: int
 ) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)))
-    for name, text in told.items():
+    for name, text in limits.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
     assert num_cores(tmp_path) == cores

@@ -1,7 +1,7 @@
-"""What a group returns is what plain `gymnasium.make` returns, to the last bit.
+"""Results of a group equal those of plain `gymnasium.make`, bit for bit.
 
-The bare simulators are stepped once for each task; every placement, number of workers and
-order of arrival is held to the same trajectories, resets and infos included.
+The bare simulators are stepped once for each task. Every placement, number of workers and order of
+arrival is compared with these trajectories, including resets and infos.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SEED = 11
 
 
 class Outcome(NamedTuple):
-    """What one call of an env returns."""
+    """The return values of one call of an env."""
 
     observation: Any
     reward: float
@@ -41,7 +41,7 @@ class Outcome(NamedTuple):
 class Task:
     """A simulator, the limit of its episodes, and the backend that runs it.
 
-    With how many envs of its own a group has at the most, each of which costs a bare one.
+    `num_envs` is the largest number of its envs in a group; each one needs a bare env.
     """
 
     backend: str
@@ -73,7 +73,7 @@ TOGETHER = {"inline": INLINE, "one": ONE, "two": TWO, "four": FOUR}
 CARTPOLE = Task("gymnasium", "CartPole-v1", 25, num_envs=8)
 TREE = Task("gymnasium", "Tree-v0", 40, ("group.sample_envs",))
 HOPPER = Task("mujoco", "Hopper-v5", 20)
-# Each in two placements, with as many envs as these need: bare ones cost as much.
+# Each in two placements, with as few envs as possible, because bare envs take time, too.
 MUJOCO = {
     Task("mujoco", "HalfCheetah-v5", 70): ("inline", "two"),
     HOPPER: ("one", "four"),
@@ -84,8 +84,8 @@ MUJOCO = {
 
 @cache
 def actions_of(task: Task) -> list[list[Any]]:
-    """For each step one action for each env."""
-    assert sample_envs  # Registers what is not Gymnasium's own.
+    """Return one action for each env, for each step."""
+    assert sample_envs  # Registers the tasks that Gymnasium doesn't have.
     env = gym.make(task.name)
     space = batch_space(env.action_space, task.num_envs)
     env.close()
@@ -95,7 +95,7 @@ def actions_of(task: Task) -> list[list[Any]]:
 
 @cache
 def bare(task: Task) -> list[list[Outcome]]:
-    """The trajectory of each env, stepped in a plain loop."""
+    """Return the trajectory of each env, stepped in a plain loop."""
     trajectories: list[list[Outcome]] = []
     for k, actions in enumerate(zip(*actions_of(task), strict=True)):
         env = gym.make(task.name, max_episode_steps=task.limit)
@@ -128,7 +128,7 @@ def same(one: Any, other: Any) -> bool:
 
 
 class Recorder:
-    """Compares each env's results with its bare trajectory, in whatever order they come."""
+    """Compares each env's results with its bare trajectory, in any order of arrival."""
 
     def __init__(self, task: Task, env_ids: list[str]) -> None:
         self.expected = bare(task)
@@ -155,7 +155,7 @@ class Recorder:
             self.calls[env_id] += 1
 
     def answer(self, batch: BatchedData) -> BatchedData:
-        """Responses for the envs of `batch` that have steps to go."""
+        """Return responses for the envs of `batch` that have steps left."""
         ids = [env_id for env_id in batch.ids() if self.calls[env_id] <= NUM_STEPS]
         return BatchedData(ids, [PolicyResponse(id_, self.action(id_)) for id_ in ids])
 
@@ -203,28 +203,28 @@ async def run_async(task: Task, entries: list[dict[str, Any]]) -> None:
 
 
 def all_at_once(task: Task, placements: Iterable[str] = TOGETHER) -> list[dict[str, Any]]:
-    """One group with an entry for each placement: starts are what takes the time."""
+    """Build one group with an entry for each placement, because starts take most of the time."""
     return [task.entry(name, TOGETHER[name]) for name in placements]
 
 
 def test_mujoco_trajectories_stepped_together() -> None:
     """Inline, in one worker, in two and in four, all in one synchronous group.
 
-    Of one task; all of them are below, where results come in any order.
+    For one task; the next test has all of them, with results in any order.
     """
-    run_sync(HOPPER, all_at_once(HOPPER))  # Whose episodes end in both ways.
+    run_sync(HOPPER, all_at_once(HOPPER))  # Its episodes end in both ways.
 
 
 @pytest.mark.parametrize("task", MUJOCO, ids=lambda task: task.name)
 @pytest.mark.asyncio(loop_factories=["uvloop"])
 async def test_mujoco_trajectories_collected_as_they_come(task: Task) -> None:
-    """The same, whatever arrives first; the placements are spread over the tasks."""
+    """The same in the order of arrival; each task runs in some of the placements."""
     await run_async(task, all_at_once(task, MUJOCO[task]))
 
 
 @pytest.mark.parametrize("placement", PLACEMENTS)
 def test_trajectories_stepped_together(placement: str) -> None:
-    """A group of each placement of its own, stepped synchronously."""
+    """A separate group for each placement, stepped synchronously."""
     run_sync(CARTPOLE, [CARTPOLE.entry(placement, PLACEMENTS[placement])])
 
 
@@ -235,18 +235,18 @@ def test_trajectories_of_every_kind_of_space_stepped_together() -> None:
 
 @pytest.mark.parametrize("placement", PLACEMENTS)
 async def test_trajectories_collected_as_they_come(placement: str) -> None:
-    """A group of each placement of its own, on either event loop."""
+    """A separate group for each placement, on either event loop."""
     await run_async(CARTPOLE, [CARTPOLE.entry(placement, PLACEMENTS[placement])])
 
 
 @pytest.mark.asyncio(loop_factories=["asyncio"])
 async def test_trajectories_of_every_kind_of_space_collected_as_they_come() -> None:
-    """All placements in one group; the other loop has MuJoCo's."""
+    """All placements in one group; the other event loop runs the MuJoCo tasks."""
     await run_async(TREE, all_at_once(TREE))
 
 
 def test_the_bare_trajectories_have_resets_and_ends_of_both_kinds() -> None:
-    """What the others are compared with is not trivial."""
+    """So the comparisons are not trivial."""
     for task in (*MUJOCO, CARTPOLE, TREE):
         outcomes = [outcome for trajectory in bare(task) for outcome in trajectory]
         assert len(outcomes) == task.num_envs * (NUM_STEPS + 1)

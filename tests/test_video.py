@@ -1,12 +1,13 @@
-"""Films of episodes: which there are, what is on them, and what becomes of one without an end."""
+"""Films of episodes: their choice, their frames, and films of unfinished episodes."""
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import signal
 import subprocess
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
 import imageio_ffmpeg
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 STEP = 8
-"""How much brighter a frame is than the one before."""
+"""The difference in brightness between successive frames."""
 
 
 class Brighter(gym.Env[Any, Any]):
@@ -54,13 +55,13 @@ class Brighter(gym.Env[Any, Any]):
 
 
 class Odd(Brighter):
-    """Frames of a size that most players don't take."""
+    """Frames of a size that most players don't support."""
 
     size = (31, 47)
 
 
 class Endless(Brighter):
-    """No episode ends by itself."""
+    """Its episodes never end by themselves."""
 
     length = 10**9
 
@@ -71,7 +72,7 @@ def ffmpeg(path: Path, *to: str) -> subprocess.CompletedProcess[bytes]:
 
 
 def brightness(path: Path) -> list[int]:
-    """Of each frame, in steps."""
+    """Return the brightness of each frame, in steps."""
     done = ffmpeg(path, "-vf", "scale=1:1:flags=area", "-pix_fmt", "gray", "-f", "rawvideo", "-")
     assert done.returncode == 0, done.stderr
     return [round(byte / STEP) for byte in done.stdout]
@@ -86,20 +87,20 @@ def entry(make_env: Callable[[], Any], **fields: Any) -> dict[str, Any]:
 
 
 def filmed(make_env: Callable[[], Any], folder: Path, **video: Any) -> dict[str, Any]:
-    """From its first episode on."""
+    """Return the fields of an entry that is filmed from its first episode on."""
     return entry(make_env, video={"folder": str(folder), **video})
 
 
 def play(group: sync.EnvGroup, num_steps: int, action: Any = 0) -> None:
-    """Reset and step all envs, resetting those whose episode is over."""
+    """Reset and step all envs; reset those whose episode has ended."""
     batch, _ = group.reset()
     with group.auto_reset(100):
         for _ in range(num_steps):
             batch, _ = group.step(batch.respond(action=[action] * len(batch)))
 
 
-def test_each_episode_is_a_film_of_all_that_was_seen(tmp_path: Path) -> None:
-    """From the frame of the reset to that of the last step; in worker processes, too."""
+def test_each_episode_is_a_film_of_all_its_frames(tmp_path: Path) -> None:
+    """From the frame of the reset to that of the last step, also in worker processes."""
     config = filmed(Brighter, tmp_path, envs=[0, 2])
     with sync.build_env_group({**config, "num_workers": 3, "placement": "process"}) as group:
         play(group, 7)
@@ -107,8 +108,8 @@ def test_each_episode_is_a_film_of_all_that_was_seen(tmp_path: Path) -> None:
     assert films(tmp_path) == {f"env-{k}-episode-{n}.mp4": whole for k in (0, 2) for n in range(2)}
 
 
-def test_an_episode_without_an_end_is_marked_as_such(tmp_path: Path) -> None:
-    """What there is when the group closes can be played."""
+def test_the_film_of_an_unfinished_episode_is_marked(tmp_path: Path) -> None:
+    """It can be played after the group has closed."""
     with sync.build_env_group(filmed(Brighter, tmp_path)) as group:
         play(group, 5)
     assert films(tmp_path) == {
@@ -118,7 +119,7 @@ def test_an_episode_without_an_end_is_marked_as_such(tmp_path: Path) -> None:
 
 
 def test_a_step_limit_ends_a_film(tmp_path: Path) -> None:
-    """Also one that only the group knows, by the reset that follows."""
+    """Also that of the group, by the reset that follows."""
     with sync.build_env_group(filmed(Endless, tmp_path)) as group:
         batch, _ = group.reset()
         with group.auto_reset(2):
@@ -131,7 +132,7 @@ def test_a_step_limit_ends_a_film(tmp_path: Path) -> None:
     ("chosen", "numbers"), [({"every": 2}, [0, 2]), ({"episodes": [1, 3]}, [1, 3])]
 )
 def test_episodes_are_chosen(tmp_path: Path, chosen: dict[str, Any], numbers: list[int]) -> None:
-    """Every so manyth, or those that are named."""
+    """Every n-th, or those listed."""
     with sync.build_env_group(filmed(Brighter, tmp_path, **chosen)) as group:
         play(group, 4 * 4 - 1)
     assert list(films(tmp_path)) == [f"env-0-episode-{n}.mp4" for n in numbers]
@@ -139,7 +140,7 @@ def test_episodes_are_chosen(tmp_path: Path, chosen: dict[str, Any], numbers: li
 
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
 def test_one_of_several_sub_environments_is_filmed(tmp_path: Path, mode: AutoresetMode) -> None:
-    """Its episodes alone, wherever the next one begins."""
+    """Only its episodes, in each autoreset mode."""
 
     def make() -> Any:
         return SyncVectorEnv([lambda: Brighter(start=100), Brighter], autoreset_mode=mode)
@@ -154,7 +155,7 @@ def test_one_of_several_sub_environments_is_filmed(tmp_path: Path, mode: Autores
     assert seen["env-0-sub-1-episode-0.mp4"] == seen["env-0-sub-1-episode-1.mp4"] == last
 
 
-def test_frames_of_any_size_and_envs_of_ones_own(tmp_path: Path) -> None:
+def test_frames_of_any_size_and_user_defined_envs(tmp_path: Path) -> None:
     """An odd width or height gets a border."""
     with sync.build_env_group(filmed(Odd, tmp_path)) as group:
         play(group, 3)
@@ -164,8 +165,8 @@ def test_frames_of_any_size_and_envs_of_ones_own(tmp_path: Path) -> None:
     assert " 10 fps" in said
 
 
-def test_a_replaced_worker_goes_on_filming(tmp_path: Path) -> None:
-    """The film of the episode that was lost is marked, until the next one takes its number."""
+def test_a_replaced_worker_continues_filming(tmp_path: Path) -> None:
+    """The film of the lost episode is marked, until the next one takes its number."""
     config = filmed(Brighter, tmp_path) | {"placement": "process"}
     with sync.build_env_group(config) as group:
         play(group, 5)
@@ -179,7 +180,7 @@ def test_a_replaced_worker_goes_on_filming(tmp_path: Path) -> None:
     }
 
 
-def test_a_folder_of_films_gets_more(tmp_path: Path) -> None:
+def test_films_are_added_to_a_folder_of_films(tmp_path: Path) -> None:
     """No film is overwritten by another run."""
     for _ in range(2):
         with sync.build_env_group(filmed(Brighter, tmp_path)) as group:
@@ -187,8 +188,8 @@ def test_a_folder_of_films_gets_more(tmp_path: Path) -> None:
     assert list(films(tmp_path)) == ["env-0-episode-0.mp4", "env-0-episode-1.mp4"]
 
 
-def test_a_filmed_env_has_a_worker_of_its_own(tmp_path: Path) -> None:
-    """So no other env waits for its frames, however many share the other workers."""
+def test_a_filmed_env_has_its_own_worker(tmp_path: Path) -> None:
+    """So no other env waits for its frames."""
     config = filmed(Brighter, tmp_path, envs=[2]) | {"num_workers": 6, "placement": "process"}
     with sync.build_env_group(config) as group:
         pids = [group[env_id].get_attr("pid") for env_id in group.env_ids]
@@ -200,7 +201,7 @@ def test_a_filmed_env_has_a_worker_of_its_own(tmp_path: Path) -> None:
 
 
 def two() -> sync.EnvGroup:
-    """They share a worker."""
+    """Yield a group of two envs, which share a worker."""
     config = entry(Brighter, num_workers=2, placement="process", envs_per_process=2)
     return sync.build_env_group(config)
 
@@ -233,7 +234,7 @@ def test_a_running_group_is_filmed_for_a_while(running: sync.EnvGroup, tmp_path:
 
 
 def test_a_film_begins_with_an_episode(running: sync.EnvGroup, tmp_path: Path) -> None:
-    """That which is under way isn't filmed. A later call replaces an earlier one."""
+    """The current episode isn't filmed. A later call replaces an earlier one."""
     batch, _ = running.reset()
     for folder in ("left", "taken"):
         rl.record_video(running, ["env-0"], tmp_path / folder)
@@ -245,7 +246,7 @@ def test_a_film_begins_with_an_episode(running: sync.EnvGroup, tmp_path: Path) -
 
 
 def test_a_death_leaves_films_that_can_be_played(tmp_path: Path) -> None:
-    """Of all that was seen before; the replacement isn't filmed."""
+    """With all earlier frames; the replacement isn't filmed."""
     with two() as group:
         rl.record_video(group, group.env_ids, tmp_path)
         play(group, 2)
@@ -258,7 +259,7 @@ def test_a_death_leaves_films_that_can_be_played(tmp_path: Path) -> None:
 
 
 async def test_an_asynchronous_group_is_filmed(tmp_path: Path) -> None:
-    """With `await`. Here a sub-environment, of an env that gives its state away."""
+    """With `await`. Here, one sub-environment of an env is filmed."""
     both = {"on_worker_death": "resume", "snapshot_every": 2, "placement": "process"}
     config = entry(lambda: SyncVectorEnv([Odd, Brighter]), **both)
     async with rl.build_env_group(config) as group:
@@ -271,8 +272,8 @@ async def test_an_asynchronous_group_is_filmed(tmp_path: Path) -> None:
     assert films(tmp_path) == {"env-0-sub-1-episode-1.mp4": [0, 1, 2, 3]}
 
 
-def test_what_cannot_be_filmed_is_told_and_leaves_nobody_filmed(tmp_path: Path) -> None:
-    """By the env or the field, with what to do."""
+def test_if_an_env_cannot_be_filmed_no_env_is_filmed(tmp_path: Path) -> None:
+    """The error names the env or the field, and what to do."""
     makers = (Brighter, lambda: Brighter(None))
     with sync.build_env_group({**entry(Brighter, num_workers=2), "make_env": makers}) as group:
         with pytest.raises(rl.EnvRaised, match="'env-1' can't be filmed: its render_mode is None"):
@@ -293,7 +294,7 @@ def test_what_cannot_be_filmed_is_told_and_leaves_nobody_filmed(tmp_path: Path) 
 # -- errors -----------------------------------------------------------------------------
 
 
-def test_a_folder_that_cannot_be_written_is_told_before_anything_starts(tmp_path: Path) -> None:
+def test_an_unwritable_folder_raises_before_anything_starts(tmp_path: Path) -> None:
     """By the entry and the field."""
     (tmp_path / "file").touch()
     config = filmed(Brighter, tmp_path / "file" / "films")
@@ -301,7 +302,7 @@ def test_a_folder_that_cannot_be_written_is_told_before_anything_starts(tmp_path
         sync.build_env_group(config)
 
 
-def test_a_missing_package_is_told_before_anything_starts(
+def test_a_missing_package_raises_before_anything_starts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With the command that installs it."""
@@ -313,22 +314,22 @@ def test_a_missing_package_is_told_before_anything_starts(
 @pytest.mark.parametrize(
     ("video", "words"),
     [
-        ({"envs": [2]}, "no env 2 among num_workers: 1"),
-        ({"sub_env": 4}, "no sub-environment 4 of num_envs: 3"),
+        ({"envs": [2]}, "there is no env 2; num_workers: 1"),
+        ({"sub_env": 4}, "no sub-environment 4; num_envs: 3"),
         ({}, "render_mode: rgb_array"),
         ({"folder": ""}, "video.folder: String should have at least 1 character"),
         ({"every": 0}, "video.every: should be greater than or equal to 1"),
     ],
 )
-def test_a_config_that_cannot_be_filmed_is_refused(video: dict[str, Any], words: str) -> None:
+def test_a_config_that_cannot_be_filmed_raises(video: dict[str, Any], words: str) -> None:
     """By the field, when it is read."""
     fields = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1", "num_envs": 3}
     with pytest.raises(rl.ConfigError, match=words):
         sync.build_env_group({**fields, "video": {"folder": "films", **video}})
 
 
-def test_an_env_that_renders_nothing_is_told_at_its_start(tmp_path: Path) -> None:
-    """It can't be known before, as its maker is the user's."""
+def test_an_env_that_renders_nothing_raises_at_its_start(tmp_path: Path) -> None:
+    """It can't be known earlier, because a callable of the user makes the env."""
     config = filmed(lambda: Brighter(None), tmp_path)
     with pytest.raises(
         rl.StartFailed, match="env 'env-0' can't be filmed: its render_mode is None"
@@ -336,12 +337,37 @@ def test_an_env_that_renders_nothing_is_told_at_its_start(tmp_path: Path) -> Non
         sync.build_env_group(config).init()
 
 
-def test_a_film_that_cannot_be_written_ends_no_training(
+def test_training_continues_if_a_film_cannot_be_written(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Here its folder goes away meanwhile; it is said once."""
+    """Here its folder is removed; there is one warning."""
     folder = tmp_path / "films"
     with sync.build_env_group(filmed(Brighter, folder)) as group:
         folder.rmdir()
         play(group, 9)
     assert capfd.readouterr().err.count("env 'env-0' is no longer filmed") == 1
+
+
+class Blind(gym.vector.VectorEnv[Any, Any, Any]):
+    """Renders nothing, like that of ale-py."""
+
+    metadata: ClassVar[Any] = {"autoreset_mode": AutoresetMode.NEXT_STEP}
+    num_envs = 2
+    single_observation_space = single_action_space = gym.spaces.Discrete(2)
+    observation_space = action_space = gym.spaces.MultiDiscrete([2, 2])
+
+    def reset(self, **_: Any) -> Any:
+        return np.zeros(2, int), {}
+
+
+def test_vector_envs_that_render_nothing_raise(tmp_path: Path) -> None:
+    """Those of Atari before anything starts."""
+    atari = {"name": "env", "backend": "ale", "task": "ALE/Pong-v5", "num_envs": 2}
+    if importlib.util.find_spec("ale_py"):
+        with pytest.raises(rl.ConfigError, match=r"entry 'env', video: .*num_envs: 2.*nothing"):
+            sync.build_env_group({**atari, "video": {"folder": str(tmp_path)}})
+    with (
+        sync.build_env_group({"name": "env", "make_env": Blind, "placement": "inline"}) as group,
+        pytest.raises(rl.EnvRaised, match="'env-0' can't be filmed: a Blind renders nothing"),
+    ):
+        rl.record_video(group, ["env-0"], tmp_path)

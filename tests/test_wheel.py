@@ -1,4 +1,4 @@
-"""What people install is the wheel or the sdist: each works with nothing else."""
+"""The wheel and the sdist, which people install, work without the source tree."""
 
 from __future__ import annotations
 
@@ -61,21 +61,21 @@ PIP = ("-m", "pip", "--quiet", "--disable-pip-version-check")
 
 
 def found_python(version: str) -> Path | None:
-    """On the path, or among pyenv's."""
+    """Return the path of an interpreter: on PATH, or one of pyenv's."""
     pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
     on_path = shutil.which(f"python{version}")
     candidates = [Path(on_path)] if on_path else []
     for python in [*candidates, *sorted(pyenv.glob(f"{version}.*/bin/python"))]:
-        # What pyenv puts on the path may stand for a version that isn't chosen.
-        told = subprocess.run([python, "--version"], capture_output=True, text=True, check=False)
-        if told.returncode == 0 and told.stdout.startswith(f"Python {version}."):
+        # A shim of pyenv may be for a version that is not selected.
+        shown = subprocess.run([python, "--version"], capture_output=True, text=True, check=False)
+        if shown.returncode == 0 and shown.stdout.startswith(f"Python {version}."):
             return python
     return None
 
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """The sdist, and the wheel that is built from it, as they would be published."""
+    """Build the sdist, and the wheel from it, as for publication."""
     folder = tmp_path_factory.mktemp("dist")
     run(sys.executable, "-m", "build", "--outdir", folder, ROOT, folder=folder)
     (sdist,), (wheel,) = folder.glob("*.tar.gz"), folder.glob("*.whl")
@@ -84,9 +84,9 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.mark.pythons
 @pytest.mark.timeout(1200)  # Pip fetches some 300 MB for each.
-@pytest.mark.parametrize("version", ["3.11", "3.12", "3.13"])
+@pytest.mark.parametrize("version", ["3.11", "3.12", "3.13", "3.14"])
 def test_both_work_under_each_python(version: str, built: dict[str, Path], tmp_path: Path) -> None:
-    """In an environment in which nothing else was installed; so does the command."""
+    """In an environment with nothing else installed; so does the command."""
     base = found_python(version)
     if base is None:
         pytest.skip(f"no Python {version} here")
@@ -109,7 +109,7 @@ def test_both_work_under_each_python(version: str, built: dict[str, Path], tmp_p
 
 @pytest.mark.simulators
 def test_it_works_in_an_empty_environment(tmp_path: Path) -> None:
-    """Installed with what it asks for; Stable-Baselines3 is lent, as it is large."""
+    """Installed with its dependencies; Stable-Baselines3 is shared, because it is large."""
     run(sys.executable, *PIP, "wheel", "--no-deps", "--wheel-dir", ".", ROOT, folder=tmp_path)
     run(sys.executable, "-m", "venv", "empty", folder=tmp_path)
     python = tmp_path / "empty" / "bin" / "python"

@@ -1,4 +1,4 @@
-"""A timeline as tests read it, and what holds of each, whatever was recorded."""
+"""Reads timelines for tests, and checks what must hold for each of them."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ if TYPE_CHECKING:
 
 SENDING = {"step", "step_async", "reset", "reset_async", "restore"}
 TRAINER = 1
-"""Its process in the file."""
+"""The trainer's process in the file."""
 
 
 @dataclass
 class Slice:
-    """Times in whole nanoseconds."""
+    """A slice with its times in whole nanoseconds."""
 
     name: str
     process: str
@@ -35,10 +35,10 @@ def _ns(us: float) -> int:
 
 
 class Seen:
-    """The timeline in a file: by Chrome's trace event format, checked as it is read.
+    """The timeline in a file in Chrome's trace event format, checked while it is read.
 
     Slices of a track nest; every track has a name; each flow leads from a call that sends through
-    the slice of an env into a hand-out, in that order; and each request has one result.
+    the slice of an env to the call that hands out its result; and each request has one result.
     """
 
     def __init__(self, path: Path) -> None:
@@ -79,7 +79,7 @@ class Seen:
         return Slice(event["name"], *place, began, ended, event.get("args", {}))
 
     def of(self, track: str) -> list[Slice]:
-        """The slices of the track of that name."""
+        """Return the slices of the track with that name."""
         return [one for one in self.slices if one.track == track]
 
     def called(self, name: str) -> list[Slice]:

@@ -1,15 +1,17 @@
-"""Every error the runtime raises, in one tree.
+"""The errors of this package.
 
-Rule: a message says which env it is about, what was being done, and what to do
-next; the class says whose fault it is. Errors that carry results hold what did
-succeed, so that nothing is lost by an exception.
-Absent on purpose: exceptions that rebuild a user's own exception type.
+Rule: a message names the env, the operation, and what to do next; the class says which side is at
+fault. An error of a batch carries the results of the other envs, so an exception loses nothing.
+Absent on purpose: rebuilding a user's own exception type. Only builtin exception classes are kept,
+as a base of the error's class.
 """
 
 from __future__ import annotations
 
+import builtins
+import functools
 import traceback
-from typing import Any
+from typing import Any, Final, cast
 
 __all__ = [
     "ActionRefused",
@@ -34,23 +36,23 @@ __all__ = [
 
 
 class RLightningError(Exception):
-    """Base of every error raised by this package.
+    """Base of all errors of this package.
 
-    All of them can be pickled and copied, as a process pool does, with their attributes; a cause
-    that is not an error of this package arrives as its text (`RemoteTraceback`).
+    They can be pickled and copied, with their attributes; a cause that is not an error of this
+    package is converted to its text (`RemoteTraceback`).
     """
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _made_again, (type(self), self.args), {**self.__dict__, "__cause__": _portable(self)}
+        return _unpickled, (type(self), self.args), {**self.__dict__, "__cause__": _portable(self)}
 
 
-def _made_again(kind: type[RLightningError], args: tuple[Any, ...]) -> RLightningError:
-    """An error whose attributes are still to be set: its constructor may ask for more."""
+def _unpickled(kind: type[RLightningError], args: tuple[Any, ...]) -> RLightningError:
+    """Make an error without its constructor, which may need more arguments."""
     return kind.__new__(kind, *args)
 
 
 def _portable(error: BaseException) -> BaseException | None:
-    """The cause of `error`, in a form that any process can read."""
+    """Convert the cause of `error` to a form that any process can unpickle."""
     cause = error.__cause__
     if cause is None or isinstance(cause, RLightningError | RemoteTraceback):
         return cause
@@ -62,7 +64,7 @@ class ConfigError(RLightningError, ValueError):
 
 
 class BadAction(RLightningError, ValueError):
-    """A response doesn't fit its env: its action's shape, dtype, count or numbers, or its id.
+    """A response doesn't fit its env: shape, dtype, count or numbers of the action, or the env id.
 
     Nothing was sent.
     """
@@ -81,11 +83,11 @@ class EnvBusy(RLightningError, RuntimeError):
 
 
 class NothingPending(RLightningError, RuntimeError):
-    """A collect would never end: no request is outstanding."""
+    """A collect would never return, because no request is outstanding."""
 
 
 class ReplayDiverged(RLightningError, RuntimeError):
-    """A replay can't follow the recorded order of results; the message says where it left it."""
+    """A replay can't follow the recorded order of results; the message names the first call."""
 
 
 class GroupClosed(RLightningError, RuntimeError):
@@ -93,17 +95,16 @@ class GroupClosed(RLightningError, RuntimeError):
 
 
 class SnapshotError(RLightningError, ValueError):
-    """A snapshot can't be restored: it is damaged, or of other envs; nothing was changed.
+    """A snapshot can't be restored, because it is damaged or of other envs; nothing was changed.
 
-    Or it can't be taken: the envs are robots or clients, or were never reset.
+    Or it can't be taken, because envs are robots or clients, or were never reset.
     """
 
 
 class RemoteTraceback(Exception):
-    """The traceback text of an exception that was raised where the env lives.
+    """The traceback of an exception in another process, as text.
 
-    It is the ``__cause__`` of `EnvRaised`, so that Python prints it above
-    the local traceback.
+    It is the ``__cause__`` of `EnvRaised`, so Python prints it above the local traceback.
     """
 
     def __init__(self, text: str) -> None:
@@ -119,23 +120,29 @@ class EnvFault(RLightningError):
 
     Attributes:
         env_id: the env at fault.
-        results: for `step` and `reset`, a `BatchedData` of the other envs of the same
-            call, which succeeded; None where the call had no other envs.
+        results: of `step` and `reset`: a `BatchedData` of the envs of the same call that succeeded;
+            None if there are none.
         others: further faults of the same call.
     """
 
     def __init__(self, message: str, *, env_id: str) -> None:
-        super().__init__(message)
+        # Not `super()`: a builtin exception among the bases may need more than a message.
+        BaseException.__init__(self, message)
         self.env_id = env_id
         self.results: Any = None
         self.others: tuple[EnvFault, ...] = ()
 
 
 class EnvRaised(EnvFault):
-    """The env's own code raised; the remote traceback is the cause. The env stays usable.
+    """The code of the env raised; the remote traceback is the cause. The env stays usable.
+
+    If the exception has a builtin class, such as `KeyError`, the error is also an instance of that
+    class, so ``except KeyError`` catches it. Attributes of the builtin class, such as `errno`, are
+    not transferred. Excluded are classes that are not an `Exception`, exception groups, and
+    `StopIteration` and `StopAsyncIteration`, which Python replaces in generators.
 
     Attributes:
-        exception_type: qualified name of the remote exception's class.
+        exception_type: qualified name of the class of the remote exception.
         exception_text: ``str()`` of the remote exception.
         traceback_text: the remote traceback as text.
     """
@@ -154,22 +161,66 @@ class EnvRaised(EnvFault):
         self.exception_text = exception_text
         self.traceback_text = traceback_text
         self.__cause__ = RemoteTraceback(traceback_text)
+        if isinstance(self, SyntaxError):
+            self.msg = message  # Tracebacks print this, not `str`.
+
+    def __str__(self) -> str:
+        # Some builtin exceptions print something else.
+        return str(self.args[0]) if self.args else ""
+
+    @classmethod
+    def of(cls, message: str, *, exception_type: str, **fields: str) -> EnvRaised:
+        """Make the error for an exception of a type; `fields` are those of the constructor."""
+        return _kind_of(exception_type)(message, exception_type=exception_type, **fields)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        if type(self) is not _kind_of(self.exception_type):
+            return super().__reduce__()
+        # Pickle can't find classes made by `_kind_of`, so choose the class again.
+        _, (_, args), state = super().__reduce__()
+        return _unpickled_of, (*args, self.exception_type), state
 
 
 class ActionRefused(EnvRaised, BadAction):
-    """The env itself raised `BadAction`, as a robot does for an action beyond its limits.
+    """The env itself raised `BadAction`, as robots do for an action beyond their limits.
 
-    Unlike other bad actions, it comes after the batch was sent: the other envs have stepped.
+    Unlike for other bad actions, the batch was sent, and the other envs have stepped.
     """
 
 
+_WITHOUT_KIND: Final = (BaseExceptionGroup, StopIteration, StopAsyncIteration)
+
+
+def _kind_of(exception_type: str) -> type[EnvRaised]:
+    """Class of the `EnvRaised` for a remote exception."""
+    if exception_type == f"{BadAction.__module__}.{BadAction.__qualname__}":
+        return ActionRefused
+    builtin = vars(builtins).get(exception_type)
+    if not isinstance(builtin, type) or not issubclass(builtin, Exception):
+        return EnvRaised
+    return EnvRaised if issubclass(builtin, _WITHOUT_KIND) else _kind_with(builtin)
+
+
+@functools.cache
+def _kind_with(builtin: type[Exception]) -> type[EnvRaised]:
+    name = builtin.__name__
+    own = {"__doc__": f"`EnvRaised` for {name}.", "__module__": __name__}
+    return cast("type[EnvRaised]", type(f"EnvRaised{name}", (EnvRaised, builtin), own))
+
+
+def _unpickled_of(message: str, exception_type: str) -> EnvRaised:
+    """Make an error with empty attributes, which pickle sets."""
+    rest = dict.fromkeys(("env_id", "exception_text", "traceback_text"), "")
+    return EnvRaised.of(message, exception_type=exception_type, **rest)
+
+
 class WorkerDied(EnvFault):
-    """The process of an env ended without being asked to.
+    """The process of an env ended unexpectedly.
 
     Attributes:
-        exit_code: the process's exit code; negative for a signal; None if unknown.
+        exit_code: of the process; negative for a signal; None if unknown.
         stderr_tail: the last lines it wrote to stderr.
-        env_ids: the envs whose outstanding request this error answers.
+        env_ids: the envs whose outstanding requests this error answers.
     """
 
     def __init__(
@@ -182,9 +233,9 @@ class WorkerDied(EnvFault):
 
 
 class EnvHung(WorkerDied):
-    """An env took longer than its timeout; its worker was dumped, then killed.
+    """An env exceeded its timeout, and its worker was killed.
 
-    ``stderr_tail`` ends with the stack dump of the worker's threads.
+    ``stderr_tail`` ends with the stacks of the worker's threads.
     """
 
 
@@ -193,8 +244,8 @@ class EnvAway(EnvFault):
 
 
 class StartFailed(EnvFault):
-    """An env could not be built; ``init`` has stopped everything it had started."""
+    """An env could not be built; ``init`` has stopped all workers."""
 
 
 class ClientRefused(RLightningError, ConnectionError):
-    """An env_server will not let this env client in, now or later; the message has its reason."""
+    """An env_server refuses this env client permanently; the message has the reason."""

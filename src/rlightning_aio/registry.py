@@ -1,25 +1,25 @@
-"""Which backends exist, and how a name becomes an env class.
+"""Backends and placements by name.
 
-Rule: naming a backend imports nothing; the class is imported where it is built,
-which is in a worker. Three sources, the first that knows the name wins: classes
-registered in this process, built-in backends, entry points of the group
-``rlightning_aio.envs``.
+Rule: naming a backend imports nothing; its class is imported where the env is built, which is in a
+worker. A name is looked up among the classes registered in this process, then among built-in
+backends, then among plug-ins: entry points of the group ``rlightning_aio.backends`` (`Backend`
+rows, which may be read in the trainer) and of ``rlightning_aio.envs`` (env classes).
 """
 
 from __future__ import annotations
 
 import difflib
 import importlib
-import importlib.metadata
 import importlib.util
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeVar
+from functools import cache
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from rlightning_aio.errors import ConfigError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
+    from collections.abc import Callable, Iterable, Mapping
+    from importlib.metadata import EntryPoints
 
 __all__ = [
     "BACKENDS",
@@ -28,34 +28,36 @@ __all__ = [
     "Backend",
     "Placement",
     "Registry",
+    "did_you_mean",
     "load",
     "placement_of",
 ]
 
 ENTRY_POINT_GROUP = "rlightning_aio.envs"
+ROWS_GROUP = "rlightning_aio.backends"
 
 EnvClass = TypeVar("EnvClass", bound="type[Any]")
 
 
 @dataclass(frozen=True, slots=True)
 class Backend:
-    """A built-in backend.
+    """The description of a backend.
 
     Attributes:
-        name: what a config entry's ``backend`` says.
+        name: the value of ``backend`` in a config entry.
         target: ``module:Class`` of the env class.
         module: the simulator's top module; it is looked for, never imported.
         distribution: the package whose version is shown.
-        extra: the extra of this package that brings it; empty for core dependencies.
-        cpu_bound: one core's worth of plain computing for each step, so that several
-            envs may share a worker (``envs_per_process: auto``).
-        vectorized: whether ``num_envs`` above 1 is supported.
-        hardware: it moves something real, and nothing but an explicit reset may set that in
-            motion after a worker's death: ``on_worker_death`` is ``raise`` by default, and a
-            replacement is not reset by itself. Its envs refuse steps until then.
-        own_command: installs the simulator, where no extra of this package does.
-        preload: modules that are safe to import before workers are forked and slow to
-            import after: no threads, no devices.
+        extra: the extra of this package that installs it; empty for core dependencies.
+        cpu_bound: a step is plain computation on one core, so several envs may share a worker
+            (``envs_per_process: auto``).
+        vectorized: ``num_envs`` above 1 is supported.
+        hardware: it moves something real. After a worker's death only an explicit reset may set
+            that in motion: ``on_worker_death`` is ``raise`` by default, a replacement is not reset
+            by itself, and its envs refuse steps until then.
+        own_command: the command that installs the simulator, where no extra does.
+        preload: modules that are slow to import and safe to import before workers are forked:
+            they start no thread and open no device.
     """
 
     name: str
@@ -71,27 +73,29 @@ class Backend:
 
     @property
     def install_command(self) -> str:
-        """The one command that installs the simulator."""
+        """Return the one command that installs the simulator."""
         package = f"'rlightning-aio[{self.extra}]'" if self.extra else "rlightning-aio"
         return self.own_command or f"pip install {package}"
 
     def installed_version(self) -> str | None:
-        """Version of the simulator in this interpreter, or None if it isn't installed."""
+        """Return the simulator's version in this interpreter, or None if it isn't installed."""
+        # Imported here, because it takes as long as a tenth of a worker's other imports.
+        from importlib.metadata import PackageNotFoundError, version  # noqa: PLC0415
+
         if importlib.util.find_spec(self.module) is None:
             return None
         try:
-            return importlib.metadata.version(self.distribution)
-        except importlib.metadata.PackageNotFoundError:
+            return version(self.distribution)
+        except PackageNotFoundError:
             return "unknown"
 
 
-# In an environment of its own; docs/backends.md says why it is two steps.
+# For an environment of its own; docs/backends.md says why it takes two steps.
 ISAAC_LAB = (
     "pip install 'rlightning-aio[isaac]' && "
     "pip install --ignore-requires-python --no-deps isaaclab==3.0.0"
 )
 
-# One row for one backend.
 # fmt: off
 BACKENDS: dict[str, Backend] = {
     backend.name: backend
@@ -121,8 +125,14 @@ BACKENDS: dict[str, Backend] = {
                 "isaaclab", "isaaclab", extra="isaac", vectorized=True, own_command=ISAAC_LAB),
         Backend("isaac_marl", "rlightning_aio.envs.isaac:IsaacMarlEnv",
                 "isaaclab", "isaaclab", extra="isaac", vectorized=True, own_command=ISAAC_LAB),
-        Backend("piper", "rlightning_aio.envs.piper:PiperEnv", "piper_sdk", "piper-sdk",
-                extra="piper", hardware=True),
+        Backend("metaworld", "rlightning_aio.envs.metaworld:MetaworldEnv", "metaworld", "metaworld",
+                extra="metaworld", cpu_bound=True, preload=("rlightning_aio.envs.metaworld",)),
+        Backend("pusht", "rlightning_aio.envs.lerobot_tasks:PushTEnv", "gym_pusht", "gym-pusht",
+                extra="pusht", cpu_bound=True, preload=("rlightning_aio.envs.lerobot_tasks",)),
+        Backend("aloha", "rlightning_aio.envs.lerobot_tasks:AlohaEnv", "gym_aloha", "gym-aloha",
+                extra="aloha", cpu_bound=True, preload=("rlightning_aio.envs.lerobot_tasks",)),
+        Backend("openenv", "rlightning_aio.envs.openenv:OpenEnv", "websockets", "websockets",
+                extra="openenv"),
     )
 }
 # fmt: on
@@ -130,18 +140,20 @@ BACKENDS: dict[str, Backend] = {
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """Where the envs of an entry may live.
+    """A place where the envs of an entry may live.
 
     Attributes:
         target: ``module:Class`` of the host.
-        spreads: an entry's envs may be spread over several hosts, to which functions travel
-            by pickle.
-        refuses: fields of an entry that mean nothing there, and why: whoever sets one counts on
-            something that would not happen. (`num_cpus` is no promise of ours anywhere but
-            with Ray, nor `num_gpus` in this process, and both are found in configs for any place.)
+        spreads: an entry's envs may be spread over several hosts; functions then travel by pickle.
+        refuses: fields of an entry that have no effect there, with the reason. (`num_cpus` and
+            `num_gpus` are refused nowhere, because configs for any place contain them.)
         local: its workers use this machine's cores and see this process's modules.
         own_share: this process takes the last share of the envs, as if it were a worker.
+        awaits: if awaitable envs (`async def` reset and step) can live there, or only such.
         extra: the extra of this package that it needs; empty for none.
+        max_members: the most envs of an entry that join and leave while the group runs; 0 where
+            the envs are built with the group.
+        check: ``module:function`` that raises `ConfigError` for an entry that can't be there.
     """
 
     target: str
@@ -149,21 +161,40 @@ class Placement:
     refuses: Mapping[str, str] = field(default_factory=dict[str, str])
     local: bool = True
     own_share: bool = False
+    awaits: Literal["never", "also", "only"] = "never"
     extra: str = ""
+    max_members: int = 0
+    check: str = ""
 
 
 _THIS_PROCESS = "the envs live in this process, which is already running"
 _NO_WORKER = "there is no worker that could die or be replaced"
 _NO_LIMIT = "nothing can end what an env does in this process"
 _OWN_SHARE = "this process, which is already running, has a share of the envs"
-_CLIENTS_OWN = "its envs live with its clients, which start them as they like"
-_NOT_RAYS = "it is for Ray actors (placement: ray)"
+_CLIENTS_OWN = "its clients start the envs, on machines of their own"
+_NOT_RAYS = "it applies to Ray actors (placement: ray)"
+_NOT_ON_LOOP = "it limits the envs on the trainer's event loop (placement: loop)"
 
 PLACEMENTS: dict[str, Placement] = {
     "process": Placement(
         "rlightning_aio.hosts.process:ProcessHost",
         spreads=True,
-        refuses={"ray_options": _NOT_RAYS},
+        refuses={"ray_options": _NOT_RAYS, "max_concurrency": _NOT_ON_LOOP},
+        awaits="also",
+    ),
+    "loop": Placement(
+        "rlightning_aio.hosts.loop:LoopHost",
+        spreads=False,
+        refuses={
+            "snapshot_every": "an env whose step takes too long is rebuilt and reset; "
+            "group.snapshot() keeps the state of idle envs",
+            "envs_per_process": "all of the entry's envs live in this process",
+            "interpreter": _THIS_PROCESS,
+            "env_vars": _THIS_PROCESS,
+            "cpu_affinity": _THIS_PROCESS,
+            "ray_options": _NOT_RAYS,
+        },
+        awaits="only",
     ),
     "inline": Placement(
         "rlightning_aio.hosts.inline:InlineHost",
@@ -180,6 +211,7 @@ PLACEMENTS: dict[str, Placement] = {
             "env_vars": _THIS_PROCESS,
             "cpu_affinity": _THIS_PROCESS,
             "ray_options": _NOT_RAYS,
+            "max_concurrency": _NOT_ON_LOOP,
         },
     ),
     "split": Placement(
@@ -192,6 +224,7 @@ PLACEMENTS: dict[str, Placement] = {
             "interpreter": _OWN_SHARE,
             "env_vars": _OWN_SHARE,
             "ray_options": _NOT_RAYS,
+            "max_concurrency": _NOT_ON_LOOP,
         },
         own_share=True,
     ),
@@ -202,6 +235,7 @@ PLACEMENTS: dict[str, Placement] = {
             "interpreter": "Ray starts the actors; ray_options.runtime_env may name another "
             "Python or other packages",
             "cpu_affinity": "Ray assigns the cores of its nodes",
+            "max_concurrency": _NOT_ON_LOOP,
         },
         local=False,
         extra="ray",
@@ -212,23 +246,26 @@ _PLACED_BY_BACKEND: dict[str, Placement] = {
     "env_server": Placement(
         BACKENDS["env_server"].target,
         spreads=False,
+        max_members=1024,  # Twice the limit on clients that are connected at a time.
+        check="rlightning_aio.hosts.server_settings:server_settings",
         refuses={
-            "num_workers": "an env_server is one, and its clients are as many as connect; "
-            "env_kwargs.min_clients says for how many a reset waits",
-            "num_envs": "each client says itself how many its env has; "
-            "env_kwargs.min_clients says for how many clients a reset waits",
+            "num_workers": "an env_server is one env with as many clients as connect; "
+            "env_kwargs.min_clients is the number for which a reset waits",
+            "num_envs": "each client announces how many its env has; "
+            "env_kwargs.min_clients is the number of clients for which a reset waits",
             "placement": _CLIENTS_OWN,
             "envs_per_process": _CLIENTS_OWN,
             "interpreter": _CLIENTS_OWN,
             "env_vars": _CLIENTS_OWN,
             "cpu_affinity": _CLIENTS_OWN,
             "ray_options": _CLIENTS_OWN,
-            "start_timeout": "its envs come when they like; env_kwargs.connect_timeout says how "
+            "max_concurrency": _CLIENTS_OWN,
+            "start_timeout": "clients connect at any time; env_kwargs.connect_timeout limits how "
             "long a reset waits for them",
-            "on_worker_death": "it has no workers; what a client owes that is gone is answered by "
-            "a truncated result, and it may come back",
-            "max_restarts": "it has no workers; a client that is gone may come back",
-            "snapshot_every": "it has no workers; a client that is gone begins anew",
+            "on_worker_death": "it has no workers; a request to a client that is lost gives a "
+            "truncated result, and the client may come back",
+            "max_restarts": "it has no workers; a client that is lost may come back",
+            "snapshot_every": "it has no workers; a client that comes back begins a new session",
             "video": _CLIENTS_OWN,
         },
     ),
@@ -236,14 +273,29 @@ _PLACED_BY_BACKEND: dict[str, Placement] = {
 
 
 def placement_of(backend: str, placement: str) -> Placement:
-    """Where an entry's envs live: as its backend says, or else as the entry does."""
+    """Return the place that the backend demands, or else the one that the entry names."""
     return _PLACED_BY_BACKEND.get(backend) or PLACEMENTS[placement]
 
 
 def load(target: str) -> Any:
-    """The object that ``module:name`` names."""
+    """Import and return the object that ``module:name`` names."""
     module_name, _, name = target.partition(":")
     return getattr(importlib.import_module(module_name), name)
+
+
+def _entry_points(group: str) -> EntryPoints:
+    from importlib.metadata import entry_points  # noqa: PLC0415  # See `Backend`.
+
+    return entry_points(group=group)
+
+
+@cache
+def _plugged_in(name: str) -> Backend | None:
+    """Return the row of a plug-in, or None. Its module imports no simulator."""
+    for point in _entry_points(ROWS_GROUP):
+        if point.name == name:
+            return point.load()
+    return None
 
 
 class Registry:
@@ -257,23 +309,23 @@ class Registry:
     def register(
         self, name: str, *, cpu_bound: bool | None = None, hardware: bool | None = None
     ) -> Callable[[EnvClass], EnvClass]:
-        """Class decorator: makes the class known as backend `name`.
+        """Return a class decorator that registers the class as backend `name`.
 
         Args:
-            name: what a config entry's ``backend`` says.
+            name: the value of ``backend`` in config entries.
             cpu_bound: a step keeps one core busy and waits for nothing (no GPU, no network, no
-                real time): with ``envs_per_process: auto`` as many workers as there are cores
-                hold all envs of such entries, instead of one each. None: as the built-in backend
-                of that name, else False. Only a registration in the trainer's process tells:
-                where ``imports`` alone bring the class, workers know it, and nobody before.
-            hardware: it moves something real, see `Backend`; None, and where it is told, as for
+                real time): with ``envs_per_process: auto``, as many workers as there are cores
+                share the envs of such entries. None: as in the description of that name, or
+                False without one. Register the class in the trainer's process, too: a class that
+                only ``imports`` register is known to workers alone, which is too late.
+            hardware: it moves something real (see `Backend`); None, and the process, as for
                 `cpu_bound`.
 
-        Registering another class under a taken name replaces it: a module that is
-        reloaded, or imported under two names, is not an error.
+        Registering another class under a name replaces it, so that a module can be reloaded, or
+        imported under two names.
 
         Raises:
-            TypeError: no name was given, as in a bare ``@ENVS.register``.
+            TypeError: the name is missing, as in a bare ``@ENVS.register``.
         """
         if not isinstance(name, str):  # pyright: ignore[reportUnnecessaryIsInstance]
             raise TypeError("name the backend: @ENVS.register('my_backend')")
@@ -291,27 +343,32 @@ class Registry:
         return remember
 
     def is_cpu_bound(self, name: str) -> bool:
-        """Whether envs of backend `name` may share a worker; False where nobody has said so."""
-        backend = BACKENDS.get(name)
+        """Return True if envs of backend `name` are known to be CPU-bound."""
+        backend = self.described(name)
         return self._cpu_bound.get(name, backend is not None and backend.cpu_bound)
 
     def registered(self, name: str) -> type[Any] | None:
-        """The class registered in this process under `name`, if any."""
+        """Return the class registered in this process under `name`, or None."""
         return self._classes.get(name)
 
+    def described(self, name: str) -> Backend | None:
+        """Return the description of a built-in backend or of a plug-in, or None."""
+        return BACKENDS.get(name) or _plugged_in(name)
+
     def is_hardware(self, name: str) -> bool:
-        """Whether backend `name` moves something real, as far as this process knows it."""
-        backend = BACKENDS.get(name)
+        """Return True if backend `name` is known to move something real."""
+        backend = self.described(name)
         return self._hardware.get(name, backend is not None and backend.hardware)
 
     def knows(self, name: str) -> bool:
-        """Whether `name` can be resolved, without importing anything."""
-        return name in self.names()
+        """Return True if `name` can be resolved; imports nothing."""
+        # Without the entry points if possible: reading them takes milliseconds.
+        return name in self._classes or name in BACKENDS or name in self.names()
 
     def names(self) -> list[str]:
-        """Every resolvable backend name, sorted."""
-        entry_points = importlib.metadata.entry_points(group=ENTRY_POINT_GROUP)
-        return sorted({*self._classes, *BACKENDS, *(ep.name for ep in entry_points)})
+        """Return the name of every backend that can be resolved, sorted."""
+        points = [p for group in (ROWS_GROUP, ENTRY_POINT_GROUP) for p in _entry_points(group)]
+        return sorted({*self._classes, *BACKENDS, *(point.name for point in points)})
 
     def resolve(self, name: str) -> type[Any]:
         """Import and return the class of backend `name`.
@@ -322,17 +379,23 @@ class Registry:
         """
         if (env_class := self._classes.get(name)) is not None:
             return env_class
-        if (backend := BACKENDS.get(name)) is not None:
+        if (backend := self.described(name)) is not None:
             return load(backend.target)
-        for entry_point in importlib.metadata.entry_points(group=ENTRY_POINT_GROUP, name=name):
-            return entry_point.load()
+        for point in _entry_points(ENTRY_POINT_GROUP):
+            if point.name == name:
+                return point.load()
         raise ConfigError(self.unknown(name))
 
     def unknown(self, name: str) -> str:
-        """The message for a backend that nobody knows."""
-        near = difflib.get_close_matches(name, self.names(), n=1)
-        hint = f"did you mean {near[0]!r}? " if near else ""
+        """Return the message for a backend name that can't be resolved."""
+        hint = did_you_mean(name, self.names(), end=" ")
         return f"unknown backend {name!r}; {hint}known: {', '.join(self.names())}"
+
+
+def did_you_mean(name: str, known: Iterable[str], end: str = "") -> str:
+    """Ask whether the nearest of `known` names was meant; empty if none is near `name`."""
+    near = difflib.get_close_matches(name, list(known), n=1)
+    return f"did you mean {near[0]!r}?{end}" if near else ""
 
 
 ENVS = Registry()

@@ -1,12 +1,13 @@
 """Stable-Baselines3's vector interface: a group of envs as one of its `VecEnv`s.
 
-It takes the place of `stable_baselines3.common.vec_env.SubprocVecEnv`, with the same results to the
-bit. docs/stable_baselines3.md tells what differs.
+It replaces `stable_baselines3.common.vec_env.SubprocVecEnv`, with bit-identical results.
+docs/stable_baselines3.md lists the differences.
 """
 
 from __future__ import annotations
 
 import contextlib
+import copy
 import inspect
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
@@ -17,11 +18,13 @@ from gymnasium.vector import AutoresetMode
 
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.envs.gymnasium import spec_of
-from rlightning_aio.envs.of_spec import OneOf
 from rlightning_aio.envs.sub_envs import adapted
-from rlightning_aio.errors import ConfigError, EnvRaised
+from rlightning_aio.errors import ConfigError
+from rlightning_aio.protocol.columns import index
 from rlightning_aio.sync import EnvGroup, build_env_group
 from rlightning_aio.types import PolicyResponse
+from rlightning_aio.vector.deaths import cause_and_rest
+from rlightning_aio.vector.lazy_infos import LazyInfos
 from rlightning_aio.vector.leftovers import drop_outstanding
 from rlightning_aio.vector.making import imports_of, steps_together, together
 from rlightning_aio.vector.rows import rows_of
@@ -31,9 +34,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from rlightning_aio.vector.rows import Singles
+
 __all__ = ["VecEnv", "make_vec_env"]
 
-# Optional and typed in part, so imported by name.
+# An optional dependency with incomplete annotations, so imported by name.
 _Base: Any = import_module("stable_baselines3.common.vec_env.base_vec_env").VecEnv
 _OF_SINGLE_ENVS: Final = ("wrapper_class", "wrapper_kwargs", "monitor_dir", "monitor_kwargs")
 """Arguments of Stable-Baselines3's `make_vec_env` that keep envs from being stepped together."""
@@ -48,22 +53,21 @@ def make_vec_env(
     vec_env_cls: type[Any] | None = None,
     **more: Any,
 ) -> Any:
-    """Monitored envs of one task; see `stable_baselines3.common.env_util.make_vec_env`.
+    """Make monitored envs of one task; see `stable_baselines3.common.env_util.make_vec_env`.
 
-    Envs of a MuJoCo task that `rlightning_aio.envs.mujoco_batch` knows are stepped together, as
-    many in each worker and in this process (``placement: split``), inside a `VecMonitor`. Those
-    of any other are separate, each in a `Monitor`, as are those that are to have a wrapper, or a
-    file, each.
+    Envs of a MuJoCo task that `rlightning_aio.envs.mujoco_batch` supports are stepped together, in
+    threads of this process, inside a `VecMonitor`. Envs of any other task, and envs that need a
+    wrapper or a file each, are separate, each in a `Monitor`.
 
     Args:
-        env_id: a registered name, or what makes an env.
-        n_envs: how many.
+        env_id: a registered name, or a callable that makes an env.
+        n_envs: the number of envs.
         seed: env k gets ``seed + k`` at the next reset.
-        env_kwargs: of `gymnasium.make`.
+        env_kwargs: of `gymnasium.make`; for envs that are stepped together also ``num_threads`` and
+            ``randomize``.
         vec_env_kwargs: of `VecEnv`: fields of a config entry.
-        vec_env_cls: accepted where it is a class that `VecEnv` takes the place of, and without
-            meaning here.
-        more: of Stable-Baselines3's function.
+        vec_env_cls: ignored if it is `SubprocVecEnv` or `DummyVecEnv`.
+        more: further arguments of Stable-Baselines3's function.
 
     Raises:
         ValueError: `vec_env_cls` is another class.
@@ -81,9 +85,9 @@ def make_vec_env(
     fields, kwargs = vec_env_kwargs or {}, {"render_mode": "rgb_array", **(env_kwargs or {})}
     single = any(more.get(name) for name in _OF_SINGLE_ENVS)
     if isinstance(env_id, str) and not single and steps_together(spec := spec_of(env_id), kwargs):
-        one = OneOf(spec, {"disable_env_checker": True, **kwargs})
+        kwargs = {"disable_env_checker": True, **kwargs}
         fields = {**imports_of(spec), **fields}
-        makers, fields = together(one, n_envs, AutoresetMode.SAME_STEP, fields)
+        makers, fields = together(spec, kwargs, n_envs, AutoresetMode.SAME_STEP, fields)
         made = VecEnv(makers, **fields)
         made.seed(seed)
         return vec_envs.VecMonitor(made)
@@ -94,21 +98,19 @@ class VecEnv(_Base):
     """Envs in worker processes behind Stable-Baselines3's vector interface.
 
     Args:
-        env_fns: one callable for each env, or for as many vector environments, each of as many
-            sub-environments that reset themselves in the same step. They run in the workers, and
-            only there; lambdas and functions of ``__main__`` will do.
-        start_method: accepted, and without meaning here.
+        env_fns: one callable for each env, or for each of several vector environments with the
+            same size and same-step autoreset. They are called only in the workers; lambdas and
+            functions of ``__main__`` are allowed.
+        start_method: accepted and ignored.
         entry: further fields of `EnvConfig` (``envs_per_process``, ``step_timeout``, …).
 
     Attributes:
-        group: the `EnvGroup` that does the work; its envs, one for each callable, are called
-            ``env-0``, ``env-1``, …
+        group: the `EnvGroup` that runs the envs ``env-0``, ``env-1``, …, one for each callable.
 
     Raises:
-        ConfigError: a callable can't be sent to a worker, `entry` is wrong, or the envs'
-            spaces differ.
+        ConfigError: a callable can't be sent to a worker, `entry` is wrong, or spaces differ.
         StartFailed: a callable raised, or didn't return an env.
-        RuntimeError: vector environments are not of as many.
+        RuntimeError: the vector environments differ in size.
     """
 
     def __init__(
@@ -138,24 +140,24 @@ class VecEnv(_Base):
                         f"the spaces of env {k} are not those of env 0; Stable-Baselines3 needs "
                         "equal spaces"
                     )
-            # Results of all envs, in order, which actions can answer.
+            # The last results of all envs, in order; actions respond to them.
             self._answerable = BatchedData(self.group.env_ids, [None] * len(metas))
             self._unfinished = False
             _Base.__init__(self, self._rows.num_envs, *first)
-            with contextlib.suppress(AttributeError):  # Of some that are stepped together.
+            with contextlib.suppress(AttributeError):  # Some batches have none.
                 self.metadata: dict[str, Any] = {**self.get_attr("metadata", 0)[0], **self.metadata}
         except BaseException:
             self.group.close()
             raise
 
     def reset(self) -> Any:
-        """Reset all envs with the seeds and options that were set since the last time.
+        """Reset all envs with the seeds and options that were set since the last reset.
 
-        Returns observations ``[num_envs, ...]``, or dicts or tuples of such; `reset_infos` has
-        the infos.
+        Returns observations ``[num_envs, ...]``, or dicts or tuples of them. The infos are in
+        `reset_infos`.
 
         Raises:
-            EnvRaised, WorkerDied, EnvHung: an env failed; the others' results are dropped.
+            EnvRaised, WorkerDied, EnvHung: an env failed; the results of the others are dropped.
         """
         with self._exchange(), self._dropping_the_rest():
             self._rows.send_resets(self._seeds, self._options, range(self.num_envs))
@@ -163,10 +165,10 @@ class VecEnv(_Base):
         self.reset_infos = self._rows.info_list(batch)
         self._reset_seeds()
         self._reset_options()
-        return self._rows.observation(batch)
+        return self._copied_observations(batch)
 
     def step_async(self, actions: Any) -> None:
-        """Send one action to each env, from an array or a sequence; cast to the space's dtype."""
+        """Send one action to each env: an array or a sequence, cast to the dtype of the space."""
         self._begin()
         if isinstance(self.action_space, gym.spaces.Dict | gym.spaces.Tuple):
             pairs = zip(self.group.env_ids, actions, strict=True)
@@ -179,44 +181,47 @@ class VecEnv(_Base):
     def step_wait(self) -> tuple[Any, NDArray[np.float64], NDArray[np.bool_], list[dict[str, Any]]]:
         """Wait for the steps.
 
-        Returns observations, rewards, whether each episode is done, and infos. Where it is,
-        the observation is the next episode's first, and the info has the last one's as
-        ``terminal_observation``. ``TimeLimit.truncated`` is in every info.
+        Returns observations, rewards, done flags and infos. If an episode is done, the observation
+        is the first of the next episode, and the info has the last one of this episode as
+        ``terminal_observation``. Each info has ``TimeLimit.truncated``. The list of infos is made
+        when it is first read.
 
         Raises:
-            EnvRaised, WorkerDied, EnvHung: an env failed; the others' results are dropped.
+            EnvRaised, WorkerDied, EnvHung: an env failed; the results of the others are dropped.
         """
         with self._dropping_the_rest():
             batch, _ = self.group.collect_async(wait_all=True, ordered=True)
         self._answerable, self._unfinished = batch, False
         rows = self._rows
-        infos = rows.info_list(batch)
-        truncated = rows.flat(batch.truncated & ~batch.terminated).tolist()
         done = rows.flat(batch.done)
+        infos = LazyInfos(lambda: _infos_of_step(rows, batch))
         for k in np.flatnonzero(done).tolist():
-            infos[k], self.reset_infos[k] = _last_and_first(infos[k])
-        for info, cut in zip(infos, truncated, strict=True):
-            info["TimeLimit.truncated"] = cut
-        return rows.observation(batch), rows.flat(batch.reward), done, infos
+            cut = infos[k].pop("TimeLimit.truncated")
+            infos[k], self.reset_infos[k] = _last_and_first(infos[k], self._observations, k)
+            infos[k]["TimeLimit.truncated"] = cut
+        return self._copied_observations(batch), rows.flat(batch.reward), done, infos
+
+    def _copied_observations(self, batch: BatchedData) -> Any:
+        """Copy the observations, and keep them: a death makes them an episode's last ones."""
+        self._observations = self._rows.observation(batch)
+        return copy.deepcopy(self._observations)
 
     def _begin(self) -> None:
-        """Before anything is sent. What was left in the middle (by Ctrl-C, say) is waited for, and
-        dropped.
-        """
+        """Before sending, drop what an interrupted call (by Ctrl-C, for example) has left."""
         if self._unfinished:
             drop_outstanding(self.group)
         self._unfinished = True
 
     @contextlib.contextmanager
     def _exchange(self) -> Generator[None]:
-        """What is sent within is answered within."""
+        """Context whose requests are answered before it ends."""
         self._begin()
         yield
         self._unfinished = False
 
     @contextlib.contextmanager
     def _dropping_the_rest(self) -> Generator[None]:
-        """Where an env fails, let the others end what they do, so that all can be reset."""
+        """Context that drops the results of the other envs if one fails, so all can be reset."""
         try:
             yield
         except Exception:
@@ -230,56 +235,81 @@ class VecEnv(_Base):
     # -- methods and attributes -------------------------------------------------------
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Attribute of envs, found through their wrappers.
+        """Get an attribute of envs, found through their wrappers.
 
         Raises:
-            AttributeError: an env has none of that name.
+            AttributeError: an env has no such attribute.
         """
-        try:
-            return self._call(indices, "get_wrapper_attr", attr_name)
-        except EnvRaised as error:
-            if error.exception_type.endswith("AttributeError"):
-                raise AttributeError(error.exception_text) from error
-            raise
+        return self._call(indices, "get_wrapper_attr", attr_name)
 
     def has_attr(self, attr_name: str) -> bool:
-        """Whether all envs have an attribute. Its value, a method perhaps, stays with them."""
+        """Return True if all envs have an attribute. Its value is not transferred."""
         return all(self._call(None, "has_wrapper_attr", attr_name))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Set an attribute of the outermost wrapper of envs.
 
         Raises:
-            ValueError: of some envs that are stepped together with others.
+            ValueError: only some of the envs that are stepped together are chosen.
         """
         with self._exchange():
-            self._rows.set_outermost(attr_name, value, list(self._get_indices(indices)))
+            self._rows.set_outermost(attr_name, value, self._chosen(indices))
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a method of envs, found through their wrappers, all at once."""
+        """Call a method of envs, found through their wrappers, in parallel."""
         return self._call(indices, method_name, *method_args, **method_kwargs)
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
-        """Whether `wrapper_class` is among the wrappers of envs."""
+        """Return for each env whether `wrapper_class` is among its wrappers."""
+        chosen = self._chosen(indices)
         with self._exchange():
-            return self._rows.are_wrapped(wrapper_class, list(self._get_indices(indices)))
+            each = dict(zip(chosen, self._rows.are_wrapped(wrapper_class, chosen), strict=True))
+        return [each[k] for k in self._places(indices)]
 
     def get_images(self) -> list[Any]:
-        """One frame of each env, as it renders it."""
+        """Return one rendered frame of each env."""
         return self._call(None, "render")
 
     def _call(self, indices: Any, name: str, /, *args: Any, **kwargs: Any) -> list[Any]:
-        chosen: list[int] = list(self._get_indices(indices))
-        with self._exchange():
-            self._rows.call(name, args, kwargs, chosen)
-            return self._rows.values(self.group.collect_calls(), chosen)
+        places = self._places(indices)
+        values: dict[int, Any] = {}
+        while left := [k for k in range(len(places)) if k not in values]:
+            # An env that is named several times is called several times, once in each turn.
+            turn = {places[k]: k for k in reversed(left)}
+            with self._exchange():
+                self._rows.call(name, args, kwargs, list(turn))
+                found = self._rows.values(self.group.collect_calls(), list(turn))
+            values.update(zip(turn.values(), found, strict=True))
+        return [values[k] for k in range(len(places))]
+
+    def _places(self, indices: Any) -> list[int]:
+        return [range(self.num_envs)[k] for k in self._get_indices(indices)]
+
+    def _chosen(self, indices: Any) -> list[int]:
+        """The places of envs, without duplicates."""
+        return list(dict.fromkeys(self._places(indices)))
 
 
-def _last_and_first(info: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The last info of an episode and the first of the next; see `SameStep`."""
-    if "final_info" not in info:  # Lost with its worker, which says so.
-        return info, {}
+def _infos_of_step(rows: Singles, batch: BatchedData) -> list[dict[str, Any]]:
+    """List the infos of a step, with ``TimeLimit.truncated``."""
+    infos = rows.info_list(batch)
+    truncated = rows.flat(batch.truncated & ~batch.terminated).tolist()
+    for info, cut in zip(infos, truncated, strict=True):
+        info["TimeLimit.truncated"] = cut
+    return infos
+
+
+def _last_and_first(
+    info: dict[str, Any], returned: Any, place: int
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Split an info into the last of an episode and the first of the next; see `SameStep`.
+
+    An episode that was lost with its worker ends with the observation `returned` last.
+    """
+    if "final_info" not in info:
+        cause, first = cause_and_rest(info)
+        return {**cause, "terminal_observation": copy.deepcopy(index(returned, place))}, first
     first = {key: value for key, value in info.items() if key not in ("final_info", "final_obs")}
     return {**info["final_info"], "terminal_observation": info["final_obs"]}, first

@@ -1,4 +1,4 @@
-"""How a wished number of simulations is laid over the cores."""
+"""The number of cores, and the division of simulations into batches for them."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from typing import Final
 __all__ = ["num_batches", "num_cores"]
 
 _AS_GOOD: Final = 1.15
-"""So many times the best share of a core, and batches may be fewer and larger."""
+"""A worker may have this many times its share if that makes batches fewer and larger."""
 
 _CGROUPS: Final = Path("/sys/fs/cgroup")
 
 
 def num_cores(cgroups: Path = _CGROUPS) -> int:
-    """How many cores this process may keep busy: by its affinity, and by its container's limit.
+    """Number of cores that this process may use, by its affinity and its container's limit.
 
     Args:
-        cgroups: where the kernel tells of limits on processor time, which Docker and Kubernetes
-            set (https://docs.kernel.org/admin-guide/cgroup-v2.html, ``cpu.max``).
+        cgroups: folder with the kernel's limits on processor time, as set by Docker and Kubernetes
+            (https://docs.kernel.org/admin-guide/cgroup-v2.html, ``cpu.max``).
     """
     cores, limit = len(os.sched_getaffinity(0)), _time_limit(cgroups)
     return cores if limit is None else max(1, min(cores, math.ceil(limit)))
 
 
 def _time_limit(cgroups: Path) -> float | None:
-    """Seconds of processor time in a second, if they are limited."""
+    """Seconds of processor time per second; None without a limit."""
     try:
         if (cgroups / "cpu.max").exists():
             quota, period = (cgroups / "cpu.max").read_text().split()
@@ -35,17 +35,17 @@ def _time_limit(cgroups: Path) -> float | None:
             quota = (cgroups / "cpu" / "cpu.cfs_quota_us").read_text()
             period = (cgroups / "cpu" / "cpu.cfs_period_us").read_text()
         limit = int(quota) / int(period)
-    except (OSError, ValueError):  # Nothing is told, or "max".
+    except (OSError, ValueError):  # Without a limit: no file, or "max".
         return None
     return limit if limit > 0 else None
 
 
 def num_batches(total: int, num_workers: int) -> int:
-    """In how many batches of equal size `num_workers` step `total` simulations best.
+    """Best number of equal batches for `total` simulations on `num_workers` workers.
 
-    One for each worker where that goes without a rest. Else the fewest with which no worker has
-    much more than its share: 100 simulations over 16 workers make 25 batches of 4, of which a
-    worker has one or two.
+    One for each worker if that divides `total`; else the smallest number at which no worker has
+    much more than its share: 100 simulations on 16 workers make 25 batches of 4, one or two for
+    each worker.
     """
     best = -(-total // num_workers)
     for count in range(1, total + 1):

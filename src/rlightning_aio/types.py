@@ -1,7 +1,6 @@
-"""The values that cross the public interface one env at a time.
+"""Values of the public interface that concern one env.
 
-Rule: these are for people; the hot path moves columns (see `batch`) and makes one
-of these only when somebody asks for it.
+Rule: the hot path uses columns (see `batch`), and makes these objects only on request.
 Absent on purpose: anything that knows where an env runs.
 """
 
@@ -20,14 +19,14 @@ Autoreset: TypeAlias = Literal["disabled", "next_step", "same_step"]
 
 
 class PolicyResponse:
-    """What a policy answers for one env: an action, and whatever it attaches.
+    """The policy's response to one env: an action and extra fields.
 
     Args:
-        env_id: the env that the action is for.
-        action: fits the env's action space, unless a preprocess function or the env
-            itself transforms it.
-        extras: further fields (``log_prob``, ``value``, …), readable as attributes by
-            the preprocess function and by the env's `step`.
+        env_id: id of the env.
+        action: an element of the action space, unless a preprocess function or the env transforms
+            it.
+        extras: further fields (``log_prob``, ``value``, …), which the preprocess function and the
+            env's `step` can read as attributes.
     """
 
     def __init__(self, env_id: str, action: Any = None, **extras: Any) -> None:
@@ -37,7 +36,7 @@ class PolicyResponse:
 
     @property
     def extras(self) -> dict[str, Any]:
-        """What was attached to the action."""
+        """Fields other than `env_id` and `action`."""
         return {k: v for k, v in self.__dict__.items() if k not in ("env_id", "action")}
 
     def __repr__(self) -> str:
@@ -46,14 +45,14 @@ class PolicyResponse:
 
 
 def default_env_preprocess_fn(policy_resp: PolicyResponse) -> Any:
-    """The action as the policy gave it."""
+    """Return the action unchanged."""
     return policy_resp.action
 
 
 class _Ret(BaseModel):
-    """What single-agent and multi-agent results share."""
+    """Fields of both single-agent and multi-agent results."""
 
-    model_config = ConfigDict(arbitrary_types_allowed=True, extra="forbid")
+    model_config = ConfigDict(arbitrary_types_allowed=True, extra="forbid", defer_build=True)
 
     env_id: str
     observation: Any
@@ -68,30 +67,30 @@ class _Ret(BaseModel):
 
 
 class EnvRet(_Ret):
-    """One env's result of a reset or a step.
+    """The result of a reset or a step of one env.
 
     Attributes:
-        env_id: the env it came from.
-        observation: fits the env's observation space (``[num_envs, *obs]`` if vectorised).
+        env_id: id of the env.
+        observation: an element of the observation space (``[num_envs, *obs]`` if vectorised).
         last_reward: float, or ``[num_envs]`` if vectorised; 0.0 after a reset.
         last_terminated: bool, or ``[num_envs]`` bool.
         last_truncated: bool, or ``[num_envs]`` bool.
-        info: what else the env reported.
+        info: further values that the env reported.
         _extra: free for extensions.
-        ts_env_sent_ns: when the env produced it, in ns since the epoch; for a client of an
-            env_server, by the client's clock, which may differ from the trainer's.
+        ts_env_sent_ns: when the env produced it, in ns since the epoch; of a client of an
+            env_server by the clock of the client.
     """
 
     last_reward: Any = 0.0
     last_terminated: Any = False
     last_truncated: Any = False
 
-    # Said again, because type checkers make one up that knows no `_extra`.
+    # Repeated, because type checkers generate one without `_extra`.
     __init__ = _Ret.__init__
 
 
 class MultiAgentEnvRet(_Ret):
-    """One multi-agent env's result: every field but the info is a dict by agent."""
+    """The result of a multi-agent env: observation, reward and flags are dicts by agent."""
 
     observation: dict[str, Any]
     last_reward: dict[str, Any] = Field(default_factory=dict)
@@ -102,23 +101,25 @@ class MultiAgentEnvRet(_Ret):
 
 
 class EnvMeta(BaseModel):
-    """What `init` reports of each env.
+    """Metadata of an env, as reported by `init`.
 
     Attributes:
         env_id: unique in its group.
-        observation_space: what `reset` and `step` return fits it; batched over the
-            sub-environments when ``num_envs > 1``; by agent (a Dict) for multi-agent envs.
-        action_space: what `step` accepts; batched and by agent likewise.
-        num_envs: vectorised sub-environments.
+        observation_space: of the observations of `reset` and `step`; batched over sub-environments
+            if ``num_envs > 1``; a Dict by agent for multi-agent envs.
+        action_space: of the actions of `step`; batched and by agent likewise.
+        num_envs: number of vectorised sub-environments.
         agents: agent names of a multi-agent env, in order; empty otherwise.
-        max_episode_steps: the configured limit, or the simulator's own; None if none.
-        autoreset: what a sub-environment does after the end of its episode, in Gymnasium's terms:
-            wait for a reset (``disabled``); reset itself in the next step, whose action and
-            reward count for nothing (``next_step``); or within the step that ends the
-            episode, whose observation is then the first of the next (``same_step``).
+        max_episode_steps: the configured limit, or that of the simulator; None without any.
+        autoreset: when a sub-environment is reset after the end of its episode, in Gymnasium's
+            terms: only on request (``disabled``); in the next step, whose action and reward are
+            ignored (``next_step``); or in the step that ends the episode, whose observation is
+            then the first of the next episode (``same_step``).
+        task: the task of the config entry.
+        switches_task: a reset with ``options={"task": name}`` switches the env to another task.
     """
 
-    model_config = ConfigDict(arbitrary_types_allowed=True)
+    model_config = ConfigDict(arbitrary_types_allowed=True, defer_build=True)
 
     env_id: str
     observation_space: gym.Space[Any] | None
@@ -127,14 +128,16 @@ class EnvMeta(BaseModel):
     agents: tuple[str, ...] = ()
     max_episode_steps: int | None = None
     autoreset: Autoreset = "disabled"
+    task: str = ""
+    switches_task: bool = False
 
 
 class ClientTraits(NamedTuple):
-    """What a client of an env_server makes of requests.
+    """Properties of a client of an env_server that affect its requests.
 
     Attributes:
-        free_actions: its actions need not fit its action space.
-        reads_extras: something there reads what the policy attaches beside the action.
+        free_actions: its actions may be outside its action space.
+        reads_extras: the client reads fields of responses other than the action.
     """
 
     free_actions: bool

@@ -1,7 +1,7 @@
-"""`record_video`: films of chosen envs of a group, as Gymnasium's `RecordVideo` makes of one env.
+"""`record_video`: films chosen envs of a group, as Gymnasium's `RecordVideo` films one env.
 
-An env is filmed where it lives: its worker renders and encodes, and no frame crosses to the
-trainer. Each is told by a call, as of a method, whatever its host.
+The worker of an env renders and encodes, so no frame is sent to the trainer. Filming starts and
+stops by a call of the env, on any host.
 """
 
 from __future__ import annotations
@@ -37,36 +37,35 @@ def record_video(
     every: int = 1,
     episodes: Sequence[int] | None = None,
 ) -> Any:
-    """Film envs of a running group, from their next episode on; or no longer.
+    """Start filming envs of a running group with their next episode; or stop filming.
 
-    To be awaited where the group is asynchronous. The envs must be idle: call it before the first
-    reset, or while their results are collected and not answered. A later call for the same env
-    replaces an earlier one.
+    Await it if the group is asynchronous. The envs must be idle: call it before the first reset, or
+    between collecting their results and answering them. A later call for an env replaces an
+    earlier one.
 
     Args:
-        group: initialised.
-        env_ids: which envs. One that shares its worker makes its neighbours wait for frames; the
-            field ``video`` of its entry gives it a worker of its own.
-        folder: gets ``<env id>-episode-<n>.mp4``, or, of an env with sub-environments,
-            ``<env id>-sub-<k>-episode-<n>.mp4``; it is created if missing. An unfinished episode
-            is called ``….partial.mp4``. A folder that has films of the env already
-            gets further ones: n goes on from the last. None: film no longer; a film under way
-            ends here, as a partial one.
-        sub_env: which of an env's sub-environments.
-        every: film episodes 0, every, 2 * every, … of each, counted from now on.
+        group: an initialised group.
+        env_ids: the envs to film. Envs that share a worker wait while it renders; the field
+            ``video`` of a config entry gives the env a separate worker.
+        folder: for ``<env id>-episode-<n>.mp4``, or ``<env id>-sub-<k>-episode-<n>.mp4`` of envs
+            with sub-environments; created if missing. An unfinished episode is called
+            ``….partial.mp4``. If the folder has films of the env, n continues after the last one.
+            None stops filming; a film in progress becomes a partial one.
+        sub_env: index of the sub-environment to film.
+        every: film episodes 0, every, 2 * every, … of each, counted from now.
         episodes: film only these.
 
-    ``render`` must give frames ``[height, width, 3]`` uint8, as Gymnasium's envs do that are made
-    with ``render_mode: rgb_array``. A film has the simulator's ``render_fps``.
+    ``render`` must return frames ``[height, width, 3]`` uint8, as Gymnasium's envs do with
+    ``render_mode: rgb_array``. A film has the simulator's ``render_fps``.
 
-    Raises (no env of `env_ids` is filmed then):
-        EnvRaised: an env renders nothing, has no such sub-environment, or finds no ffmpeg or
-            folder.
-        EnvBusy: an env has a reply outstanding.
+    Raises (and films no env of `env_ids`):
+        EnvRaised: an env renders nothing or has no such sub-environment, or ffmpeg or the folder
+            is missing.
+        EnvBusy: an env has a request outstanding.
         UnknownEnv: no env of this group has that id.
-        NotImplementedError: an env is an env_server's.
-        WorkerDied, EnvHung: a worker ended meanwhile. Replacements are not filmed.
-        ConfigError: `sub_env`, `every` or `episodes` isn't what it should be.
+        NotImplementedError: an env belongs to an env_server.
+        WorkerDied, EnvHung: a worker ended. Replacements are not filmed.
+        ConfigError: `sub_env`, `every` or `episodes` is invalid.
         GroupClosed: the group was not initialised, or is closed.
     """
     video = None if folder is None else _video(folder, sub_env, every, episodes)

@@ -7,15 +7,10 @@ import importlib.util
 import json
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any
 
 import pytest
 from run_python import output_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    ReportOf: TypeAlias = Callable[[str], dict[str, Any]]
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 ONE_STAGE = Path(__file__).with_name("one_stage.py")
@@ -24,7 +19,12 @@ ONE_STAGE = Path(__file__).with_name("one_stage.py")
 ASKED = {
     "cheetah": ["rlightning_aio async"],
     "adapters": ["rlightning_aio VectorEnv", "sb3.VecEnv"],
-    "batches": ["aio, HalfCheetah x 32", "aio, 16 of HalfCheetah", "ceiling"],
+    "batches": [
+        "aio, HalfCheetah x 32",
+        "aio, 16 of HalfCheetah",
+        "make_vec, H",
+        "bare mujoco.batch, Ant",
+    ],
     "cartpole": ["rlightning_aio sync", "loop"],
     "humanoid": ["rlightning_aio sync"],
     "round_trip": [],
@@ -37,12 +37,29 @@ ASKED = {
     "pong": ["rlightning_aio"],
     "tracing": ["async half, CartPole"],
     "filming": ["compute"],
+    "threads": [],
+    "loop_pause": [],
+    "headline": ["make_vec"],
+    "exchange": ["sync", "bare exchange"],
     "peers": ["Gymnasium", "SB3", "Tianshou", "EnvPool, 16 of 32", "TorchRL", "PufferLib"],
 }
 # Here the work itself gives the length.
 WITHOUT_SECONDS = ("start", "memory")
 TOGETHER = (
-    ("cheetah", "batches", "cartpole", "humanoid", "start", "memory", "tracing", "filming"),
+    (
+        "cheetah",
+        "batches",
+        "cartpole",
+        "humanoid",
+        "start",
+        "memory",
+        "tracing",
+        "filming",
+        "threads",
+        "loop_pause",
+        "headline",
+        "exchange",
+    ),
     ("round_trip", "facade", "trainer_cpu", "stragglers", "uneven", "peers", "pong", "adapters"),
 )
 RARELY_SLOW = "all work 50 µs, 2 of 8 rarely take 100 ms, 4 to a worker"
@@ -55,24 +72,6 @@ def short_round(script: str, folder: Path) -> list[str]:
     return [script, "--rounds", "1", *seconds, "--json", str(folder / f"{script}.json"), *only]
 
 
-@pytest.fixture(scope="module")
-def report_of(tmp_path_factory: pytest.TempPathFactory) -> ReportOf:
-    """What a script reports of one short round; those of `TOGETHER` are run in one process."""
-    folder = tmp_path_factory.mktemp("reports")
-    reports: dict[str, dict[str, Any]] = {}
-
-    def report_of(script: str) -> dict[str, Any]:
-        if script not in reports:
-            (scripts,) = (scripts for scripts in TOGETHER if script in scripts)
-            output_of(
-                ONE_STAGE, json.dumps([short_round(s, folder) for s in scripts]), folder=folder
-            )
-            reports.update({s: json.loads((folder / f"{s}.json").read_text()) for s in scripts})
-        return reports[script]
-
-    return report_of
-
-
 def test_a_script_run_by_itself(tmp_path: Path) -> None:
     """Contenders have processes of their own then, and their figures come from there."""
     script, *arguments = short_round("cartpole", tmp_path)
@@ -83,59 +82,48 @@ def test_a_script_run_by_itself(tmp_path: Path) -> None:
     assert all(found["cores_used"] > 0 for found in report["results"].values())
 
 
-@pytest.mark.parametrize(
-    ("script", "contenders"),
-    [
-        ("cheetah", 1),
-        ("batches", 3),
-        ("cartpole", 2),
-        ("humanoid", 1),
-        ("round_trip", 4),
-        ("facade", 2),
-        ("trainer_cpu", 2),
-        ("stragglers", 1),
-        ("start", 2),
-        ("memory", 1),
-        ("tracing", 2),
-        ("filming", 2),
-    ],
-)
-def test_script_measures_each_of_its_contenders(
-    script: str, contenders: int, report_of: ReportOf
-) -> None:
-    """A short run ends with a positive figure for every contender that was asked for."""
-    report = report_of(script)
-    assert not report["skipped"]
-    assert len(report["results"]) == contenders
-    if script != "facade":  # Both of its sides are alike.
-        assert all(found["median"] > 0 for found in report["results"].values())
+CONTENDERS = {
+    "cheetah": 1,
+    "batches": 4,
+    "cartpole": 2,
+    "humanoid": 1,
+    "round_trip": 4,
+    "facade": 2,
+    "trainer_cpu": 2,
+    "stragglers": 1,
+    "start": 4,
+    "memory": 1,
+    "tracing": 2,
+    "filming": 2,
+    "loop_pause": 2,
+    "headline": 1,
+    "exchange": 6,
+}
+PEERS = {
+    "Gymnasium AsyncVectorEnv": "gymnasium",
+    "Gymnasium SyncVectorEnv": "gymnasium",
+    "SB3 SubprocVecEnv": "stable_baselines3",
+    "Tianshou ShmemVectorEnv": "tianshou",
+    "EnvPool, 16 of 32": "envpool",
+    "TorchRL ParallelEnv": "torchrl",
+    "TorchRL AsyncEnvPool, all": "torchrl",
+    "TorchRL AsyncEnvPool, 16 of 32": "torchrl",
+    "PufferLib, synchronous": "pufferlib",
+    "PufferLib, 16 of 32": "pufferlib",
+}
 
 
-@pytest.mark.parametrize(
-    ("module", "peer"),
-    [
-        ("gymnasium", "Gymnasium AsyncVectorEnv"),
-        ("gymnasium", "Gymnasium SyncVectorEnv"),
-        ("stable_baselines3", "SB3 SubprocVecEnv"),
-        ("tianshou", "Tianshou ShmemVectorEnv"),
-        ("envpool", "EnvPool, 16 of 32"),
-        ("torchrl", "TorchRL ParallelEnv"),
-        ("torchrl", "TorchRL AsyncEnvPool, all"),
-        ("torchrl", "TorchRL AsyncEnvPool, 16 of 32"),
-        ("pufferlib", "PufferLib, synchronous"),
-        ("pufferlib", "PufferLib, 16 of 32"),
-    ],
-)
-def test_peer_steps(module: str, peer: str, report_of: ReportOf) -> None:
-    """Each peer that is installed can be measured."""
-    if importlib.util.find_spec(module) is None:
-        pytest.skip(f"{module} is not installed")
-    assert report_of("peers")["results"][peer]["median"] > 0
+def check_peers(report: dict[str, Any]) -> None:
+    """Each peer that is installed was measured."""
+    for peer, module in PEERS.items():
+        if importlib.util.find_spec(module) is not None:
+            assert report["results"][peer]["median"] > 0
 
 
-def test_uneven_tells_how_late_each_driver_collects(report_of: ReportOf) -> None:
-    """Each number of results has its latenesses, of both drivers and of the bare pipe."""
-    report = report_of("uneven")
+def check_uneven(report: dict[str, Any]) -> None:
+    """Each number of results has its latenesses, of both drivers and of the bare pipe; results of
+    the calm turns between rare slow steps are not among them. Even step times have rates.
+    """
     assert not report["skipped"]
     rows = [row for row in report["lateness"] if row["mixture"] != RARELY_SLOW]
     assert [row["min_results"] for row in rows] == [1, 4, 6]
@@ -144,20 +132,47 @@ def test_uneven_tells_how_late_each_driver_collects(report_of: ReportOf) -> None
             assert row[who]["count"] > 0
             assert 0 <= row[who]["median"] <= row[who]["p99"] <= row[who]["worst"]
         assert row["mixture"] in report["tables"]
-
-
-def test_uneven_counts_turns_with_a_rare_slow_step(report_of: ReportOf) -> None:
-    """What is collected in the calm turns between is not among the latenesses."""
-    rows = [row for row in report_of("uneven")["lateness"] if row["mixture"] == RARELY_SLOW]
+    rows = [row for row in report["lateness"] if row["mixture"] == RARELY_SLOW]
     assert len(rows) == 3
     assert all(0 < row["asyncio"]["count"] <= 8 for row in rows)
+    assert len(report["rates"]) == 3
+    assert all(found["median"] > 0 for found in report["rates"].values())
 
 
-def test_uneven_tells_the_rate_at_even_step_times(report_of: ReportOf) -> None:
-    """Both drivers and the bare loops have a rate."""
-    rates = report_of("uneven")["rates"]
-    assert len(rates) == 3
-    assert all(found["median"] > 0 for found in rates.values())
+def check_adapters(report: dict[str, Any]) -> None:
+    """Each interface steps, where the library that it belongs to is installed."""
+    asked = {"rlightning_aio VectorEnv"}
+    if importlib.util.find_spec("stable_baselines3") is not None:
+        asked.add("rlightning_aio sb3.VecEnv")
+    assert report["results"].keys() == asked
+
+
+def check_pong(report: dict[str, Any]) -> None:
+    """Raw frames pass through the synchronous and the asynchronous group."""
+    if importlib.util.find_spec("ale_py") is not None:
+        assert len(report["results"]) == 2
+
+
+CHECKS = {
+    "peers": check_peers, "uneven": check_uneven, "adapters": check_adapters, "pong": check_pong
+}  # fmt: skip
+
+
+# In few tests, because each starts a process: the processes of pytest would repeat a fixture.
+@pytest.mark.parametrize("scripts", TOGETHER, ids=lambda scripts: f"{scripts[0]} and others")
+def test_each_script_measures_its_contenders(scripts: tuple[str, ...], tmp_path: Path) -> None:
+    """A short round ends with a positive figure for every contender that was asked for."""
+    rounds = [short_round(script, tmp_path) for script in scripts]
+    output_of(ONE_STAGE, json.dumps(rounds), folder=tmp_path)
+    for script in scripts:
+        report = json.loads((tmp_path / f"{script}.json").read_text())
+        if script in CHECKS:
+            CHECKS[script](report)
+        if script in CONTENDERS:
+            assert not report["skipped"], script
+            assert len(report["results"]) == CONTENDERS[script], script
+        if script in CONTENDERS and script != "facade":  # Both of its sides are alike.
+            assert all(found["median"] > 0 for found in report["results"].values()), script
 
 
 def test_lateness_is_measured_from_the_kth_of_all_outstanding(
@@ -179,26 +194,11 @@ def test_lateness_is_measured_from_the_kth_of_all_outstanding(
     assert calls.late_ms() == [2000.0, 1000.0]
 
 
-def test_adapters(report_of: ReportOf) -> None:
-    """Each interface steps, where the library that it belongs to is installed."""
-    asked = {"rlightning_aio VectorEnv"}
-    if importlib.util.find_spec("stable_baselines3") is not None:
-        asked.add("rlightning_aio sb3.VecEnv")
-    assert report_of("adapters")["results"].keys() == asked
-
-
-def test_pong(report_of: ReportOf) -> None:
-    """Raw frames pass through the synchronous and the asynchronous group."""
-    if importlib.util.find_spec("ale_py") is None:
-        pytest.skip("ale_py is not installed")
-    assert len(report_of("pong")["results"]) == 2
-
-
-def test_every_script_has_its_place_in_the_readme(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What `run_all` runs is what the README has tables for."""
+def test_every_script_has_its_place_in_the_results(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What `run_all` runs is what the page of all tables has room for."""
     monkeypatch.syspath_prepend(BENCHMARKS)
     run_all = importlib.import_module("run_all")
-    marked = re.findall(r"^<!-- (\w+) -->$", (BENCHMARKS / "README.md").read_text(), re.MULTILINE)
+    marked = re.findall(r"^<!-- (\w+) -->$", (BENCHMARKS / "tables.md").read_text(), re.MULTILINE)
     assert sorted(set(marked) - {"end"}) == sorted((*run_all.SCRIPTS, *run_all.LONG))
 
 

@@ -1,4 +1,4 @@
-"""The command as a user starts it, and as a function in this process."""
+"""Runs the command as a user would, in a process of its own or in this one."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CARTPOLE = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1"}
 
 
 def write_config(folder: Path, *entries: dict[str, Any]) -> str:
-    """A YAML file (JSON is YAML) with `entries`, which may use the stub envs."""
+    """Write a YAML file (JSON is YAML) with `entries`, which may use the stub envs."""
     path = folder / "config.yaml"
     document = {"imports": ["cli.stub_envs"], "envs": list(entries)}
     path.write_text(json.dumps(document))
@@ -32,12 +32,12 @@ def write_config(folder: Path, *entries: dict[str, Any]) -> str:
 
 
 def invoke(*words: object) -> Any:
-    """Run the command here; stdout, stderr and exit_code of what came of it."""
+    """Run the command in this process. Return stdout, stderr and exit_code."""
     return CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
 
 
 def invoke_json(*words: object) -> Any:
-    """Run the command here with --json; the document."""
+    """Run the command in this process with --json. Return the document."""
     done = invoke(*words, "--json")
     assert done.exit_code == 0, done.stderr
     return json.loads(done.stdout)
@@ -46,7 +46,7 @@ def invoke_json(*words: object) -> Any:
 def run(
     *words: object, cwd: Path = TESTS, program: Sequence[str] = COMMAND
 ) -> subprocess.CompletedProcess[str]:
-    """Run the command in a process of its own, to its end."""
+    """Run the command in a process of its own and wait for its end."""
     return subprocess.run(
         [*program, *map(str, words)],
         cwd=cwd,

@@ -1,4 +1,4 @@
-"""What commands keep for the process they run in is made before tests count descriptors."""
+"""Makes what commands keep open in a process before tests count descriptors."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import uvloop
 
 # libuv keeps a pipe for signals from its first loop to the end of the process.
 uvloop.new_event_loop().close()
-# And multiprocessing the memory that Gymnasium's AsyncVectorEnv shares with its processes.
+# Multiprocessing keeps the memory that Gymnasium's AsyncVectorEnv shares with its processes.
 multiprocessing.RawArray("b", 1)
 
 
 @pytest.fixture(autouse=True)
 def path_as_before(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A command adds the working folder to the path of its process."""
+    """Restore the path, to which a command adds the working directory."""
     monkeypatch.setattr(sys, "path", list(sys.path))

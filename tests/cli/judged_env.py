@@ -12,7 +12,7 @@ from gymnasium.vector import SyncVectorEnv
 
 
 class Judged(gym.Env[Any, Any]):
-    """Succeeds where the seed of the episode is even; an episode has three steps."""
+    """Succeeds if the seed of the episode is even; an episode has three steps."""
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
     action_space = gym.spaces.Discrete(2)
@@ -48,6 +48,22 @@ class Waiting(Judged):
         return super().step(action)
 
 
+class Rewarded(Judged):
+    """Gives the same reward, of any value, for each step of an episode."""
+
+    def __init__(self, reward: float) -> None:
+        super().__init__()
+        self.reward = reward
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        observation, _, *ends_and_info = super().step(action)
+        return observation, self.reward, *ends_and_info
+
+
+def rewarded(reward: str) -> Rewarded:
+    return Rewarded(float(reward))
+
+
 def make() -> Judged:
     return Judged()
 
@@ -57,5 +73,20 @@ def wait() -> Waiting:
 
 
 def poles() -> SyncVectorEnv:
-    """Three CartPoles, each as if it were alone."""
+    """Make a vector env of three independent CartPoles."""
     return SyncVectorEnv([lambda: gym.make("CartPole-v1")] * 3)
+
+
+class Switching(Judged):
+    """Plays any task, and raises in one."""
+
+    switches_task = True
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        if options and options["task"] == "raises":
+            raise ValueError("as its task says")
+        return super().reset(seed=seed)
+
+
+def switching() -> Switching:
+    return Switching()

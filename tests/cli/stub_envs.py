@@ -1,4 +1,4 @@
-"""Envs that count, fail, die and hang on demand; registered when a config imports this."""
+"""Envs that count, fail, die and hang on demand; a config registers them by importing this."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import atexit
 import os
 import subprocess
 import threading
+import time
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -57,7 +58,7 @@ class Stub(rl.BaseEnv):
 
 @rl.ENVS.register("stub")
 class PlainStub(Stub):
-    """Nothing goes wrong."""
+    """An env without faults."""
 
 
 @rl.ENVS.register("raising")
@@ -90,7 +91,7 @@ class Unbuildable(Stub):
 
 @rl.ENVS.register("stuck")
 class Stuck(Stub):
-    """Never finishes being built, or its third step; says in a file which process it is in."""
+    """Hangs when built or in its third step, after writing its process id to a file."""
 
     def __init__(self, config: rl.EnvConfig, *args: Any, **kwargs: Any) -> None:
         super().__init__(config, *args, **kwargs)
@@ -106,7 +107,7 @@ class Stuck(Stub):
 
 @rl.ENVS.register("worker_only")
 class WorkerOnly(Stub):
-    """Refuses to live where commands run."""
+    """Refuses to be built in the process of the command."""
 
     def __init__(self, config: rl.EnvConfig, *args: Any, **kwargs: Any) -> None:
         super().__init__(config, *args, **kwargs)
@@ -116,7 +117,7 @@ class WorkerOnly(Stub):
 
 @rl.ENVS.register("unclosable")
 class Unclosable(Stub):
-    """Fails where nobody can help it any more."""
+    """Fails while it is closed."""
 
     def close(self) -> None:
         raise RuntimeError("the lid is stuck")
@@ -124,7 +125,7 @@ class Unclosable(Stub):
 
 @rl.ENVS.register("talkative")
 class Talkative(Stub):
-    """Prints in every way there is, to the end of its process."""
+    """Prints in every possible way, until its process ends."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -142,9 +143,18 @@ class Talkative(Stub):
         print("closed")  # noqa: T201
 
 
+@rl.ENVS.register("stub_waiting")
+class Waiting(Stub):
+    """Sleeps in each step, as an env does that waits for hardware."""
+
+    def step(self, policy_resp: rl.PolicyResponse) -> rl.EnvRet:
+        time.sleep(0.02)
+        return super().step(policy_resp)
+
+
 @rl.ENVS.register("finishing")
 class Finishing(Stub):
-    """Wants no more after ``wanted_steps``; says in a file that it was closed."""
+    """Finishes after ``wanted_steps``; creates a file when it is closed."""
 
     def __init__(self, config: rl.EnvConfig, *args: Any, **kwargs: Any) -> None:
         super().__init__(config, *args, **kwargs)

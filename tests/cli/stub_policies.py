@@ -1,4 +1,4 @@
-"""Policies that tests name on the command line; they note what they were given."""
+"""Policies that tests name on the command line; they record their batches."""
 
 from __future__ import annotations
 
@@ -12,36 +12,36 @@ not_callable = 3
 
 
 def furthest(batch: Any) -> list[int]:
-    """Notes the highest step count that the stub envs of a batch have observed."""
+    """Record the highest step count in the observations of a batch."""
     furthest_seen.append(int(batch.observation.max()))
     return [0] * len(batch)
 
 
 def names(batch: Any) -> list[int]:
-    """Notes whose results come at once, and that they stack."""
+    """Record the envs of a batch, whose results must be stackable."""
     assert len(batch.observation) == len(batch)
     names_seen.append(frozenset(id_.partition("-")[0] for id_ in batch.ids()))
     return [0] * len(batch)
 
 
 def respond(batch: Any) -> Any:
-    """Attaches something to its actions."""
+    """Attach a column to the actions."""
     return batch.respond(action=[1] * len(batch), value=[0.5] * len(batch))
 
 
 async def later(batch: Any) -> list[int]:
-    """Takes its time, as one that asks a server does."""
+    """Return actions after a pause, as a policy does that asks a server."""
     await asyncio.sleep(0)
     return [1] * len(batch)
 
 
 def too_few(batch: Any) -> list[int]:
-    """Forgets an env."""
+    """Return an action too few."""
     return [0] * (len(batch) - 1)
 
 
 def broken(batch: Any) -> list[int]:
-    """Fails."""
+    """Raise an exception."""
     raise LookupError("no such weights")
 
 

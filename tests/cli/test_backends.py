@@ -1,4 +1,4 @@
-"""``rlightning-aio backends``: what is here, and how to get the rest."""
+"""``rlightning-aio backends`` lists backends and how to install them."""
 
 from __future__ import annotations
 
@@ -8,40 +8,44 @@ from typing import TYPE_CHECKING
 import gymnasium
 from cli.command import invoke, invoke_json, run
 
-from rlightning_aio.registry import BACKENDS, ENTRY_POINT_GROUP, Backend
+from rlightning_aio.registry import BACKENDS, ENTRY_POINT_GROUP, ENVS, Backend
 
 if TYPE_CHECKING:
     import pytest
 
+PIPER = ENVS.described("piper")
+assert PIPER is not None
+ROWS = [*BACKENDS.values(), PIPER]
 
-def test_every_built_in_backend_has_its_line() -> None:
-    """Name, version and the command that installs it, each in full."""
+
+def test_each_backend_has_a_line() -> None:
+    """The line has its name, version and install command in full."""
     lines = run("backends").stdout.splitlines()
-    for backend in BACKENDS.values():
+    for backend in ROWS:
         (line,) = [line for line in lines if line.split()[:1] == [backend.name]]
         assert line.rstrip().endswith(backend.install_command)
         assert (backend.installed_version() or "not installed") in line
 
 
-def test_json_says_the_same() -> None:
-    """One object for each backend, in the registry's order."""
+def test_json_has_one_object_for_each_backend() -> None:
+    """Built-in ones come first, then plug-ins."""
     rows = invoke_json("backends")
-    assert [row["name"] for row in rows[: len(BACKENDS)]] == list(BACKENDS)
+    assert [row["name"] for row in rows[: len(ROWS)]] == [backend.name for backend in ROWS]
     (row,) = [row for row in rows if row["name"] == "gymnasium"]
     assert row["installed"] is True
     assert row["version"] == gymnasium.__version__
     assert row["install"] == BACKENDS["gymnasium"].install_command
 
 
-def test_what_is_missing_is_said_to_be(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A simulator that is not installed has no version, and no error."""
+def test_a_missing_simulator_is_listed_as_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It has no version, and is no error."""
     monkeypatch.setattr(Backend, "installed_version", lambda self: None)
-    assert {row["installed"] for row in invoke_json("backends")[: len(BACKENDS)]} == {False}
-    assert invoke("backends").stdout.count("not installed") == len(BACKENDS)
+    assert {row["installed"] for row in invoke_json("backends")[: len(ROWS)]} == {False}
+    assert invoke("backends").stdout.count("not installed") == len(ROWS)
 
 
-def test_backends_of_other_packages_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An entry point brings a line with its package's version."""
+def test_env_classes_of_other_packages_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their lines have their package's version."""
     distribution = importlib.metadata.distribution("gymnasium")
     point = importlib.metadata.EntryPoint("theirs", "their.module:Env", ENTRY_POINT_GROUP)
     vars(point)["dist"] = distribution

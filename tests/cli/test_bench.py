@@ -1,12 +1,13 @@
-"""``bench`` and ``tune``: what they compare, and that what they print can be used."""
+"""``bench`` and ``tune`` compare settings and print usable results."""
 
 from __future__ import annotations
 
 import csv
 import importlib.util
 import json
+from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import pytest
 from cli import stub_policies
@@ -17,9 +18,7 @@ from timelines import Seen
 from rlightning_aio import EnvConfig, load_config
 from rlightning_aio.cli import bench, measuring, settings, tune
 from rlightning_aio.config import moved
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from rlightning_aio.sharing import num_cores
 
 STUB = {"name": "stub", "backend": "stub", "task": "any", "num_workers": 4}
 QUICK = ["--seconds", 0.01, "--rounds", 2]
@@ -27,7 +26,7 @@ QUICK = ["--seconds", 0.01, "--rounds", 2]
 
 @pytest.fixture(autouse=True)
 def two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The settings tried depend on the machine."""
+    """Fix the number of cores, on which the settings depend."""
     monkeypatch.setattr(settings, "num_cores", lambda: 2)
 
 
@@ -35,8 +34,8 @@ def settings_of(contenders: list[dict[str, Any]]) -> list[tuple[str, int]]:
     return list(dict.fromkeys((c["placement"], c["workers"]) for c in contenders))
 
 
-def test_bench_compares_places_and_rules(tmp_path: Path) -> None:
-    """Every place meets every rule, in as many rounds as asked for."""
+def test_bench_measures_every_place_under_every_rule(tmp_path: Path) -> None:
+    """Each has the given number of rounds."""
     document = invoke_json("bench", write_config(tmp_path, STUB), *QUICK)
     contenders = document["contenders"]
     assert settings_of(contenders) == [
@@ -55,34 +54,54 @@ def test_bench_compares_places_and_rules(tmp_path: Path) -> None:
     assert (document["interrupted"], document["cores"] > 0) == (False, True)
 
 
-def test_a_measurement_has_a_step_however_slow_the_machine_is(
+def test_a_measurement_has_a_step_on_any_machine(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where the time is over with the first batch, and that was of resets, it goes on."""
+    """It continues past its time limit if there were only resets before."""
     monkeypatch.setattr(bench, "Limits", lambda steps, _: measuring.Limits(steps, 0.0))
     config = write_config(tmp_path, {**STUB, "num_workers": 1, "max_episode_steps": 1})
     document = invoke_json("bench", config, "--rounds", 3)
     assert all(min(c["rounds"]) > 0 for c in document["contenders"])
 
 
+def test_bench_publishes_a_page(tmp_path: Path) -> None:
+    """It has the machine, the figures of each contender, the command and the whole config."""
+    config = write_config(tmp_path, {**STUB, "num_workers": 1})
+    page = tmp_path / "page.md"
+    override = "envs.0.max_episode_steps=9"
+    done = invoke("bench", config, override, *QUICK, "--publish", page)
+    text = page.read_text()
+    assert done.exit_code == 0
+    assert "2 rounds" in text
+    assert (
+        len([row for row in text.splitlines() if row.startswith(("| 1 worker", "| inline"))]) == 4
+    )
+    assert f"rlightning-aio bench {Path(config).name} {override}" in text
+    assert Path(config).read_text().strip() in text
+    assert str(tmp_path) not in text
+
+
 def test_bench_prints_a_table(tmp_path: Path) -> None:
-    """One row for each contender, named by place and rule."""
+    """The table has a line for each contender, with its place and rule."""
     config = write_config(tmp_path, {**STUB, "num_workers": 1})
     done = invoke("bench", config, *QUICK)
     rows = [line for line in done.stdout.splitlines() if "async" in line or "step " in line]
-    assert [row.split("  ")[0] for row in rows] == ["1 worker"] * 2 + ["inline"] * 2
+    assert [row.split("  ")[0] for row in rows] == ["1 worker process"] * 2 + ["inline"] * 2
 
 
-def test_bench_counts_what_entries_with_different_spaces_do_together(tmp_path: Path) -> None:
-    """Mixed groups are stepped as one, synchronously too."""
-    other = {**STUB, "name": "other", "env_kwargs": {"actions": 5, "observation_size": 3}}
-    document = invoke_json("bench", write_config(tmp_path, STUB, other), *QUICK)
+def test_bench_measures_entries_with_different_spaces_together(tmp_path: Path) -> None:
+    """Such a group is also stepped synchronously."""
+    stub = {**STUB, "num_workers": 2}
+    other = {**stub, "name": "other", "env_kwargs": {"actions": 5, "observation_size": 3}}
+    document = invoke_json("bench", write_config(tmp_path, stub, other), *QUICK)
     assert all(c["steps_per_second"] > 0 for c in document["contenders"])
-    assert document["contenders"][0]["envs_per_process"] == {"stub": 4, "other": 4}
+    assert document["contenders"][0]["envs_per_process"] == {"stub": 2, "other": 2}
 
 
-def test_a_setting_that_can_not_start_is_told_and_the_others_are_measured(tmp_path: Path) -> None:
-    """An env that can't live in the trainer's process doesn't end the bench."""
+def test_a_setting_that_cannot_start_is_reported_and_the_others_are_measured(
+    tmp_path: Path,
+) -> None:
+    """One reason is an env that can't live in the trainer's process."""
     entry = {**STUB, "backend": "worker_only", "num_workers": 2}
     done = invoke("bench", write_config(tmp_path, entry), *QUICK)
     assert done.exit_code == 0
@@ -90,16 +109,16 @@ def test_a_setting_that_can_not_start_is_told_and_the_others_are_measured(tmp_pa
     assert "needs a process of its own" in done.stdout
 
 
-def test_a_bench_of_which_nothing_starts_fails(tmp_path: Path) -> None:
-    """The cause is the message."""
+def test_a_bench_without_any_working_setting_fails(tmp_path: Path) -> None:
+    """The message is the cause."""
     entry = {"name": "robot", "backend": "unbuildable", "task": "any"}
     done = invoke("bench", write_config(tmp_path, entry), *QUICK)
     assert done.exit_code == 1
     assert "no such robot" in done.stderr
 
 
-def test_an_interrupted_bench_prints_what_it_has(tmp_path: Path) -> None:
-    """Ctrl-C ends it with the measurements made so far."""
+def test_an_interrupted_bench_prints_its_results_so_far(tmp_path: Path) -> None:
+    """Ctrl-C ends it after the present measurement."""
     import signal
 
     with start("bench", write_config(tmp_path, CARTPOLE), "--rounds", 10**6, "--json") as child:
@@ -115,10 +134,10 @@ def test_an_interrupted_bench_prints_what_it_has(tmp_path: Path) -> None:
         assert (document["interrupted"], bool(document["contenders"])) == (True, True)
 
 
-def test_a_plot_without_matplotlib_is_refused_before_anything_is_measured(
+def test_a_plot_without_matplotlib_is_refused_at_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The message says how to get it."""
+    """The message has the install command."""
     find = importlib.util.find_spec
     monkeypatch.setattr(
         importlib.util, "find_spec", lambda name: None if name == "matplotlib" else find(name)
@@ -129,18 +148,18 @@ def test_a_plot_without_matplotlib_is_refused_before_anything_is_measured(
 
 
 def test_the_plot_is_an_image(tmp_path: Path) -> None:
-    """--plot writes a PNG of what was measured."""
+    """--plot writes a PNG."""
     if importlib.util.find_spec("matplotlib") is None:
         pytest.skip("matplotlib is not installed")
     path = tmp_path / "plot.png"
-    # Matplotlib keeps its fonts open for the rest of the process, which is why it has its own.
+    # In a process of its own, because matplotlib keeps its fonts open.
     done = run("bench", write_config(tmp_path, CARTPOLE), *QUICK, "--plot", path)
     assert done.returncode == 0, done.stderr
     assert path.read_bytes().startswith(b"\x89PNG")
 
 
 def test_the_plot_of_a_rollout_is_an_image(tmp_path: Path) -> None:
-    """Rates and returns of each entry."""
+    """It shows rates and returns of each entry."""
     if importlib.util.find_spec("matplotlib") is None:
         pytest.skip("matplotlib is not installed")
     path = tmp_path / "plot.svg"
@@ -150,8 +169,8 @@ def test_the_plot_of_a_rollout_is_an_image(tmp_path: Path) -> None:
     assert b"<svg" in path.read_bytes()
 
 
-def test_what_tune_prints_of_inline_envs_loads(tmp_path: Path) -> None:
-    """It leaves out what has no meaning there, defaults included."""
+def test_tunes_config_of_inline_envs_can_be_loaded(tmp_path: Path) -> None:
+    """It leaves out all fields that have no meaning there."""
     entry = EnvConfig(name="a", backend="gymnasium", task="CartPole-v1", step_timeout=3.0)
     setting = settings.Setting((moved(entry, "inline"),), "inline")
     best = SimpleNamespace(setting=setting, steps_per_second=1.0, rule=measuring.Rule("step", None))
@@ -161,9 +180,9 @@ def test_what_tune_prints_of_inline_envs_loads(tmp_path: Path) -> None:
     assert (loaded.placement, loaded.step_timeout) == ("inline", None)
 
 
-def test_tune_prints_a_config_that_loads(tmp_path: Path) -> None:
-    """Stdout is YAML that differs from the config in where the envs live, and nowhere else."""
-    config = write_config(tmp_path, {**STUB, "max_episode_steps": 20})
+def test_tunes_config_can_be_loaded(tmp_path: Path) -> None:
+    """The YAML on stdout differs from the config only in the placement of envs."""
+    config = write_config(tmp_path, {**STUB, "num_workers": 2, "max_episode_steps": 20})
     done = invoke("tune", config, *QUICK)
     assert done.exit_code == 0, done.stderr
     tuned = tmp_path / "tuned.yaml"
@@ -177,8 +196,8 @@ def test_tune_prints_a_config_that_loads(tmp_path: Path) -> None:
     assert "Where the envs live" in done.stderr
 
 
-def test_tune_chooses_among_the_finals(tmp_path: Path) -> None:
-    """The best is one of the two fastest places, under one of the rules tried there."""
+def test_tune_chooses_one_of_the_finalists(tmp_path: Path) -> None:
+    """The best is one of the two fastest places, with one of the rules tried there."""
     document = invoke_json("tune", write_config(tmp_path, STUB), *QUICK)
     tried, best = document["tried"], document["best"]
     places, finals = tried[:4], tried[4:]
@@ -190,9 +209,32 @@ def test_tune_chooses_among_the_finals(tmp_path: Path) -> None:
     assert document["step_us"] > 0
 
 
+def test_tune_prints_no_bound_for_envs_that_wait(tmp_path: Path) -> None:
+    """More of them than cores step at once, so a step's time gives no bound."""
+    config = write_config(tmp_path, {**STUB, "backend": "stub_waiting", "num_workers": 3})
+    waiting = ("--rounds", 1, "--seconds", 0.1)
+    document = invoke_json("tune", config, *waiting)
+    assert document["step_us"] >= 20_000
+    assert document["limit_steps_per_second"] is None
+    assert "most of it waiting" in invoke("tune", config, *waiting).stderr
+
+
+def test_tune_prints_no_bound_below_its_own_measurement() -> None:
+    """Several simulations in one env may take less time each than one alone."""
+    entry = EnvConfig(name="a", backend="gymnasium", task="CartPole-v1")
+    setting = settings.Setting((moved(entry, "inline"),), "inline")
+    search = tune._Search([entry], 1, measuring.Limits(1, 1.0))
+    search.step_us = search.core_us = 1000.0
+    search.places = [measuring.Contender(setting, measuring.Rule("step", None))]
+    possible = num_cores() * 1000.0
+    for rate, bound in ((possible / 2, possible), (possible * 1.2, None)):
+        search.places[0].rounds = [measuring.Round(rate, (1.0, 1.0), 1.0)]
+        assert search.limit == bound
+
+
 @pytest.mark.parametrize("command", ["bench", "tune"])
-def test_envs_that_live_elsewhere_are_no_choice(tmp_path: Path, command: str) -> None:
-    """For a server of remote envs there is nothing to compare."""
+def test_tune_and_bench_refuse_an_env_server(tmp_path: Path, command: str) -> None:
+    """Its clients choose where envs live."""
     config = write_config(tmp_path, {"name": "robots", "backend": "env_server"})
     done = invoke(command, config)
     assert done.exit_code == 2
@@ -204,7 +246,7 @@ def entry(**fields: Any) -> EnvConfig:
 
 
 def found(*entries: EnvConfig) -> list[tuple[str, int, list[tuple[int, int]]]]:
-    """The settings tried: where, in how many workers, and how many envs of how many each."""
+    """Return the settings: placement, workers, and the numbers of envs and sub-environments."""
     return [
         (s.placement, s.workers, [(c.num_workers, c.num_envs) for c in s.configs])
         for s in settings.possible_settings(entries)
@@ -217,23 +259,23 @@ def found(*entries: EnvConfig) -> list[tuple[str, int, list[tuple[int, int]]]]:
         ({"num_workers": 1}, [1, 0]),
         ({"num_workers": 3}, [1, 2, 3, 0]),
         ({"num_workers": 64}, [1, 2, 4, 32, 0]),
-        # Simulators with threads or devices of their own share no process.
+        # A simulator that uses threads or a device needs a process for each env.
         ({"num_workers": 3, "backend": "maniskill"}, [3, 0]),
-        # What is set for workers alone can't be had in this process.
+        # Fields that need a worker exclude this process.
         ({"num_workers": 2, "env_vars": {"A": "1"}}, [1, 2]),
         ({"num_workers": 2, "interpreter": "/usr/bin/python3"}, [1, 2]),
     ],
 )
-def test_the_numbers_of_workers_that_are_tried(fields: dict[str, Any], workers: list[int]) -> None:
-    """From one worker to one for each env, within reason, and this process where it may be."""
+def test_numbers_of_workers_to_try(fields: dict[str, Any], workers: list[int]) -> None:
+    """They go from one to one for each env, up to a limit; this process is tried if possible."""
     sizes = [(fields["num_workers"], 1)]
     tried = [(where, count) for where, count, own in found(entry(**fields)) if own == sizes]
     assert [count for where, count in tried if where != "split"] == workers
     assert [where for where, count in tried if count == 0] == ["inline"] * workers.count(0)
 
 
-def test_simulations_that_can_share_an_env_are_tried_that_way() -> None:
-    """CartPole-v1 has a vector entry point: whether that, and where, is best is found out, too."""
+def test_simulations_that_can_share_an_env_are_also_tried_that_way() -> None:
+    """CartPole-v1 can, because it has a vector entry point."""
     tried = found(entry(num_workers=8))
     eight, four, one = [(8, 1)], [(2, 4)], [(1, 8)]
     assert {"inline", "split"} == {where for where, _, own in tried if own == eight} - {"process"}
@@ -241,15 +283,15 @@ def test_simulations_that_can_share_an_env_are_tried_that_way() -> None:
     assert ("process", 1, one) in tried
     assert ("process", 2, four) in tried
     assert ("split", 1, four) in tried
-    # However they are configured, and beside entries that can't be had like that.
+    # In any configuration, also together with entries that can't do this.
     assert found(entry(num_envs=8))[:1] == [("process", 1, one)]
     assert ("process", 2, four) in found(entry(num_envs=8))
     other = entry(name="b", backend="callable", task="module:make", num_workers=3)
     assert ("inline", 0, [(1, 8), (3, 1)]) in found(entry(num_workers=8), other)
 
 
-def test_what_tune_prints_is_complete(tmp_path: Path) -> None:
-    """Sub-environments, and the results to wait for, dealt out over the entries."""
+def test_tunes_config_has_sub_environments_and_min_results(tmp_path: Path) -> None:
+    """Both are divided among the entries."""
     entries = tuple(
         EnvConfig(name=name, backend="gymnasium", task="CartPole-v1", num_workers=n, num_envs=2)
         for name, n in (("a", 1), ("b", 2), ("c", 4))
@@ -264,10 +306,10 @@ def test_what_tune_prints_is_complete(tmp_path: Path) -> None:
     assert sum(c.min_results or 0 for c in loaded) == 5
 
 
-def test_baselines_stand_in_the_same_table(tmp_path: Path) -> None:
-    """A plain loop and Gymnasium's two vector envs step what it can make; CSV has all figures."""
+def test_baselines_are_in_the_same_table(tmp_path: Path) -> None:
+    """They are a plain loop and Gymnasium's two vector envs; CSV has all figures."""
     config = write_config(tmp_path, {**CARTPOLE, "num_workers": 2, "max_episode_steps": 5})
-    # What Gymnasium shares with its processes is kept for the rest of this one.
+    # Gymnasium's shared memory stays open until this process ends.
     done = run("bench", config, "--seconds", 0.005, "--rounds", 1, "--format", "csv")
     assert done.returncode == 0, done.stderr
     rows = list(csv.DictReader(done.stdout.splitlines()))
@@ -275,8 +317,8 @@ def test_baselines_stand_in_the_same_table(tmp_path: Path) -> None:
     assert all(float(row["steps_per_second"]) > 0 for row in rows)
 
 
-def test_a_policy_and_a_seed_are_used(tmp_path: Path) -> None:
-    """Every place steps with the policy's actions; what takes no batch is left out."""
+def test_bench_uses_a_policy_and_a_seed(tmp_path: Path) -> None:
+    """Contenders without batches are left out."""
     config = write_config(tmp_path, {**STUB, "num_workers": 1})
     stub_policies.furthest_seen.clear()
     words = ("--policy", "cli.stub_policies:furthest", "--seed", 3, "--rounds", 1)
@@ -289,8 +331,8 @@ def test_a_policy_and_a_seed_are_used(tmp_path: Path) -> None:
     assert stub_policies.furthest_seen
 
 
-def test_what_was_saved_is_compared_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Exit code 3 where all rounds are slower than all that were saved, and only there."""
+def test_bench_compares_with_saved_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The exit code is 3 only if all rounds are slower than all saved ones."""
     monkeypatch.chdir(tmp_path)
     config = write_config(tmp_path, {**STUB, "num_workers": 1})
     words = ("bench", config, "--seconds", 0.005, "--rounds", 1)
@@ -311,15 +353,15 @@ def test_what_was_saved_is_compared_with(tmp_path: Path, monkeypatch: pytest.Mon
         assert comparison["differences"][0].startswith("cpu was another")
 
 
-def test_a_plot_that_can_not_be_written_is_found_before_anything_is_measured(
+def test_a_plot_that_cannot_be_written_is_refused_at_once(
     tmp_path: Path,
 ) -> None:
-    """A folder that isn't there, a folder in its place, and a kind that is none."""
+    """The folder is missing, the path is a folder, or the format is unknown."""
     config = write_config(tmp_path, STUB)
     (tmp_path / "taken.png").mkdir()
     for name, why in (
-        ("no/plot.png", "No such file"),
-        ("taken.png", "Is a directory"),
+        ("no/plot.png", "there is no folder"),
+        ("taken.png", "it is a folder"),
         ("plot.txt", "should end in"),
     ):
         done = invoke("bench", config, "--plot", tmp_path / name)
@@ -329,8 +371,8 @@ def test_a_plot_that_can_not_be_written_is_found_before_anything_is_measured(
     assert not (tmp_path / "plot.png").exists()
 
 
-def test_bench_traces_the_fastest(tmp_path: Path) -> None:
-    """One file, of one measurement more; the figures are as many as without."""
+def test_bench_traces_the_fastest_contender(tmp_path: Path) -> None:
+    """It measures once more for the file, which adds no figures."""
     config = write_config(tmp_path, {**STUB, "num_workers": 1})
     document = invoke_json("bench", config, *QUICK, "--trace", tmp_path / "run.json")
     assert all(len(c["rounds"]) == 2 for c in document["contenders"])

@@ -1,4 +1,4 @@
-"""``check`` and ``tasks``: what a config's envs are like, and what else there is."""
+"""``check`` tries a config's envs; ``tasks`` lists tasks of a backend."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 INLINE = {**CARTPOLE, "placement": "inline"}
 
 
-def test_spaces_are_printed_of_envs_that_work(tmp_path: Path) -> None:
-    """One env of each entry is built and stepped, however many there are."""
+def test_check_prints_the_spaces_of_working_envs(tmp_path: Path) -> None:
+    """It builds and steps one env of each entry."""
     stub = {"name": "stub", "backend": "stub", "task": "any", "placement": "inline"}
     config = write_config(tmp_path, {**INLINE, "num_envs": 3}, {**stub, "num_workers": 50})
     Stub.steps = 0
@@ -26,8 +26,8 @@ def test_spaces_are_printed_of_envs_that_work(tmp_path: Path) -> None:
     assert "  action       Discrete(2)" in invoke("check", config).stdout.splitlines()
 
 
-def test_what_can_not_be_started_is_left_alone_and_named(tmp_path: Path) -> None:
-    """A robot would move; a server's envs live elsewhere."""
+def test_check_names_the_envs_that_it_does_not_start(tmp_path: Path) -> None:
+    """These are robots, which would move, and env_servers, whose envs live elsewhere."""
     config = write_config(tmp_path, INLINE, {"name": "robots", "backend": "env_server"})
     lines = invoke("check", config).stdout.splitlines()
     assert lines[-2:] == [
@@ -36,16 +36,16 @@ def test_what_can_not_be_started_is_left_alone_and_named(tmp_path: Path) -> None
     ]
 
 
-def test_an_env_that_fails_fails_the_check(tmp_path: Path) -> None:
-    """With the message that any command has."""
+def test_check_fails_if_an_env_fails(tmp_path: Path) -> None:
+    """The message is that of every command."""
     entry = {"name": "cracked", "backend": "raising", "task": "any", "placement": "inline"}
     done = invoke("check", write_config(tmp_path, entry))
     assert (done.exit_code, done.stdout) == (1, "")
     assert "the floor is missing" in done.stderr
 
 
-def test_tasks_of_a_backend_are_listed() -> None:
-    """Each backend has its own; one that has no list says so, and one that is none."""
+def test_tasks_lists_the_tasks_of_a_backend() -> None:
+    """A backend without a list, and an unknown one, raise an error."""
     assert "CartPole-v1" in invoke("tasks", "gymnasium").stdout.splitlines()
     assert "HalfCheetah-v5" in invoke_json("tasks", "mujoco")
     assert "HalfCheetah-v5" not in invoke_json("tasks", "gymnasium")

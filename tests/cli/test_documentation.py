@@ -1,4 +1,4 @@
-"""What ``docs/command-line.md``, other pages and the README say can be typed."""
+"""Commands in ``docs/command-line.md``, other pages and the README run."""
 
 from __future__ import annotations
 
@@ -34,42 +34,42 @@ ELSEWHERE = ("make ", "python -m rlightning_aio.legacy ")
 
 SHORT = {
     "rollout": ["--steps", "500", "envs.0.num_workers=8"],
-    "bench": ["--seconds", "0.005", "--rounds", "1", "envs.0.num_workers=2"],
+    "bench": ["--seconds", "0.005", "--rounds", "1", "envs.0.num_workers=1"],
     "eval": ["envs.0.num_workers=2"],
-    "tune": ["--seconds", "0.005", "--rounds", "1", "envs.0.num_workers=2"],
+    "tune": ["--seconds", "0.005", "--rounds", "1", "envs.0.num_workers=1"],
 }
 
 
 @pytest.mark.parametrize("line", LINES)
 def test_every_command_runs(line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As it stands but for its length, with the page's policy in the folder where it is run."""
+    """Each runs unchanged except for its length, with the page's policy in its folder."""
     (policy,) = blocks("python", PAGE)
     (tmp_path / "my_policies.py").write_text(policy)
     (tmp_path / "configs").symlink_to(ROOT / "configs")
     monkeypatch.chdir(tmp_path)
-    # How long it goes on, and with how many envs, is a matter of patience.
+    # Shorter runs with fewer envs save time.
     short = SHORT.get(shlex.split(line)[1], [])
     done = invoke(*shlex.split(line)[1:], *short)
     assert done.exit_code == 0, done.stderr
 
 
-def test_no_command_is_left_out() -> None:
-    """What a reader can't type as it stands is in a block of `console`."""
+def test_commands_that_cannot_run_are_console_blocks() -> None:
+    """All others are `sh` blocks."""
     others = [line for line in COMMANDS if line not in LINES and line.strip()]
     assert [line for line in others if not line.startswith(ELSEWHERE)] == []
 
 
 @pytest.mark.parametrize("command", re.findall(r"^## (\w+)$", PAGE, re.MULTILINE))
-def test_every_option_is_one(command: str) -> None:
-    """Each option named in a command's section is in its help."""
+def test_every_option_of_the_page_exists(command: str) -> None:
+    """Each is in the help of its section's command."""
     section = PAGE.partition(f"\n## {command}\n")[2].partition("\n## ")[0]
     named = set(re.findall(r"--[a-z][a-z-]+", section))
     known = set(re.findall(r"--[a-z][a-z-]+", invoke(command, "--help").stdout))
     assert named - known == set()
 
 
-def test_every_command_has_its_row() -> None:
-    """The page lists what --help lists, and the two commands of env_server."""
+def test_every_command_is_on_the_page() -> None:
+    """The page lists the same commands as --help."""
     known = set(re.findall(r"^│ (\w+) ", invoke("--help").stdout, re.MULTILINE))
     rows = set(re.findall(r"`(\w+)`", "".join(re.findall(r"^\| (`.*?) \|", PAGE, re.MULTILINE))))
     assert known <= rows

@@ -1,8 +1,9 @@
-"""``rlightning-aio eval``: equally many episodes of each env, and what they say of a policy."""
+"""``rlightning-aio eval`` plays equal numbers of episodes and prints statistics."""
 
 from __future__ import annotations
 
 import json
+import os
 import signal
 from collections import Counter
 from typing import TYPE_CHECKING, Any
@@ -25,8 +26,8 @@ def by_number(episodes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return sorted(episodes, key=lambda one: (one["env_id"], one["number"]))
 
 
-def test_each_env_plays_equally_many_episodes(tmp_path: Path) -> None:
-    """The real command prints a line for each entry, with intervals; by JSON all episodes."""
+def test_each_env_plays_the_same_number_of_episodes(tmp_path: Path) -> None:
+    """The command prints a line with intervals for each entry; JSON has all episodes."""
     config = write_config(tmp_path, {**CARTPOLE, "num_workers": 3})
     done = run("eval", config, "--episodes", 2, "--seed", 0)
     assert done.returncode == 0, done.stderr
@@ -42,8 +43,8 @@ def test_each_env_plays_equally_many_episodes(tmp_path: Path) -> None:
     assert played == [(f"pole-{k}", n) for k in range(3) for n in range(2)]
 
 
-def test_success_is_judged(tmp_path: Path) -> None:
-    """By what the last info says; of an env that says nothing there is no rate."""
+def test_success_is_read_from_the_last_info(tmp_path: Path) -> None:
+    """Without it there is no success rate."""
     config = write_config(tmp_path, {**JUDGED, "num_workers": 2}, STUB)
     judged, stub = invoke_json("eval", config, "--episodes", 5, "--seed", 0)["entries"]
     assert judged["success"]["mean"] == 0.5
@@ -52,8 +53,8 @@ def test_success_is_judged(tmp_path: Path) -> None:
     assert (stub["episodes"], stub["length"]["mean"]) == (5, 10)
 
 
-def test_a_policy_is_named(tmp_path: Path) -> None:
-    """By its module, as for rollout; a step limit holds."""
+def test_a_policy_is_given_by_module_and_name(tmp_path: Path) -> None:
+    """This is as for rollout; a step limit applies."""
     config = write_config(tmp_path, {**POLE, "max_episode_steps": 4})
     policy = "cli.stub_policies:respond"
     document = invoke_json("eval", config, "--episodes", 2, "--policy", policy)
@@ -61,13 +62,13 @@ def test_a_policy_is_named(tmp_path: Path) -> None:
     assert document["entries"][0]["length"]["mean"] == 4
 
 
-def test_finished_episodes_are_not_played_again(tmp_path: Path) -> None:
-    """What an evaluation in two parts says is what one in a single part says."""
+def test_resume_does_not_repeat_finished_episodes(tmp_path: Path) -> None:
+    """An evaluation in two parts has the results of one in a single part."""
     config, file = write_config(tmp_path, POLE), tmp_path / "episodes.jsonl"
     asked = ("eval", config, "--seed", 3, "--policy", "cli.stub_policies:respond")
     whole = invoke_json(*asked, "--episodes", 4)
     invoke_json(*asked, "--episodes", 2, "--resume", file)
-    # Ended in the middle of a line.
+    # The command ended in the middle of a line.
     file.write_text(file.read_text() + '{"env_id": "pole-0", "sub')
     lines = len(file.read_text().splitlines()) - 1
     both = invoke_json(*asked, "--episodes", 4, "--resume", file)
@@ -77,8 +78,8 @@ def test_finished_episodes_are_not_played_again(tmp_path: Path) -> None:
     assert len(fewer["episodes"]) == 3
 
 
-def test_ctrl_c_keeps_what_was_played(tmp_path: Path) -> None:
-    """The summary says that it is no fair sample, and its film has a mark of its own."""
+def test_ctrl_c_keeps_finished_episodes(tmp_path: Path) -> None:
+    """The summary says that it is no fair sample, and the film is marked."""
     config = write_config(
         tmp_path, {"name": "slow", "task": "cli.judged_env:wait", "num_workers": 2}
     )
@@ -99,13 +100,65 @@ def test_ctrl_c_keeps_what_was_played(tmp_path: Path) -> None:
     assert names == {"slow-0-episode-0.mp4", "slow-0-episode-1.partial.mp4"}
 
 
-def test_it_is_drawn_filmed_and_traced(tmp_path: Path) -> None:
-    """In the files that were named; the timeline holds each episode from its reset on."""
+def test_a_file_is_locked_while_a_command_writes_it(tmp_path: Path) -> None:
+    """A second command is refused until the first one ends in any way."""
+    waiting = {"name": "slow", "task": "cli.judged_env:wait", "num_workers": 2}
+    config, file = write_config(tmp_path, waiting), tmp_path / "episodes.jsonl"
+    words = (config, "--seed", 0, "--resume", file, "--episodes")
+    with start("eval", *words, 2) as child:
+        assert child.stderr is not None
+        while "waits" not in (line := child.stderr.readline()):
+            assert line, "it has ended"
+        before = file.read_bytes()
+        assert "another eval is writing this file" in refused(*words, 2)
+        assert file.read_bytes() == before
+        child.kill()
+        child.communicate(timeout=HANG)
+    # The killed command has played all episodes.
+    file.write_text(file.read_text() + before.decode().splitlines()[1].replace("w-0", "w-1") + "\n")
+    assert len(invoke_json("eval", *words, 1)["episodes"]) == 2
+
+
+def test_a_file_that_holds_an_episode_twice_is_refused(tmp_path: Path) -> None:
+    """Two concurrent writers would have left such a file; it is not changed."""
+    config, file = write_config(tmp_path, POLE), tmp_path / "episodes.jsonl"
+    invoke_json("eval", config, "--episodes", 2, "--resume", file)
+    head, *episodes = file.read_text().splitlines(keepends=True)
+    later = [line for line in episodes if '"number": 1' in line]
+    for lines, words in (
+        ([*episodes, later[0]], "is a duplicate"),
+        (later, "is out of order"),
+    ):
+        file.write_text("".join((head, *lines)))
+        assert words in refused(config, "--resume", file)
+        assert file.read_text() == "".join((head, *lines))
+
+
+def test_a_full_disk_leaves_complete_lines(small_disk: Path) -> None:
+    """Results so far are printed, and the rest is played later."""
+    config, file = write_config(small_disk, POLE), small_disk / "episodes.jsonl"
+    invoke_json("eval", config, "--episodes", 1, "--resume", file)
+    free = os.statvfs(small_disk)
+    (small_disk / "rest").write_bytes(bytes(free.f_bavail * free.f_bsize - 4096))
+    done = invoke("eval", config, "--episodes", 60, "--resume", file, "--json")
+    assert done.exit_code == 2
+    assert done.stderr.endswith("episodes.jsonl: can't be written: No space left on device\n")
+    whole = file.read_text()
+    assert whole.endswith("}\n")
+    kept = len(whole.splitlines()) - 1
+    assert 3 < kept < 180
+    assert len(json.loads(done.stdout)["episodes"]) == kept + 1
+    (small_disk / "rest").unlink()
+    assert len(invoke_json("eval", config, "--episodes", 60, "--resume", file)["episodes"]) == 180
+
+
+def test_eval_draws_films_and_traces(tmp_path: Path) -> None:
+    """The timeline has each episode from its reset on."""
     config = write_config(tmp_path, {**JUDGED, "num_workers": 2}, STUB)
     plot, films, trace = tmp_path / "plot.png", tmp_path / "films", tmp_path / "run.json"
     filming = ("--video", films, "--video-env", "judged-1", "--video-every", 2)
     drawing = ("--plot", plot, "--trace", trace, "--json")
-    # In a process of its own: matplotlib keeps its fonts open.
+    # In a process of its own, because matplotlib keeps its fonts open.
     done = run("eval", config, "--episodes", 3, "--seed", 0, *drawing, *filming)
     assert done.returncode == 0, done.stderr
     assert plot.read_bytes().startswith(b"\x89PNG")
@@ -129,8 +182,8 @@ def refused(*words: object) -> str:
     return str(done.stderr)
 
 
-def test_what_is_wrong_is_told_before_anything_starts(tmp_path: Path) -> None:
-    """By the option, with what to do."""
+def test_wrong_options_are_refused_at_once(tmp_path: Path) -> None:
+    """The message names the option and the fix."""
     config = write_config(tmp_path, POLE)
     assert "there is no such file" in refused(config, "--policy", "absent.zip")
     assert "--algo is for a model" in refused(config, "--algo", "PPO")
@@ -145,8 +198,8 @@ def test_what_is_wrong_is_told_before_anything_starts(tmp_path: Path) -> None:
     assert "'robots'), backend: clients of an env_server come and go" in refused(server)
 
 
-def test_a_file_of_another_evaluation_is_left_as_it_is(tmp_path: Path) -> None:
-    """Nor is one overwritten that holds something else."""
+def test_a_file_of_another_evaluation_is_left_unchanged(tmp_path: Path) -> None:
+    """So is a file with other contents."""
     config, file = write_config(tmp_path, POLE), tmp_path / "episodes.jsonl"
     invoke_json("eval", config, "--episodes", 1, "--seed", 3, "--resume", file)
     before = file.read_bytes()
@@ -154,14 +207,14 @@ def test_a_file_of_another_evaluation_is_left_as_it_is(tmp_path: Path) -> None:
     assert file.read_bytes() == before
     for text in ("notes", "notes\nmore notes\n", "[1]\n", "{}\n"):
         file.write_text(text)
-        assert "is not a file that eval has written" in refused(config, "--resume", file)
+        assert "is not a file written by eval" in refused(config, "--resume", file)
         assert file.read_text() == text
 
 
 @pytest.mark.simulators
 @pytest.mark.parametrize(("algorithm", "together"), [("PPO", False), ("A2C", False), ("DQN", True)])
 def test_a_model_of_stable_baselines3(tmp_path: Path, algorithm: str, together: bool) -> None:
-    """The algorithm is read from the file; each episode is what the model plays by itself."""
+    """Its algorithm is found in the file, and episodes equal those of the model alone."""
     sb3 = pytest.importorskip("stable_baselines3")
     import gymnasium as gym
 
@@ -188,3 +241,89 @@ def test_a_model_of_stable_baselines3(tmp_path: Path, algorithm: str, together: 
     assert "those of env 'pendulum-0' are Box" in refused(other, *asked)
     assert "no such algorithm" in refused(config, *asked, "--algo", "PQN")
     assert "can't be loaded as SAC" in refused(config, *asked, "--algo", "SAC")
+
+
+# -- a queue of episodes ----------------------------------------------------------------
+
+SWITCHING = {"name": "many", "task": "cli.judged_env:switching", "placement": "inline"}
+
+
+def test_a_queue_plays_each_task_with_each_seed(tmp_path: Path) -> None:
+    """Figures are by task, whichever envs play; the file resumes with another number of them."""
+    config, file = write_config(tmp_path, {**SWITCHING, "num_workers": 3}), tmp_path / "rows.jsonl"
+    invoke_json("eval", config, "--tasks", "a,b", "--seeds", "0:3", "--resume", file)
+    asked = ("--tasks", "a,b", "--tasks", "c", "--seeds", "0:4", "--resume", file)
+    done = run("eval", config, "envs.0.num_workers=2", *asked)
+    assert done.returncode == 0, done.stderr
+    assert "playing 12 episodes, 6 of them played before" in done.stderr
+    table = {line.split()[0]: line.split()[1:3] for line in done.stdout.splitlines()[3:]}
+    assert table == {**{task: ["4", "50.0%"] for task in "abc"}, "all": ["12", "50.0%"]}
+    document = invoke_json("eval", config, *asked)
+    assert [(one["task"], one["episodes"]) for one in document["tasks"]] == [
+        (task, 4) for task in "abc"
+    ]
+    assert sorted((one["task"], one["seed"]) for one in document["rows"]) == [
+        (task, seed) for task in "abc" for seed in range(4)
+    ]
+    assert (document["queue"], document["episodes"], document["failed"]) == (12, 12, 0)
+
+
+def test_a_file_names_the_episodes(tmp_path: Path) -> None:
+    """Without a task it is the entry's; with several entries each names its own."""
+    config = write_config(tmp_path, JUDGED, STUB)
+    file = tmp_path / "episodes.jsonl"
+    file.write_text('{"entry": "judged", "seed": 2}\n\n{"entry": "stub", "seed": 1}\n')
+    document = invoke_json("eval", config, "--episodes-file", file)
+    played = {(one["entry"], one["task"], one["seed"]) for one in document["rows"]}
+    assert played == {("judged", JUDGED["task"], 2), ("stub", "any", 1)}
+    both = invoke_json("eval", config, "--seeds", "5,7")["rows"]
+    assert len(both) == 4
+    for text, words in (
+        ("[1]\n", "line 1: "),
+        ('\n{"task": "any"}\n', "line 2: "),
+        ('{"seed": "1"}\n', "seed should be an int"),
+        ("", "has no episodes"),
+    ):
+        file.write_text(text)
+        assert words in refused(config, "--episodes-file", file)
+
+
+def test_an_episode_that_fails_is_told_of(tmp_path: Path) -> None:
+    """The others are in the table, and the exit code says that some have no result."""
+    config = write_config(tmp_path, SWITCHING)
+    done = run("eval", config, "--tasks", "a,raises", "--seeds", "0:2", "--max-attempts", 2)
+    assert done.returncode == 1
+    assert "4 attempts lost with a worker or by an error of an env" in done.stdout
+    assert "failed: task 'raises', seed 1: env 'many-0'" in done.stdout
+    (line,) = [line for line in done.stdout.splitlines() if line.startswith("a ")]
+    assert line.split()[1:3] == ["2", "50.0%"]
+
+
+def test_a_queue_is_drawn_and_filmed(tmp_path: Path) -> None:
+    """Of chosen episodes, those that fail."""
+    config = write_config(tmp_path, {**SWITCHING, "num_workers": 2})
+    plot, films = tmp_path / "plot.png", tmp_path / "films"
+    chosen = ("--video-episode", "a:1", "--video-episode", "b:2", "--video-failed")
+    asked = ("--tasks", "a,b", "--seeds", "0:4", "--video", films, *chosen, "--plot", plot)
+    # In a process of its own, because matplotlib keeps its fonts open.
+    done = run("eval", config, *asked)
+    assert done.returncode == 0, done.stderr
+    assert [path.name for path in films.iterdir()] == ["many-a-seed-1.mp4"]
+    assert plot.read_bytes().startswith(b"\x89PNG")
+
+
+def test_wrong_options_of_a_queue_are_refused(tmp_path: Path) -> None:
+    """The message names the option and the fix."""
+    config = write_config(tmp_path, SWITCHING)
+    for words, text in (
+        (("--tasks", "a"), "add --seeds 0:50"),
+        (("--seeds", "3:1"), "should look like 0:50 or 1,2,5"),
+        (("--seeds", "a"), "should look like 0:50 or 1,2,5"),
+        (("--seeds", "0:2", "--episodes", 3), "--episodes is for a number of episodes"),
+        (("--seeds", "0:2", "--video-failed"), "add --video FOLDER"),
+        (("--video-failed",), "choose episodes of a queue"),
+        (("--seeds", "0:2", "--video", tmp_path, "--video-episode", "x:1"), "not in the queue"),
+        (("--seeds", "0:2", "--episodes-file", config), "leave --tasks and --seeds out"),
+        (("--seeds", "1,1"), "the queue has"),
+    ):
+        assert text in refused(config, *words)

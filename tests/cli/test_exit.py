@@ -1,19 +1,18 @@
-"""How commands end when something is wrong: the exit code, one message, no traceback."""
+"""Errors end a command with an exit code and one message, without a traceback."""
 
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
+import subprocess
+from pathlib import Path
 
 import pytest
-from cli.command import CARTPOLE, invoke, run, write_config
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from cli.command import CARTPOLE, COMMAND, TESTS, invoke, run, write_config
+from patience import HANG
 
 STUB = {"name": "stub", "backend": "stub", "task": "any"}
 
-# A YAML text, overrides, and what the message has to name beside the file.
+# A YAML text, overrides, and words of the message, which also names the file.
 WRONG: dict[str, tuple[str, list[str], list[str]]] = {
     "no list": ("envs: 3", [], ["envs", "should be a list"]),
     "an empty list": ("envs: []", [], ["envs", "no entries"]),
@@ -58,10 +57,10 @@ WRONG: dict[str, tuple[str, list[str], list[str]]] = {
 
 @pytest.mark.parametrize("wrong", WRONG.values(), ids=WRONG)
 @pytest.mark.parametrize("command", ["rollout", "bench", "tune"])
-def test_a_wrong_config_is_code_2_and_names_its_place(
+def test_a_wrong_config_is_code_2_and_names_the_field(
     tmp_path: Path, command: str, wrong: tuple[str, list[str], list[str]]
 ) -> None:
-    """File, entry and field are in the one message; nothing is on stdout."""
+    """The message has file, entry and field; stdout is empty."""
     text, overrides, named = wrong
     path = tmp_path / "wrong.yaml"
     path.write_text(text)
@@ -73,7 +72,7 @@ def test_a_wrong_config_is_code_2_and_names_its_place(
 
 
 def test_a_wrong_config_shows_no_traceback(tmp_path: Path) -> None:
-    """The process itself says one line."""
+    """Stderr has one line."""
     config = write_config(tmp_path, {**CARTPOLE, "num_workers": -1})
     done = run("rollout", config)
     assert done.returncode == 2
@@ -82,7 +81,7 @@ def test_a_wrong_config_shows_no_traceback(tmp_path: Path) -> None:
 
 
 def test_a_missing_file_is_named() -> None:
-    """A path that leads nowhere is a wrong configuration."""
+    """It counts as a wrong configuration."""
     done = invoke("rollout", "nowhere.yaml")
     assert done.exit_code == 2
     assert done.stderr.startswith("error: nowhere.yaml: ")
@@ -90,7 +89,7 @@ def test_a_missing_file_is_named() -> None:
 
 @pytest.mark.parametrize("words", [["--steps", "0"], ["--min-results", "none"], ["--nonsense"]])
 def test_a_wrong_option_is_code_2(tmp_path: Path, words: list[str]) -> None:
-    """The command line itself is checked before anything starts."""
+    """It is refused before anything starts."""
     done = invoke("rollout", write_config(tmp_path, CARTPOLE), *words)
     assert done.exit_code == 2
     assert words[0] in done.stderr
@@ -105,8 +104,8 @@ def test_a_wrong_option_is_code_2(tmp_path: Path, words: list[str]) -> None:
         ("cli.stub_policies:not_callable", "is a int, not a callable"),
     ],
 )
-def test_a_policy_that_is_none_is_code_2(tmp_path: Path, policy: str, message: str) -> None:
-    """It is found before any env starts, and named."""
+def test_an_invalid_policy_is_code_2(tmp_path: Path, policy: str, message: str) -> None:
+    """It is named before any env starts."""
     done = invoke("rollout", write_config(tmp_path, CARTPOLE), "--policy", policy)
     assert done.exit_code == 2
     assert f"--policy '{policy}': " in done.stderr
@@ -115,8 +114,8 @@ def test_a_policy_that_is_none_is_code_2(tmp_path: Path, policy: str, message: s
 
 
 @pytest.mark.parametrize("placement", ["process", "inline"])
-def test_an_env_that_raises_is_code_1_with_what_came_before(tmp_path: Path, placement: str) -> None:
-    """The message names the env and the line that raised; the table shows what there is."""
+def test_an_env_that_raises_is_code_1(tmp_path: Path, placement: str) -> None:
+    """The message names the env and the line; the table has the results so far."""
     raising = {"name": "cracked", "backend": "raising", "task": "any", "placement": placement}
     done = invoke("rollout", write_config(tmp_path, raising))
     assert done.exit_code == 1
@@ -129,7 +128,7 @@ def test_an_env_that_raises_is_code_1_with_what_came_before(tmp_path: Path, plac
 
 
 def test_a_dead_worker_is_code_1(tmp_path: Path) -> None:
-    """Where the config says so, a worker's end is the command's."""
+    """The config asks for it with on_worker_death: raise."""
     dying = {"name": "frail", "backend": "dying", "task": "any", "on_worker_death": "raise"}
     done = invoke("rollout", write_config(tmp_path, dying), "--json")
     assert done.exit_code == 1
@@ -139,16 +138,16 @@ def test_a_dead_worker_is_code_1(tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:close.. of env 'frail-0' raised WorkerDied")
-def test_a_worker_that_is_replaced_ends_nothing(tmp_path: Path) -> None:
-    """By default a dead worker is replaced, and the rollout goes on."""
+def test_a_rollout_continues_after_a_worker_is_replaced(tmp_path: Path) -> None:
+    """A dead worker is replaced by default."""
     dying = {"name": "frail", "backend": "dying", "task": "any", "max_restarts": 10**6}
     done = invoke("rollout", write_config(tmp_path, dying), "--steps", 20)
     assert done.exit_code == 0, done.stderr
 
 
 @pytest.mark.parametrize("placement", ["process", "inline"])
-def test_an_env_that_can_not_be_built_is_code_1(tmp_path: Path, placement: str) -> None:
-    """No table: nothing came. The cause is named."""
+def test_an_env_that_cannot_be_built_is_code_1(tmp_path: Path, placement: str) -> None:
+    """There is no table; the message has the cause."""
     entry = {"name": "robot", "backend": "unbuildable", "task": "any", "placement": placement}
     done = invoke("rollout", write_config(tmp_path, entry))
     assert done.exit_code == 1
@@ -161,7 +160,7 @@ def test_an_env_that_can_not_be_built_is_code_1(tmp_path: Path, placement: str) 
 def test_a_missing_simulator_is_code_2_with_the_command_that_installs_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is found before any worker starts."""
+    """The message comes before any worker starts."""
     from rlightning_aio.registry import Backend
 
     monkeypatch.setattr(Backend, "installed_version", lambda self: None)
@@ -171,15 +170,15 @@ def test_a_missing_simulator_is_code_2_with_the_command_that_installs_it(
 
 
 def test_actions_that_do_not_fit_are_code_1(tmp_path: Path) -> None:
-    """A policy that answers too few is told so."""
+    """A policy may return too few, for example."""
     config = write_config(tmp_path, {**STUB, "placement": "inline", "num_workers": 3})
     done = invoke("rollout", config, "--policy", "cli.stub_policies:too_few")
     assert done.exit_code == 1
     assert "2 rows for a batch of 3" in done.stderr
 
 
-def test_a_policy_that_raises_shows_the_way_through_its_own_code(tmp_path: Path) -> None:
-    """It is the user's code: where it went wrong is what they need, and nothing else."""
+def test_an_exception_of_a_policy_shows_its_own_code(tmp_path: Path) -> None:
+    """The traceback leaves out this library's code."""
     config = write_config(tmp_path, {**STUB, "placement": "inline"})
     done = invoke("rollout", config, "--policy", "cli.stub_policies:broken")
     assert (done.exit_code, done.stdout) == (1, "")
@@ -189,8 +188,8 @@ def test_a_policy_that_raises_shows_the_way_through_its_own_code(tmp_path: Path)
     assert ["stub_policies.py" in place for place in places] == [True]
 
 
-def test_clients_that_do_not_come_are_one_message(tmp_path: Path) -> None:
-    """It names the server, its address and for how long it has waited."""
+def test_missing_clients_are_one_message(tmp_path: Path) -> None:
+    """It has the server, its address and the time waited."""
     server = {"name": "robots", "backend": "env_server", "env_kwargs": {"connect_timeout": 0.01}}
     done = invoke("rollout", write_config(tmp_path, server))
     assert (done.exit_code, done.stdout) == (1, "")
@@ -198,10 +197,60 @@ def test_clients_that_do_not_come_are_one_message(tmp_path: Path) -> None:
 
 
 def test_a_warning_is_one_line(tmp_path: Path) -> None:
-    """What the library warns of is told without the line of code that it came from."""
+    """It leaves out the line of code that raised it."""
     entry = {"name": "box", "backend": "unclosable", "task": "any"}
     done = run("rollout", write_config(tmp_path, entry), "--steps", 5)
     assert done.returncode == 0
     (warning,) = [line for line in done.stderr.splitlines() if "the lid is stuck" in line]
     assert warning.startswith("warning: close() of env 'box-0' raised")
     assert "self." not in done.stderr
+
+
+@pytest.mark.parametrize("command", ["rollout", "eval", "bench"])
+@pytest.mark.parametrize("seed", [2**62 - 1, 2**62, 2**64, 10**40])
+def test_a_seed_that_is_too_large_is_one_line_and_code_2(
+    tmp_path: Path, command: str, seed: int
+) -> None:
+    done = invoke(command, write_config(tmp_path, STUB), "--seed", seed)
+    assert done.exit_code == 2
+    assert done.stderr == f"error: --seed {seed}: should be from 0 to 2**61\n"
+
+
+def test_the_largest_seed_is_taken(tmp_path: Path) -> None:
+    for command, length in (("rollout", "--steps"), ("eval", "--episodes")):
+        done = invoke(command, write_config(tmp_path, STUB), "--seed", 2**61, length, 2)
+        assert done.exit_code == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    "words", [("rollout", "--steps", "9"), ("rollout", "--steps", "9", "--json"), ("check",)]
+)
+def test_a_full_stdout_is_one_line_and_code_2(tmp_path: Path, words: tuple[str, ...]) -> None:
+    command, *options = words
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [*COMMAND, command, write_config(tmp_path, STUB), *options],
+            cwd=TESTS,
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=HANG,
+            check=False,
+        )
+    assert done.returncode == 2
+    lines = [line for line in done.stderr.splitlines() if not line.startswith("starting")]
+    assert lines[-1:] == ["error: stdout: results can't be written: No space left on device"]
+    assert "Traceback" not in done.stderr
+    assert "Exception" not in done.stderr
+
+
+def test_help_and_version_to_a_full_stdout_are_code_2() -> None:
+    for word in ("--version", "--help", "backends"):
+        with Path("/dev/full").open("w") as full:
+            done = subprocess.run(
+                [*COMMAND, word], stdout=full, stderr=subprocess.PIPE, text=True, timeout=HANG,
+                check=False,
+            )  # fmt: skip
+        assert done.returncode == 2
+        assert len(done.stderr.splitlines()) == 1
+        assert "No space left on device" in done.stderr

@@ -1,4 +1,4 @@
-"""Ctrl-C at any moment: what there is so far, exit code 130, no traceback, nobody left."""
+"""Ctrl-C prints results so far, exits with 130 without a traceback, and leaves no process."""
 
 from __future__ import annotations
 
@@ -37,21 +37,21 @@ main()
 
 
 def stuck(tmp_path: Path, where: str) -> tuple[str, Path]:
-    """A config of one env that says who it is and then hangs."""
+    """Write a config of one env that writes its process id and then hangs."""
     pid_file = tmp_path / "pid"
-    os.mkfifo(pid_file)  # Reading it waits for the env.
+    os.mkfifo(pid_file)  # Reading this pipe waits for the env.
     kwargs = {"pid_file": str(pid_file), "where": where}
     entry = {"name": "stuck", "backend": "stuck", "task": "any", "env_kwargs": kwargs}
     return write_config(tmp_path, entry), pid_file
 
 
 def interrupt(child: subprocess.Popen[str]) -> tuple[str, str]:
-    """Press Ctrl-C; all that the command still says."""
+    """Press Ctrl-C. Return the rest of the command's output."""
     child.send_signal(signal.SIGINT)
     stdout, stderr = child.communicate(timeout=HANG)
     assert child.returncode == 130, stderr
     assert "Traceback" not in stderr
-    assert "Warning:" not in stderr  # Python's way of showing one, with a line of code.
+    assert "Warning:" not in stderr  # A traceback has a line of code.
     return stdout, stderr
 
 
@@ -60,8 +60,8 @@ def is_alive(pid: int) -> bool:
 
 
 @pytest.mark.parametrize("as_json", [False, True])
-def test_while_envs_start(tmp_path: Path, as_json: bool) -> None:
-    """A start that hangs is given up, and its worker is gone."""
+def test_ctrl_c_while_envs_start(tmp_path: Path, as_json: bool) -> None:
+    """A start that hangs is abandoned, and its worker ends."""
     config, pid_file = stuck(tmp_path, "init")
     with start("rollout", config, *["--json"] * as_json) as child:
         worker = int(pid_file.read_text())
@@ -73,8 +73,8 @@ def test_while_envs_start(tmp_path: Path, as_json: bool) -> None:
         assert stdout.startswith("Interrupted after 0 steps")
 
 
-def test_while_an_env_hangs_in_a_step(tmp_path: Path) -> None:
-    """The summary has the steps before it; the worker is gone."""
+def test_ctrl_c_while_an_env_hangs_in_a_step(tmp_path: Path) -> None:
+    """The summary has the steps before it, and the worker ends."""
     config, pid_file = stuck(tmp_path, "step")
     with start("rollout", config, "--json") as child:
         worker = int(pid_file.read_text())
@@ -87,8 +87,8 @@ def test_while_an_env_hangs_in_a_step(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("placement", ["process", "inline"])
-def test_while_results_never_stop_coming(tmp_path: Path, placement: str) -> None:
-    """Envs that are always ready leave Ctrl-C its turn; what came is summed up."""
+def test_ctrl_c_while_results_are_always_ready(tmp_path: Path, placement: str) -> None:
+    """It takes effect, and the summary has the results so far."""
     config = write_config(tmp_path, {**CARTPOLE, "num_workers": 8, "placement": placement})
     with start("rollout", config, "--steps", 10**9, "--json", "--min-results", 1) as child:
         assert child.stderr is not None
@@ -101,8 +101,8 @@ def test_while_results_never_stop_coming(tmp_path: Path, placement: str) -> None
 
 
 @pytest.mark.parametrize("calls", [300, 50_000, 150_000])
-def test_after_any_number_of_calls(tmp_path: Path, calls: int) -> None:
-    """Wherever the code is when the signal comes, from the first option read to the last row."""
+def test_ctrl_c_at_any_call(tmp_path: Path, calls: int) -> None:
+    """The signal may arrive anywhere from the first option to the last line of the table."""
     config = write_config(tmp_path, {**CARTPOLE, "num_workers": 2})
     script = tmp_path / "interrupt_at_a_call.py"
     script.write_text(INTERRUPT_AT_A_CALL)

@@ -1,4 +1,4 @@
-"""What a person sees on a terminal: whom a rollout waits for, and tables that cut nothing."""
+"""The live display on a terminal, and tables that fit it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def worker(entry: str, owed: list[str], **fields: Any) -> dict[str, Any]:
 
 
 def display(workers: list[dict[str, Any]], *, idle: float, steps: int = 400) -> Display:
-    """Of a rollout of 1,000 steps that is 10 seconds old, with a rate of 50 steps/s lately."""
+    """The display of a rollout after 10 seconds, with a recent rate of 50 steps/s."""
     group = SimpleNamespace(
         get_workers=lambda: workers,
         get_env_stats=lambda by_entry: {"a": {"episodes": 4, "mean_return": 2.5}},
@@ -42,15 +42,21 @@ def display(workers: list[dict[str, Any]], *, idle: float, steps: int = 400) -> 
     return shown
 
 
-def test_while_results_come_it_tells_how_fast_and_until_when() -> None:
-    """The most important first; what has no room is left out as a whole."""
+def test_the_line_has_the_rate_and_the_time_left() -> None:
+    """The most important part is first; parts that don't fit are left out."""
     parts = display([], idle=0.1)._parts(10.0)
-    assert parts == ["50 steps/s", "0:12 left", "400 steps", "return 2.50", "4 episodes"]
+    assert parts == [
+        "50 steps/s",
+        "0:12 left",
+        "400 steps",
+        "4 episodes ended",
+        "return of these 2.50",
+    ]
     assert live._fitting(parts, 32) == "50 steps/s  0:12 left  400 steps"
 
 
-def test_while_nothing_comes_it_tells_whom_it_waits_for_and_since_when() -> None:
-    """The longest first, in place of a rate that is none any more."""
+def test_without_results_the_line_names_the_envs_it_waits_for() -> None:
+    """They replace the rate, longest wait first."""
     ids = [f"a-{k}" for k in range(5)]
     workers = [worker("a", ids[1:], owed_seconds=3.0), worker("a", ids[:1], owed_seconds=9.0)]
     parts = display(workers, idle=8.4)._parts(10.0)
@@ -59,15 +65,15 @@ def test_while_nothing_comes_it_tells_whom_it_waits_for_and_since_when() -> None
     assert parts[0] == "waiting 3 s for clients of robots"
 
 
-def test_while_envs_start_it_tells_which_are_not_there() -> None:
-    """Those of workers that are up are waited for no more."""
+def test_during_the_start_the_line_names_missing_envs() -> None:
+    """Envs of workers that have started are not among them."""
     starting = display([worker("a", ["a-0"], state="starting")], idle=0.0)
     starting._doing, starting._since = "starting 2 envs", 6.0
     assert starting._parts(10.0) == ["starting 2 envs", "waiting 4 s for a-0"]
 
 
-def test_each_worker_has_its_line() -> None:
-    """What it does, and for how long; a restart is counted."""
+def test_each_worker_has_a_line() -> None:
+    """It shows the worker's state, its duration, and the number of restarts."""
     workers = [worker("a", ["a-0"], restarts=2), worker("b", ["b-0"], state="down")]
     shown = display(workers, idle=0.0)
     table = live._WorkerTable(shown._group, shown._statistics).drawn(10.0, rows=8)
@@ -80,8 +86,8 @@ def test_each_worker_has_its_line() -> None:
 
 
 @pytest.mark.parametrize("width", [60, 80, 120, 160])
-def test_narrow_terminals_get_fewer_columns_and_no_cut_figures(width: int) -> None:
-    """What matters most stays, whole; what was left out is named."""
+def test_a_narrow_terminal_gets_fewer_columns(width: int) -> None:
+    """The most important ones stay complete; a note names the others."""
     entry = EnvConfig(name="a", backend="gymnasium", task="CartPole-v1", num_workers=8)
     contenders = [
         Contender(setting, Rule("async, first ready", 1), [Round(1234567.0, (123456.0, 2e6), 9.5)])

@@ -1,4 +1,4 @@
-"""Random actions: whatever the space, each row is an action of it, and seeds repeat."""
+"""Random actions are in their space, and repeatable by seed."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ wholes = st.integers(-120, 120)
 
 @st.composite
 def boxes(draw: st.DrawFn) -> spaces.Box:
-    """With two bounds, one or none for each number, of any kind of number."""
+    """Boxes of any dtype with two bounds, one or none for each number."""
     shape = draw(shapes)
     dtype = draw(st.sampled_from([np.float32, np.float64, np.int8, np.int64]))
     bounds = floats if np.issubdtype(dtype, np.floating) else wholes
@@ -60,10 +60,8 @@ def sample(space: gym.Space[Any], num_envs: int, seed: int) -> BatchedData:
 
 
 @given(any_space, st.integers(1, 5), st.integers(0, 2**32 - 1))
-def test_every_row_is_an_action_of_the_space(
-    space: gym.Space[Any], num_envs: int, seed: int
-) -> None:
-    """Taken one by one, as an env gets them, with the dtypes that the space asks for."""
+def test_random_actions_are_in_their_space(space: gym.Space[Any], num_envs: int, seed: int) -> None:
+    """Each has the dtypes of the space."""
     responses = sample(space, num_envs, seed).values()
     assert len(responses) == num_envs
     for response in responses:
@@ -71,30 +69,30 @@ def test_every_row_is_an_action_of_the_space(
 
 
 @given(boxes(), st.integers(0, 2**32 - 1))
-def test_a_seed_repeats(space: spaces.Box, seed: int) -> None:
+def test_a_seed_repeats_actions(space: spaces.Box, seed: int) -> None:
     """The same seed gives the same actions."""
     first, second = sample(space, 3, seed), sample(space, 3, seed)
     assert np.array_equal(first.action, second.action)
 
 
 def test_bounded_numbers_are_spread_over_their_range() -> None:
-    """Both halves of each dimension's range are met equally often."""
+    """Both halves of each dimension's range occur equally often."""
     space = spaces.Box(np.array([-1.0, 10.0]), np.array([1.0, 30.0]), dtype=np.float64)
     actions = sample(space, 4000, 0).action
     middle = (space.low + space.high) / 2
     assert np.abs((actions > middle).mean(axis=0) - 0.5).max() < 0.05
 
 
-def test_numbers_without_bounds_stay_small() -> None:
-    """A simulator that takes any number is not thrown about."""
+def test_unbounded_numbers_are_small() -> None:
+    """Large ones would throw a robot about."""
     space = spaces.Box(-np.inf, np.inf, (2,))
     actions = sample(space, 1000, 0).action
     assert 0.05 < actions.std() < 0.2
 
 
 @given(st.lists(any_space, min_size=2, max_size=4), st.integers(0, 2**32 - 1))
-def test_envs_get_actions_of_their_own_space(kinds: list[gym.Space[Any]], seed: int) -> None:
-    """Who is asked for decides, in whatever order and company its result comes."""
+def test_each_env_gets_actions_of_its_own_space(kinds: list[gym.Space[Any]], seed: int) -> None:
+    """This holds for any composition and order of batches."""
     by_id = {f"env-{k}": space for k, space in enumerate(kinds)}
     policy = RandomPolicy(by_id.__getitem__, seed)
     for ids in (list(by_id), list(reversed(by_id)), ["env-1"]):
@@ -108,7 +106,7 @@ FIVE = spaces.Discrete(5, start=-1)
 
 
 def masked(form: str) -> tuple[gym.Space[Any], Any]:
-    """An action space, and a result whose masks allow 0 and 2 of it."""
+    """Return an action space, and a result whose masks allow 0 and 2."""
     single = EnvRet(env_id="a-0", observation=0)
     mask = {"action_mask": MASK}
     match form:
@@ -129,8 +127,8 @@ def masked(form: str) -> tuple[gym.Space[Any], Any]:
 
 @pytest.mark.parametrize("form", ["observation", "info", "vectorised", "agents"])
 @pytest.mark.parametrize("company", [[], [("b-0", spaces.Discrete(3))]])
-def test_masks_are_respected(form: str, company: list[tuple[str, gym.Space[Any]]]) -> None:
-    """All that they allow is met, and nothing else, whoever else is asked for."""
+def test_random_actions_respect_masks(form: str, company: list[tuple[str, gym.Space[Any]]]) -> None:
+    """Exactly the allowed actions occur, whatever other envs are in the batch."""
     space, result = masked(form)
     others = dict(company)
     policy = RandomPolicy({"a-0": space, **others}.__getitem__, 0)
@@ -149,8 +147,8 @@ def unmasked(env_id: str) -> EnvRet:
     return EnvRet(env_id=env_id, observation=0)
 
 
-def test_who_may_do_nothing_does_anything() -> None:
-    """It's another's turn: whatever is done is ignored, and must be an action all the same."""
+def test_a_mask_without_allowed_actions_is_ignored() -> None:
+    """It is another agent's turn: the action is ignored but must be in the space."""
     result = EnvRet(env_id="a-0", observation={"action_mask": 0 * MASK})
     policy = RandomPolicy(lambda env_id: FIVE, 0)
     batch = BatchedData(["a-0"], [result])
@@ -159,7 +157,7 @@ def test_who_may_do_nothing_does_anything() -> None:
 
 
 def test_an_env_without_an_action_space_needs_a_policy() -> None:
-    """It is said by name."""
+    """The message names the env."""
     policy = RandomPolicy(lambda env_id: None, 0)
     with pytest.raises(ConfigError, match=r"'a-0'.*--policy"):
         policy(BatchedData(["a-0"], [None]))

@@ -1,4 +1,4 @@
-"""``client`` and ``keygen``: an env lent to a server, from two terminals."""
+"""``client`` and ``keygen`` connect an env to a server in another process."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import pytest
 from cli.command import COMMAND, TESTS, invoke, invoke_json, start, write_config
 from patience import HANG
 
+from rlightning_aio.remote import make_keys
 from rlightning_aio.remote.keys import read_client_keys, read_server_keys
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ NOBODY = "tcp://127.0.0.1:9"
 
 
 def finishing(folder: Path, wanted_steps: int) -> str:
-    """A config whose env is finished after so many steps, and touches folder/closed."""
+    """Write a config whose env finishes after some steps and creates folder/closed."""
     kwargs = {"wanted_steps": wanted_steps, "closed_file": str(folder / "closed")}
     entry = {"name": "arm", "backend": "finishing", "task": "any", "env_kwargs": kwargs}
     return write_config(folder, entry)
@@ -37,7 +38,7 @@ def server_config(folder: Path, **env_kwargs: object) -> str:
 
 
 def line_with(child: subprocess.Popen[str], words: str) -> str:
-    """The next line on stderr that has `words`."""
+    """Return the next line on stderr that contains `words`."""
     assert child.stderr is not None
     while words not in (line := child.stderr.readline()):
         assert line, "the command has ended"
@@ -45,21 +46,21 @@ def line_with(child: subprocess.Popen[str], words: str) -> str:
 
 
 def spawn(command: str) -> subprocess.Popen[str]:
-    """A line of the README, in the repository's root."""
+    """Start a command of a page, in the repository's root."""
     words = [*COMMAND, *shlex.split(command)[1:]]
     pipe = subprocess.PIPE
     return subprocess.Popen(words, cwd=ROOT, stdout=pipe, stderr=pipe, text=True)
 
 
-def test_the_two_terminals_of_the_readme() -> None:
-    """Its two commands find each other; the server ends with its table, the client on Ctrl-C."""
-    readme = (ROOT / "README.md").read_text()
-    server_line, client_line = re.findall(r"^\$ (rlightning-aio .*)$", readme, re.MULTILINE)
+def test_the_two_commands_of_the_page_connect() -> None:
+    """The server ends with its table, the client on Ctrl-C."""
+    page = (ROOT / "docs" / "remote.md").read_text()
+    server_line, client_line = re.findall(r"^\$ (rlightning-aio .*)$", page, re.MULTILINE)
     configured = re.search(r"port: (\d+)", (ROOT / "configs/env_server.yaml").read_text())
     assert configured is not None
     where = f"tcp://127.0.0.1:{configured[1]}"
     assert where in client_line
-    # The port may be taken, and the number of steps is only a matter of patience.
+    # The port may be in use, and fewer steps save time.
     with spawn(f"{server_line} --steps 500 envs.0.env_kwargs.port=0") as server:
         address = line_with(server, "listens at").split()[-1]
         with spawn(client_line.replace(where, address)) as client:
@@ -75,8 +76,8 @@ def test_the_two_terminals_of_the_readme() -> None:
     assert 500 <= int(steps[1]) <= 501
 
 
-def test_keys_let_a_client_in_until_its_env_is_finished(tmp_path: Path) -> None:
-    """What keygen made is what both sides need; a finished env ends the client with code 0."""
+def test_keygens_keys_let_a_client_in(tmp_path: Path) -> None:
+    """A finished env ends the client with code 0."""
     keys = invoke_json("keygen", tmp_path / "keys", "left")
     config = server_config(tmp_path, keys=keys["server"])
     with start("rollout", config, "--steps", 5, "--json") as server:
@@ -93,6 +94,30 @@ def test_keys_let_a_client_in_until_its_env_is_finished(tmp_path: Path) -> None:
     assert json.loads(server_stdout)["steps"] == 5
 
 
+def test_each_change_of_a_connection_is_one_line_on_both_sides(tmp_path: Path) -> None:
+    """A client without a valid key logs it once for all attempts, then connects with one."""
+    keys = tmp_path / "keys"
+    make_keys(keys, ["left"])
+    allowed = keys / "server" / "clients" / "left.key"
+    withheld = allowed.rename(tmp_path / "left.key")
+    config = server_config(tmp_path, keys=str(keys / "server"), connect_timeout=HANG)
+    with start("rollout", config, "--steps", "5") as server:
+        address = line_with(server, "listens at").split()[-1]
+        words = ["--connect", address, "--keys", str(keys / "left"), "--name", "left"]
+        with start("client", finishing(tmp_path, 5), *words) as client:
+            assert line_with(client, "left: ") == (
+                "left: not connected (the server does not know this client's key)\n"
+            )
+            line_with(server, "robots-0: a client at 127.0.0.1 has a key that is not in")
+            withheld.rename(allowed)
+            assert line_with(client, "left: ") == "left: asking to be let in\n"
+            assert line_with(client, "left: ") == "left: serving\n"
+            line_with(server, "robots-0: the client 'left' has joined")
+            client.communicate(timeout=HANG)
+            server.communicate(timeout=HANG)
+    assert client.returncode == server.returncode == 0
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
 def test_an_interrupt_closes_the_env_while_nobody_answers(
     tmp_path: Path, number: signal.Signals
@@ -101,7 +126,7 @@ def test_an_interrupt_closes_the_env_while_nobody_answers(
     or by the end of a terminal's session, it leaves its env in order.
     """
     with start("client", finishing(tmp_path, 1), "--connect", NOBODY, "--json") as client:
-        line_with(client, " dials ")
+        line_with(client, " connects to ")
         client.send_signal(number)
         stdout, stderr = client.communicate(timeout=HANG)
     assert client.returncode == 130, stderr
@@ -125,10 +150,10 @@ STUB = {"name": "stub", "backend": "stub", "task": "any"}
     ],
     ids=["two entries", "a server", "env_vars", "interpreter", "a bad field"],
 )
-def test_a_config_that_is_no_clients(
+def test_a_config_that_a_client_cannot_use_is_refused(
     tmp_path: Path, entries: list[dict[str, object]], named: list[str]
 ) -> None:
-    """It is refused before anything is built, with file, entry and field."""
+    """The message has file, entry and field, before anything is built."""
     config = write_config(tmp_path, *entries)
     done = invoke("client", config, "--connect", NOBODY)
     assert done.exit_code == 2
@@ -140,16 +165,16 @@ def test_a_config_that_is_no_clients(
     "address",
     ["robot", "tcp://robot", "tcp://:5555", "udp://robot:1", "tcp://robot:0", "tcp://robot:65536"],
 )
-def test_an_address_that_is_none(tmp_path: Path, address: str) -> None:
-    """The message says what one looks like."""
+def test_an_invalid_address_is_refused(tmp_path: Path, address: str) -> None:
+    """The message has an example."""
     done = invoke("client", write_config(tmp_path, STUB), "--connect", address)
     assert done.exit_code == 2
     assert repr(address) in done.stderr
     assert "tcp://127.0.0.1:5555" in done.stderr
 
 
-def test_an_env_that_can_not_be_built(tmp_path: Path) -> None:
-    """One message with the env, its exception and the place in its code; exit code 1."""
+def test_an_env_that_cannot_be_built_is_one_message(tmp_path: Path) -> None:
+    """It has the env, its exception and the place in its code; the exit code is 1."""
     config = write_config(tmp_path, {**STUB, "backend": "unbuildable"})
     done = invoke("client", config, "--connect", NOBODY)
     assert (done.exit_code, done.stdout) == (1, "")
@@ -158,8 +183,8 @@ def test_an_env_that_can_not_be_built(tmp_path: Path) -> None:
     assert "stub_envs.py" in done.stderr
 
 
-def test_keys_that_can_not_be_read_leave_no_env_behind(tmp_path: Path) -> None:
-    """Their directory is named, and the env that was built is closed."""
+def test_unreadable_keys_close_the_env(tmp_path: Path) -> None:
+    """The message names their directory."""
     config, missing = finishing(tmp_path, 1), tmp_path / "missing"
     done = invoke("client", config, "--connect", NOBODY, "--keys", missing)
     assert done.exit_code == 2
@@ -167,16 +192,16 @@ def test_keys_that_can_not_be_read_leave_no_env_behind(tmp_path: Path) -> None:
     assert (tmp_path / "closed").exists()
 
 
-def test_a_name_that_no_server_would_read(tmp_path: Path) -> None:
-    """It is refused here, where somebody sees it; the env is closed."""
+def test_a_name_that_a_server_would_refuse_is_refused_at_once(tmp_path: Path) -> None:
+    """The env is closed."""
     done = invoke("client", finishing(tmp_path, 1), "--connect", NOBODY, "--name", 129 * "n")
     assert done.exit_code == 2
     assert "128" in done.stderr
     assert (tmp_path / "closed").exists()
 
 
-def test_keygen_says_what_goes_where(tmp_path: Path) -> None:
-    """Each directory is named and holds keys that can be read; secrets are their owner's alone."""
+def test_keygen_explains_the_directories(tmp_path: Path) -> None:
+    """Each holds readable keys, and only the owner can read secrets."""
     top = tmp_path / "keys"
     done = invoke("keygen", top, "left", "right")
     assert done.exit_code == 0
@@ -189,16 +214,16 @@ def test_keygen_says_what_goes_where(tmp_path: Path) -> None:
     assert {stat.S_IMODE(path.stat().st_mode) for path in secrets} == {0o600}
 
 
-def test_keys_that_can_not_be_written_are_one_message(tmp_path: Path) -> None:
-    """The folder is named, and what is in its way."""
+def test_keys_that_cannot_be_written_are_one_message(tmp_path: Path) -> None:
+    """It names the folder and the cause."""
     (tmp_path / "keys").write_text("a file")
     done = invoke("keygen", tmp_path / "keys", "left")
     assert (done.exit_code, done.stdout) == (2, "")
     assert done.stderr.startswith(f"error: no keys can be written into {tmp_path / 'keys'}: ")
 
 
-def test_keygen_replaces_no_keys(tmp_path: Path) -> None:
-    """A second client is added beside the first, whose keys stay as they are."""
+def test_keygen_keeps_existing_keys(tmp_path: Path) -> None:
+    """A second call adds a client and changes no other keys."""
     top = tmp_path / "keys"
     invoke("keygen", top, "left")
     before = read_client_keys(top / "left")

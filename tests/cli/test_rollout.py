@@ -1,4 +1,4 @@
-"""``rlightning-aio rollout``: it collects what it was asked to, and says what came."""
+"""``rlightning-aio rollout`` collects steps and prints statistics."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 STUB = {"name": "stub", "backend": "stub", "task": "any", "placement": "inline"}
 
 
-def test_it_collects_through_workers_and_prints_a_line_for_each_entry(tmp_path: Path) -> None:
-    """The real command collects exactly as many steps as it was told, and prints a table."""
+def test_rollout_prints_a_line_for_each_entry(tmp_path: Path) -> None:
+    """It collects exactly the given number of steps, from workers."""
     config = write_config(
         tmp_path,
         {**CARTPOLE, "num_workers": 3},
@@ -35,8 +35,8 @@ def test_it_collects_through_workers_and_prints_a_line_for_each_entry(tmp_path: 
     assert "Traceback" not in done.stderr
 
 
-def test_json_is_all_that_stdout_holds(tmp_path: Path) -> None:
-    """With --json stdout is one document, whatever is said on stderr."""
+def test_stdout_is_one_json_document(tmp_path: Path) -> None:
+    """Other messages go to stderr."""
     config = write_config(tmp_path, {**CARTPOLE, "num_workers": 2})
     done = run("rollout", config, "--steps", 500, "--json")
     document = json.loads(done.stdout)
@@ -49,11 +49,10 @@ def test_json_is_all_that_stdout_holds(tmp_path: Path) -> None:
     assert "collecting 500 steps" in done.stderr
 
 
-def test_a_rollout_may_be_bounded_in_time(tmp_path: Path) -> None:
-    """It ends then, whoever is still awaited; a number of steps beside it ends it earlier."""
+def test_a_rollout_can_have_a_time_limit(tmp_path: Path) -> None:
+    """It ends then even if results are missing; --steps may end it earlier."""
     config = write_config(tmp_path, {**STUB, "num_workers": 2})
     document = invoke_json("rollout", config, "--seconds", 0.05, "--min-results", 1)
-    assert document["steps"] > 0
     assert document["interrupted"] is False
     assert invoke_json("rollout", config, "--seconds", 1000, "--steps", 10)["steps"] == 10
     kwargs = {"pid_file": str(tmp_path / "pid"), "where": "step"}
@@ -64,14 +63,21 @@ def test_a_rollout_may_be_bounded_in_time(tmp_path: Path) -> None:
     assert document["seconds"] >= 0.05
 
 
-def test_the_configs_number_of_results_is_waited_for(tmp_path: Path) -> None:
-    """As `tune` writes it."""
+def test_a_rollout_without_results_prints_a_document(tmp_path: Path) -> None:
+    """The time limit may pass before the first result."""
+    config = write_config(tmp_path, {**STUB, "num_workers": 2})
+    assert "steps" in invoke_json("rollout", config, "--seconds", 0.001, "--min-results", 2)
+    assert " steps in " in invoke("rollout", config, "--seconds", 0.001).stdout
+
+
+def test_rollout_uses_the_configs_min_results(tmp_path: Path) -> None:
+    """`tune` writes this field."""
     config = write_config(tmp_path, {**STUB, "num_workers": 6, "min_results": 5})
     assert invoke_json("rollout", config, "--steps", 100)["batch_size"]["max"] >= 5
 
 
-def test_overrides_change_the_configuration(tmp_path: Path) -> None:
-    """What follows the file is applied to it."""
+def test_overrides_change_the_config(tmp_path: Path) -> None:
+    """They follow the file on the command line."""
     config = write_config(tmp_path, {**STUB, "num_workers": 2})
     document = invoke_json("rollout", config, "envs.0.num_workers=5", "--steps", 50)
     assert document["entries"][0]["envs"] == 5
@@ -79,8 +85,10 @@ def test_overrides_change_the_configuration(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("num_envs", [1, 3])
 @pytest.mark.parametrize("episode_length", [1, 4, 1000])
-def test_resets_are_no_steps(tmp_path: Path, episode_length: int, num_envs: int) -> None:
-    """The steps told are those that envs executed, those of sub-environments each."""
+def test_resets_are_not_counted_as_steps(
+    tmp_path: Path, episode_length: int, num_envs: int
+) -> None:
+    """Steps of sub-environments count individually."""
     kwargs = {"episode_length": episode_length}
     config = write_config(
         tmp_path, {**STUB, "num_workers": 3, "num_envs": num_envs, "env_kwargs": kwargs}
@@ -88,13 +96,13 @@ def test_resets_are_no_steps(tmp_path: Path, episode_length: int, num_envs: int)
     Stub.steps = 0
     document = invoke_json("rollout", config, "--steps", 90, "--min-results", 1)
     assert document["steps"] == 90
-    # Those that were sent on and not collected any more are executed or not.
+    # Steps that were sent but not collected may have been executed or not.
     assert 90 <= Stub.steps <= 90 + 3 * num_envs
     assert document["entries"][0]["episodes"] <= 90 // episode_length
 
 
-def test_a_configured_limit_ends_episodes_of_envs_that_never_end(tmp_path: Path) -> None:
-    """Where every entry has a step limit, episodes end there."""
+def test_configured_step_limits_end_episodes(tmp_path: Path) -> None:
+    """Every entry has one, and the envs never end by themselves."""
     kwargs = {"episode_length": 10**9}
     config = write_config(
         tmp_path, {**STUB, "num_workers": 2, "env_kwargs": kwargs, "max_episode_steps": 5}
@@ -104,8 +112,8 @@ def test_a_configured_limit_ends_episodes_of_envs_that_never_end(tmp_path: Path)
     assert max(stub_policies.furthest_seen) == 5
 
 
-def test_one_seed_makes_one_rollout(tmp_path: Path) -> None:
-    """In one process, the same seed gives the same episodes, another one others."""
+def test_a_seed_repeats_a_rollout(tmp_path: Path) -> None:
+    """This holds in one process; another seed gives other episodes."""
     config = write_config(tmp_path, {**CARTPOLE, "num_workers": 3, "placement": "inline"})
 
     def episodes(seed: int) -> tuple[int, float]:
@@ -128,8 +136,8 @@ def test_a_policy_chooses_the_actions(tmp_path: Path) -> None:
     assert 8 <= entry["mean_length"] <= 11
 
 
-def test_a_policy_may_answer_with_a_batch_of_responses(tmp_path: Path) -> None:
-    """What `respond` makes is sent as it is."""
+def test_a_policy_may_return_a_batch_of_responses(tmp_path: Path) -> None:
+    """The return value of `respond` is sent unchanged."""
     config = write_config(tmp_path, {**STUB, "num_workers": 2})
     document = invoke_json(
         "rollout", config, "--steps", 30, "--policy", "cli.stub_policies:respond"
@@ -137,16 +145,16 @@ def test_a_policy_may_answer_with_a_batch_of_responses(tmp_path: Path) -> None:
     assert document["steps"] == 30
 
 
-def test_a_policy_may_be_awaited(tmp_path: Path) -> None:
-    """As one that asks an inference server."""
+def test_a_policy_may_be_a_coroutine_function(tmp_path: Path) -> None:
+    """One that asks an inference server is an example."""
     config = write_config(tmp_path, {**STUB, "num_workers": 2})
     document = invoke_json("rollout", config, "--steps", 30, "--policy", "cli.stub_policies:later")
     assert document["steps"] == 30
 
 
 @pytest.mark.parametrize("placement", ["process", "inline"])
-def test_nobody_who_prints_gets_into_the_results(tmp_path: Path, placement: str) -> None:
-    """What an env, what it starts, or a policy prints is on stderr, to the end of the process."""
+def test_printing_of_other_code_goes_to_stderr(tmp_path: Path, placement: str) -> None:
+    """This includes envs, processes they start, and policies, until the end."""
     talkative = {"name": "a", "backend": "talkative", "task": "any", "placement": placement}
     words = ("--steps", 20, "--policy", "cli.stub_policies:respond", "--json")
     done = run("rollout", write_config(tmp_path, talkative), *words)
@@ -157,10 +165,10 @@ def test_nobody_who_prints_gets_into_the_results(tmp_path: Path, placement: str)
 
 
 @pytest.mark.parametrize("differing", [{"observation_size": 2}, {"actions": 3}])
-def test_a_policy_gets_one_batch_for_each_entry_where_spaces_differ(
+def test_a_policy_gets_a_batch_for_each_entry_if_spaces_differ(
     tmp_path: Path, differing: dict[str, int]
 ) -> None:
-    """Each call's results stack, and belong to one entry."""
+    """The results of each call can be stacked."""
     other = {**STUB, "name": "other", "env_kwargs": differing}
     config = write_config(tmp_path, {**STUB, "num_workers": 2}, {**other, "num_workers": 3})
     stub_policies.names_seen.clear()
@@ -171,8 +179,8 @@ def test_a_policy_gets_one_batch_for_each_entry_where_spaces_differ(
     assert set(stub_policies.names_seen) == {frozenset({"stub"}), frozenset({"other"})}
 
 
-def test_random_actions_suit_entries_with_different_spaces(tmp_path: Path) -> None:
-    """Entries whose actions differ are collected together, each with its own."""
+def test_random_actions_fit_entries_with_different_spaces(tmp_path: Path) -> None:
+    """The entries are collected together."""
     pendulum = {"name": "pendulum", "backend": "gymnasium", "task": "Pendulum-v1"}
     config = write_config(
         tmp_path,
@@ -183,20 +191,20 @@ def test_random_actions_suit_entries_with_different_spaces(tmp_path: Path) -> No
     assert all(entry["steps"] > 50 for entry in document["entries"])
 
 
-def test_it_is_filmed(tmp_path: Path) -> None:
-    """The first env of each entry, in a worker of its own; what had no end is marked."""
+def test_rollout_films_the_first_env_of_each_entry(tmp_path: Path) -> None:
+    """It has a worker of its own; films of unfinished episodes are marked."""
     judged = {"name": "judged", "task": "cli.judged_env:make", "num_workers": 2}
     films = tmp_path / "films"
     config = write_config(tmp_path, judged)
-    both = ("--min-results", 2)  # Else the other one may take all the steps.
+    both = ("--min-results", 2)  # Otherwise the other env might take all the steps.
     done = run("rollout", config, "--steps", 40, *both, "--video", films, "--video-every", 2)
     assert done.returncode == 0, done.stderr
     assert {path.name.partition("-episode-")[0] for path in films.iterdir()} == {"judged-0"}
     assert (films / "judged-0-episode-2.mp4").exists()
 
 
-def test_the_console_script_is_this_command() -> None:
-    """What is installed as rlightning-aio is `cli.main`."""
+def test_the_console_script_runs_cli_main() -> None:
+    """Its name is rlightning-aio."""
     project = tomllib.loads((TESTS.parent / "pyproject.toml").read_text())["project"]
     assert project["scripts"] == {"rlightning-aio": "rlightning_aio.cli:main"}
 
@@ -205,15 +213,15 @@ def test_the_console_script_is_this_command() -> None:
     "command",
     [[], *([name] for name in ("rollout", "bench", "tune", "check", "backends", "tasks"))],
 )
-def test_help_teaches_by_example(command: list[str]) -> None:
-    """Each help text has command lines to copy."""
+def test_help_has_examples(command: list[str]) -> None:
+    """Each help text has command lines."""
     done = invoke(*command, "--help")
     assert done.exit_code == 0
     assert invoke(*command, "-h").stdout == done.stdout
     assert f"rlightning-aio {' '.join(command)}".strip() in done.stdout
 
 
-def test_the_version_is_told() -> None:
+def test_version_is_printed() -> None:
     """--version prints it and nothing else."""
     import rlightning_aio
 
@@ -221,7 +229,7 @@ def test_the_version_is_told() -> None:
 
 
 def test_trace_writes_a_timeline(tmp_path: Path) -> None:
-    """With the policy's part; a place where it can't be is told before any env is started."""
+    """It includes the policy; an invalid path is refused before any env starts."""
     config = write_config(tmp_path, {**CARTPOLE, "num_workers": 2, "placement": "inline"})
     trace = tmp_path / "run.json"
     document = invoke_json("rollout", config, "--steps", 50, "--trace", trace)

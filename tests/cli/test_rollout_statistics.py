@@ -1,4 +1,4 @@
-"""What counts as a step."""
+"""Rules for counting steps."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rlightning_aio.cli.rollout_statistics import RolloutStatistics
 if TYPE_CHECKING:
     from rlightning_aio import BatchedData
 
-assert stub_envs  # Its import registers the envs.
+assert stub_envs  # Importing it registers the envs.
 
 
 def act(batch: BatchedData) -> BatchedData:
@@ -29,10 +29,10 @@ def act(batch: BatchedData) -> BatchedData:
     limit=st.integers(1, 8),
     collects=st.lists(st.tuples(st.integers(1, 12), st.integers(1, 12)), max_size=12),
 )
-def test_steps_are_what_envs_have_executed(
+def test_steps_are_actions_that_envs_have_executed(
     lengths: list[int], num_workers: int, limit: int, collects: list[tuple[int, int]]
 ) -> None:
-    """With any episode lengths, step limit and order of arrival, resets are left out."""
+    """Resets are left out, for any episode lengths, step limit and order of arrival."""
     configs = [
         EnvConfig(
             name=f"entry{index}",
@@ -67,8 +67,8 @@ def test_steps_are_what_envs_have_executed(
         assert entry.mean_length == entry.mean_return == expected
 
 
-def test_an_entry_that_was_not_met_has_no_figures() -> None:
-    """None stands for what is not known; zero would be a lie."""
+def test_an_entry_without_results_has_no_figures() -> None:
+    """They are None, because zero would be wrong."""
     config = EnvConfig(name="idle", backend="stub", task="any")
     idle: dict[str, Any] = {"episodes": 0, "mean_return": None, "mean_length": None}
     (figures,) = RolloutStatistics([config]).by_entry({"idle-0": idle})

@@ -1,4 +1,4 @@
-"""``rollout`` with envs that dial in: who they are is known only when they have come."""
+"""``rollout`` with clients, whose envs are known only once they have connected."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SERVER = {
 
 
 def address(child: subprocess.Popen[str]) -> str:
-    """Where the command says that it listens."""
+    """Return the address that the command prints."""
     assert child.stderr is not None
     while not (line := child.stderr.readline()).startswith("robots-0 listens at "):
         assert line, "the command has ended"
@@ -34,8 +34,8 @@ def finish(child: subprocess.Popen[str]) -> Any:
     return json.loads(stdout)
 
 
-def test_clients_are_collected_from(tmp_path: Path) -> None:
-    """Random actions suit the spaces that clients have announced; their steps are counted."""
+def test_rollout_collects_from_clients(tmp_path: Path) -> None:
+    """Random actions fit the announced spaces, and steps are counted."""
     config = write_config(tmp_path, SERVER)
     with start("rollout", config, "--steps", 60, "--json") as child:
         where = address(child)
@@ -45,12 +45,12 @@ def test_clients_are_collected_from(tmp_path: Path) -> None:
             client.join()
     (entry,) = document["entries"]
     assert (document["steps"], entry["steps"], entry["envs"]) == (60, 60, 2)
-    # Those that were under way when enough had come are not counted.
+    # Steps in flight at the end are not counted.
     assert 60 <= sum(client.env.steps for client in clients) <= 62
 
 
-def test_clients_and_local_envs_are_collected_together(tmp_path: Path) -> None:
-    """Each gets actions of its own kind."""
+def test_rollout_collects_from_clients_and_local_envs_together(tmp_path: Path) -> None:
+    """Each gets actions of its own space."""
     local = {**CARTPOLE, "num_workers": 2}
     config = write_config(tmp_path, local, SERVER)
     with start("rollout", config, "--steps", 400, "--min-results", 4, "--json") as child:

@@ -1,4 +1,4 @@
-"""Envs that remember what was done to them, and a group whose results come in any order."""
+"""Envs that log their transitions, and a group with results in random order."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from rlightning_aio import sync
 from rlightning_aio.batch import BatchedData, joined
-from rlightning_aio.batch.data import parts_of
+from rlightning_aio.batch.contents import parts_of
 from rlightning_aio.envs.same_step import SameStep
 from rlightning_aio.errors import NothingPending
 from rlightning_aio.protocol.slab import TRUNCATED
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class Step:
-    """A transition, as the env has seen it."""
+    """A transition in the log of an env."""
 
     before: list[float]
     action: float
@@ -36,7 +36,7 @@ class Step:
 
 @dataclass
 class Script(gym.Env[Any, Any]):
-    """Shows [its number, episodes, steps] and ends by chance."""
+    """Observes [number of the env, episodes, steps]; episodes end at random."""
 
     number: int
     ends: float
@@ -57,7 +57,7 @@ class Script(gym.Env[Any, Any]):
     def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
         self.episode += 1
         self.steps = 0
-        return self._observation(), {}
+        return self._observation(), {"acted": -1.0}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         before = self._observation().tolist()
@@ -67,11 +67,14 @@ class Script(gym.Env[Any, Any]):
         reward = float(self.generator.integers(100))
         after = self._observation()
         self.log.append(Step(before, action.item(), reward, terminated, truncated, after.tolist()))
-        return after, reward, terminated, truncated, {}
+        info: dict[str, Any] = {"acted": action.item()}
+        if self.steps % 2:
+            info["odd"] = np.True_
+        return after, reward, terminated, truncated, info
 
 
 class Tickets:
-    """A policy whose every action is a number of its own; it may raise before it answers."""
+    """A policy with a unique number as each action; it may raise before it answers."""
 
     def __init__(self, raises: Callable[[], bool] = lambda: False) -> None:
         self.count = 0
@@ -118,7 +121,7 @@ def scripted_group(
 
 
 class Disturbed:
-    """A group whose results come in an order of chance, and whose workers die by chance.
+    """A group with results in random order and random worker deaths.
 
     Args:
         group: of inline envs, which is executed at once.
@@ -167,7 +170,7 @@ class Disturbed:
         return self.last, self.last.limit_reached.reshape(count, -1).any(axis=1).tolist()
 
     def _lost(self, row: BatchedData) -> BatchedData:
-        """What a replaced worker's env answers instead."""
+        """The result of the env of a replaced worker."""
         for index, is_reset in zip(row.index.reshape(-1), row.is_reset.reshape(-1), strict=True):
             if not is_reset:
                 self.logs[int(index)].pop()

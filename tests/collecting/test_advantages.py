@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rlightning_aio.collecting import Lag, Rollout, Seconds
+from rlightning_aio.collecting.rollout import Ends
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -20,7 +21,7 @@ NO_LAG, NO_TIME = Lag(0, 0.0, 0), Seconds(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 def rollout_of(
     rewards: Any, terminated: Any, truncated: Any, cuts: Sequence[int] = (), lengths: Any = None
 ) -> Rollout:
-    """Chains of `lengths`, or a block; `cuts` are ends beside those of chains and episodes."""
+    """Chains of `lengths`, or a block; `cuts` are ends besides those of chains and episodes."""
     reward = np.asarray(rewards, np.float32)
     ends = np.asarray(terminated, bool), np.asarray(truncated, bool)
     columns = {"reward": reward, "terminated": ends[0], "truncated": ends[1]}
@@ -33,13 +34,13 @@ def rollout_of(
     others = np.union1d(np.flatnonzero(columns["done"]), np.array(cuts, int))
     places = np.concatenate([lasts, np.setdiff1d(others, lasts)]).astype(np.intp)
     empty = np.zeros((len(places), 1))
-    return Rollout(columns, reward.shape, places, empty, len(lasts), NO_LAG, NO_TIME)
+    return Rollout(columns, reward.shape, Ends(places, empty), len(lasts), [], NO_LAG, NO_TIME)
 
 
 def cleanrl(
     rewards: Any, dones: Any, values: Any, next_value: Any, next_done: Any, gamma: float, lam: float
 ) -> Any:
-    """As CleanRL's ppo.py has it, `dones` being those before each step."""
+    """CleanRL's ppo.py, with `dones` before each step."""
     advantages = np.zeros_like(rewards)
     last: Any = 0
     for t in reversed(range(len(rewards))):
@@ -53,7 +54,7 @@ def cleanrl(
 
 
 def test_an_example_by_hand() -> None:
-    """A termination is worth nothing after, a truncation and a seam what is given for them."""
+    """The value after a termination is 0, after a truncation or a seam the given one."""
     rollout = rollout_of([1, 2, 3, 4], [0, 1, 0, 0], [0, 0, 1, 0], lengths=[4])
     values, next_values = [10.0, 20.0, 30.0, 40.0], [50.0, 60.0, 70.0]
     assert rollout.ends.tolist() == [3, 1, 2]
@@ -64,7 +65,7 @@ def test_an_example_by_hand() -> None:
 
 
 def test_v_trace_by_hand() -> None:
-    """Ratios are clipped at 1; what comes after an end doesn't reach before it."""
+    """Ratios are clipped at 1; values after an end don't affect those before it."""
     rollout = rollout_of([1, 2], [0, 0], [0, 0], lengths=[2])
     found = rollout.vtrace(np.array([4.0, 8.0]), [6.0], np.log([0.5, 4.0]), 0.5)
     # Errors: .5 * (1 + 4 - 4) = .5 and 1 * (2 + 3 - 8) = -3; targets 8 - 3 and 4 + .5 + .25 * -3.
@@ -145,7 +146,7 @@ def test_v_trace_equals_the_papers_sum(case: tuple[list[int], Any]) -> None:
 
 @given(st.integers(1, 7), st.integers(1, 5), st.integers(0, 2**32 - 1))
 def test_a_block_equals_cleanrl_to_the_bit(steps: int, envs: int, seed: int) -> None:
-    """With values of 0 where an episode is truncated, as CleanRL takes that for its end."""
+    """With values of 0 at truncations, which CleanRL treats as terminations."""
     rng = np.random.default_rng(seed)
     terminated, truncated = rng.random((2, steps, envs)) < 0.2
     rollout = rollout_of(rng.normal(size=(steps, envs)), terminated, truncated)
@@ -161,14 +162,14 @@ def test_a_block_equals_cleanrl_to_the_bit(steps: int, envs: int, seed: int) -> 
     np.testing.assert_array_equal(found, expected)
 
 
-def test_agents_have_advantages_of_their_own() -> None:
-    """What follows an agent's end doesn't reach before it, though the env goes on."""
+def test_each_agent_has_its_own_advantages() -> None:
+    """Values after an agent's end don't affect those before it, though the env continues."""
     block = rollout_of([1, 2], [0, 1], [0, 0], lengths=[2])
     columns = {
         name: {"a": block[name], "b": 2 * block[name] if name == "reward" else ~block[name]}
         for name in ("reward", "terminated", "truncated", "done")
     }
-    both = Rollout(columns, (2,), block.ends, np.zeros((1, 1)), 1, NO_LAG, NO_TIME)
+    both = Rollout(columns, (2,), Ends(block.ends, np.zeros((1, 1))), 1, [], NO_LAG, NO_TIME)
     values = {"a": np.zeros(2), "b": np.zeros(2)}
     found = both.advantages(values, {"a": [9.0], "b": [9.0]}, 0.5, 1.0)
     assert found["a"].tolist() == [1 + 0.5 * 2, 2.0]
@@ -179,6 +180,100 @@ def test_agents_have_advantages_of_their_own() -> None:
         "a": [2.0, 2.0],
         "b": [2.0, 8.5],
     }
+
+
+def naive(
+    rewards: Any, terminated: Any, ends: Any, values: Any, next_values: dict[int, float], rhos: Any
+) -> tuple[list[float], list[float]]:
+    """Targets and advantages of V-trace for one chain, transition by transition, last first.
+
+    Nothing follows at `ends`; `next_values` are those after each of them. With clipped ratios
+    `rhos` of 1, targets less values are the advantages of GAE.
+    """
+    targets, advantages, correction = [0.0] * len(rewards), [0.0] * len(rewards), 0.0
+    for t in reversed(range(len(rewards))):
+        if ends[t]:
+            correction, value, target = 0.0, next_values[t], next_values[t]
+        else:
+            value, target = values[t + 1], targets[t + 1]
+        if terminated[t]:
+            value = target = 0.0
+        error = rhos[t] * (rewards[t] + 0.97 * value - values[t])
+        correction = error + 0.97 * 0.9 * rhos[t] * correction
+        targets[t] = values[t] + correction
+        advantages[t] = rhos[t] * (rewards[t] + 0.97 * target - values[t])
+    return targets, advantages
+
+
+NOT_FINITE = [np.nan, np.inf, -np.inf]
+
+
+@given(st.integers(1, 7), st.integers(1, 4), st.booleans(), st.integers(0, 2**32 - 1), st.data())
+def test_values_after_a_termination_are_ignored(
+    steps: int, envs: int, block: bool, seed: int, data: Any
+) -> None:
+    """In blocks and in chains, even if they are NaN or infinite."""
+    rng = np.random.default_rng(seed)
+    terminated, truncated = rng.random((2, steps, envs)) < 0.3
+    rewards, values, log_ratios = rng.normal(size=(3, steps, envs))
+    if not block:
+        # Chains are contiguous.
+        terminated, truncated, rewards, values, log_ratios = (
+            column.T.reshape(-1) for column in (terminated, truncated, rewards, values, log_ratios)
+        )
+    rollout = rollout_of(rewards, terminated, truncated, (), [steps] * envs)
+    next_values = rng.normal(size=len(rollout.ends))
+    over = np.flatnonzero(rollout.at_ends("terminated"))
+    next_values[over] = [data.draw(st.sampled_from(NOT_FINITE)) for _ in over]
+    places = np.arange(steps * envs).reshape(rollout.shape)
+    chains = places.T if block else places.reshape(envs, steps)
+    after = dict(zip(rollout.ends.tolist(), next_values.tolist(), strict=True))
+    gains = rollout.advantages(values, next_values, 0.97, 0.9)
+    trace = rollout.vtrace(values, next_values, log_ratios, 0.97, 0.9)
+    for chain in chains:
+        reward = rollout.reward.astype(float)
+        own = [column.reshape(-1)[chain] for column in (reward, terminated, values)]
+        ends = {k: after[place] for k, place in enumerate(chain.tolist()) if place in after}
+        last = [k in ends for k in range(steps)]
+        ones = np.ones(steps)
+        targets, _ = naive(own[0], own[1], last, own[2], ends, ones)
+        np.testing.assert_allclose(gains.reshape(-1)[chain], targets - own[2], atol=1e-9)
+        rhos = np.minimum(np.exp(log_ratios.reshape(-1)[chain]), 1)
+        targets, advantages = naive(own[0], own[1], last, own[2], ends, rhos)
+        np.testing.assert_allclose(trace.targets.reshape(-1)[chain], targets, atol=1e-9)
+        np.testing.assert_allclose(trace.advantages.reshape(-1)[chain], advantages, atol=1e-9)
+
+
+@pytest.mark.parametrize("number", NOT_FINITE)
+def test_values_after_an_agents_end_are_ignored(number: float) -> None:
+    """The env continues without the agent, whose later rows are not part of the chain."""
+    block = rollout_of([1, 2, 3], [0, 1, 0], [0, 0, 0], lengths=[3])
+    ends = np.array([2], np.intp)
+    columns = {name: {"a": block[name]} for name in ("reward", "terminated", "truncated", "done")}
+    rollout = Rollout(columns, (3,), Ends(ends, np.zeros((1, 1))), 1, [], NO_LAG, NO_TIME)
+    values = {"a": np.array([0.0, 0.0, number])}
+    gains = rollout.advantages(values, {"a": [9.0]}, 0.5, 1.0)
+    assert gains["a"][:2].tolist() == [1 + 0.5 * 2, 2.0]
+    with np.errstate(invalid="ignore"):  # Of the later rows themselves.
+        traced: Any = rollout.vtrace(values, {"a": [9.0]}, {"a": np.zeros(3)}, 0.5)
+    assert traced["a"].targets[:2].tolist() == [2.0, 2.0]
+    assert traced["a"].advantages[:2].tolist() == [2.0, 2.0]
+
+
+@pytest.mark.parametrize("shape", [(2, 3), (6,), (3, 2, 1)])
+def test_a_shape_other_than_the_rollouts_raises(shape: tuple[int, ...]) -> None:
+    """Even with the same size, such as ``[N, T]`` for a block."""
+    block = rollout_of(np.ones((3, 2)), np.zeros((3, 2)), np.zeros((3, 2)))
+    right, wrong, after = np.zeros((3, 2)), np.zeros(shape), np.zeros(2)
+    named = rf"has shape \[{', '.join(map(str, shape))}\].* shape \[3, 2\]"
+    with pytest.raises(ValueError, match=f"^values {named}"):
+        block.advantages(wrong, after, 0.99, 0.95)
+    with pytest.raises(ValueError, match=f"^values {named}"):
+        block.vtrace(wrong, after, right, 0.99)
+    with pytest.raises(ValueError, match=f"^log_ratios {named}"):
+        block.vtrace(right, after, wrong, 0.99)
+    with pytest.raises(ValueError, match=r"^next_values has shape \[2, 1\].* 2 ends.*: \[2\]"):
+        block.advantages(right, after[:, None], 0.99, 0.95)
 
 
 @pytest.mark.parametrize(("values", "next_values", "named"), [(3, 1, "values"), (2, 2, "next_")])

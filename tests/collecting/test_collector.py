@@ -1,4 +1,4 @@
-"""What a collector makes of the kinds of envs, of policies that wait or fail, and of its memory."""
+"""Collectors with all kinds of envs, with policies that wait or fail, and their memory."""
 
 from __future__ import annotations
 
@@ -40,8 +40,28 @@ def poles(count: int, **fields: Any) -> Any:
 # -- kinds of envs
 
 
-def test_each_kind_of_env_has_a_policy_and_a_rollout_of_its_own() -> None:
-    """Together they have as many transitions as were asked for."""
+def sizes_of_batches(group: Any, **options: Any) -> set[int]:
+    """Numbers of results in each call of the policy, after the reset."""
+    sizes: list[int] = []
+
+    def policy(batch: BatchedData) -> dict[str, Any]:
+        sizes.append(len(batch))
+        return zeros(batch)
+
+    with group, group.auto_reset():
+        Collector(group, policy, num_transitions=40, **options).collect()
+    return set(sizes[1:])
+
+
+def test_the_configs_number_of_results_is_the_default() -> None:
+    """Inline envs are executed only while too few results are ready."""
+    assert sizes_of_batches(poles(4)) == {1}
+    assert sizes_of_batches(poles(4, min_results=3)) == {3}
+    assert sizes_of_batches(poles(4, min_results=3), min_results=2) == {2}
+
+
+def test_each_kind_of_env_has_its_own_policy_and_rollout() -> None:
+    """Together they have the requested number of transitions."""
     entries = [
         {**POLE, "num_workers": 3},
         {"name": "probe", "backend": "probe", "task": "-", "num_workers": 2, "placement": "inline"},
@@ -52,7 +72,7 @@ def test_each_kind_of_env_has_a_policy_and_a_rollout_of_its_own() -> None:
         return {"action": np.zeros((len(batch), 2)), "note": np.arange(len(batch))}
 
     for options, expected in (
-        ({"min_batch": 2}, {}),
+        ({"min_results": 2}, {}),
         ({"wait_all": True}, {"pole": (4, 3), "probe": (4, 2)}),
     ):
         group = sync.build_env_group(entries, mixed_actions=True)
@@ -73,12 +93,12 @@ def test_each_kind_of_env_has_a_policy_and_a_rollout_of_its_own() -> None:
 
 
 def test_a_kind_whose_first_step_has_not_ended_has_an_empty_rollout() -> None:
-    """Its step is in a later one; the other kind's rollouts are complete."""
+    """Its step is in a later rollout; those of the other kind are complete."""
     after: dict[str, Any] = {}
     group = sync.build_env_group([{**POLE, "name": name} for name in ("one", "other")])
     with group, group.auto_reset():
         collector = Collector(
-            group, {"one": zeros, "other": zeros}, num_transitions=1, min_batch=1, seed=0
+            group, {"one": zeros, "other": zeros}, num_transitions=1, min_results=1, seed=0
         )
         for _ in range(4):
             rollouts = collector.collect()
@@ -95,7 +115,7 @@ def test_a_kind_whose_first_step_has_not_ended_has_an_empty_rollout() -> None:
     assert set(after) == {"one", "other"}
 
 
-def test_an_entry_without_a_policy_is_named_again_and_again() -> None:
+def test_an_entry_without_a_policy_raises_each_time() -> None:
     with poles(1) as group, group.auto_reset():
         collector = Collector(group, {"cart": zeros}, num_transitions=4)
         for _ in range(2):
@@ -127,11 +147,58 @@ def test_columns_of_dict_observations_are_trees() -> None:
         for k in range(59):
             if k not in rollout.ends:
                 assert (after[k] == rollout.observation["place"][k + 1]).all()
-        assert rollout.action.shape == (60,)  # What doesn't stack stays as it is.
+        assert len(rollout.action) == 60  # Values that do not stack stay in a list.
         assert set(rollout.action[0]) == {"push", "hands", "jump"}
 
 
-def test_agents_have_rewards_and_ends_of_their_own() -> None:
+class Judged(gym.Wrapper[Any, Any, Any, Any]):
+    """CartPole with `value` as the success in the last info of an episode."""
+
+    def __init__(self, value: Any) -> None:
+        super().__init__(gym.make("CartPole-v1"))
+        self.value = value
+
+    def step(self, action: Any) -> Any:
+        observation, reward, terminated, truncated, _ = self.env.step(action)
+        info = {"success": self.value} if terminated or truncated else {}
+        return observation, reward, terminated, truncated, info
+
+
+def collector_of_infos(value: Any, infos: Any) -> Any:
+    entry = {"name": "judged", "make_env": lambda: Judged(value), "placement": "inline"}
+    group = sync.build_env_group(entry)
+    return group, Collector(group, zeros, num_transitions=60, infos=infos, seed=0)
+
+
+@pytest.mark.parametrize("value", [True, np.False_, 0.5, np.float32(0.5), np.array(1)])
+def test_an_info_becomes_a_column_that_is_nan_where_it_is_missing(value: Any) -> None:
+    group, collector = collector_of_infos(value, ["success", "absent"])
+    with group, group.auto_reset():
+        rollout = collector.collect()
+    assert rollout.done.any()
+    np.testing.assert_array_equal(rollout.success, np.where(rollout.done, float(value), np.nan))
+    assert np.isnan(rollout.absent).all()
+    assert [episode.info for episode in rollout.episodes] == [{"success": value}] * len(
+        rollout.episodes
+    )
+
+
+@pytest.mark.parametrize("value", ["yes", [1.0, 2.0], {"a": 1}, np.zeros(2)])
+def test_an_info_that_is_not_a_number_raises(value: Any) -> None:
+    group, collector = collector_of_infos(value, ["success"])
+    with group, group.auto_reset():
+        for _ in range(2):
+            with pytest.raises(ValueError, match=r"info 'success' .* one number"):
+                collector.collect()
+
+
+def test_infos_with_the_name_of_a_rollouts_column_raise() -> None:
+    for infos, why in (("success", "give .'success',."), (["reward"], "already has 'reward'")):
+        with pytest.raises(ValueError, match=why):
+            collector_of_infos(1.0, infos)
+
+
+def test_each_agent_has_its_own_rewards_and_ends() -> None:
     def policy(batch: BatchedData) -> dict[str, Any]:
         count = len(batch)
         action = {"tall": np.ones((count, 1), np.float32), "small": np.ones(count, int)}
@@ -140,12 +207,16 @@ def test_agents_have_rewards_and_ends_of_their_own() -> None:
     crowd = {"name": "crowd", "backend": "crowd", "task": "-", "num_workers": 2}
     group = sync.build_env_group({**crowd, "placement": "inline"})
     with group, group.auto_reset(9):
-        rollout = Collector(group, policy, num_transitions=9, min_batch=2).collect()
+        rollout = Collector(group, policy, num_transitions=9, min_results=2).collect()
         assert rollout.index.tolist() == [0] * 5 + [1] * 4
         assert rollout.observation["small"].tolist() == [0, 1, 2, 0, 1, 0, 1, 2, 0]
         assert rollout.terminated["tall"].tolist() == [0, 1, 1, 0, 1, 0, 1, 1, 0]
         assert rollout.terminated["small"].tolist() == [0, 0, 1, 0, 0, 0, 0, 1, 0]
         assert rollout.ends.tolist() == [4, 8, 2, 7]
+        assert [(e.index, e.total_reward, e.length) for e in rollout.episodes] == [
+            (0, 5.0, 3),
+            (1, 5.0, 3),
+        ]
         values = {agent: np.zeros(4) for agent in ("tall", "small")}
         found = rollout.advantages(rollout.value, values, 1.0, 1.0)
         assert found["small"].tolist() == [3, 2, 1, 2, 1, 3, 2, 1, 1]
@@ -153,7 +224,7 @@ def test_agents_have_rewards_and_ends_of_their_own() -> None:
 
 
 def test_a_sub_environment_that_waits_for_others_makes_no_transitions() -> None:
-    """Of a simulator without resets of its own, which is reset when all have ended."""
+    """With a simulator without autoreset, which is reset when all have ended."""
     batched = {"name": "batched", "backend": "batched", "task": "-", "num_envs": 3}
 
     def policy(batch: BatchedData) -> dict[str, Any]:
@@ -167,11 +238,11 @@ def test_a_sub_environment_that_waits_for_others_makes_no_transitions() -> None:
         assert rollout.first.tolist() == [1, 0, 0, 1, 0, 0, 1, 0, 1, 0, 1, 1]
 
 
-def test_blocks_are_refused_where_they_would_have_holes() -> None:
+def test_blocks_that_would_have_holes_raise() -> None:
     group, _ = scripted_group("vector", 2, 0.1)
     with group, group.auto_reset(99):
         collector = Collector(group, Tickets(), num_transitions=8, wait_all=True)
-        with pytest.raises(ValueError, match=r"no \[T, N\] block.*min_batch instead"):
+        with pytest.raises(ValueError, match=r"no \[T, N\] block.*min_results instead"):
             collector.collect()
     with poles(3) as group, group.auto_reset():
         collector = Collector(group, zeros, num_transitions=8, wait_all=True)
@@ -180,8 +251,8 @@ def test_blocks_are_refused_where_they_would_have_holes() -> None:
                 collector.collect()
 
 
-def test_a_block_has_what_gymnasiums_vector_env_steps_through() -> None:
-    """In the same step, as its own mode of that name: to the bit."""
+def test_a_block_equals_the_steps_of_gymnasiums_vector_env() -> None:
+    """With same-step autoreset, bit for bit."""
     generator = np.random.default_rng(0)
     actions: list[Any] = []
 
@@ -209,8 +280,8 @@ def test_a_block_has_what_gymnasiums_vector_env_steps_through() -> None:
     envs.close()
 
 
-def test_the_step_limit_cuts_envs_that_reset_themselves_at_once() -> None:
-    """They have not begun anew then: what they show is what comes after the last step."""
+def test_the_step_limit_cuts_envs_with_same_step_autoreset() -> None:
+    """They have not reset themselves, so their observation is the final one."""
 
     def make() -> Any:
         makers = [lambda number=number: Script(number, 0.0) for number in range(2)]
@@ -236,9 +307,9 @@ def test_the_step_limit_truncates() -> None:
 
 
 @pytest.mark.one_driver_for_each_place
-@pytest.mark.parametrize("options", [{"min_batch": 2}, {"wait_all": True}])
+@pytest.mark.parametrize("options", [{"min_results": 2}, {"wait_all": True}])
 async def test_a_lost_worker_cuts_a_chain(options: Any) -> None:
-    """The transition that was under way is in no rollout; behind the one before, what it led to."""
+    """The step in flight is in no rollout; the transition before it ends a chain."""
     killed: list[int] = []
 
     def policy(batch: BatchedData) -> dict[str, Any]:
@@ -269,7 +340,7 @@ async def test_a_lost_worker_cuts_a_chain(options: Any) -> None:
 
 
 def test_clients_join_while_it_collects() -> None:
-    """Their first result is a reset; a block of envs that come and go can't be made."""
+    """Their first result is a reset; clients can't be in blocks."""
 
     def policy(batch: BatchedData) -> dict[str, Any]:
         return {"action": np.zeros((len(batch), 2), np.float32)}
@@ -299,8 +370,8 @@ def test_clients_join_while_it_collects() -> None:
     second.join()
 
 
-async def test_a_start_that_waited_for_clients_is_made_again() -> None:
-    """Cancelled, it has asked nobody for anything: local envs take part, from their seeds."""
+async def test_a_cancelled_wait_for_clients_is_repeated() -> None:
+    """It has sent nothing, so local envs begin with their seeds."""
 
     def policy(batch: BatchedData) -> dict[str, Any]:
         return {"action": np.zeros((len(batch), 2), np.float32)}
@@ -312,7 +383,7 @@ async def test_a_start_that_waited_for_clients_is_made_again() -> None:
         with group.auto_reset(4):
             collector = Collector(group, policy, num_transitions=4, seed=3)
             task = asyncio.ensure_future(collector.collect())
-            await asyncio.sleep(0)  # It has begun to wait.
+            await asyncio.sleep(0)  # The wait has begun.
             task.cancel()
             with pytest.raises(asyncio.CancelledError):
                 await task
@@ -329,7 +400,7 @@ async def test_a_start_that_waited_for_clients_is_made_again() -> None:
 
 
 async def test_policies_may_be_awaited_and_cancelled() -> None:
-    """Cancelled anywhere, the next call goes on; nothing is lost or doubled."""
+    """The next call continues after a cancellation anywhere; nothing is lost or duplicated."""
     async with rl.build_env_group({**POLE, "num_workers": 3}) as group:
         asked, answering = asyncio.Event(), asyncio.Event()
         calls: list[list[int]] = []
@@ -341,7 +412,7 @@ async def test_policies_may_be_awaited_and_cancelled() -> None:
             return zeros(batch)
 
         with group.auto_reset():
-            collector = Collector(group, policy, num_transitions=6, min_batch=3, seed=0)
+            collector = Collector(group, policy, num_transitions=6, min_results=3, seed=0)
             task = asyncio.ensure_future(collector.collect())
             await asked.wait()
             with pytest.raises(RuntimeError, match="already collecting"):
@@ -375,11 +446,11 @@ def test_a_coroutine_needs_an_asynchronous_group() -> None:
             ValueError,
             r"'value' has shape \[3\]",
         ),
-        ({"action": np.zeros(2, int), "reward": np.zeros(2)}, ValueError, "'reward' of its own"),
+        ({"action": np.zeros(2, int), "reward": np.zeros(2)}, ValueError, "already has 'reward'"),
         ({"action": np.zeros((2, 5), int)}, BadAction, "nothing was sent"),
     ],
 )
-def test_a_policy_that_answers_badly_is_told_and_asked_again(
+def test_a_bad_answer_of_a_policy_raises_and_the_policy_is_called_again(
     answer: Any, error: type[Exception], named: str
 ) -> None:
     answers = [answer]
@@ -388,7 +459,7 @@ def test_a_policy_that_answers_badly_is_told_and_asked_again(
         return answers.pop() if answers else zeros(batch)
 
     with poles(2) as group, group.auto_reset():
-        collector = Collector(group, policy, num_transitions=4, min_batch=2, seed=0)
+        collector = Collector(group, policy, num_transitions=4, min_results=2, seed=0)
         with pytest.raises(error, match=named):
             collector.collect()
         assert collector.collect().index.tolist() == [0, 0, 1, 1]
@@ -401,7 +472,7 @@ def test_an_env_that_raised_takes_part_again_after_a_reset() -> None:
         return {"action": np.stack([3.0 * raising, batch.index], axis=1)}
 
     probe = {"name": "probe", "backend": "probe", "task": "-", "num_workers": 2}
-    for options in ({"min_batch": 2}, {"wait_all": True}):
+    for options in ({"min_results": 2}, {"wait_all": True}):
         group = sync.build_env_group({**probe, "placement": "inline"})
         with group, group.auto_reset(99):
             collector = Collector(group, policy, num_transitions=8, **options)
@@ -415,7 +486,7 @@ def test_an_env_that_raised_takes_part_again_after_a_reset() -> None:
 
 
 def test_a_policy_must_give_the_same_columns_each_time() -> None:
-    """In shape and kind of number, too: 0.5 is no whole number."""
+    """With the same shape and kind of number: 0.5 is not an integer."""
     for more in (
         {"value": np.zeros(2)},
         {"note": np.full(2, 0.5)},
@@ -427,7 +498,7 @@ def test_a_policy_must_give_the_same_columns_each_time() -> None:
             return {**zeros(batch), **(answers.pop() if answers else {"note": np.ones(2, int)})}
 
         with poles(2) as group, group.auto_reset():
-            collector = Collector(group, policy, num_transitions=4, min_batch=2, seed=0)
+            collector = Collector(group, policy, num_transitions=4, min_results=2, seed=0)
             with pytest.raises(ValueError, match="before"):
                 collector.collect()
             assert collector.collect().note.tolist() == [0, 1, 0, 1]
@@ -441,9 +512,9 @@ def test_envs_must_be_reset_by_the_group() -> None:
         Collector(group, zeros, num_transitions=2).collect()
 
 
-def test_a_rollouts_memory_is_its_own_until_the_second_collect_after_it() -> None:
+def test_a_rollouts_memory_is_valid_until_the_second_collect_after_it() -> None:
     with poles(2) as group, group.auto_reset():
-        collector = Collector(group, zeros, num_transitions=6, min_batch=2, seed=0)
+        collector = Collector(group, zeros, num_transitions=6, min_results=2, seed=0)
         first = collector.collect()
         kept = first.observation.copy()
         for name in ("observation", "action", "reward", "index", "done"):
@@ -457,18 +528,18 @@ def test_a_rollouts_memory_is_its_own_until_the_second_collect_after_it() -> Non
 
 def test_lag_is_counted_in_versions() -> None:
     with poles(2) as group, group.auto_reset():
-        collector = Collector(group, zeros, num_transitions=3, min_batch=2, seed=0)
-        collector.collect()  # The fourth transition is there already, and of version 0.
+        collector = Collector(group, zeros, num_transitions=3, min_results=2, seed=0)
+        collector.collect()  # The fourth transition has already begun, with version 0.
         collector.policy_version += 2
         rollout = collector.collect()
         assert sorted(rollout.policy_version.tolist()) == [0, 2, 2]
         assert rollout.lag == (0, 2 / 3, 2)
 
 
-def test_it_says_where_the_time_went() -> None:
-    """Each of two envs is in one place at a time; what is counted late is in a later rollout."""
+def test_a_rollout_reports_its_times() -> None:
+    """At any time each of two envs is in one state; late times count for a later rollout."""
     with poles(2) as group, group.auto_reset():
-        collector = Collector(group, zeros, num_transitions=20, min_batch=2, seed=0)
+        collector = Collector(group, zeros, num_transitions=20, min_results=2, seed=0)
         seconds = [collector.collect().seconds for _ in range(3)]
     for own in seconds:
         assert 0 < own.policy <= own.collecting <= own.elapsed
@@ -481,7 +552,7 @@ def test_it_says_where_the_time_went() -> None:
 
 
 @pytest.mark.parametrize(
-    "options", [{"num_transitions": 0}, {"num_transitions": 1, "min_batch": 0}]
+    "options", [{"num_transitions": 0}, {"num_transitions": 1, "min_results": 0}]
 )
 def test_numbers_must_be_above_zero(options: Any) -> None:
     with pytest.raises(ValueError, match="at least 1"):

@@ -1,7 +1,8 @@
-"""A collector over envs that remember, whatever comes when, against one list for each env."""
+"""Compares a collector, with results in random order, with the logs of its envs."""
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class Model:
-    """What was collected of each env, compared with what each env remembers."""
+    """Compares the collected transitions of each env with its log."""
 
     def __init__(self, logs: dict[int, list[Step]], tickets: Tickets) -> None:
         self.logs = logs
@@ -38,6 +39,7 @@ class Model:
             chains = list(numbers.T)
         assert rollout.num_chains == len(chains)
         assert rollout.ends[: len(chains)].tolist() == [chain[-1] for chain in chains]
+        over: dict[int, list[tuple[float, int, float, bool]]] = {}
         ends = set(rollout.ends.tolist())
         assert len(ends) == len(rollout.ends)
         for chain in chains:
@@ -56,14 +58,26 @@ class Model:
                 assert flat("done")[row] == (step.terminated or step.truncated)
                 assert flat("first")[row] == (step.before[2] == 0)
                 assert after[row].tolist() == step.after
+                assert flat("acted")[row] == step.action
+                odd = step.after[2] % 2 == 1
+                np.testing.assert_equal(flat("odd")[row], 1.0 if odd else np.nan)
+                if flat("done")[row]:
+                    rewards = [s.reward for s in self.logs[env] if s.before[1] == step.before[1]]
+                    over.setdefault(env, []).append((sum(rewards), len(rewards), step.action, odd))
                 assert flat("policy_version")[row] == self.tickets.version_of[step.action]
                 followed = k + 1 < len(chain) and not flat("first")[chain[k + 1]]
                 assert (row in ends) == (not followed)
+        ended: dict[int, list[tuple[float, int, float, bool]]] = {}
+        for episode in rollout.episodes:
+            told = episode.info["acted"], bool(episode.info.get("odd", False))
+            about = (episode.total_reward, episode.length, *told)
+            ended.setdefault(episode.index, []).append(about)
+        assert ended == over
         ages = version - flat("policy_version")
         assert rollout.lag == (ages.min(), ages.mean(), ages.max())
 
     def uncollected(self) -> set[float]:
-        """Tickets of all that was stepped and is in no rollout."""
+        """Tickets of all steps that are in no rollout."""
         rests = (log[self.collected[env] :] for env, log in self.logs.items())
         return {step.action for rest in rests for step in rest}
 
@@ -90,7 +104,7 @@ def chance_of(draw: Any, generator: Any, most: float) -> Callable[[], bool]:
 @given(st.data(), st.sampled_from(["single", "same_step", "vector", "same_step_vector"]))
 @pytest.mark.parametrize("block", [False, True])
 def test_every_transition_is_in_one_rollout_in_order(block: bool, data: Any, kind: str) -> None:
-    """With what comes after each end, however results come, get lost and are interrupted."""
+    """Also the observation after each end, for any order of results, losses and interruptions."""
     if block and kind == "vector":
         return  # See test_collector.py.
     draw = data.draw
@@ -98,7 +112,7 @@ def test_every_transition_is_in_one_rollout_in_order(block: bool, data: Any, kin
     num_envs = draw(st.integers(1, 5))
     group, logs = scripted_group(kind, num_envs, draw(st.sampled_from([0.0, 0.1, 0.5, 1.0])))
     tickets = Tickets(chance_of(draw, generator, 0.2))
-    with group, group.auto_reset(10**6):
+    with group, group.auto_reset(math.inf):
         disturbed: Any = Disturbed(
             group,
             logs,
@@ -107,7 +121,8 @@ def test_every_transition_is_in_one_rollout_in_order(block: bool, data: Any, kin
             interrupts=chance_of(draw, generator, 0.3),
         )
         total = draw(st.integers(1, 12)) * (len(logs) if block else 1)
-        options = {"wait_all": True} if block else {"min_batch": draw(st.integers(1, 5))}
+        options: Any = {"wait_all": True} if block else {"min_results": draw(st.integers(1, 5))}
+        options["infos"] = ("acted", "odd")
         collector: Any = Collector(disturbed, tickets, num_transitions=total, **options)
         tickets.version = lambda: collector.policy_version
         model = Model(logs, tickets)

@@ -1,15 +1,17 @@
-"""The order of results is kept and kept to, so that an asynchronous run is repeated to the bit."""
+"""Recording and replaying the order of results repeats an asynchronous run bit for bit."""
 
 from __future__ import annotations
 
 import pickle
+import tempfile
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 from collecting.scripted import Disturbed, Tickets, scripted_group
 from group import sample_envs
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 import rlightning_aio as rl
@@ -18,8 +20,6 @@ from rlightning_aio.collecting import Collector, Record, RecordedGroup, Replayed
 from rlightning_aio.errors import EnvRaised, ReplayDiverged
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.collecting import Rollout
 
@@ -52,7 +52,7 @@ class Learner:
 
 
 async def trained(group: Any) -> Any:
-    """Weights after some asynchronous updates, and what they were learned from."""
+    """Weights after some asynchronous updates, and their rollouts."""
     learner, seen = Learner(), []
     with group.auto_reset():
         collector = Collector(group, learner, num_transitions=60, seed=3)
@@ -65,8 +65,8 @@ async def trained(group: Any) -> Any:
 
 
 @pytest.mark.one_driver_for_each_place
-async def test_an_asynchronous_training_is_repeated_to_the_bit(tmp_path: Path) -> None:
-    """Weights included; in workers first, and then in this process, which has another order."""
+async def test_an_asynchronous_training_is_repeated_bit_for_bit(tmp_path: Path) -> None:
+    """Including weights; first in workers, then in this process, where the order differs."""
     async with rl.build_env_group({**POLE, "envs_per_process": 2}) as group:
         recorded = RecordedGroup(group)
         weights, seen = await trained(recorded)
@@ -85,14 +85,16 @@ async def test_an_asynchronous_training_is_repeated_to_the_bit(tmp_path: Path) -
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["single", "vector"]), st.integers(1, 4))
-def test_any_order_can_be_replayed(seed: int, kind: str, min_batch: int) -> None:
+def test_any_order_can_be_replayed(seed: int, kind: str, min_results: int) -> None:
     generator = np.random.default_rng(seed)
 
     def collected(in_front: Any) -> tuple[list[Any], Any]:
         group, logs = scripted_group(kind, 4, 0.2)
         with group, group.auto_reset(10**6):
             chosen = in_front(group, logs)
-            collector: Any = Collector(chosen, Tickets(), num_transitions=7, min_batch=min_batch)
+            collector: Any = Collector(
+                chosen, Tickets(), num_transitions=7, min_results=min_results
+            )
             found = [collector.collect() for _ in range(4)]
             return [(r.index.copy(), r.action.copy(), r.end_observation) for r in found], chosen
 
@@ -112,7 +114,7 @@ def test_any_order_can_be_replayed(seed: int, kind: str, min_batch: int) -> None
 
 
 def recorded_calls(count: int) -> Record:
-    """Of two envs that are stepped one after the other."""
+    """A record of two envs that are stepped in turn."""
     with sync.build_env_group({**POLE, "num_workers": 2, "placement": "inline"}) as group:
         recorded = RecordedGroup(group)
         batch, _ = recorded.reset(seed=0)
@@ -123,31 +125,31 @@ def recorded_calls(count: int) -> Record:
     return recorded.record
 
 
-def test_a_replay_tells_where_the_record_ends_or_is_left() -> None:
+def test_a_replay_names_the_call_at_which_it_differs() -> None:
     record = recorded_calls(3)
     with sync.build_env_group({**POLE, "num_workers": 2, "placement": "inline"}) as group:
         replayed = ReplayedGroup(group, record)
         batch, _ = replayed.reset(seed=0)
         replayed.step_async(batch.respond(action=[0, 0]))
         batch, _ = replayed.collect_async(wait_all=True)
-        assert batch.ids() == ["pole-0"]  # As the record has it.
+        assert batch.ids() == ["pole-0"]  # As recorded.
         batch, _ = replayed.collect_async()
         assert batch.ids() == ["pole-1"]
-        with pytest.raises(ReplayDiverged, match=r"call 3 .*of 3.*'pole-0'.*asked for nothing"):
+        with pytest.raises(ReplayDiverged, match=r"call 3 .*of 3.*'pole-0'.*no request to answer"):
             replayed.collect_async()
         group.reset_async(env_ids=["pole-0"])
         with pytest.raises(ReplayDiverged, match=r"'pole-0'.*was a step, and is a reset now"):
             replayed.collect_async()
 
 
-def test_what_was_not_recorded_is_not_replayed() -> None:
+def test_a_replay_ends_with_its_record() -> None:
     with sync.build_env_group({**POLE, "placement": "inline"}) as group:
         replayed = ReplayedGroup(group, Record())
-        with pytest.raises(ReplayDiverged, match="ends here, after 0 calls"):
+        with pytest.raises(ReplayDiverged, match="ends after 0 calls"):
             replayed.collect_async()
 
 
-def test_errors_are_raised_in_their_turn() -> None:
+def test_errors_are_raised_in_the_recorded_order() -> None:
     entry = {"name": "probe", "backend": "probe", "task": "-", "num_workers": 2}
     record = None
     for _ in range(2):
@@ -162,8 +164,44 @@ def test_errors_are_raised_in_their_turn() -> None:
             record = getattr(chosen, "record", None)
 
 
-def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
+def test_a_file_with_other_content_raises(tmp_path: Path) -> None:
     path = tmp_path / "notes"
     path.write_text("shopping list")
-    with pytest.raises(ValueError, match="notes is not a record"):
+    with pytest.raises(ValueError, match=r"record in .*notes can't be replayed: it doesn't start"):
         Record.load(path)
+
+
+RECORD = Record()
+for calls in ([("a-0", 1), ("b-1", 0)], [("a-0", 0)], [("b-1", 2)], [("a-0", 3)]):
+    RECORD.note(calls)
+
+
+def sealed(record: Record) -> bytes:
+    with tempfile.NamedTemporaryFile() as file:
+        record.save(file.name)
+        return Path(file.name).read_bytes()
+
+
+def load(data: bytes) -> Record:
+    with tempfile.NamedTemporaryFile() as file:
+        Path(file.name).write_bytes(data)
+        return Record.load(file.name)
+
+
+@pytest.mark.parametrize("record", [Record(), RECORD], ids=["empty", "of two envs"])
+def test_a_saved_record_is_loaded_unchanged(record: Record) -> None:
+    assert vars(load(sealed(record))) == vars(record)
+
+
+@given(st.data())
+def test_any_damage_to_a_file_raises(data: st.DataObject) -> None:
+    """Flipped bits, truncation, extra bytes, or several of these."""
+    whole = sealed(RECORD)
+    damaged = bytearray(whole)
+    for bit in data.draw(st.lists(st.integers(0, 8 * len(whole) - 1), max_size=3, unique=True)):
+        damaged[bit // 8] ^= 1 << bit % 8
+    del damaged[data.draw(st.integers(0, len(whole))) :]
+    damaged += data.draw(st.binary(max_size=3))
+    assume(bytes(damaged) != whole)
+    with pytest.raises(ValueError, match=r"can't be replayed: it (doesn't start|was changed)"):
+        load(bytes(damaged))

@@ -1,4 +1,4 @@
-"""`GroupContract`: an env is in a group what it is alone, wherever it lives."""
+"""`GroupContract`: an env in a group behaves as it does alone, in any placement."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
 NO_LIMIT = 10**6
 
 
-# Episodes end by the envs' own limits here.
+# Here, episodes end by the limits of the envs.
 @pytest.mark.filterwarnings("ignore:.*overrides the limits")
 class GroupContract(EnvContract):
     """The tests of `EnvContract`, and the same env in worker processes and inline."""
 
     @pytest.mark.parametrize("placement", ["process", "inline"])
-    def test_in_a_group_it_is_what_it_is_alone(self, placement: str) -> None:
-        """Each env has its spaces, goes bit for bit its seed's way, and counts its episodes."""
+    def test_an_env_in_a_group_behaves_as_alone(self, placement: str) -> None:
+        """Each env has its spaces, the exact trajectory of its seed, and its statistics."""
         with self.opened() as env:
             meta, actions = env.get_metadata(), self.actions(env)
             spaces = env.get_observation_space(), env.get_action_space()
@@ -52,7 +52,9 @@ class GroupContract(EnvContract):
 
 
 def batches(group: sync.EnvGroup, seed: int, actions: Sequence[Any]) -> Iterator[BatchedData]:
-    """What a group gives for a seeded reset and for one step with each action, in all envs."""
+    """Yield the results of a group for a seeded reset and for one step with each action, of all
+    envs.
+    """
     yield group.reset(seed=seed)[0]
     with group.auto_reset(max_episode_steps=NO_LIMIT):
         for action in actions:
@@ -61,7 +63,7 @@ def batches(group: sync.EnvGroup, seed: int, actions: Sequence[Any]) -> Iterator
 
 
 def same_outcome(one: Outcome, other: Outcome) -> bool:
-    """Whether two outcomes are the same; what nobody has told stands for all that are."""
+    """Return True if two outcomes are equal; missing values equal any."""
     return same(one[0], other[0]) and all(map(_same_column, one[1:], other[1:]))
 
 
@@ -72,7 +74,7 @@ def _same_column(one: Any, other: Any) -> bool:
 
 
 def episodes(meta: EnvMeta, outcomes: Iterable[Outcome]) -> Iterator[tuple[float, int]]:
-    """Return and length of each finished episode, by agent and sub-environment."""
+    """Return length and return of each finished episode, by agent and sub-environment."""
     streams: dict[Any, list[tuple[float, bool]]] = {}
     for _, *columns in outcomes:
         for agent in meta.agents or (None,):
@@ -81,7 +83,7 @@ def episodes(meta: EnvMeta, outcomes: Iterable[Outcome]) -> Iterator[tuple[float
             for k, (reward, terminated, truncated) in enumerate(zip(*table, strict=True)):
                 streams.setdefault((agent, k), []).append((reward, terminated or truncated))
     for stream in streams.values():
-        # A stream begins with a reset; after an end the next outcome is one again, and an
+        # A stream begins with a reset; after an end the next outcome is a reset again, and an
         # agent that has ended stays so until then.
         total, length, over = 0.0, -1, False
         for reward, ended in stream:

@@ -1,10 +1,9 @@
-"""Stand-ins for the USD files that Isaac Lab's tasks fetch from a server.
+"""Replacements for the USD files that Isaac Lab's tasks download from a server.
 
-Two carts on a rail, a dog on four legs and a ground plane, written with `pxr`, enough for the
-real simulator to build and step its own Cartpole, Pendulum and Unitree Go2 tasks without a
-network.
-``python isaac_assets.py FOLDER`` writes them for tests that run under another Python.
-Absent on purpose: everything visual.
+Two carts on a rail, a dog with four legs and a ground plane, written with `pxr`. With them, the
+real simulator builds and steps its own Cartpole, Pendulum and Unitree Go2 tasks without a network.
+``python isaac_assets.py FOLDER`` writes them for tests that run under another Python. Left out on
+purpose: everything visual.
 """
 
 from __future__ import annotations
@@ -97,7 +96,7 @@ def _write_dog(path: Path) -> None:
 
 
 def _add_body(stage: Usd.Stage, name: str, at: Point, size: Point, mass: float) -> UsdGeom.Xform:
-    """A box without a shape."""
+    """Add a box without a shape."""
     body = UsdGeom.Xform.Define(stage, f"/robot/{name}")
     body.AddTranslateOp().Set(Gf.Vec3d(at))
     UsdPhysics.RigidBodyAPI.Apply(body.GetPrim())

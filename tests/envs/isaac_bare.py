@@ -1,7 +1,7 @@
-"""Isaac Lab with nothing of this package around it: what its backends are compared with.
+"""Isaac Lab without this package: the reference for its backends.
 
-Run by the Python that has Isaac Lab, which needn't be the one that runs the tests:
-``python isaac_bare.py TASK NUM_ENVS MAX_EPISODE_LENGTH SEED ACTIONS.npy ASSETS OUT.npz``.
+Run by the Python that has Isaac Lab, which may differ from that of the tests: ``python
+isaac_bare.py TASK NUM_ENVS MAX_EPISODE_LENGTH SEED ACTIONS.npy ASSETS OUT.npz``.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 
 def bare_simulator(task: str, num_envs: int, max_episode_length: int) -> Any:
-    """The task's environment; one at a time in a process."""
+    """Yield the task's environment; one at a time in a process."""
     import gymnasium as gym
     from isaaclab.app import launch_simulation
     from isaaclab_tasks.utils import parse_env_cfg
@@ -28,16 +28,16 @@ def bare_simulator(task: str, num_envs: int, max_episode_length: int) -> Any:
 
 
 def by_agent(action: Any) -> dict[str, Any]:
-    """The double pendulum's two actions, made of one."""
+    """Split one action into those of the double pendulum's two agents."""
     return {"cart": action, "pendulum": -action}
 
 
 def trajectory(env: Any, seed: int, actions: np.ndarray) -> dict[str, np.ndarray]:
-    """Observations, rewards and flags of a reset and of 200 steps, stacked over time."""
+    """Return observations, rewards and flags of a reset and of 200 steps, stacked over time."""
     import torch
 
     env.reset(seed=seed)
-    # The first reset reports velocities from before it.
+    # The velocities after the first reset are from before it.
     steps: list[tuple[Any, ...]] = [(env.reset(seed=seed)[0],)]
     for action in torch.tensor(actions):
         given = by_agent(action) if hasattr(env, "possible_agents") else action

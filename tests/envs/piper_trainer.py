@@ -1,4 +1,4 @@
-"""A trainer that is killed while its arm is on the way: ``python piper_trainer.py CHANNEL``."""
+"""A trainer that is killed while its arm moves: ``python piper_trainer.py CHANNEL``."""
 
 from __future__ import annotations
 

@@ -118,7 +118,7 @@ class TestVectorOfPreprocessedStacks(GroupContract):
     ],
 )
 def test_num_envs_only_adds_an_axis(env_kwargs: dict[str, Any], shape: tuple[int, ...]) -> None:
-    """The options mean the same for one game and for several."""
+    """Options have the same meaning for one game and for several."""
     for num_envs, head in ((1, ()), (2, (2,))):
         env = make(entry(num_envs=num_envs, env_kwargs=env_kwargs))
         assert env.get_observation_space().shape == (*head, *shape)
@@ -127,7 +127,7 @@ def test_num_envs_only_adds_an_axis(env_kwargs: dict[str, Any], shape: tuple[int
 
 
 @pytest.mark.parametrize("preprocessing", [False, {"noop_max": 0}])
-def test_a_vector_plays_the_games_that_single_envs_play(preprocessing: Any) -> None:
+def test_a_vector_plays_the_same_games_as_single_envs(preprocessing: Any) -> None:
     """Game k of a vector is a single game with seed + k, frame for frame, until it ends."""
     env_kwargs = {"repeat_action_probability": 0.0, "preprocessing": preprocessing}
     vector = make(entry("ALE/Breakout-v5", 2, env_kwargs=env_kwargs))
@@ -142,7 +142,7 @@ def test_a_vector_plays_the_games_that_single_envs_play(preprocessing: Any) -> N
         for k, single in enumerate(singles):
             alone = outcome_of(single.step(PolicyResponse("atari-0", action[k])))
             assert same([column[k] for column in together[1:]], list(alone[1:]))
-            # The last raw frame of a game may be one that the other never drew.
+            # The last raw frames of a game may differ.
             assert same(together[0][k], alone[0]) or alone[2]
         steps += 1
         if together[2].any():
@@ -153,7 +153,7 @@ def test_a_vector_plays_the_games_that_single_envs_play(preprocessing: Any) -> N
 
 
 def test_a_vectorised_game_that_ended_starts_over_in_the_next_step() -> None:
-    """The step after an end is a reset: no reward, and the action counts for nothing."""
+    """The step after an end is a reset: reward 0, and the action is ignored."""
     env = make(entry(num_envs=2, max_episode_steps=5))
     env.reset(seed=0)
     results = [env.step(PolicyResponse("atari-0", np.array([2, 2]))) for _ in range(7)]
@@ -180,8 +180,8 @@ def test_unseeded_vectors_differ() -> None:
         env.close()
 
 
-def test_an_option_that_nobody_has_is_named() -> None:
-    """The message says which option, for how many envs, and what there is."""
+def test_an_unknown_option_raises() -> None:
+    """The message has the option, the number of envs, and the known options."""
     with pytest.raises(ConfigError, match="preprocessing has no frameskip"):
         make(entry(env_kwargs={"preprocessing": {"frameskip": 2}}))
     with pytest.raises(ConfigError, match=r"no scale_obs with num_envs: 2; .*screen_size"):

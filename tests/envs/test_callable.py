@@ -1,4 +1,4 @@
-"""Envs that come from callables: whatever these return, wrapped as its author likes."""
+"""Envs from callables, with any wrappers."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def inline(**fields: Any) -> Any:
 
 
 class Counter(BaseEnv):
-    """An env of the runtime's own kind, made without knowing its entry."""
+    """A `BaseEnv`, made without its entry."""
 
     def __init__(self) -> None:
         super().__init__(EnvConfig(name="made", backend="made", task="made"))
@@ -51,9 +51,9 @@ class Counter(BaseEnv):
 
 
 def test_wrapped_envs_behave_as_in_a_plain_loop() -> None:
-    """One callable for each env; each env is its own, in workers, over the ends of episodes."""
+    """One callable for each env, in workers, over episode ends."""
     gravities = [1.0, 5.0, 10.0]
-    # A lambda, which knows its number: it can't be imported anywhere.
+    # A lambda with a captured number, which can't be imported.
     makers = [lambda g=g: wrapped_pendulum(g) for g in gravities]
     loop = [wrapped_pendulum(g) for g in gravities]
     actions = np.random.default_rng(0).uniform(-3, 3, (12, 3, 1)).astype(np.float32)
@@ -76,7 +76,7 @@ def test_wrapped_envs_behave_as_in_a_plain_loop() -> None:
 
 
 def test_one_callable_makes_every_env_of_an_entry() -> None:
-    """With the entry's ``env_kwargs``; its step limit is put around what it returns."""
+    """With the ``env_kwargs`` and the step limit of the entry."""
     fields = {"make_env": wrapped_pendulum, "env_kwargs": {"gravity": 0.0}, "num_workers": 2}
     with inline(**fields, max_episode_steps=3) as group:
         batch, _ = group.reset(seed=0)
@@ -90,8 +90,8 @@ def test_one_callable_makes_every_env_of_an_entry() -> None:
         ]
 
 
-def test_workers_know_the_tasks_that_the_program_has_registered() -> None:
-    """By name in an entry and in a callable, beside one that can't be pickled."""
+def test_workers_have_the_tasks_that_the_program_has_registered() -> None:
+    """By name in an entry and in a callable, even if another task can't be pickled."""
     gym.register("Here-v0", wrapped_pendulum, max_episode_steps=3)
     gym.register("Locked-v0", wrapped_pendulum, kwargs={"lock": threading.Lock()})
     try:
@@ -107,8 +107,8 @@ def test_workers_know_the_tasks_that_the_program_has_registered() -> None:
         del gym.registry["Here-v0"], gym.registry["Locked-v0"]
 
 
-def test_errors_name_what_has_made_the_env() -> None:
-    """Where there is no task to name."""
+def test_errors_name_the_callable_of_the_env() -> None:
+    """If there is no task."""
     makers = [wrapped_pendulum, lambda: wrapped_pendulum(5.0)]
     with inline(make_env=makers, num_workers=2) as group:
         for k, name in enumerate((r"wrapped_pendulum", r"\S+<lambda>")):
@@ -128,8 +128,8 @@ def test_yaml_names_a_function(tmp_path: Any) -> None:
         assert group.reset(seed=1)[0].observation.shape == (1, 3)
 
 
-def test_a_vector_env_brings_its_own_number() -> None:
-    """Its sub-environments, what they do at an end, and its axis, one or several."""
+def test_a_vector_env_determines_num_envs() -> None:
+    """Sub-environments, autoreset mode, and leading axis, for one or several."""
     for count in (1, 3):
         with inline(make_env=lambda n=count: gym.make_vec("CartPole-v1", n)) as group:
             (meta,) = group.init()
@@ -140,8 +140,8 @@ def test_a_vector_env_brings_its_own_number() -> None:
             assert batch.reward.reshape(-1).tolist() == [1.0] * count
 
 
-def test_an_env_of_the_runtimes_own_becomes_one_of_the_entry() -> None:
-    """It goes by the entry's name, and steps with the group's preprocess function."""
+def test_a_base_env_gets_the_entry_of_its_callable() -> None:
+    """It has the entry's name, and uses the group's preprocess function."""
     config = EnvConfig(name="own", make_env=Counter, num_workers=2, placement="inline")
     with build_env_group(config, preprocess_fn=lambda response: response.action + 1) as group:
         batch, _ = group.reset()
@@ -152,7 +152,7 @@ def test_an_env_of_the_runtimes_own_becomes_one_of_the_entry() -> None:
 
 @pytest.mark.parametrize(("task", "entry_point"), [("CartPole-v1", True), ("Pendulum-v1", False)])
 def test_many_of_a_gymnasium_task_in_one_env(task: str, entry_point: bool) -> None:
-    """By the task's own vector environment, or by a loop; both as `make_vec` makes them."""
+    """By the vector environment of the task, or by a loop; both as made by `make_vec`."""
     vector: Any = gym.make_vec(task, 3)
     assert isinstance(vector, gym.vector.SyncVectorEnv) != entry_point
     with inline(backend="gymnasium", task=task, num_envs=3) as group:
@@ -174,21 +174,21 @@ def test_many_of_a_gymnasium_task_in_one_env(task: str, entry_point: bool) -> No
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ({"name": "e", "make_env": wrapped_pendulum, "backend": "mujoco"}, "takes the place of"),
+        ({"name": "e", "make_env": wrapped_pendulum, "backend": "mujoco"}, "replaces backend"),
         ({"name": "e", "make_env": [Counter], "num_workers": 2}, "1 callables for num_workers: 2"),
-        ({"name": "e", "make_env": Counter, "task": "a:b"}, "leave out 'a:b'"),
+        ({"name": "e", "make_env": Counter, "task": "a:b"}, "leave 'a:b' out"),
         ({"name": "e", "task": "Counter", "backend": "callable"}, "module:function"),
         ({"name": "e", "make_env": "Counter"}, "make_env"),
     ],
 )
-def test_what_can_be_no_env_is_refused_before_anything_starts(given: Any, said: str) -> None:
-    """By its field, with what to do."""
+def test_an_invalid_callable_raises_before_anything_starts(given: Any, said: str) -> None:
+    """The message names the field, and what to do."""
     with pytest.raises(ConfigError, match=said):
         build_env_group(given)
 
 
-def test_a_callable_that_can_t_travel_is_named_before_anything_starts() -> None:
-    """With what it captures; inline it need not travel."""
+def test_a_callable_that_cannot_be_pickled_raises_before_anything_starts() -> None:
+    """The message names the captured object; inline envs need no pickle."""
     lock = threading.Lock()
 
     def locked() -> Any:
@@ -215,7 +215,7 @@ def test_a_callable_that_can_t_travel_is_named_before_anything_starts() -> None:
         ),
     ],
 )
-def test_what_is_no_env_of_the_entry_fails_the_start(fields: Any, said: str) -> None:
-    """The message says what it was and what is needed."""
+def test_a_wrong_return_value_of_a_callable_fails_the_start(fields: Any, said: str) -> None:
+    """The message has the value and the requirement."""
     with pytest.raises((StartFailed, ConfigError), match=said):
         inline(**fields).init()

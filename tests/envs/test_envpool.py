@@ -79,8 +79,8 @@ class TestPoolOfOne(GroupContract):
 
 
 @pytest.mark.parametrize("task", ["HalfCheetah-v5", "Pong-v5", "Blackjack-v1", "CheetahRun-v1"])
-def test_results_are_what_the_pools_own_methods_give(task: str) -> None:
-    """`send` and `recv`, down to names, dtypes and nesting; arrays and dicts of them."""
+def test_results_equal_those_of_the_pools_methods(task: str) -> None:
+    """`send` and `recv`, including names, dtypes and nesting; arrays and dicts of them."""
     env = make(task, 3)
     pool = envpool.make(task, env_type="gymnasium", num_envs=3, seed=[4, 5, 6])
     pool.async_reset()
@@ -100,8 +100,8 @@ def test_results_are_what_the_pools_own_methods_give(task: str) -> None:
         opened.close()
 
 
-def test_inline_results_are_handed_over_uncopied() -> None:
-    """What EnvPool has made belongs to the batch alone; a row of shared memory would copy it."""
+def test_inline_results_are_not_copied() -> None:
+    """The batch owns EnvPool's arrays; a row of shared memory would need a copy."""
     config = entry("Pong-v5", 2, placement="inline")
     with sync.build_env_group(config) as group:
         batch, _ = group.reset(seed=1)
@@ -115,8 +115,8 @@ def test_inline_results_are_handed_over_uncopied() -> None:
 
 
 @pytest.mark.parametrize("task", ["LunarLander-v3", "WalkerRun-v1"])
-def test_a_space_that_excludes_its_observations_is_no_refusal(task: str) -> None:
-    """One warning names the task, and what EnvPool gives is handed out."""
+def test_observations_outside_their_space_only_warn(task: str) -> None:
+    """One warning names the task, and EnvPool's observations are returned."""
     with sync.build_env_group(entry(task, 2, placement="inline")) as group:
         with pytest.warns(UserWarning, match=f"task '{task}'.*an observation.* holds") as said:
             batch, _ = group.reset(seed=0)
@@ -128,7 +128,7 @@ def test_a_space_that_excludes_its_observations_is_no_refusal(task: str) -> None
 
 
 def test_a_result_belongs_to_its_caller() -> None:
-    """Who writes to its ids changes nothing of where the next actions go."""
+    """Writing to its ids doesn't redirect the next actions."""
     env, alone = make(num_envs=4), make(num_envs=4)
     result, expected = env.reset(seed=2), alone.reset(seed=2)
     for k in range(20):
@@ -140,8 +140,8 @@ def test_a_result_belongs_to_its_caller() -> None:
         opened.close()
 
 
-def test_an_action_may_be_written_over_once_it_was_sent() -> None:
-    """EnvPool reads it when the sub-environment's turn comes."""
+def test_an_action_may_be_overwritten_after_it_was_sent() -> None:
+    """EnvPool reads it later."""
     pool = make("HalfCheetah-v5", 8, env_kwargs={"batch_size": 2, "num_threads": 1})
     alone = [make("HalfCheetah-v5", 1) for _ in range(8)]
     expected = [env.reset(seed=k) for k, env in enumerate(alone)]
@@ -158,8 +158,8 @@ def test_an_action_may_be_written_over_once_it_was_sent() -> None:
         env.close()
 
 
-def test_asynchronous_results_are_batches_of_whoever_is_ready() -> None:
-    """Spaces and num_envs are the batch's; each sub-environment's own steps are in order."""
+def test_asynchronous_results_are_batches_of_ready_sub_environments() -> None:
+    """Spaces and num_envs are those of the batch; steps of each sub-environment are in order."""
     env = make(num_envs=6, env_kwargs={"batch_size": 2})
     meta = env.get_metadata()
     assert meta.num_envs == 2
@@ -177,8 +177,8 @@ def test_asynchronous_results_are_batches_of_whoever_is_ready() -> None:
     env.close()
 
 
-def test_asynchronous_trajectories_are_each_sub_environments_own() -> None:
-    """Whatever the order of arrival, sub-environment k goes the way that its seed leads."""
+def test_asynchronous_trajectories_depend_only_on_seeds() -> None:
+    """In any order of arrival, the seed determines the trajectory of a sub-environment."""
     pool = make(num_envs=4, env_kwargs={"batch_size": 2})
     alone = [make(num_envs=1) for _ in range(4)]
     expected = [env.reset(seed=9 + k) for k, env in enumerate(alone)]
@@ -195,7 +195,7 @@ def test_asynchronous_trajectories_are_each_sub_environments_own() -> None:
 
 @pytest.mark.parametrize("placement", ["process", "inline"])
 def test_a_group_counts_the_episodes_of_each_sub_environment(placement: str) -> None:
-    """Turns are told apart, nobody resets what resets itself, and every end is counted."""
+    """With partial batches, without additional resets, and with all episodes counted."""
     config = entry(
         num_envs=4, placement=placement, max_episode_steps=7, env_kwargs={"batch_size": 2}
     )
@@ -224,7 +224,7 @@ def test_a_group_counts_the_episodes_of_each_sub_environment(placement: str) -> 
 
 
 def test_asynchronous_pools_can_be_reset_while_they_compute() -> None:
-    """What was under way is forgotten; a seed gives the same start as ever."""
+    """Steps in flight are dropped; a seed gives the same start."""
     env = make(num_envs=4, env_kwargs={"batch_size": 2})
     starts = []
     for _ in range(3):
@@ -239,7 +239,7 @@ def test_asynchronous_pools_can_be_reset_while_they_compute() -> None:
 
 
 def test_a_seed_or_a_list_of_seeds() -> None:
-    """Sub-environment k takes seed + k, or the k-th of a list."""
+    """Sub-environment k gets seed + k, or element k of a list."""
     env = make()
     start = outcome_of(env.reset(seed=7))
     assert same(start, outcome_of(env.reset(seed=[7, 8, 9, 10])))
@@ -250,7 +250,7 @@ def test_a_seed_or_a_list_of_seeds() -> None:
 
 
 def test_unseeded_pools_differ() -> None:
-    """EnvPool's fixed default seed doesn't make all workers alike."""
+    """Despite EnvPool's fixed default seed."""
     envs = [make(), make()]
     assert not np.array_equal(envs[0].reset().observation, envs[1].reset().observation)
     for env in envs:
@@ -258,7 +258,7 @@ def test_unseeded_pools_differ() -> None:
 
 
 def test_the_final_observation_comes_before_the_reset() -> None:
-    """The step after an end gives the new episode's first observation and no reward."""
+    """The step after an end returns the first observation of the next episode and reward 0."""
     env = make("Pendulum-v1", 2, max_episode_steps=3)
     env.reset(seed=0)
     results = [env.step(PolicyResponse("pool-0", np.ones((2, 1), np.float32))) for _ in range(5)]
@@ -275,9 +275,9 @@ def test_limits_are_known() -> None:
     assert make("Blackjack-v1").get_metadata().max_episode_steps is None
 
 
-def test_misuse_is_named() -> None:
-    """Batch sizes that can't be, steps before a reset, and options of a reset."""
-    with pytest.raises(ConfigError, match="batch_size is 5, but must lie between 1 and num_envs"):
+def test_misuse_raises() -> None:
+    """Invalid batch sizes, steps before a reset, and options of a reset."""
+    with pytest.raises(ConfigError, match="batch_size is 5, but must be between 1 and num_envs"):
         make(env_kwargs={"batch_size": 5})
     env = make()
     with pytest.raises(RuntimeError, match="before its first reset"):

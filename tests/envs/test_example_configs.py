@@ -24,6 +24,6 @@ pytestmark = [
     ],
 )
 def test_the_example_ends_with_its_table(name: str, entry: str, simulator: str) -> None:
-    """It runs as it stands, and its closing table counts the steps of its entry."""
+    """It runs unchanged, and its closing table has the steps of its entry."""
     pytest.importorskip(simulator)
     assert steps(closing_table(name, "--steps", "400")[entry]) >= 400

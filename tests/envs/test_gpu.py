@@ -41,7 +41,7 @@ NUM_ENVS, NUM_STEPS = 16, 20
 
 
 def walk(config: EnvConfig, actions: list[Any]) -> list[EnvRet]:
-    """The env's results, of a seeded reset and of each action."""
+    """Results of a seeded reset and of each action."""
     with sync.build_env_group(config) as group:
         (env_id,) = group.env_ids
         results = [group.reset(seed=3)[0].values()[0]]
@@ -52,7 +52,7 @@ def walk(config: EnvConfig, actions: list[Any]) -> list[EnvRet]:
 
 
 def check_both_places(config: EnvConfig, action_size: int, part: str | None) -> None:
-    """Tensors on the GPU inline, for actions that are there too; the same numbers elsewhere."""
+    """Tensors on the GPU inline, for actions on the GPU; the same numbers elsewhere."""
     import torch
 
     rng = np.random.default_rng(0)
@@ -68,7 +68,7 @@ def check_both_places(config: EnvConfig, action_size: int, part: str | None) -> 
         assert tensor.device.type == "cuda"
         assert tensor.shape[0] == NUM_ENVS
         assert isinstance(array, np.ndarray)
-        # Contacts are summed in whatever order a GPU takes them.
+        # A GPU sums contacts in any order.
         np.testing.assert_allclose(tensor.cpu().numpy(), array, rtol=1e-2, atol=1e-2)
     for here, there in zip(inline[1:], apart[1:], strict=True):
         for name in ("last_reward", "last_terminated", "last_truncated"):
@@ -85,7 +85,7 @@ def test_maniskill_batches_on_the_gpu() -> None:
 
 @needs_isaac
 def test_isaac_lab_simulates_on_the_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a `device` in the config: a GPU goes before the CPU."""
+    """Without a `device` in the config, a GPU is preferred to the CPU."""
     from envs.isaac_assets import write_assets
 
     monkeypatch.setenv("ISAACSIM_ASSET_ROOT", str(write_assets(tmp_path)))

@@ -1,4 +1,4 @@
-"""The backends that every installation has: `gymnasium` and `mujoco`."""
+"""The backends of each installation: `gymnasium` and `mujoco`."""
 
 from __future__ import annotations
 
@@ -65,13 +65,13 @@ def cartpole(**fields: Any) -> GymnasiumEnv:
 
 
 def test_the_step_limit_is_the_registered_one_unless_configured() -> None:
-    """Metadata tell the limit that holds."""
+    """Metadata have the effective limit."""
     assert cartpole().get_metadata().max_episode_steps == 500
     assert cartpole(max_episode_steps=7).get_metadata().max_episode_steps == 7
 
 
 def test_a_preprocess_function_makes_the_action() -> None:
-    """`step` calls it; a bare step is the simulator's, and its caller's to prepare for."""
+    """`step` calls it; callers of a bare step must do so themselves."""
     config = EnvConfig(name="cartpole", backend="gymnasium", task="CartPole-v1")
     flipped = GymnasiumEnv(config, preprocess_fn=lambda response: 1 - response.action)
     plain = GymnasiumEnv(config)
@@ -84,7 +84,7 @@ def test_a_preprocess_function_makes_the_action() -> None:
 
 
 def test_a_subclass_with_its_own_step_is_not_stepped_bare() -> None:
-    """`bare_step` never goes around what a subclass wrote."""
+    """`bare_step` never bypasses the method of a subclass."""
 
     class Doubled(GymnasiumEnv):
         def step(self, policy_resp: PolicyResponse) -> Any:
@@ -95,7 +95,7 @@ def test_a_subclass_with_its_own_step_is_not_stepped_bare() -> None:
     assert env.bare_step() is None
 
 
-def test_what_the_backend_cannot_do_says_so() -> None:
-    """Offloading needs device memory, which these don't hold."""
+def test_unsupported_operations_raise() -> None:
+    """Offloading needs device memory, which these don't use."""
     with pytest.raises(NotImplementedError, match="'gymnasium' has no offload"):
         cartpole().offload()

@@ -1,7 +1,7 @@
-"""The Isaac Lab backends on the real simulator, kit-less, on the CPU.
+"""The Isaac Lab backends on the real simulator, without Kit, on the CPU.
 
-These run in the virtual environment that holds Isaac Lab (docs/backends.md); robots and
-ground come from `isaac_assets`.
+These tests run in the virtual environment of Isaac Lab (docs/backends.md); `isaac_assets` has
+robots and ground.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ pytest.importorskip("isaaclab")
 
 pytestmark = [
     pytest.mark.simulators,
-    pytest.mark.timeout(600),  # Kernels are compiled the first time.
-    pytest.mark.filterwarnings("default"),  # The simulator warns about its own future.
+    pytest.mark.timeout(600),  # The first run compiles kernels.
+    pytest.mark.filterwarnings("default"),  # The simulator has deprecation warnings.
 ]
 
 MANAGER_BASED = "Isaac-Cartpole"
@@ -55,7 +55,7 @@ def _assets(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture
 def make() -> Iterator[Any]:
-    """Builds envs; each is closed before the next and at the end."""
+    """Build envs; each is closed before the next one and after the test."""
     live: list[BaseEnv] = []
 
     def build(task: str = MANAGER_BASED, backend: str = "isaac_manager_based", **fields: Any):
@@ -87,8 +87,8 @@ def respond(action: Any) -> PolicyResponse:
     return PolicyResponse("isaac-0", action=action)
 
 
-def test_spaces_are_batched_and_hold_what_comes_out(make: Any) -> None:
-    """With 4 sub-environments every array has a leading axis of 4 and fits the spaces."""
+def test_spaces_are_batched_and_contain_the_results(make: Any) -> None:
+    """With 4 sub-environments every array has a first axis of 4 and is in its space."""
     env = make(num_envs=4)
     meta = env.init()
     assert meta.observation_space["policy"].shape == (4, 4)
@@ -119,7 +119,7 @@ def test_one_sub_environment_has_no_batch_axis(make: Any) -> None:
 
 
 def test_the_first_reset_is_like_every_other(make: Any) -> None:
-    """The same seed gives the same observation, fresh velocities included, from the start."""
+    """The same seed gives the same observation, including new velocities, from the start."""
     env = make(num_envs=4)
     first, second = env.reset(seed=5).observation, env.reset(seed=5).observation
     assert torch.equal(first["policy"], second["policy"])
@@ -128,7 +128,7 @@ def test_the_first_reset_is_like_every_other(make: Any) -> None:
 
 
 def test_manager_based_steps_equal_the_bare_simulators(make: Any) -> None:
-    """200 steps, resets within them included, are those of the simulator alone."""
+    """200 steps, including resets, equal those of the bare simulator."""
     env = make(num_envs=4, max_episode_steps=60)
     assert env.max_episode_steps == 60
     ours = [env.reset(seed=1)] + [env.step(respond(a)) for a in actions(200, 4)]
@@ -156,7 +156,7 @@ def test_manager_based_steps_equal_the_bare_simulators(make: Any) -> None:
 
 
 def test_marl_steps_equal_the_bare_simulators(make: Any) -> None:
-    """200 steps of both agents, resets within them included, are those of the simulator alone."""
+    """200 steps of both agents, including resets, equal those of the bare simulator."""
     env = make(MARL, "isaac_marl", num_envs=3, max_episode_steps=40)
     steps = actions(200, 3)
     ours = [env.reset(seed=1)]
@@ -188,8 +188,8 @@ def test_marl_steps_equal_the_bare_simulators(make: Any) -> None:
         bare.close()
 
 
-def test_marl_speaks_by_agent(make: Any) -> None:
-    """Spaces and results of a multi-agent task are dicts by agent, batched in each."""
+def test_spaces_and_results_of_marl_are_dicts_by_agent(make: Any) -> None:
+    """Each agent's values are batched."""
     env = make(MARL, "isaac_marl", num_envs=2)
     meta = env.init()
     assert meta.agents == ("cart", "pendulum")
@@ -209,7 +209,7 @@ def test_marl_speaks_by_agent(make: Any) -> None:
 
 
 def test_results_are_never_overwritten(make: Any) -> None:
-    """What a step handed out is the same after 60 more, over resets of sub-environments."""
+    """A step's result is unchanged after 60 more steps, including resets of sub-environments."""
     env = make(num_envs=2, max_episode_steps=20)
     env.reset(seed=0)
     kept: list[tuple[EnvRet, list[Any]]] = []
@@ -228,8 +228,8 @@ def _tensors(ret: EnvRet) -> Iterator[Any]:
         yield ret.info["final_obs"]["policy"]
 
 
-def test_torch_and_numpy_actions_do_the_same(make: Any) -> None:
-    """An action counts the same as a tensor, as an array and as a read-only array."""
+def test_torch_and_numpy_actions_have_the_same_effect(make: Any) -> None:
+    """A tensor, an array and a read-only array."""
     env = make(num_envs=2)
     array = actions(1, 2)[0]
     frozen = array.copy()
@@ -243,7 +243,7 @@ def test_torch_and_numpy_actions_do_the_same(make: Any) -> None:
 
 
 def test_a_second_live_env_is_refused(make: Any) -> None:
-    """Isaac Lab has one env in a process: a second names the first, and works after its close."""
+    """Isaac Lab has one env in a process: the error names the first, and closing it helps."""
     from rlightning_aio.envs.isaac import IsaacManagerBasedEnv
 
     first = make(num_envs=2)
@@ -286,21 +286,21 @@ def test_a_configuration_class_with_overrides(make: Any) -> None:
     ],
 )
 def test_faults_of_the_config_are_named(make: Any, fields: Any, message: str) -> None:
-    """A task, option or override that doesn't exist is named, and the process stays free."""
+    """A task, option or override that doesn't exist; the process can build another env."""
     with pytest.raises(ConfigError, match=message):
         make(**fields)
     make(num_envs=1)
 
 
 def walk(env: BaseEnv) -> Any:
-    """Observations of a seeded reset and of ten steps."""
+    """Return the observations of a seeded reset and of ten steps."""
     start = env.reset(seed=3)
     steps = [env.step(respond(action)) for action in actions(10, 2 * 12).reshape(10, 2, 12)]
     return torch.stack([ret.observation["policy"] for ret in (start, *steps)])
 
 
 def test_another_task_walks_on_rough_ground(make: Any) -> None:
-    """A dog sees the ground under it, whose terrain is generated; seeded, it is the same again."""
+    """A dog sees the generated terrain; the same seed repeats it."""
     overrides = {
         "seed": 7,
         "scene.terrain.terrain_generator": {"num_rows": 1, "num_cols": 2},
@@ -317,8 +317,8 @@ def test_another_task_walks_on_rough_ground(make: Any) -> None:
     assert torch.equal(*walks)
 
 
-def test_what_is_drawn_once_is_drawn_from_a_seed_of_the_env(make: Any) -> None:
-    """Startup events give the dogs their masses: by the seed, and other ones to other envs."""
+def test_values_drawn_at_the_start_depend_on_the_seed(make: Any) -> None:
+    """Startup events draw the masses of the dogs; they differ between envs."""
     masses, walks = [], []
     for worker_index in (0, 0, 1):
         env = make(
@@ -333,7 +333,7 @@ def test_what_is_drawn_once_is_drawn_from_a_seed_of_the_env(make: Any) -> None:
 
 
 def test_assets_come_from_a_server(tmp_path: Path) -> None:
-    """A URL does for ISAACSIM_ASSET_ROOT, as it stands in the configurations of all tasks."""
+    """ISAACSIM_ASSET_ROOT may be a URL, as in the configurations of all tasks."""
     with serving(Path(os.environ["ISAACSIM_ASSET_ROOT"])) as (url, paths):
         entry = {
             "name": "isaac",
@@ -341,7 +341,7 @@ def test_assets_come_from_a_server(tmp_path: Path) -> None:
             "task": MANAGER_BASED,
             "num_envs": 2,
             "start_timeout": 300.0,
-            # What was fetched is kept among temporary files.
+            # Downloads are kept among the temporary files.
             "env_vars": {"ISAACSIM_ASSET_ROOT": url, "TMPDIR": str(tmp_path)},
             "env_kwargs": {"device": "cpu"},
         }
@@ -352,7 +352,7 @@ def test_assets_come_from_a_server(tmp_path: Path) -> None:
 
 @contextlib.contextmanager
 def serving(folder: Path) -> Iterator[tuple[str, list[str]]]:
-    """The URL of an HTTP server for `folder`, and the paths that it was asked for."""
+    """Yield the URL of an HTTP server for `folder`, and the requested paths."""
     paths: list[str] = []
 
     class Handler(SimpleHTTPRequestHandler):
@@ -372,7 +372,7 @@ def serving(folder: Path) -> Iterator[tuple[str, list[str]]]:
 
 @pytest.mark.parametrize("placement", ["inline", "process"])
 def test_tensors_stay_tensors_inline_and_are_arrays_from_a_process(placement: str) -> None:
-    """In this process results are torch tensors; from a worker they are equal NumPy arrays."""
+    """Inline results are torch tensors; from a worker they are equal NumPy arrays."""
     entry = {
         "name": "isaac",
         "backend": "isaac_manager_based",

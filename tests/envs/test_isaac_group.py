@@ -1,7 +1,7 @@
-"""Isaac Lab in a group of simulators that its own dependencies exclude.
+"""Isaac Lab in a group with simulators that conflict with its dependencies.
 
-Its workers run under the Python that the variable ISAAC_PYTHON names, these tests under
-one that has MuJoCo 4 and no Isaac Lab.
+Its workers run under the Python in the variable ISAAC_PYTHON; these tests run under one that has
+MuJoCo 4 and no Isaac Lab.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ SEED, LENGTH = 3, 60
 
 pytestmark = [
     pytest.mark.simulators,
-    pytest.mark.timeout(600),  # Kernels are compiled the first time.
+    pytest.mark.timeout(600),  # The first run compiles kernels.
     pytest.mark.skipif(not PYTHON, reason="ISAAC_PYTHON names no Python with Isaac Lab"),
 ]
 
@@ -39,7 +39,7 @@ def actions(num_steps: int, num_envs: int) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def bare(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
-    """Where the assets are, and what the simulator alone does with each task."""
+    """Return the folder of the assets, and the bare simulator's results for each task."""
     folder = tmp_path_factory.mktemp("bare")
     np.save(folder / "actions.npy", actions(200, 4))
     script = Path(__file__).with_name("isaac_bare.py")
@@ -69,7 +69,7 @@ def entry(backend: str, task: str, assets: Path, **fields: Any) -> dict[str, Any
 
 
 def test_isaac_lab_and_mujoco_4_share_a_group(bare: tuple[Path, dict[str, Any]]) -> None:
-    """200 steps beside MuJoCo envs are, bit for bit, those of each simulator alone."""
+    """200 steps next to MuJoCo envs equal those of each bare simulator, bit for bit."""
     assets, expected = bare
     cheetah = {"name": "cheetah", "backend": "mujoco", "task": "HalfCheetah-v5"}
     entries = [
@@ -120,8 +120,8 @@ def test_isaac_lab_and_mujoco_4_share_a_group(bare: tuple[Path, dict[str, Any]])
     assert len(rets["cheetah-0"]) == 201
 
 
-def test_what_is_wrong_over_there_is_told_here(bare: tuple[Path, dict[str, Any]]) -> None:
-    """An error from the other environment arrives with its message, and so does a missing one."""
+def test_errors_of_the_other_python_are_reported(bare: tuple[Path, dict[str, Any]]) -> None:
+    """An error in it arrives with its message, and so does a missing Python."""
     assets, _ = bare
     with (
         pytest.raises(ConfigError, match="task 'Isaac-Cartpol' is not registered; did you mean"),
@@ -142,7 +142,7 @@ def test_what_is_wrong_over_there_is_told_here(bare: tuple[Path, dict[str, Any]]
 def test_the_examples_end_with_their_tables(
     bare: tuple[Path, dict[str, Any]], monkeypatch: pytest.MonkeyPatch, name: str, entry: str
 ) -> None:
-    """Each example config runs with nothing changed but the Python of its workers."""
+    """Each example config runs unchanged except for the Python of its workers."""
     assets, _ = bare
     monkeypatch.setenv("ISAACSIM_ASSET_ROOT", str(assets))
     table = closing_table(name, f"envs.0.interpreter={PYTHON}", "--steps", "128")

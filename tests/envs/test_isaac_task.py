@@ -1,4 +1,4 @@
-"""What can be said of Isaac Lab's launch order and overrides without Isaac Lab."""
+"""Isaac Lab's launch order and overrides, tested without Isaac Lab."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CONFIG = EnvConfig(
 
 
 class Cfg:
-    """The fields that every Isaac Lab configuration has."""
+    """Has the fields of every Isaac Lab configuration."""
 
     def __init__(self) -> None:
         self.sim = SimpleNamespace(device="cuda:0", dt=0.01)
@@ -39,7 +39,7 @@ class Cfg:
 
 @pytest.fixture
 def events(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """Stands in for an installed 2.3; records what is done in which order."""
+    """Replace an installed Isaac Lab 2.3, and record calls in order."""
     events: list[Any] = []
 
     def app_launcher(**kwargs: Any) -> object:
@@ -70,8 +70,8 @@ def events(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     return events
 
 
-def test_isaac_lab_2_launches_its_app_before_all_else(events: list[Any]) -> None:
-    """Without `launch_simulation` the app starts first, once, with the entry's arguments."""
+def test_isaac_lab_2_launches_its_app_first(events: list[Any]) -> None:
+    """Without `launch_simulation` the app starts once, with the entry's arguments."""
     for _ in range(2):
         cfg = isaac_task.make_simulator("isaac-0", CONFIG, "stub_package::Env")
         assert (cfg.sim.device, cfg.scene.num_envs) == ("cuda:1", 3)
@@ -82,7 +82,7 @@ def test_isaac_lab_2_launches_its_app_before_all_else(events: list[Any]) -> None
 
 
 def test_isaac_lab_2_needs_the_main_thread(events: list[Any]) -> None:
-    """Isaac Sim can't be started from another thread; the message says what can be done."""
+    """Isaac Sim can't start in another thread; the message says what to do."""
     raised: list[Exception] = []
 
     def build() -> None:
@@ -100,7 +100,9 @@ def test_isaac_lab_2_needs_the_main_thread(events: list[Any]) -> None:
 
 @pytest.mark.parametrize("steps", [1, 7, 50, 333, 1000])
 def test_the_step_limit_survives_the_simulators_rounding(events: list[Any], steps: int) -> None:
-    """`max_episode_steps` becomes a length in seconds that rounds up to the same steps."""
+    """`max_episode_steps` becomes a length in seconds that rounds up to the same number
+    of steps.
+    """
     config = CONFIG.model_copy(update={"max_episode_steps": steps})
     cfg = isaac_task.make_simulator("isaac-0", config, "stub_package::Env")
     assert math.ceil(cfg.episode_length_s / (cfg.decimation * cfg.sim.dt)) == steps
@@ -109,11 +111,11 @@ def test_the_step_limit_survives_the_simulators_rounding(events: list[Any], step
 @pytest.mark.parametrize(
     ("given", "worker_index", "taken"), [(7, 0, 7), (7, 2, 13), (None, 2, None), (-1, 2, -1)]
 )
-def test_each_env_of_an_entry_is_built_from_a_seed_of_its_own(
+def test_each_env_of_an_entry_is_built_with_its_own_seed(
     events: list[Any], given: int | None, worker_index: int, taken: int | None
 ) -> None:
-    """They count on by sub-environments, as those of resets; without one, and with Isaac Lab's
-    own sign for any, nothing is counted.
+    """Seeds count sub-environments, as those of resets; without a seed, or with Isaac Lab's value
+    for any seed, nothing is counted.
     """
     env_kwargs = {**CONFIG.env_kwargs, "overrides": {"seed": given}}
     config = CONFIG.model_copy(update={"env_kwargs": env_kwargs})
@@ -122,8 +124,8 @@ def test_each_env_of_an_entry_is_built_from_a_seed_of_its_own(
 
 
 def test_a_python_without_isaac_lab_is_named() -> None:
-    """The message says which Python was asked, how an entry gets another one, and by what
-    command that other one is made, which the extra of this package stands in.
+    """The message has the Python, the field that chooses another one, and the command of the extra
+    that makes such a Python.
     """
     if importlib.util.find_spec("isaaclab"):
         pytest.skip("Isaac Lab is here")
@@ -135,8 +137,8 @@ def test_a_python_without_isaac_lab_is_named() -> None:
     )
 
 
-def test_the_extra_brings_what_terrains_and_assets_need() -> None:
-    """Isaac Lab is installed without what it declares, so the extra names it."""
+def test_the_extra_has_the_packages_for_terrains_and_assets() -> None:
+    """Isaac Lab is installed without its dependencies, so the extra lists them."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extra = project["optional-dependencies"]["isaac"]
     names = {re.split(r"[\[=>]", line)[0] for line in extra}

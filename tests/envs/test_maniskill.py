@@ -29,12 +29,12 @@ if TYPE_CHECKING:
 
 if find_spec("mani_skill") is None:
     pytest.skip("ManiSkill is not installed", allow_module_level=True)
-# Not `mani_skill` itself: where there is no Vulkan device, it must not come first.
+# Not `mani_skill` itself: without a Vulkan device, it must not be imported first.
 torch: Any = pytest.importorskip("torch")
 
 pytestmark = [
     pytest.mark.simulators,
-    pytest.mark.filterwarnings("default"),  # The simulator warns about its own future.
+    pytest.mark.filterwarnings("default"),  # The simulator has deprecation warnings.
 ]
 needs_vulkan = pytest.mark.skipif(
     not render_device_is_usable(), reason="images need a Vulkan device"
@@ -108,7 +108,7 @@ class TestRgb(ManiskillContract):
     num_steps = 6
 
     def test_images_are_bytes_of_the_size_asked_for(self) -> None:
-        """Cameras give uint8 images that show something."""
+        """Cameras give uint8 images that are not blank."""
         with self.opened() as env:
             image = env.reset(seed=0).observation["sensor_data"]["base_camera"]["rgb"]
             assert image.shape == (48, 64, 3)
@@ -123,7 +123,7 @@ class TestBatchOnAGpu(GroupContract):
     num_steps = 40
 
     def test_tensors_stay_on_the_gpu_and_keep_their_batch_axis(self) -> None:
-        """Everything is a tensor of the simulator's device."""
+        """All values are tensors on the device of the simulator."""
         with self.opened() as env:
             env.reset(seed=0)
             result = env.step(PolicyResponse(env.env_id, env.get_action_space().sample()))
@@ -132,7 +132,7 @@ class TestBatchOnAGpu(GroupContract):
                 assert value.shape[0] == 4
 
     def test_single_sub_environments_can_be_reset(self) -> None:
-        """The others keep their place in their episode."""
+        """The others continue their episodes."""
         with self.opened() as env:
             env.reset(seed=0)
             for _ in range(3):
@@ -142,7 +142,7 @@ class TestBatchOnAGpu(GroupContract):
 
 
 def test_one_env_has_no_batch_axis() -> None:
-    """Observations fit the single space; rewards, flags and verdicts are Python scalars."""
+    """Observations fit the single space; rewards, flags and success are Python scalars."""
     env = make()
     start = env.reset(seed=0)
     assert start.observation.shape == (42,)
@@ -154,8 +154,8 @@ def test_one_env_has_no_batch_axis() -> None:
     env.close()
 
 
-def test_the_verdict_ends_the_episode() -> None:
-    """Success and fail are in the info; either terminates."""
+def test_success_and_failure_end_the_episode() -> None:
+    """Both are in the info, and both terminate."""
     env = make("MS-CartpoleBalance-v1")
     env.reset(seed=0)
     for _ in range(500):
@@ -167,8 +167,8 @@ def test_the_verdict_ends_the_episode() -> None:
     env.close()
 
 
-def test_a_group_tells_how_often_the_task_failed() -> None:
-    """The verdicts at the ends of episodes are in the env's statistics."""
+def test_statistics_have_the_rate_of_failures() -> None:
+    """Success and failure at the ends of episodes are in the statistics of the env."""
     config = entry("MS-CartpoleBalance-v1", max_episode_steps=200)
     with sync.build_env_group(config) as group:
         batch, _ = group.reset(seed=0)
@@ -182,7 +182,7 @@ def test_a_group_tells_how_often_the_task_failed() -> None:
 
 
 def test_the_step_limit_is_the_tasks_unless_configured() -> None:
-    """ManiSkill keeps it where Gymnasium doesn't look; it truncates."""
+    """Gymnasium doesn't find ManiSkill's limit; it truncates."""
     env = make()
     assert env.get_metadata().max_episode_steps == 50
     env.close()
@@ -206,14 +206,14 @@ def test_reset_options_reach_the_simulator() -> None:
 
 
 def test_unseeded_envs_differ() -> None:
-    """ManiSkill's fixed default seed doesn't make all workers alike."""
+    """Despite ManiSkill's fixed default seed."""
     envs = [make(), make()]
     assert not same(*(env.reset().observation.numpy() for env in envs))
     for env in envs:
         env.close()
 
 
-def test_an_offloaded_env_says_so_until_it_is_reloaded() -> None:
+def test_an_offloaded_env_raises_until_it_is_reloaded() -> None:
     """Offloading closes the simulator, keeps spaces known, and can be repeated."""
     env = make()
     before = env.reset(seed=6)
@@ -245,16 +245,16 @@ def test_a_frame_is_an_array() -> None:
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_batches_without_a_gpu_are_refused() -> None:
+def test_batches_without_a_gpu_raise() -> None:
     """The message says why, and what to do instead."""
     with pytest.raises(ConfigError, match=r"no CUDA device is usable.*num_workers: 8"):
         make(num_envs=8)
 
 
-def test_missing_assets_are_named_with_the_command_that_fetches_them(
+def test_missing_assets_raise_with_the_command_that_fetches_them(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Any
 ) -> None:
-    """A worker has no terminal to be asked at."""
+    """A worker has no terminal for a question."""
     monkeypatch.setattr(sys, "stdin", io.StringIO(""))
     with pytest.raises(ConfigError, match=r"mani_skill\.utils\.download_asset PickSingleYCB-v1"):
         make("PickSingleYCB-v1")
@@ -280,8 +280,8 @@ except ValueError as error:
 """
 
 
-def test_states_need_no_vulkan_and_images_say_that_they_do() -> None:
-    """State mode gives the same bits with and without a device; images are refused."""
+def test_states_need_no_vulkan_and_images_raise_without_it() -> None:
+    """State mode gives identical results with and without a device; image modes raise."""
     done = subprocess.run(
         [sys.executable, "-c", WITHOUT_VULKAN],
         env={**os.environ, **NO_VULKAN, "PYTHONPATH": os.pathsep.join(sys.path)},

@@ -1,25 +1,34 @@
-"""Many MuJoCo simulations in one env: to the bit what as many of Gymnasium's are."""
+"""Many MuJoCo simulations in one env are bit-identical to separate Gymnasium envs."""
 
 from __future__ import annotations
 
+import ctypes
 import os
+from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import SyncVectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from vector.toys import assert_alike
 
 from rlightning_aio import sync
 from rlightning_aio.config import EnvConfig
+from rlightning_aio.envs import mujoco_threads
 from rlightning_aio.envs.gymnasium import MujocoEnv, outdated_assets_accepted
 from rlightning_aio.envs.mujoco_batch import MujocoBatch
+from rlightning_aio.envs.mujoco_threads import Simulations
+from rlightning_aio.errors import ConfigError
+from rlightning_aio.vector import make_vec
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+mujoco: Any = import_module("mujoco")
 
 WEIGHT = st.floats(0.001, 3) | st.integers(1, 3)
 NOISE = st.floats(0, 0.3)
@@ -81,17 +90,19 @@ def make(task: str, options: dict[str, Any]) -> Callable[[], gym.Env[Any, Any]]:
     return lambda: gym.make(task, disable_env_checker=True, **options)
 
 
-def compare(task: str, options: dict[str, Any], seed: int, num_steps: int) -> None:
+def compare(
+    task: str, options: dict[str, Any], seed: int, num_steps: int, num_threads: int = 2
+) -> None:
     """Observations, rewards, ends, infos and their dtypes, over ends; the seeds differ."""
     with outdated_assets_accepted():
-        ours = MujocoBatch(make(task, options)(), 3)
+        ours = MujocoBatch(make(task, options)(), 3, num_threads=num_threads)
         theirs: Any = SyncVectorEnv([make(task, options)] * 3)
     seeds = [seed, seed + 10, seed + 5]
     assert_alike(ours.reset(seed=seeds), theirs.reset(seed=seeds))
     actions = np.random.default_rng(seed)
     low, high = ours.action_space.low, ours.action_space.high  # pyright: ignore[reportAttributeAccessIssue]
     for step in range(num_steps):
-        # Beyond the bounds, too, where MuJoCo clips.
+        # Also beyond the bounds, where MuJoCo clips.
         action = (1.2 * actions.uniform(low, high)).astype(np.float32)
         assert_alike(ours.step(action), theirs.step(action), f"{task} {options}, step {step}")
     ours.close()
@@ -99,10 +110,11 @@ def compare(task: str, options: dict[str, Any], seed: int, num_steps: int) -> No
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_every_task_is_gymnasiums(task: str) -> None:
-    """As it is made without options, and with short episodes."""
+def test_every_task_equals_gymnasiums(task: str) -> None:
+    """Without options, and with short episodes; with any number of threads."""
     compare(task, {}, 1, 30)
-    compare(task, {"max_episode_steps": 4}, 2, 12)
+    compare(task, {"max_episode_steps": 4}, 2, 12, num_threads=1)
+    compare(task, {"max_episode_steps": 4}, 2, 12, num_threads=3)
 
 
 def compare_with_any_options(task: str, examples: int, num_steps: int) -> None:
@@ -115,21 +127,208 @@ def compare_with_any_options(task: str, examples: int, num_steps: int) -> None:
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_options_mean_what_they_mean_to_gymnasium(task: str) -> None:
-    """Whatever a task's constructor takes."""
+def test_options_have_the_same_effect_as_in_gymnasium(task: str) -> None:
+    """All arguments of the constructor of a task."""
     compare_with_any_options(task, 3, 15)
 
 
 @pytest.mark.simulators
 @pytest.mark.parametrize("task", TASKS)
 def test_a_thousand_steps_with_any_options(task: str) -> None:
-    """As above, for long."""
+    """Like the test above, for longer."""
     compare_with_any_options(task, 6, 1000)
 
 
+@pytest.mark.parametrize("task", ["Ant-v5", "Hopper-v5", "InvertedDoublePendulum-v5"])
+def test_all_data_of_a_simulation_equal_gymnasiums(task: str) -> None:
+    """Positions of bodies, contacts and forces, after steps and after resets."""
+    options = {"max_episode_steps": 4}
+    ours = MujocoBatch(make(task, options)(), 2)
+    theirs: Any = make(task, options)()
+    ours.reset(seed=4)
+    theirs.reset(seed=5)
+    over = False
+    ours.action_space.seed(0)
+    for _ in range(12):
+        action = ours.action_space.sample()
+        ours.step(action)
+        if over:
+            theirs.reset()
+        over = not over and any(theirs.step(action[1])[2:4])
+        found, expected = ours.call_one(1, "data"), theirs.unwrapped.data
+        assert (found.time, found.ncon) == (expected.time, expected.ncon)
+        for name in ("qpos", "qacc", "xpos", "cfrc_ext", "cinert", "efc_force", "qacc_warmstart"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), name)
+    ours.close()
+    theirs.close()
+
+
+SMALL = "a simulation that runs out of memory"
+"""MuJoCo raises an error for it when it has several contacts."""
+WILD = "a simulation that moves too fast"
+"""MuJoCo warns, and resets it to the defaults of the model."""
+
+
+def ants(reason: str, mode: AutoresetMode, folder: Path) -> MujocoBatch:
+    """Two Ants; the second will fail."""
+    options: dict[str, Any] = {}
+    if reason == SMALL:
+        assets = Path(gym.__file__).parent / "envs" / "mujoco" / "assets"
+        text = (assets / "ant.xml").read_text()
+        (folder / "ant.xml").write_text(text.replace("<option", '<size memory="14K"/><option', 1))
+        options["xml_file"] = str(folder / "ant.xml")
+    return MujocoBatch(make("Ant-v5", options)(), 2, mode, num_threads=2)
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.value)
+@pytest.mark.parametrize("reason", [SMALL, WILD])
+def test_a_simulation_that_fails_ends_its_own_episode(
+    reason: str, mode: AutoresetMode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is truncated, with the cause and its last observation; the other one is unaffected."""
+    monkeypatch.chdir(tmp_path)  # MuJoCo logs there.
+    batch = ants(reason, mode, tmp_path)
+    alone: Any = make("Ant-v5", {})()
+    before, _ = batch.reset(seed=[0, 1])
+    alone.reset(seed=0)
+    actions = np.random.default_rng(1).uniform(-1, 1, (200, 2, 8)).astype(np.float32)
+    actions[:, 0] = 0.0  # It stands, and never touches the ground with more than its feet.
+    if reason == WILD:
+        data = batch.call_one(1, "data")
+        batch.call_one(1, "set_state", data.qpos, data.qvel + 1e9)
+        before[1] = batch.call_one(1, "_get_obs")
+    for action in actions:
+        observations, rewards, terminated, truncated, infos = batch.step(action)
+        expected = alone.step(action[0])
+        np.testing.assert_array_equal(observations[0], expected[0])
+        assert (rewards[0], terminated[0], truncated[0]) == expected[1:4]
+        if truncated[1]:
+            break
+        before = observations
+    else:
+        pytest.fail("no simulation has failed")
+    if mode == AutoresetMode.SAME_STEP:
+        last, info = infos["final_obs"][1], infos["final_info"]
+        assert (observations[1] != last).any()
+    else:
+        last, info = observations[1], infos
+    if reason == SMALL:
+        np.testing.assert_array_equal(last, before[1])
+    assert (rewards[1], terminated[1]) == (0.0, False)
+    assert ("out of memory" if reason == SMALL else "is unstable") in info["simulation_failed"][1]
+    assert info["_simulation_failed"].tolist() == [False, True]
+    if mode == AutoresetMode.NEXT_STEP:
+        _, _, _, truncated, infos = batch.step(actions[0])
+        assert not truncated.any()
+        assert "simulation_failed" not in infos
+        assert infos["_x_position"].all()
+    batch.close()
+    alone.close()
+
+
+RANGES = {
+    "body_mass": [0.7, 1.3],
+    "geom_friction": [0.5, 1.5],
+    "opt.gravity": [0.8, 1.1],
+    "actuator_gear": [0.9, 1.1],
+}
+
+
+def with_factors(env: Any, task: str, factors: dict[str, Any], k: int) -> None:
+    """Give a Gymnasium env the model drawn for simulation k."""
+    model, own = gym.make(task).unwrapped.model, env.unwrapped.model  # type: ignore[attr-defined]
+    for name in RANGES:
+        owners = (own.opt, model.opt) if name.startswith("opt.") else (own, model)
+        mine, nominal = (getattr(owner, name.removeprefix("opt.")) for owner in owners)
+        mine[:] = nominal * factors[name][k]
+    mujoco.mj_setConst(own, mujoco.MjData(own))
+
+
+@pytest.mark.parametrize("task", ["Humanoid-v5", "Hopper-v5"])
+def test_randomized_simulations_equal_gymnasiums_with_the_same_models(task: str) -> None:
+    """Each reset draws masses, friction, gravity and gears; its info has the factors."""
+    options = {"max_episode_steps": 4}
+    ours = MujocoBatch(make(task, options)(), 2, num_threads=2, randomize=RANGES)
+    theirs: list[Any] = [make(task, options)() for _ in range(2)]
+    observations, infos = ours.reset(seed=4)
+    factors = infos["randomized"]
+    assert all(0.5 <= factors[name].min() < factors[name].max() <= 1.5 for name in RANGES)
+    for k, env in enumerate(theirs):
+        with_factors(env, task, factors, k)
+        np.testing.assert_array_equal(observations[k], env.reset(seed=4 + k)[0])
+    over = [False, False]
+    ours.action_space.seed(0)
+    for _ in range(10):
+        actions = ours.action_space.sample()
+        observations, rewards, _, _, infos = ours.step(actions)
+        for k, env in enumerate(theirs):
+            if over[k]:
+                with_factors(env, task, infos["randomized"], k)
+                expected = env.reset()[0], 0.0, False, False
+            else:
+                expected = env.step(actions[k])
+            over[k] = expected[2] or expected[3]
+            np.testing.assert_array_equal(observations[k], expected[0])
+            assert rewards[k] == expected[1]
+    again = MujocoBatch(make(task, options)(), 2, num_threads=1, randomize=RANGES)
+    assert_alike(again.reset(seed=4)[1]["randomized"], factors)
+    for batch in (ours, again, *theirs):
+        batch.close()
+
+
+def test_a_snapshot_has_the_randomized_fields() -> None:
+    """Another group continues with the same models, and draws the same next ones."""
+    entry = {"name": "a", "backend": "mujoco", "task": "Hopper-v5", "num_envs": 2}
+    entry |= {"env_kwargs": {"randomize": RANGES}, "max_episode_steps": 3, "placement": "inline"}
+    actions = np.random.default_rng(0).uniform(-1, 1, (8, 1, 2, 3)).astype(np.float32)
+
+    def steps(group: Any, batch: Any, actions: Any) -> list[Any]:
+        found: list[Any] = []
+        for action in actions:
+            batch, _ = group.step(batch.respond(action=action))
+            found.append((batch.observation, batch.reward, batch.info()))
+        return found
+
+    with sync.build_env_group(entry) as one, sync.build_env_group(entry) as other:
+        batch, _ = one.reset(seed=1)
+        steps(one, batch, actions[:2])
+        snapshot = one.snapshot()
+        expected = steps(one, one.restore(snapshot)[0], actions[2:])
+        other.reset(seed=5)
+        assert_alike(steps(other, other.restore(snapshot)[0], actions[2:]), expected)
+
+
+@pytest.mark.parametrize(
+    ("randomize", "message"),
+    [
+        ({"opt.timestep": [1, 2]}, "rewards assume"),
+        ({"body_weight": [1, 2]}, "no number 'body_weight'"),
+        ({"geom_type": [1, 2]}, "no number 'geom_type'"),
+        ({"body_mass": [2, 1]}, r"is \[2, 1\], but must be \[lowest, highest\]"),
+        ({"body_mass": 0.5}, r"is 0.5, but must be \[lowest, highest\]"),
+        (["body_mass"], "must map fields to ranges"),
+    ],
+)
+def test_a_wrong_randomization_raises(randomize: Any, message: str) -> None:
+    """The message names the field, and valid values."""
+    with pytest.raises(ConfigError, match=message):
+        MujocoBatch(make("Hopper-v5", {})(), 2, randomize=randomize)
+
+
+def test_randomization_needs_simulations_that_are_stepped_together() -> None:
+    """A single env can't differ from others."""
+    config = EnvConfig(
+        name="x", backend="mujoco", task="Hopper-v5", env_kwargs={"randomize": RANGES}
+    )
+    with pytest.raises(ConfigError, match="stepped together: num_envs above 1"):
+        MujocoEnv(config)
+    with pytest.raises(ConfigError, match="several in each batch"):
+        make_vec("Hopper-v5", 1, randomize=RANGES)
+
+
 @pytest.mark.parametrize("placement", ["inline", "process"])
-def test_a_group_of_batches_is_as_many_envs(placement: str) -> None:
-    """Two envs of three each, seeded one after the other; they reset themselves."""
+def test_a_group_of_batches_equals_separate_envs(placement: str) -> None:
+    """Two envs of three each, with consecutive seeds and autoreset."""
     fields = {"max_episode_steps": 6, "env_kwargs": {"reset_noise_scale": 0.2}}
     entry = {"name": "hop", "backend": "mujoco", "task": "Hopper-v5", "num_envs": 3, **fields}
     plain = SyncVectorEnv(
@@ -154,8 +353,8 @@ def test_a_group_of_batches_is_as_many_envs(placement: str) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*out of date:DeprecationWarning")
-def test_what_can_not_be_batched_is_stepped_in_a_loop_and_says_so() -> None:
-    """Older versions, and tasks that are wrapped."""
+def test_tasks_that_cannot_be_batched_are_stepped_in_a_loop_with_a_warning() -> None:
+    """Older versions, and wrapped tasks."""
     config = EnvConfig(name="old", backend="mujoco", task="Hopper-v4", num_envs=2)
     with pytest.warns(RuntimeWarning, match=r"one after the other: HopperEnv is not one of"):
         env = MujocoEnv(config)
@@ -168,8 +367,22 @@ def test_what_can_not_be_batched_is_stepped_in_a_loop_and_says_so() -> None:
         MujocoEnv(checked).close()
 
 
+def test_an_older_mujoco_steps_them_in_a_loop_with_a_warning(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its library lacks the functions, as the one of this process's own symbols does."""
+    own = ctypes.CDLL(None)
+    monkeypatch.setattr(mujoco_threads.ctypes, "CDLL", lambda _: own)
+    mujoco_threads._library.cache_clear()  # pyright: ignore[reportPrivateUsage]
+    config = EnvConfig(name="old", backend="mujoco", task="Hopper-v5", num_envs=2)
+    with pytest.warns(RuntimeWarning, match=r"has no batches; install mujoco 3\.17 or later"):
+        env = MujocoEnv(config)
+    assert env.reset(seed=0).observation.shape == (2, 11)
+    env.close()
+
+
 def test_misuse_is_refused() -> None:
-    """A step before the first reset, actions of another shape, seeds of another number."""
+    """A step before the first reset, a wrong shape of actions, a wrong number of seeds."""
     batch = MujocoBatch(make("InvertedPendulum-v5", {})(), 2)
     with pytest.raises(gym.error.ResetNeeded):
         batch.step(np.zeros((2, 1), np.float32))
@@ -179,10 +392,15 @@ def test_misuse_is_refused() -> None:
     with pytest.raises(ValueError, match=r"shape \(2, 1\), not \(2,\)"):
         batch.step(np.zeros(2, np.float32))
     batch.close()
+    config = EnvConfig(
+        name="x", backend="mujoco", task="Hopper-v5", num_envs=2, env_kwargs={"num_threads": 0}
+    )
+    with pytest.raises(ConfigError, match=r"num_threads is 0, but must be an int above"):
+        MujocoEnv(config)
 
 
 def test_one_of_them_is_rendered() -> None:
-    """As Gymnasium renders the env with that seed."""
+    """Like the Gymnasium env with that seed."""
     if os.environ.get("MUJOCO_GL") not in ("egl", "osmesa", "glfw"):
         pytest.skip("needs MUJOCO_GL")
     look = {"render_mode": "rgb_array", "width": 64, "height": 64}
@@ -197,3 +415,30 @@ def test_one_of_them_is_rendered() -> None:
     assert (batch.render_one(0) != batch.render_one(1)).any()
     batch.close()
     alone.close()
+
+
+@pytest.mark.parametrize(
+    ("placement", "num_workers", "num_threads"),
+    [("inline", 1, 4), ("inline", 2, 2), ("inline", 8, 1), ("process", 2, 2)],
+)
+def test_batches_of_one_entry_share_the_cores(
+    placement: str, num_workers: int, num_threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They compute at the same time, so together they have a thread for each core."""
+    asked: list[int] = []
+
+    class Counted(Simulations):
+        def __init__(self, model: Any, count: int, num_threads: int, **options: Any) -> None:
+            asked.append(num_threads)
+            super().__init__(model, count, num_threads, **options)
+
+    monkeypatch.setattr("rlightning_aio.envs.mujoco_batch.Simulations", Counted)
+    monkeypatch.setattr("rlightning_aio.envs.gymnasium.num_cores", lambda: 4)
+    config = EnvConfig.model_validate(
+        {
+            "name": "x", "backend": "mujoco", "task": "Hopper-v5", "num_envs": 2,
+            "placement": placement, "num_workers": num_workers,
+        }
+    )  # fmt: skip
+    MujocoEnv(config).close()
+    assert asked == [num_threads]

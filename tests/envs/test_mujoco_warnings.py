@@ -1,4 +1,4 @@
-"""What MuJoCo says while a task is made reaches people who can act on it, and nobody else."""
+"""MuJoCo's warnings while a task is made reach only users who can act on them."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ class Unstable(gym.Env[object, object]):
         mujoco.mj_step(model, data)
 
 
-def test_deprecated_attributes_of_assets_are_not_told(capfd: pytest.CaptureFixture[str]) -> None:
-    """HalfCheetah's XML uses one; its user hears nothing."""
+def test_deprecated_attributes_of_assets_do_not_warn(capfd: pytest.CaptureFixture[str]) -> None:
+    """HalfCheetah's XML uses one, without a warning."""
     MujocoEnv(EnvConfig(name="cheetah", backend="mujoco", task="HalfCheetah-v5")).close()
     assert capfd.readouterr().err == ""
 
 
 def test_other_warnings_pass() -> None:
-    """An unstable simulation is told, and told alone."""
+    """Only an unstable simulation warns."""
     gym.register("Unstable-v0", Unstable)
     try:
         with pytest.warns(RuntimeWarning, match="QVEL") as told:
@@ -44,8 +44,8 @@ def test_other_warnings_pass() -> None:
     assert len(told) == 1
 
 
-def test_a_handler_of_ones_own_stays_and_hears_other_warnings() -> None:
-    """Whoever had MuJoCo's warnings before has them during and after."""
+def test_a_users_handler_stays_and_gets_other_warnings() -> None:
+    """During and after the env is made."""
     heard: list[str] = []
     mine = heard.append
     gym.register("Unstable-v0", Unstable)

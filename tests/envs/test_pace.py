@@ -20,8 +20,8 @@ class FakeTime:
         self.now += seconds
 
 
-def test_the_rate_is_kept_whatever_the_work_takes() -> None:
-    """Work shorter than a period doesn't shift the grid, by however many steps."""
+def test_the_rate_is_independent_of_the_duration_of_work() -> None:
+    """Work shorter than a period doesn't shift the grid, for any number of steps."""
     time = FakeTime()
     pace = Pace(10.0, time.clock, time.sleep)
     for step in range(1, 1001):
@@ -40,7 +40,7 @@ def test_a_short_delay_is_made_up_for() -> None:
     assert time.now == pytest.approx(100.2)
 
 
-def test_a_restart_counts_from_now() -> None:
+def test_a_restart_begins_a_new_grid() -> None:
     """After a restart the next deadline is one period away."""
     time = FakeTime()
     pace = Pace(10.0, time.clock, time.sleep)
@@ -52,7 +52,7 @@ def test_a_restart_counts_from_now() -> None:
 
 @given(st.lists(st.floats(0.0, 5.0), min_size=1, max_size=50))
 def test_delays_never_end_in_a_rush(delays: list[float]) -> None:
-    """Whatever was missed, two idle waits in a row take at least one period."""
+    """After any delays, two successive idle waits take at least one period."""
     time = FakeTime()
     pace = Pace(10.0, time.clock, time.sleep)
     for delay in delays:

@@ -48,7 +48,7 @@ def make(task: str, **fields: Any) -> PettingZooEnv:
 
 
 def parallel_outcomes(env: Any, seed: int, actions: Sequence[Any]) -> Iterator[Outcome]:
-    """Of a parallel environment whose agents stay together."""
+    """For a parallel environment whose agents stay together."""
     nothing = dict.fromkeys(env.possible_agents, 0.0)
     nobody = dict.fromkeys(env.possible_agents, False)
     observations, _ = env.reset(seed=seed)
@@ -77,7 +77,7 @@ class TestAgentsWithDifferentSpaces(GroupContract):
         return parallel_outcomes(simple_tag_v3.parallel_env(), self.seed, actions)
 
     def test_spaces_are_dicts_by_agent(self) -> None:
-        """Each agent keeps its own spaces; their order is that of `agents`."""
+        """Each agent has its own spaces, in the order of `agents`."""
         with self.opened() as env:
             assert env.agents == ("adversary_0", "adversary_1", "adversary_2", "agent_0")
             space = env.get_observation_space()
@@ -94,13 +94,13 @@ class TestRegistered(GroupContract):
         return parallel_outcomes(env, self.seed, actions)
 
     def test_its_own_limit_is_known(self) -> None:
-        """SISL's environments have it one object further in than others."""
+        """SISL's environments have it in an inner object."""
         with self.opened() as env:
             assert env.get_metadata().max_episode_steps == 25
 
 
 def test_modules_may_register_environments() -> None:
-    """One that is named before the colon is imported first."""
+    """A module named before the colon is imported first."""
     assert "arena/tag-v3" not in pettingzoo.parallel_registry
     env = make("envs.registered_arena:arena/tag-v3")
     assert env.get_metadata().max_episode_steps == 7
@@ -114,8 +114,8 @@ def test_modules_may_register_environments() -> None:
         ("atari/pong-v3", r"'zoo-0': .*pip install 'pettingzoo\[atari\]'"),
     ],
 )
-def test_what_the_registry_cannot_make_is_named(task: str, message: str) -> None:
-    """A name that isn't there, one that is another kind's, and one whose packages are missing."""
+def test_environments_that_the_registry_cannot_make_raise(task: str, message: str) -> None:
+    """An unknown name, one of another kind, and one with missing packages."""
     with pytest.raises(ConfigError, match=message):
         make(task)
 
@@ -124,8 +124,8 @@ def turns() -> ParallelEnv:
     return turn_based_aec_to_parallel(pettingzoo.make("aec", "classic/tictactoe-v3"))
 
 
-def test_random_policies_play_by_the_rules() -> None:
-    """Tic-tac-toe ends a game in which somebody makes an illegal move, to the loss of one alone."""
+def test_random_policies_make_legal_moves() -> None:
+    """An illegal move ends a game of tic-tac-toe, and only one agent loses."""
     config = entry(f"{HERE}:turns", num_workers=2, placement="inline")
     with sync.build_env_group(config) as group:
         spaces = dict(zip(group.env_ids, group.get_action_spaces(), strict=True))
@@ -136,7 +136,7 @@ def test_random_policies_play_by_the_rules() -> None:
                 batch, _ = group.step(batch.respond(action=policy(batch)))
                 assert (batch.reward["player_1"] == -batch.reward["player_2"]).all()
         episodes = [stats["episodes"] for stats in group.get_env_stats().values()]
-    # Two agents' each, and nobody has won or lost by less than five moves.
+    # One move of each agent, and a game takes at least five moves.
     assert all(20 <= count <= 2 * 200 / 5 for count in episodes)
 
 
@@ -198,8 +198,8 @@ def awkward_episode(**fields: Any) -> list[MultiAgentEnvRet]:
     return results
 
 
-def test_every_result_speaks_of_every_agent() -> None:
-    """Agents that left, or haven't come yet, keep a member of their space and their flags."""
+def test_every_result_has_all_agents() -> None:
+    """Absent agents have an element of their space, and their flags."""
     results = awkward_episode()
     flags = [
         {a: (r.last_terminated[a], r.last_truncated[a]) for a in r.last_terminated} for r in results
@@ -211,8 +211,8 @@ def test_every_result_speaks_of_every_agent() -> None:
     assert [f["late"] for f in flags] == [terminated, terminated, here, here, terminated]
 
 
-def test_who_is_gone_observes_zeros_and_earns_nothing() -> None:
-    """The observation is the member of the space nearest to zero."""
+def test_absent_agents_observe_zeros_and_get_no_reward() -> None:
+    """The observation is the element of the space nearest to zero."""
     last = awkward_episode()[3]
     assert last.observation["early"].tolist() == [0.0, 0.0]
     ghost = last.observation["ghost"]
@@ -221,8 +221,8 @@ def test_who_is_gone_observes_zeros_and_earns_nothing() -> None:
     assert last.last_reward == {"early": 0.0, "quitter": 1.0, "ghost": 0.0, "late": 1.0}
 
 
-def test_infos_are_by_agent_for_those_who_have_any() -> None:
-    """Empty infos aren't carried around."""
+def test_infos_are_by_agent() -> None:
+    """Empty infos are left out."""
     assert [result.info for result in awkward_episode()] == [
         {},
         {},
@@ -232,8 +232,8 @@ def test_infos_are_by_agent_for_those_who_have_any() -> None:
     ]
 
 
-def test_the_step_limit_truncates_whoever_is_left() -> None:
-    """Those who ended before keep how they ended."""
+def test_the_step_limit_truncates_the_remaining_agents() -> None:
+    """Agents that ended earlier keep their flags."""
     third = awkward_episode(max_episode_steps=3)[3]
     assert third.last_truncated == {"early": False, "quitter": True, "ghost": False, "late": True}
     assert third.last_terminated["early"]
@@ -246,15 +246,15 @@ def test_the_simulators_own_limit_is_known() -> None:
     assert spread.get_metadata().max_episode_steps == 9
 
 
-def test_stepping_with_no_agents_left_says_what_to_do() -> None:
-    """Before the first reset and after an episode's end there is nobody to act."""
+def test_a_step_without_agents_raises_with_the_fix() -> None:
+    """Before the first reset and after the end of an episode no agent can act."""
     env = make(f"{HERE}:comings_and_goings", max_episode_steps=None)
     env.env.agents = []
     with pytest.raises(RuntimeError, match=r"'zoo-0' has no agents: reset it"):
         env.step(PolicyResponse("zoo-0", {}))
 
 
-def test_a_module_without_such_a_function_is_named() -> None:
-    """The message says what a task may be."""
+def test_a_module_without_the_function_raises() -> None:
+    """The message describes valid tasks."""
     with pytest.raises(ConfigError, match=r"mpe2 has no function parallel_env; task names"):
         make("mpe2")

@@ -21,24 +21,25 @@ from rlightning_aio.types import PolicyResponse
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+    from pathlib import Path
 
 pytest.importorskip("piper_sdk")
 pytest.importorskip("serial")
 
 from envs.watched_arm import WatchedArm
 
-from rlightning_aio.envs.piper import PiperEnv
-from rlightning_aio.envs.piper_arm import Frame
-from rlightning_aio.envs.piper_sim import SlcanPort, running
+from rlightning_aio.piper.arm import CanFrame
+from rlightning_aio.piper.env import PiperEnv
+from rlightning_aio.piper.sim import SlcanPort, running
 
 pytestmark = [
     pytest.mark.simulators,
-    # The SDK calls an argument of python-can by its former name.
+    # The SDK uses the former name of an argument of python-can.
     pytest.mark.filterwarnings("ignore:.*bustype.*:DeprecationWarning"),
 ]
 
 READY = [0.0, 0.5, -0.5, 0.0, 0.0, 0.0]
-STOP_COMMAND = Frame(0x150, bytes([1, 0, 0, 0, 0, 0, 0, 0]))
+STOP_COMMAND = CanFrame(0x150, bytes([1, 0, 0, 0, 0, 0, 0, 0]))
 
 
 @pytest.fixture
@@ -59,7 +60,7 @@ def arm(port: SlcanPort) -> Iterator[WatchedArm]:
 
 @pytest.fixture
 def make(port: SlcanPort) -> Iterator[Callable[..., PiperEnv]]:
-    """Builds envs on the test's port. Asked for after the arm, so that they are closed first."""
+    """Builds envs on the test's port. Requested after the arm, so that envs are closed first."""
     made: list[PiperEnv] = []
 
     def build(num_workers: int = 1, max_episode_steps: int | None = None, **env_kwargs: Any):
@@ -94,8 +95,8 @@ def respond(action: Any) -> PolicyResponse:
     return PolicyResponse("arm-0", action=action)
 
 
-def sent_joints(commands: list[Frame]) -> list[list[int]]:
-    """Every complete set of joint targets, in 0.001 degrees."""
+def sent_joints(commands: list[CanFrame]) -> list[list[int]]:
+    """All complete sets of joint targets, in 0.001 degrees."""
     halves = [f for f in commands if f.can_id in (0x155, 0x156, 0x157)]
     sets = zip(halves[::3], halves[1::3], halves[2::3], strict=False)
     return [[n for f in three for n in struct.unpack(">ii", f.data)] for three in sets]
@@ -107,7 +108,7 @@ def in_si_units(pose: list[float]) -> list[float]:
 
 
 def test_a_reset_goes_to_the_configured_position(arm: WatchedArm, make: Any) -> None:
-    """After a reset the motors are on and every joint is at its place, in rad."""
+    """After a reset the motors are on and each joint is at its position."""
     env = make(reset_gripper=0.05)
     assert arm.enabled == [False] * 6
     ret = env.reset(seed=0)
@@ -117,19 +118,19 @@ def test_a_reset_goes_to_the_configured_position(arm: WatchedArm, make: Any) -> 
     assert ret.info == {"arm_status": "NORMAL", "late": 0.0}
 
 
-def test_joint_targets_travel_in_thousandths_of_degrees(arm: WatchedArm, make: Any) -> None:
+def test_joint_targets_are_sent_in_thousandths_of_degrees(arm: WatchedArm, make: Any) -> None:
     """An action in rad and m is sent in the units of the protocol, at the set speed."""
     env = make(speed=40)
     env.reset()
     arm.commands.clear()
     env.step(respond([0.1, 0.6, -0.7, 0.2, -0.3, 1.0, 0.0335]))
     assert sent_joints(arm.commands) == [[5730, 34377, -40107, 11459, -17189, 57296]]
-    assert Frame(0x151, bytes([1, 1, 40, 0, 0, 0, 0, 0])) in arm.commands
-    assert Frame(0x159, struct.pack(">iHBB", 33500, 1000, 1, 0)) in arm.commands
+    assert CanFrame(0x151, bytes([1, 1, 40, 0, 0, 0, 0, 0])) in arm.commands
+    assert CanFrame(0x159, struct.pack(">iHBB", 33500, 1000, 1, 0)) in arm.commands
 
 
 def test_steps_take_the_arm_to_the_target(arm: WatchedArm, make: Any) -> None:
-    """Held for a while, an action is where the arm ends up, by its own feedback."""
+    """Repeating an action takes the arm to its target, by the arm's feedback."""
     env = make()
     env.reset()
     target = np.array([0.4, 0.8, -0.9, 0.3, -0.2, 0.5, 0.02], np.float32)
@@ -145,7 +146,7 @@ def test_steps_take_the_arm_to_the_target(arm: WatchedArm, make: Any) -> None:
 
 
 def test_an_observation_is_newer_than_its_action(arm: WatchedArm, make: Any) -> None:
-    """At a control rate above the feedback rate a step still waits for what the action did."""
+    """Even at a control rate above the feedback rate."""
     env = make(control_hz=200)
     env.reset()
     before = env.step(respond([*READY, 0.0])).observation["joint_positions"][0]
@@ -156,7 +157,7 @@ def test_an_observation_is_newer_than_its_action(arm: WatchedArm, make: Any) -> 
 
 
 def test_end_poses_are_reached_or_reported(arm: WatchedArm, make: Any) -> None:
-    """A pose is reached in m and rad; one that has no solution moves nothing and is no error."""
+    """A pose is reached in m and rad; one without a solution moves nothing and is not an error."""
     env = make(control="end_pose", gripper=False)
     env.reset()
     action = in_si_units(arm.end_pose([0.2, 0.7, -0.8, 0.1, 0.2, 0.1]))
@@ -184,7 +185,7 @@ def test_end_poses_are_reached_or_reported(arm: WatchedArm, make: Any) -> None:
         ("end_pose", 2, -0.1, r"z = -0\.1 m is outside \[0, 0\.8\]"),
     ],
 )
-def test_a_number_beyond_its_limits_is_never_sent(
+def test_a_number_outside_its_limits_is_never_sent(
     arm: WatchedArm, make: Any, control: str, index: int, value: float, message: str
 ) -> None:
     """The error names the number, its value and its limits; the arm holds its position."""
@@ -197,14 +198,14 @@ def test_a_number_beyond_its_limits_is_never_sent(
     with pytest.raises(BadAction, match=message):
         env.step(respond(action))
     assert arm.wait_for(lambda: sent_joints(arm.commands))
-    # The safe stop is all that went out: hold where the arm is.
+    # Only the safe stop was sent: hold the position.
     assert {frame.can_id for frame in arm.commands} <= {0x151, 0x155, 0x156, 0x157, 0x159}
     held = np.radians(np.array(sent_joints(arm.commands)[-1]) / 1000)
     assert held == pytest.approx(arm.joints, abs=1e-4)
 
 
 def test_the_action_space_is_the_limits(arm: WatchedArm, make: Any) -> None:
-    """Every member of the space is accepted, its corners included; limits can be narrowed."""
+    """Each element of the space is accepted, including corners; limits can be narrowed."""
     env = make(limits={"joint_1": [-0.5, 0.5], "gripper": [0.0, 0.03]})
     space = env.get_action_space()
     assert space.low[0] == -0.5
@@ -216,12 +217,14 @@ def test_the_action_space_is_the_limits(arm: WatchedArm, make: Any) -> None:
         env.step(respond([0.6, *space.low[1:]]))
 
 
-def test_an_action_of_the_wrong_shape_is_named(arm: WatchedArm, make: Any) -> None:
-    """The error says how many numbers there are, which, and what came instead."""
+def test_an_action_of_the_wrong_shape_raises(arm: WatchedArm, make: Any) -> None:
+    """The error lists the elements with their limits, and the given shape."""
     env = make()
-    env.reset()
-    with pytest.raises(BadAction, match=r"shape \(7,\): joint_1, .*gripper; got \(6,\)"):
-        env.step(respond(READY))
+    for action, found in ((READY, r"shape \(6,\)"), (None, "None"), ("left", "a str")):
+        env.reset()
+        expected = rf"shape \(7,\): joint_1 in \[-2.6179, 2.6179\] rad, .*gripper.*; got {found};"
+        with pytest.raises(BadAction, match=expected):
+            env.step(respond(action))
 
 
 STOPS = {
@@ -233,7 +236,7 @@ STOPS = {
 
 @pytest.mark.parametrize("safe_stop", STOPS)
 @pytest.mark.parametrize("cause", ["exception", "interrupt", "close", "on_disconnect"])
-def test_every_way_out_ends_in_the_safe_stop(
+def test_errors_and_ends_make_the_safe_stop(
     arm: WatchedArm, make: Any, safe_stop: str, cause: str
 ) -> None:
     """An exception in a step, a close and a lost trainer each stop the arm as configured."""
@@ -261,7 +264,7 @@ def test_every_way_out_ends_in_the_safe_stop(
 
 
 def test_a_hold_holds_the_gripper(arm: WatchedArm, make: Any) -> None:
-    """Opening to 69 mm when an exception comes, it stays where it is."""
+    """At an exception while it opens to 69 mm, it stays at its opening."""
     env = make()
     env.reset()
     while arm.gripper < 0.004:
@@ -273,8 +276,8 @@ def test_a_hold_holds_the_gripper(arm: WatchedArm, make: Any) -> None:
     assert arm.wait_for(lambda: abs(arm.gripper_target - arm.gripper) < 1e-4)
 
 
-def test_a_hold_keeps_what_the_gripper_holds(arm: WatchedArm, make: Any) -> None:
-    """Closed onto something, it is told nothing else: to hold its opening would let go."""
+def test_a_hold_keeps_a_gripped_object(arm: WatchedArm, make: Any) -> None:
+    """It gets no command, because holding the opening would release the object."""
     arm.in_the_grip = 0.03
     env = make(reset_gripper=0.05)
     env.reset()
@@ -288,7 +291,7 @@ def test_a_hold_keeps_what_the_gripper_holds(arm: WatchedArm, make: Any) -> None
 
 
 def test_a_reset_waits_for_the_gripper(arm: WatchedArm, make: Any) -> None:
-    """It is where it was sent when the reset returns, or the error says where it is."""
+    """It is at its position when the reset returns, or the error has its position."""
     env = make(reset_gripper=0.06, move_timeout=5.0)
     ret = env.reset()
     assert ret.observation["gripper"] == pytest.approx([0.06], abs=2.1e-3)
@@ -300,7 +303,7 @@ def test_a_reset_waits_for_the_gripper(arm: WatchedArm, make: Any) -> None:
 
 
 def test_the_pose_that_the_arm_reports_is_an_action(arm: WatchedArm, make: Any) -> None:
-    """Where its hand points down, rx is half a turn; a little more of it is no fault."""
+    """If the hand points down, rx is half a turn; slightly more is accepted."""
     env = make(control="end_pose", reset_joints=[0.0, 1.2, -1.0, 0.0, 1.1, 0.0])
     ret = env.reset()
     pose = ret.observation["end_pose"]
@@ -315,7 +318,7 @@ def test_the_pose_that_the_arm_reports_is_an_action(arm: WatchedArm, make: Any) 
 def test_a_watchdog_that_is_lost_is_replaced_by_one_that_stops_the_arm(
     arm: WatchedArm, make: Any, fault: signal.Signals
 ) -> None:
-    """Killed or stopped itself, it leaves the env without a bus, and the arm not without a stop."""
+    """If it is killed or suspended, the env loses the bus, but the arm is stopped."""
     env = make(safe_stop="emergency_stop", feedback_timeout=1.0)
     env.reset()
     env.step(respond([*READY, 0.0]))
@@ -328,18 +331,55 @@ def test_a_watchdog_that_is_lost_is_replaced_by_one_that_stops_the_arm(
     with pytest.raises(ConnectionError, match="no feedback from the arm"):
         go_on()
     assert arm.wait_for(lambda: arm.emergency_stopped)
-    with pytest.raises(ConnectionError):
-        env.reset(options={"resume": True})
-    env.close()
-    env = make()
     assert env.reset(options={"resume": True}).info["arm_status"] == "NORMAL"
+    assert env.step(respond([*READY, 0.0])).info["arm_status"] == "NORMAL"
 
 
-def test_signs_of_life_that_end_stop_the_arm(arm: WatchedArm, make: Any) -> None:
-    """An arm that was stopped unasked says why in the next step, and starts with a reset."""
+@pytest.mark.parametrize("fault", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize("was_reset", [False, True])
+def test_a_reset_replaces_a_lost_watchdog_of_a_stopped_arm(
+    arm: WatchedArm, make: Any, fault: signal.Signals, was_reset: bool
+) -> None:
+    """Without an emergency stop of an arm that was never switched on."""
+    env = make(safe_stop="emergency_stop" if not was_reset else "hold")
+    if was_reset:
+        env.reset()
+        env.on_disconnect()
+    env._link._process.send_signal(fault)
+    assert env.reset().info["arm_status"] == "NORMAL"
+    assert env.step(respond([*READY, 0.0])).info["arm_status"] == "NORMAL"
+
+
+def test_a_reset_opens_a_bus_that_is_back(
+    monkeypatch: pytest.MonkeyPatch, make: Any, tmp_path: Path
+) -> None:
+    """An adapter is unplugged and plugged in again; in between the reset raises."""
+    monkeypatch.setenv("CAN_CONFIG", '{"sleep_after_open": 0.0}')
+    channel = tmp_path / "adapter"
+    port = SlcanPort()
+    channel.symlink_to(port.path)
+    with running(WatchedArm(), port):
+        env = make(channel=str(channel))
+        env.reset()
+    port.close()
+    channel.unlink()
+    with pytest.raises(ConnectionError, match="no feedback from the arm"):
+        env.step(respond([*READY, 0.0]))
+    with pytest.raises(ConnectionError, match="can't be opened; is it there"):
+        env.reset()
+    port = SlcanPort()
+    channel.symlink_to(port.path)
+    with running(WatchedArm(), port):
+        assert env.reset().info["arm_status"] == "NORMAL"
+        env.close()
+    port.close()
+
+
+def test_missing_heartbeats_stop_the_arm(arm: WatchedArm, make: Any) -> None:
+    """The next step raises with the cause; a reset starts the arm again."""
     env = make(watchdog_timeout=1.0)
     env.reset()
-    period, env._link._period = env._link._period, 1000.0  # As if this process were stopped.
+    period, env._link._period = env._link._period, 1000.0  # As if this process were suspended.
     assert env._link.wait_until(lambda: env._link.stopped_because, HANG)
     with pytest.raises(RuntimeError, match="watchdog stopped it: it gave no sign of life for 1 s"):
         env.step(respond([*READY, 0.0]))
@@ -349,7 +389,7 @@ def test_signs_of_life_that_end_stop_the_arm(arm: WatchedArm, make: Any) -> None
 
 
 def test_a_stopped_arm_moves_again_only_after_a_reset(arm: WatchedArm, make: Any) -> None:
-    """Steps before the first reset, and after a safe stop, are refused and send nothing."""
+    """Steps before the first reset, and after a safe stop, raise and send nothing."""
     env = make()
     with pytest.raises(RuntimeError, match=r"arm-0: the arm is stopped; reset\(\)"):
         env.step(respond([*READY, 0.0]))
@@ -363,7 +403,7 @@ def test_a_stopped_arm_moves_again_only_after_a_reset(arm: WatchedArm, make: Any
 
 
 def test_an_emergency_stop_is_ended_only_on_request(arm: WatchedArm, make: Any) -> None:
-    """Whoever pressed it, a plain reset leaves the stop alone and says how to end it."""
+    """A reset without the option raises, and says how to end the stop."""
     env = make()
     env.reset()
     arm.emergency_stopped = True
@@ -378,7 +418,7 @@ def test_an_emergency_stop_is_ended_only_on_request(arm: WatchedArm, make: Any) 
 
 
 def test_lost_feedback_is_an_error_and_an_emergency_stop(arm: WatchedArm, make: Any) -> None:
-    """Without feedback nobody knows what to hold, so the arm's own stop is used."""
+    """Without feedback the position for a hold is unknown."""
     env = make(feedback_timeout=0.6)
     env.reset()
     arm.silent = True
@@ -387,16 +427,16 @@ def test_lost_feedback_is_an_error_and_an_emergency_stop(arm: WatchedArm, make: 
     assert arm.wait_for(lambda: STOP_COMMAND in arm.commands)
 
 
-def test_an_arm_that_says_nothing_is_a_clear_error(make: Any, port: SlcanPort) -> None:
-    """With nobody on the channel building the env fails in time, and leaves it free."""
+def test_a_silent_arm_is_a_clear_error(make: Any, port: SlcanPort) -> None:
+    """Building the env fails in time, and releases the channel."""
     message = r"no feedback from the arm on slcan channel.*0\.2 s.*is it powered"
     for _ in range(2):
         with pytest.raises(ConnectionError, match=message):
             make(connect_timeout=0.2)
 
 
-def test_a_channel_that_is_not_there_is_a_clear_error(arm: WatchedArm, make: Any) -> None:
-    """The message says which channel, and for SocketCAN how to bring it up."""
+def test_a_missing_channel_is_a_clear_error(arm: WatchedArm, make: Any) -> None:
+    """The message has the channel, and for SocketCAN the command that brings it up."""
     with pytest.raises(ConnectionError, match="slcan channel '/dev/nothing' can't be opened"):
         make(channel="/dev/nothing")
     with pytest.raises(ConnectionError, match=r"socketcan channel 'can9'.*ip link set can9 up"):
@@ -404,7 +444,7 @@ def test_a_channel_that_is_not_there_is_a_clear_error(arm: WatchedArm, make: Any
 
 
 def test_motors_that_stay_off_end_the_reset(arm: WatchedArm, make: Any) -> None:
-    """Switching on is tried until the limit, then given up with the arm's own status."""
+    """After the time limit, with the status of the arm."""
     env = make(connect_timeout=0.5)
     arm.deaf_to.add(0x471)
     with pytest.raises(TimeoutError, match=r"motors .* not enabled after 0\.5 s.*NORMAL"):
@@ -434,7 +474,7 @@ def test_commands_that_the_bus_loses_are_repeated(arm: WatchedArm, make: Any) ->
 
 
 def test_the_step_limit_truncates(arm: WatchedArm, make: Any) -> None:
-    """The step that reaches `max_episode_steps` says so; a reset starts the count anew."""
+    """At `max_episode_steps` steps; a reset restarts the count."""
     env = make(max_episode_steps=3)
     for _ in range(2):
         env.reset()
@@ -443,7 +483,7 @@ def test_the_step_limit_truncates(arm: WatchedArm, make: Any) -> None:
 
 
 def test_one_channel_has_one_env(arm: WatchedArm, make: Any, port: SlcanPort) -> None:
-    """A second env on the channel is refused; after a close it may have it."""
+    """A second env on the channel raises, until the first is closed."""
     env = make()
     with pytest.raises(ConfigError, match=r"channel: .* is in use by another env of this process"):
         make()
@@ -458,7 +498,7 @@ def test_one_channel_has_one_env(arm: WatchedArm, make: Any, port: SlcanPort) ->
 HOLDER = """
 import sys
 from rlightning_aio.config import EnvConfig
-from rlightning_aio.envs.piper import PiperEnv
+from rlightning_aio.piper.env import PiperEnv
 env_kwargs = {"can_interface": "slcan", "channel": sys.argv[1], "connect_timeout": 30}
 try:
     env = PiperEnv(EnvConfig(name="other", backend="piper", task="t", env_kwargs=env_kwargs))
@@ -473,7 +513,7 @@ else:
 def test_one_channel_has_one_env_in_all_processes(
     arm: WatchedArm, make: Any, port: SlcanPort
 ) -> None:
-    """Two programs can't drive one arm; one that is killed leaves the channel to the next."""
+    """Two programs can't drive one arm; a killed program releases the channel."""
 
     def other() -> subprocess.Popen[str]:
         return subprocess.Popen(
@@ -531,16 +571,16 @@ def test_cameras_and_reward_come_from_hooks(arm: WatchedArm, make: Any) -> None:
         ({"reward": "nowhere:at_all"}, r"env_kwargs\.reward: 'nowhere:at_all' can't be loaded"),
     ],
 )
-def test_faults_of_the_config_are_named(
+def test_errors_of_the_config_are_named(
     arm: WatchedArm, make: Any, env_kwargs: dict[str, Any], message: str
 ) -> None:
-    """What is wrong in `env_kwargs` is named before the channel is opened."""
+    """Before the channel is opened."""
     with pytest.raises(ConfigError, match=message):
         make(**env_kwargs)
 
 
-def test_a_virtual_channel_brings_its_own_arm(make: Any) -> None:
-    """`can_interface: virtual` needs no hardware and no second process, time after time."""
+def test_a_virtual_channel_makes_its_own_arm(make: Any) -> None:
+    """`can_interface: virtual` needs no hardware and no second process, also repeatedly."""
     for _ in range(2):
         env = make(can_interface="virtual", channel="dry run")
         env.reset()
@@ -550,9 +590,9 @@ def test_a_virtual_channel_brings_its_own_arm(make: Any) -> None:
         env.close()
 
 
-def test_the_arm_can_live_in_another_process(make: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """`python -m rlightning_aio.envs.piper_sim` prints a channel and ends when told to."""
-    command = [sys.executable, "-m", "rlightning_aio.envs.piper_sim", "--feedback-hz", "50"]
+def test_the_arm_can_be_in_another_process(make: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`python -m rlightning_aio.piper.sim` prints a channel and ends at a signal."""
+    command = [sys.executable, "-m", "rlightning_aio.piper.sim", "--feedback-hz", "50"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout
         channel = process.stdout.readline().strip()

@@ -14,35 +14,35 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 piper_sdk: Any = pytest.importorskip("piper_sdk")
 
-from rlightning_aio.envs import piper_arm  # noqa: E402 - needs the SDK
-from rlightning_aio.envs.piper_arm import (  # noqa: E402
+from rlightning_aio.piper import arm as arm_module  # noqa: E402 - needs the SDK
+from rlightning_aio.piper.arm import (  # noqa: E402
     GRIPPER_RANGE,
     JOINT_LIMITS,
     JOINT_SPEED,
-    Frame,
+    CanFrame,
     SimulatedArm,
 )
 
 pytestmark = pytest.mark.simulators
 
-ON = Frame(0x471, bytes([7, 2, 0, 0, 0, 0, 0, 0]))
-OFF = Frame(0x471, bytes([7, 1, 0, 0, 0, 0, 0, 0]))
-STOP = Frame(0x150, bytes([1, 0, 0, 0, 0, 0, 0, 0]))
-RESUME = Frame(0x150, bytes([2, 0, 0, 0, 0, 0, 0, 0]))
+ON = CanFrame(0x471, bytes([7, 2, 0, 0, 0, 0, 0, 0]))
+OFF = CanFrame(0x471, bytes([7, 1, 0, 0, 0, 0, 0, 0]))
+STOP = CanFrame(0x150, bytes([1, 0, 0, 0, 0, 0, 0, 0]))
+RESUME = CanFrame(0x150, bytes([2, 0, 0, 0, 0, 0, 0, 0]))
 
 
-def mode(move: int, speed: int) -> Frame:
-    return Frame(0x151, bytes([1, move, speed, 0, 0, 0, 0, 0]))
+def mode(move: int, speed: int) -> CanFrame:
+    return CanFrame(0x151, bytes([1, move, speed, 0, 0, 0, 0, 0]))
 
 
-def joint_frames(degrees: list[float]) -> list[Frame]:
+def joint_frames(degrees: list[float]) -> list[CanFrame]:
     values = [round(angle * 1000) for angle in degrees]
-    return [Frame(0x155 + i, struct.pack(">ii", *values[2 * i : 2 * i + 2])) for i in range(3)]
+    return [CanFrame(0x155 + i, struct.pack(">ii", *values[2 * i : 2 * i + 2])) for i in range(3)]
 
 
-def pose_frames(pose: list[float]) -> list[Frame]:
+def pose_frames(pose: list[float]) -> list[CanFrame]:
     values = [round(value * 1000) for value in pose]
-    return [Frame(0x152 + i, struct.pack(">ii", *values[2 * i : 2 * i + 2])) for i in range(3)]
+    return [CanFrame(0x152 + i, struct.pack(">ii", *values[2 * i : 2 * i + 2])) for i in range(3)]
 
 
 def started(move: int = 1, speed: int = 100) -> SimulatedArm:
@@ -66,7 +66,7 @@ class ArmMachine(RuleBasedStateMachine):
 
     @rule(on=st.booleans(), motor=st.integers(0, 8))
     def power(self, on: bool, motor: int) -> None:
-        self.arm.receive(Frame(0x471, bytes([motor, 2 if on else 1, 0, 0, 0, 0, 0, 0])))
+        self.arm.receive(CanFrame(0x471, bytes([motor, 2 if on else 1, 0, 0, 0, 0, 0, 0])))
 
     @rule(speed=st.integers(0, 255), move=st.integers(0, 5))
     def set_mode(self, speed: int, move: int) -> None:
@@ -79,7 +79,7 @@ class ArmMachine(RuleBasedStateMachine):
 
     @rule(opening=st.integers(-(2**31), 2**31 - 1), code=st.integers(0, 255))
     def grip(self, opening: int, code: int) -> None:
-        self.arm.receive(Frame(0x159, struct.pack(">iHBB", opening, 1000, code, 0)))
+        self.arm.receive(CanFrame(0x159, struct.pack(">iHBB", opening, 1000, code, 0)))
 
     @rule(stop=st.booleans())
     def emergency(self, stop: bool) -> None:
@@ -89,7 +89,7 @@ class ArmMachine(RuleBasedStateMachine):
     @rule(can_id=st.integers(0x160, 0x7FF), data=st.binary(max_size=8))
     def noise(self, can_id: int, data: bytes) -> None:
         if can_id != 0x471:
-            self.arm.receive(Frame(can_id, data))
+            self.arm.receive(CanFrame(can_id, data))
 
     @rule(seconds=st.floats(0.001, 1.0))
     def wait(self, seconds: float) -> None:
@@ -173,8 +173,8 @@ def test_nearby_poses_are_found(data: st.DataObject) -> None:
     arm.advance(10.0)
     assert status_of(arm) == 0
     # Compared as a rotation: roll and yaw mean little by themselves when the hand points down.
-    miss = piper_arm._difference(
-        piper_arm._as_transform(arm.end_pose(arm.joints)), piper_arm._as_transform(pose)
+    miss = arm_module._difference(
+        arm_module._as_transform(arm.end_pose(arm.joints)), arm_module._as_transform(pose)
     )
     assert np.abs(miss[:3]).max() < 1e-4
     assert np.degrees(np.abs(miss[3:])).max() < 0.1
@@ -193,23 +193,23 @@ def test_a_pose_out_of_reach_is_declined() -> None:
 def test_questions_are_answered_and_answers_are_not() -> None:
     """Limits and firmware are reported on request; another arm's report is no request."""
     arm = SimulatedArm()
-    (limits,) = arm.receive(Frame(0x472, bytes([2, 1, 0, 0, 0, 0, 0, 0])))
+    (limits,) = arm.receive(CanFrame(0x472, bytes([2, 1, 0, 0, 0, 0, 0, 0])))
     assert struct.unpack(">BhhHx", limits.data) == (2, 1799, 0, 3000)
-    (acceleration,) = arm.receive(Frame(0x472, bytes([2, 2, 0, 0, 0, 0, 0, 0])))
+    (acceleration,) = arm.receive(CanFrame(0x472, bytes([2, 2, 0, 0, 0, 0, 0, 0])))
     assert acceleration.can_id == 0x47C
-    (firmware,) = arm.receive(Frame(0x4AF, bytes([1, 0, 0, 0, 0, 0, 0, 0])))
+    (firmware,) = arm.receive(CanFrame(0x4AF, bytes([1, 0, 0, 0, 0, 0, 0, 0])))
     assert arm.receive(firmware) == []
 
 
 def test_the_sdk_states_the_same_limits() -> None:
     """The arm, the env and the vendor's SDK agree on every limit."""
-    from rlightning_aio.envs import piper_options
+    from rlightning_aio.piper import options
 
     parameters = piper_sdk.C_PiperInterface_V2("limits", False, False)
     vendor = tuple(tuple(parameters.GetSDKJointLimitParam(f"j{i}")) for i in range(1, 7))
-    assert vendor == JOINT_LIMITS == tuple(piper_options.JOINT_LIMITS.values())
+    assert vendor == JOINT_LIMITS == tuple(options.JOINT_LIMITS.values())
     assert (
         tuple(parameters.GetSDKGripperRangeParam())
         == GRIPPER_RANGE
-        == piper_options.GRIPPER_LIMITS["gripper"]
+        == options.GRIPPER_LIMITS["gripper"]
     )

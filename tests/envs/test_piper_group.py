@@ -1,11 +1,13 @@
-"""Piper arms in a group: workers, statistics, and what becomes of an arm without a trainer."""
+"""Piper arms in a group: workers, statistics, and arms without a trainer."""
 
 from __future__ import annotations
 
 import contextlib
+import math
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -17,18 +19,22 @@ pytest.importorskip("serial")
 
 from envs.closing_table import closing_table, steps
 from envs.watched_arm import WatchedArm
+from patience import HANG
+from remote.counting import ClientThread
 
-from rlightning_aio import sync
-from rlightning_aio.envs.piper_sim import SlcanPort, running
-from rlightning_aio.errors import BadAction
+from rlightning_aio import BatchedData, EnvConfig, PolicyResponse, sync
+from rlightning_aio.errors import BadAction, EnvRaised
+from rlightning_aio.piper.env import PiperEnv
+from rlightning_aio.piper.sim import SlcanPort, running
 
 pytestmark = [
     pytest.mark.simulators,
-    # The SDK calls an argument of python-can by its former name.
+    # The SDK uses the former name of an argument of python-can.
     pytest.mark.filterwarnings("ignore:.*bustype.*:DeprecationWarning"),
 ]
 
 READY = [0.0, 0.5, -0.5, 0.0, 0.0, 0.0]
+SERVER = {"name": "arm", "backend": "env_server", "env_kwargs": {"connect_timeout": HANG}}
 
 
 def entry(**fields: Any) -> dict[str, Any]:
@@ -51,8 +57,8 @@ def entry(**fields: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("placement", ["process", "inline"])
-def test_arms_in_a_group_go_where_they_are_sent(placement: str) -> None:
-    """Two arms on channels of their own: spaces, steps, limits, episodes, as of one env."""
+def test_arms_in_a_group_reach_their_targets(placement: str) -> None:
+    """Two arms on their own channels: spaces, steps, limits, episodes."""
     two = entry(num_workers=2, placement=placement, env_kwargs={"channel": ["left", "right"]})
     target = np.array([0.3, 0.6, -0.6, 0.0, 0.0, 0.0, 0.01], np.float32)
     with sync.build_env_group(two) as group, group.auto_reset():
@@ -78,7 +84,7 @@ def test_arms_in_a_group_go_where_they_are_sent(placement: str) -> None:
 
 
 def test_a_bad_action_reaches_the_trainer_and_not_the_arm() -> None:
-    """The worker's error has the joint and its limits; after a reset the arm goes on."""
+    """The worker's error has the joint and its limits; after a reset the arm continues."""
     with sync.build_env_group(entry()) as group:
         batch, _ = group.reset()
         bad = np.array([[9.0, *READY[1:], 0.0]], np.float32)
@@ -89,9 +95,54 @@ def test_a_bad_action_reaches_the_trainer_and_not_the_arm() -> None:
         assert batch.info()[0]["arm_status"] == "NORMAL"
 
 
+ACTIONS_THAT_ARE_NONE = {
+    "NaN": ([0.1, *READY[1:5], math.nan, 0.0], r"joint_6 = nan rad is outside \[-2\.09439, 2"),
+    "infinity": ([0.1, *READY[1:5], math.inf, 0.0], r"joint_6 = inf rad is outside \[-2\.09439"),
+    "too few": (READY, r"shape \(7,\): joint_1 in \[-2\.6179, 2\.6179\] rad.*; got shape \(6,\)"),
+    "None": (None, r"joint_1 in \[-2\.6179, 2\.6179\] rad.*; got None"),
+    "text": ("left", r"joint_1 in \[-2\.6179, 2\.6179\] rad.*; got "),
+}
+
+
+@pytest.mark.parametrize("place", ["process", "inline", "client"])
+def test_an_invalid_action_stops_a_moving_arm(monkeypatch: pytest.MonkeyPatch, place: str) -> None:
+    """The error names joint and limits, and the arm moves again only after a reset."""
+    monkeypatch.setenv("CAN_CONFIG", '{"sleep_after_open": 0.0}')
+    arm = WatchedArm()
+    with contextlib.ExitStack() as stack:
+        port = stack.enter_context(contextlib.closing(SlcanPort()))
+        stack.enter_context(running(arm, port))
+        slcan = {"can_interface": "slcan", "channel": port.path, "speed": 10}
+        fields = entry(env_kwargs=slcan, placement="process" if place == "client" else place)
+        config = SERVER if place == "client" else fields
+        group = stack.enter_context(sync.build_env_group(config))
+        if place == "client":
+            env = PiperEnv(EnvConfig(**fields))
+            monkeypatch.setattr(env, "is_finish", (finished := threading.Event()).is_set)
+            client = ClientThread(group["arm-0"].address, "c", env)
+            stack.callback(client.join)
+            stack.callback(group.close)
+            stack.callback(finished.set)
+
+        def step(action: Any) -> Any:
+            (env_id,) = batch.env_ids()
+            group.step_async(BatchedData([batch.ids()[0]], [PolicyResponse(env_id, action)]))
+            return group.collect_async(deadline=HANG)[0]
+
+        for action, expected in ACTIONS_THAT_ARE_NONE.values():
+            batch, _ = group.reset()
+            batch = step([2.0, 2.0, -2.0, 1.0, 1.0, 1.0, 0.0])
+            assert np.abs(arm.joints - arm.targets).max() > 0.5, "it is under way"
+            with pytest.raises(BadAction, match=expected):
+                step(action)
+            assert np.abs(arm.joints - arm.targets).max() < 0.1, "it holds where it is"
+            with pytest.raises(EnvRaised, match=r"the arm is stopped; reset\(\) starts it again"):
+                step([*READY[:5], 0.1, 0.0])
+
+
 @pytest.mark.parametrize("death", [signal.SIGKILL, signal.SIGTERM])
 def test_the_arm_stops_when_its_trainer_dies(death: signal.Signals) -> None:
-    """Whatever kills the trainer, the worker makes the safe stop."""
+    """By any signal; the worker makes the safe stop."""
     arm = WatchedArm()
     script = Path(__file__).with_name("piper_trainer.py")
     with (
@@ -113,5 +164,5 @@ def test_the_arm_stops_when_its_trainer_dies(death: signal.Signals) -> None:
 
 
 def test_the_dry_run_ends_with_its_table() -> None:
-    """The example config runs as it stands, without an arm."""
+    """The example config runs unchanged, without an arm."""
     assert steps(closing_table("piper", "--steps", "30")["piper"]) == 30

@@ -1,4 +1,4 @@
-"""What passes to an arm and how it is stopped, frame by frame, without a bus or a clock."""
+"""The guard's filter and stops, frame by frame, without a bus or a clock."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rlightning_aio.envs.piper_guard import ArmGuard, Frame
+from rlightning_aio.piper.guard import ArmGuard, CanFrame
 
-ANY_COMMAND = Frame(0x155, struct.pack(">ii", 1000, 2000))
-EMERGENCY_STOP = Frame(0x150, bytes([1, 0, 0, 0, 0, 0, 0, 0]))
-MOTORS_OFF = Frame(0x471, bytes([7, 1, 0, 0, 0, 0, 0, 0]))
+ANY_COMMAND = CanFrame(0x155, struct.pack(">ii", 1000, 2000))
+EMERGENCY_STOP = CanFrame(0x150, bytes([1, 0, 0, 0, 0, 0, 0, 0]))
+MOTORS_OFF = CanFrame(0x471, bytes([7, 1, 0, 0, 0, 0, 0, 0]))
 AT_REST = (1000, 30_000, -30_000, 4000, -5000, 6000)
 """Joints, in 0.001 degrees."""
 
@@ -26,27 +26,27 @@ def guard(stop: Any = "hold", *, gripper: bool = False) -> ArmGuard:
 
 def report(made: ArmGuard, now: float, joints: Any = AT_REST, gripper: int = 0) -> None:
     for k in range(3):
-        made.heard(Frame(0x2A5 + k, struct.pack(">ii", *joints[2 * k : 2 * k + 2])), now)
-    made.heard(Frame(0x2A8, struct.pack(">ihBB", gripper, 0, 0x40, 0)), now)
+        made.heard(CanFrame(0x2A5 + k, struct.pack(">ii", *joints[2 * k : 2 * k + 2])), now)
+    made.heard(CanFrame(0x2A8, struct.pack(">ihBB", gripper, 0, 0x40, 0)), now)
 
 
 def grip(made: ArmGuard, opening: int, now: float) -> None:
-    made.passes(Frame(0x159, struct.pack(">iHBB", opening, 1500, 1, 0)), now)
+    made.passes(CanFrame(0x159, struct.pack(">iHBB", opening, 1500, 1, 0)), now)
 
 
-def grips(frames: list[Frame]) -> list[tuple[int, ...]]:
+def grips(frames: list[CanFrame]) -> list[tuple[int, ...]]:
     return [struct.unpack(">iHBB", f.data) for f in frames if f.can_id == 0x159]
 
 
-def targets(frames: list[Frame]) -> list[int]:
+def targets(frames: list[CanFrame]) -> list[int]:
     halves = [f.data for f in frames if f.can_id in (0x155, 0x156, 0x157)]
     return [n for data in halves for n in struct.unpack(">ii", data)]
 
 
-def stopped(made: ArmGuard, now: float, **reported: Any) -> list[Frame]:
-    """All that goes out once the stop has begun, the arm reporting on."""
+def stopped(made: ArmGuard, now: float, **reported: Any) -> list[CanFrame]:
+    """All frames sent after the stop has begun, while the arm reports."""
     made.stop("a test", now)
-    frames: list[Frame] = []
+    frames: list[CanFrame] = []
     for turn in range(100):
         if reported:
             report(made, now + turn * 0.01, **reported)
@@ -57,8 +57,8 @@ def stopped(made: ArmGuard, now: float, **reported: Any) -> list[Frame]:
 
 
 @given(st.lists(st.sampled_from(["arm", "stop", "beat", "silence"]), max_size=20))
-def test_nothing_passes_but_between_arming_and_the_next_stop(acts: list[str]) -> None:
-    """Whatever comes in whatever order, a stopped arm is told nothing more of the program's."""
+def test_commands_pass_only_between_arming_and_the_next_stop(acts: list[str]) -> None:
+    """In any order of events, a stopped arm gets no commands of the program."""
     made, now, armed = ArmGuard("emergency_stop", 0.5, 40, None), 0.0, False
     for act in acts:
         now += 0.6 if act == "silence" else 0.1
@@ -73,13 +73,13 @@ def test_nothing_passes_but_between_arming_and_the_next_stop(acts: list[str]) ->
         else:
             armed = False
         made.act(now)
-        if act != "beat":  # A sign of life that comes too late is too late.
+        if act != "beat":  # A late heartbeat doesn't count.
             assert made.passes(ANY_COMMAND, now) == armed
         armed = made.armed
 
 
-def test_signs_of_life_that_end_stop_the_arm() -> None:
-    """At the timeout and no earlier; the cause says so."""
+def test_missing_heartbeats_stop_the_arm() -> None:
+    """At the timeout and no earlier, with the cause."""
     made = guard("emergency_stop")
     made.beat(10.0)
     assert made.act(10.5) == []
@@ -88,8 +88,8 @@ def test_signs_of_life_that_end_stop_the_arm() -> None:
     assert made.cause == "it gave no sign of life for 0.5 s"
 
 
-def test_a_stop_is_said_three_times() -> None:
-    """A bus may lose a frame; what it did not take counts as unsaid."""
+def test_a_stop_is_sent_three_times() -> None:
+    """Because a bus may lose frames; frames that it rejects don't count."""
     assert stopped(guard("emergency_stop"), 1.0) == [EMERGENCY_STOP] * 3
     assert stopped(guard("disable"), 1.0) == [MOTORS_OFF] * 3
     made = guard("emergency_stop")
@@ -100,14 +100,14 @@ def test_a_stop_is_said_three_times() -> None:
     assert made.stopping
 
 
-def test_a_hold_is_said_at_once_and_again_where_the_arm_is_by_then() -> None:
-    """The first hold takes the latest feedback, the others what has come since the stop."""
+def test_a_hold_is_repeated_at_the_latest_position() -> None:
+    """The first hold uses the latest feedback, the others feedback since the stop."""
     made = guard()
     report(made, 1.0)
     made.stop("a test", 1.01)
     first = made.act(1.01)
     assert targets(first) == list(AT_REST)
-    assert Frame(0x151, bytes([1, 1, 40, 0, 0, 0, 0, 0])) in first
+    assert CanFrame(0x151, bytes([1, 1, 40, 0, 0, 0, 0, 0])) in first
     later = (1100, *AT_REST[1:])
     report(made, 1.02, later)
     assert made.act(1.02) == []
@@ -116,7 +116,7 @@ def test_a_hold_is_said_at_once_and_again_where_the_arm_is_by_then() -> None:
 
 
 def test_a_hold_stays_within_the_limits() -> None:
-    """A joint that lies beyond its limits would take no target there and go on to its last."""
+    """A joint beyond its limits would refuse the target and continue to its last one."""
     low = targets(stopped(guard(), 1.0, joints=(0, -300, 200, 0, 0, 0)))
     assert set(low) == {0}
     far = targets(stopped(guard(), 1.0, joints=(151_000, 0, 0, 0, 0, -121_000)))
@@ -124,15 +124,15 @@ def test_a_hold_stays_within_the_limits() -> None:
 
 
 def test_without_feedback_a_hold_is_an_emergency_stop() -> None:
-    """Nobody knows then where to hold, and old feedback isn't believed."""
+    """The position is unknown, and old feedback doesn't count."""
     made = guard()
     report(made, 0.5)
     frames = stopped(made, 1.0)
     assert frames == [EMERGENCY_STOP] * 3
 
 
-def test_a_moving_gripper_is_held_where_it_is() -> None:
-    """One that was told to go on stops at the opening that it reports."""
+def test_a_moving_gripper_is_held_at_its_opening() -> None:
+    """It stops at the opening that it reports."""
     made = guard(gripper=True)
     report(made, 0.9, gripper=2000)
     grip(made, 69_000, 0.95)
@@ -142,8 +142,8 @@ def test_a_moving_gripper_is_held_where_it_is() -> None:
     assert {opening for opening, *_ in held} <= {4000, 4100}
 
 
-def test_a_gripper_that_has_just_been_told_to_close_is_held_open() -> None:
-    """It has not moved yet, so it is no sign of a grip that it stands still."""
+def test_a_gripper_that_is_about_to_close_is_held_open() -> None:
+    """It has not moved yet, so standing still doesn't mean that it grips an object."""
     made = guard(gripper=True)
     grip(made, 40_000, 0.0)
     for now in (0.0, 0.5, 0.99):
@@ -152,19 +152,19 @@ def test_a_gripper_that_has_just_been_told_to_close_is_held_open() -> None:
     assert grips(stopped(made, 1.0, gripper=40_000))[-1] == (40_000, 1500, 1, 0)
 
 
-def test_what_is_gripped_stays_gripped() -> None:
-    """To hold at the present opening would let go: so a gripper that presses is left alone."""
+def test_a_gripped_object_stays_gripped() -> None:
+    """Holding the opening would release it, so a pressing gripper gets no command."""
     made = guard(gripper=True)
     for now, opening in ((0.0, 40_000), (0.2, 30_000), (0.4, 30_000), (0.8, 30_050)):
-        grip(made, round(1000 * now), now)  # A policy's targets are never quite the same.
+        grip(made, round(1000 * now), now)  # Targets of a policy vary slightly.
         report(made, now, gripper=opening)
     frames = stopped(made, 1.0, gripper=30_000)
     assert targets(frames)
     assert grips(frames) == []
 
 
-def test_a_hard_stop_takes_the_gripper_along() -> None:
-    """It is switched off with the motors, and stopped where it is by an emergency stop."""
+def test_a_hard_stop_includes_the_gripper() -> None:
+    """It is switched off with the motors, and held by an emergency stop."""
     made = guard("disable", gripper=True)
     report(made, 1.0, gripper=5000)
     assert grips(stopped(made, 1.0)) == [(5000, 0, 0, 0)] * 3

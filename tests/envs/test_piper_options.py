@@ -1,4 +1,4 @@
-"""Limits of a Piper arm's actions: bounds belong to them, as float32 and the bus can say them."""
+"""Limits of a Piper arm's actions include their bounds, rounded to float32 and bus units."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rlightning_aio.envs.piper_options import (
+from rlightning_aio.errors import ConfigError
+from rlightning_aio.piper.options import (
     HALF_UNIT,
     Limit,
     PiperOptions,
     action_limits,
     check_reset_position,
 )
-from rlightning_aio.errors import ConfigError
 
 
 @pytest.mark.parametrize(
@@ -40,8 +40,8 @@ from rlightning_aio.errors import ConfigError
         (Limit("rx", -math.pi, math.pi), math.nan, None),
     ],
 )
-def test_what_a_bound_lets_through(limit: Limit, value: Any, sent: float | None) -> None:
-    """Bounds and what rounds to them are sent as the bound; whole turns of the hand don't count."""
+def test_values_at_a_bound_are_sent(limit: Limit, value: Any, sent: float | None) -> None:
+    """Values that round to a bound are sent as the bound; whole turns are ignored."""
     within = limit.within(float(value))
     if within is None or sent is None:
         assert within == sent
@@ -55,7 +55,7 @@ BOUNDS = st.tuples(st.floats(-2, 2), st.floats(0.01, 3)).map(lambda pair: (pair[
 
 @given(BOUNDS, st.floats(-8, 8), st.sampled_from(["joint_2", "x", "rx"]))
 def test_nothing_beyond_a_bound_is_sent(bounds: Any, value: float, name: str) -> None:
-    """What is sent lies within the bounds, and is what was given as far as the bus can tell."""
+    """The sent value is within the bounds, and equals the given one up to bus units."""
     limit = Limit(name, *bounds)
     sent = limit.within(value)
     if sent is None:
@@ -87,14 +87,14 @@ def test_members_of_the_action_space_are_within(bounds: Any) -> None:
         ({"reset_joints": (0, 0, 1, 0, 0, 0)}, r"reset_joints: joint_3 = 1.* rad is outside"),
     ],
 )
-def test_a_reset_position_lies_within_the_limits(fields: dict[str, Any], message: str) -> None:
-    """The default one as well: an arm whose workspace was narrowed is not driven out of it."""
+def test_a_reset_position_must_be_within_the_limits(fields: dict[str, Any], message: str) -> None:
+    """Also the default one, so that an arm isn't driven out of a narrowed workspace."""
     with pytest.raises(ConfigError, match=f"arm-0: env_kwargs.{message}.*within the limits"):
         check_reset_position("arm-0", PiperOptions(**fields))
 
 
 def test_orientations_may_be_bounded_around_half_a_turn() -> None:
-    """Where the hand points down; positions stay within what the arm reaches."""
+    """Where the hand points down; positions stay within the arm's reach."""
     options = PiperOptions(control="end_pose", limits={"rx": (2.8, 3.5)})
     assert action_limits("arm-0", options)[3] == Limit("rx", 2.8, 3.5)
     wide = PiperOptions(control="end_pose", limits={"rx": (-4.0, 4.0)})

@@ -1,4 +1,4 @@
-"""An arm stops when what drives it ends, by any signal, in any place; its watchdog, too."""
+"""An arm stops when a process that drives it ends, by any signal; also its watchdog."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def load_harness() -> Any:
     assert spec
     assert spec.loader
     module = importlib.util.module_from_spec(spec)
-    sys.modules["arm_stops"] = module  # Its dataclasses look for it there.
+    sys.modules["arm_stops"] = module  # Dataclasses need it there.
     spec.loader.exec_module(module)
     return module
 
@@ -31,7 +31,7 @@ arm_stops = load_harness()
 
 @pytest.mark.parametrize("place", arm_stops.PLACES)
 @pytest.mark.parametrize("name", arm_stops.SIGNALS)
-def test_arms_stop_as_configured_when_what_drives_them_ends(name: str, place: str) -> None:
+def test_arms_stop_as_configured_when_their_process_ends(name: str, place: str) -> None:
     """Three arms under way, one for each kind of stop, come nowhere near their target.
 
     What was only stopped and goes on moves nothing: a late command doesn't reach the arm.
@@ -44,7 +44,7 @@ def test_arms_stop_as_configured_when_what_drives_them_ends(name: str, place: st
 
 
 def test_the_table_has_a_row_for_each_place_and_signal() -> None:
-    """As the page on faults shows it."""
+    """As on the page about faults."""
     found = [arm_stops.Stopped("HUP", "client", stop, 0.25, 4.0, 0.0) for stop in arm_stops.STOPS]
     assert arm_stops.table(found).splitlines()[2:] == [
         "| SIGHUP | client | 4.0° in 0.25 s | 4.0° in 0.25 s | 4.0° in 0.25 s |"

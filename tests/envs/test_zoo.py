@@ -44,7 +44,7 @@ pytestmark = [
 
 @pytest.fixture
 def overrides(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What the config needs to be told here, where Isaac Lab has no network for its robots."""
+    """Overrides of the config for tests, where Isaac Lab has no network for its assets."""
     assets = tmp_path / "assets"
     script = Path(__file__).with_name("isaac_assets.py")
     subprocess.run([ISAAC_PYTHON, script, assets], check=True)
@@ -54,7 +54,7 @@ def overrides(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def check(part: BatchedData, spaces: dict[str, gym.Space[Any]]) -> None:
-    """The columns are as long as the batch, and each observation is one of its env's."""
+    """Columns are as long as the batch, and each observation is in the space of its env."""
     space = spaces[part.ids()[0]]
     for array in leaves(part.observation):
         assert len(array) == len(part)
@@ -65,7 +65,7 @@ def check(part: BatchedData, spaces: dict[str, gym.Space[Any]]) -> None:
 
 
 def actions(part: BatchedData, spaces: dict[str, gym.Space[Any]]) -> list[Any]:
-    """One for each result, at random; nothing for Isaac Lab's cart, whose actions are unbounded."""
+    """A random action for each result; zeros for Isaac Lab's cart, whose actions are unbounded."""
     if part.ids() == ["isaac_cartpole-0"]:
         return [np.zeros((16, 1), np.float32)]
     return [spaces[env_id].sample() for env_id in part.ids()]
@@ -80,7 +80,7 @@ def leaves(value: Any) -> list[Any]:
 # Episodes end by the envs' own limits here.
 @pytest.mark.filterwarnings("ignore:.*overrides the limits")
 async def test_six_simulators_are_collected_as_they_answer(overrides: list[str]) -> None:
-    """Every result is its own entry's; the slow ones hold nobody up, and nobody is left out."""
+    """Results go to their entries; slow ones delay no other, and all take part."""
     counts: Counter[str] = Counter(dict.fromkeys(NAMES, 0))
     group = rl.build_env_group(rl.load_config(ZOO, overrides), mixed_actions=True)
     async with group:
@@ -100,12 +100,12 @@ async def test_six_simulators_are_collected_as_they_answer(overrides: list[str])
                     if counts[name] < MOST:
                         group.step_async(part.respond(action=actions(part, action_spaces)))
     assert list(counts) == NAMES
-    # In lockstep it would be once for each of the four.
+    # In lockstep each of the four would step once.
     assert counts["cheetah"] > 4 * counts["piper"]
 
 
-def test_the_columns_of_each_entry_are_its_own(overrides: list[str]) -> None:
-    """by_name() splits what doesn't stack: arrays, images, and dicts by part or by agent."""
+def test_each_entry_has_its_own_columns(overrides: list[str]) -> None:
+    """`by_name` separates values that don't stack: arrays, images, dicts by part or by agent."""
     with sync.build_env_group(rl.load_config(ZOO, overrides), mixed_actions=True) as group:
         parts = group.reset(seed=0)[0].by_name()
     assert list(parts) == NAMES

@@ -1,4 +1,4 @@
-"""`WatchedArm`: a simulated arm that a test can listen in on, and hinder."""
+"""`WatchedArm`: a simulated arm that a test can observe, and disturb."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from patience import HANG
 
-from rlightning_aio.envs.piper_arm import Frame, SimulatedArm
+from rlightning_aio.piper.arm import CanFrame, SimulatedArm
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -22,13 +22,13 @@ class WatchedArm(SimulatedArm):
 
     def __init__(self) -> None:
         super().__init__()
-        self.commands: list[Frame] = []
+        self.commands: list[CanFrame] = []
         self.deaf_to: set[int] = set()
         self.silent = False
         self.in_the_grip = 0.0
         self._changed = threading.Condition()
 
-    def receive(self, frame: Frame) -> list[Frame]:
+    def receive(self, frame: CanFrame) -> list[CanFrame]:
         with self._changed:
             self.commands.append(frame)
             answers = [] if frame.can_id in self.deaf_to else super().receive(frame)
@@ -40,10 +40,10 @@ class WatchedArm(SimulatedArm):
         if self.in_the_grip:
             self.gripper = max(self.gripper, self.in_the_grip)
 
-    def feedback(self) -> list[Frame]:
+    def feedback(self) -> list[CanFrame]:
         return [] if self.silent else super().feedback()
 
     def wait_for(self, predicate: Callable[[], Any], seconds: float = HANG) -> bool:
-        """Whether `predicate` becomes true after some command, within that time."""
+        """Return True if `predicate` becomes true after a command, within the time limit."""
         with self._changed:
             return bool(self._changed.wait_for(predicate, seconds))

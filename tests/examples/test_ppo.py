@@ -23,7 +23,7 @@ def modules(monkeypatch: pytest.MonkeyPatch) -> dict[str, ModuleType]:
     """The example, its parts, and the baseline."""
     for folder in ("benchmarks", "examples"):
         monkeypatch.syspath_prepend(ROOT / folder)
-    names = ("ppo", "normalizer", "training_run", "gymnasium_ppo")
+    names = ("ppo", "training_run", "gymnasium_ppo")
     return {name: importlib.import_module(name) for name in names}
 
 

@@ -22,7 +22,7 @@ EXAMPLES = ROOT / "examples"
 SHORT = {
     "ppo": "--task CartPole-v1 --num-steps 32",
     "ppo_async": "--task CartPole-v1 --num-steps 32",
-    "ppo_overlap": "--num-envs 2 --envs-each 2 --min-batch 1 --num-steps 32 --epochs 1",
+    "ppo_overlap": "--num-envs 2 --envs-each 2 --min-results 1 --num-steps 32 --epochs 1",
     "sac": "--num-envs 4 --min-results 2 --learning-starts 240 --record-every 32 --hidden 16",
 }
 
@@ -96,10 +96,10 @@ def test_a_run_that_ctrl_c_ended_resumes_as_if_it_had_not(
     assert repr(curves[0]) == repr(curves[1])
 
 
-def test_the_readmes_program_learns(tmp_path: Path) -> None:
+def test_the_program_of_the_training_page_learns(tmp_path: Path) -> None:
     """It is complete, runs as it stands (with fewer updates), and is short."""
-    text = (ROOT / "README.md").read_text()
-    section = text.partition("## Training with it")[2]
+    text = (ROOT / "docs" / "training.md").read_text()
+    section = text.partition("## A complete asynchronous PPO")[2]
     (block,) = re.findall(
         r"^```python\n(.*?)^```", section.partition("\n## ")[0], re.MULTILINE | re.DOTALL
     )

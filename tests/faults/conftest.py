@@ -1,4 +1,4 @@
-"""Groups for the fault tests: of either driver, closed at the end whatever happened."""
+"""Groups for fault tests, with either driver; fixtures close them whatever happened."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from faults.driven import Driven
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-# The first loop opens a pipe that libuv keeps for good; no test is to be blamed for it.
+# The first loop opens a pipe that libuv keeps, so it is made before the tests.
 uvloop.new_event_loop().close()
 
 
@@ -22,7 +22,7 @@ def driver(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture
 def build(driver: str) -> Iterator[Callable[..., Driven]]:
-    """Builds groups, not initialised."""
+    """Build groups without initialising them."""
     built: list[Driven] = []
 
     def build(cfgs: Any, **kwargs: Any) -> Driven:
@@ -30,13 +30,13 @@ def build(driver: str) -> Iterator[Callable[..., Driven]]:
         return built[-1]
 
     yield build
-    while built:  # The test's item holds on to its fixtures; it shall not hold on to groups.
+    while built:  # The test's item keeps its fixtures alive; it must not keep groups alive.
         built.pop().end()
 
 
 @pytest.fixture
 def start(build: Callable[..., Driven]) -> Callable[..., Driven]:
-    """Builds groups, initialised and reset."""
+    """Build groups, initialise and reset them."""
 
     def start(cfgs: Any, **kwargs: Any) -> Driven:
         group = build(cfgs, **kwargs)

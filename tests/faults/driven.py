@@ -1,6 +1,4 @@
-"""A way to use either driver's group from plain code, and to hold what it returns against
-what was asked of envs that break on demand.
-"""
+"""Use the group of either driver from plain code, and check its results against the requests."""
 
 from __future__ import annotations
 
@@ -27,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class Driven:
-    """A group of either kind, used from plain code: what must be awaited is awaited here."""
+    """A group of either kind for plain code: awaitable methods are awaited here."""
 
     def __init__(self, driver: str, cfgs: Any, **kwargs: Any) -> None:
         self.runner: asyncio.Runner | None = None
@@ -52,7 +50,7 @@ class Driven:
         return len(self.group)
 
     def call(self, env_id: str, name: str, *args: Any, **kwargs: Any) -> Any:
-        """`call` of an env's handle."""
+        """Call a method through the env's handle."""
         return self._wait(self.group[env_id].call(name, *args, **kwargs))
 
     def end(self) -> None:
@@ -63,7 +61,9 @@ class Driven:
 
 
 def entry(num_workers: int = 2, **fields: Any) -> dict[str, Any]:
-    """A config entry of faulty envs, which all share one worker unless `fields` say otherwise."""
+    """Return a config entry of faulty envs, which share one worker unless `fields` say
+    otherwise.
+    """
     return {
         "name": "faulty",
         "backend": "faulty",
@@ -75,41 +75,41 @@ def entry(num_workers: int = 2, **fields: Any) -> dict[str, Any]:
 
 
 def two_workers(**fields: Any) -> dict[str, Any]:
-    """Four envs, two in each worker."""
+    """Return an entry of four envs, two in each worker."""
     return entry(4, **{"envs_per_process": 2, **fields})
 
 
 def pid_of(group: Driven, env_id: str) -> int:
-    """The process of an env."""
+    """Return the process id of an env's worker."""
     return group.call(env_id, "returns", os.getpid)
 
 
 def kill(pid: int) -> None:
-    """Kill a process; returns when it is dead."""
+    """Kill a process; return when it is dead."""
     descriptor = os.pidfd_open(pid)
     try:
         signal.pidfd_send_signal(descriptor, signal.SIGKILL)
-        assert select.select([descriptor], [], [], HANG)[0], "it lives"
+        assert select.select([descriptor], [], [], HANG)[0], "the process is still alive"
     finally:
         os.close(descriptor)
 
 
 def stop(pid: int) -> None:
-    """Stop a process; returns when it has stopped: on another core it goes on for a moment."""
+    """Stop a process; return when it has stopped, which may take a moment on another core."""
     os.kill(pid, signal.SIGSTOP)
     while Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "T":
         os.sched_yield()
 
 
 class Tokens:
-    """Makes steps with a fresh token for each env, and holds results against them."""
+    """Makes steps with a new token for each env, and checks results against them."""
 
     def __init__(self) -> None:
         self._next = 1.0
         self._asked: dict[str, float] = {}
 
     def steps(self, env_ids: list[str], faults: dict[str, str] | None = None) -> BatchedData:
-        """A batch of steps; `faults` by env id."""
+        """Return a batch of steps; `faults` is by env id."""
         actions: list[np.ndarray] = []
         for env_id in env_ids:
             self._asked[env_id] = self._next
@@ -123,7 +123,7 @@ class Tokens:
         return rlightning_aio.BatchedData(env_ids, responses)
 
     def check(self, batch: BatchedData) -> None:
-        """Every result of `batch` is its own env's answer to that env's last step."""
+        """Check that every result of `batch` answers its own env's last step."""
         for env_id, ret in batch.items():
             index, _, _, steps, token = ret.observation
             assert env_id == ret.env_id
@@ -134,19 +134,21 @@ class Tokens:
 
 
 def marked(ret: EnvRet) -> bool:
-    """Whether a result comes from a replacement, and is in all respects what it must be then."""
+    """Return True if a result comes from a replacement; check that it is as it must be then."""
     if "worker_restarted" not in ret.info:
         return False
     assert ret.last_truncated
     assert not ret.last_terminated
     assert ret.last_reward == 0.0
-    assert list(ret.observation[2:]) == [1, 0, 0], "it shows the first reset of a new life"
+    assert list(ret.observation[2:]) == [1, 0, 0], (
+        "a marked result has the first reset of a new life"
+    )
     assert ret.info["resets"] == 1
     return True
 
 
 def fork_server_of(group: Any) -> ForkServer:
-    """The one fork server of a group."""
+    """Return the only fork server of a group."""
     shared = group._core.supervisor.resources.values()
     (server,) = (one for one in shared if isinstance(one, ForkServer))
     return server

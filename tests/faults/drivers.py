@@ -1,6 +1,7 @@
-"""On which drivers a test of faults runs; on both, unless it says otherwise.
+"""Choose the drivers for a fault test: both, unless the test says otherwise.
 
-A start of workers is what such a test costs. What the driver has no part in is shown once.
+Such a test mainly costs the start of workers, so behaviour that the driver can't affect is tested
+on one.
 """
 
 from __future__ import annotations
@@ -13,13 +14,13 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 on_one_driver = pytest.mark.parametrize("driver", ["sync"])
-"""For what is decided before anything is waited for, or in the worker alone."""
+"""For behaviour that is decided before any wait, or in the worker."""
 
 
 def kinds_on_both_drivers(name: str, values: Iterable[str]) -> pytest.MarkDecorator:
-    """Parameter `name` is a list: of all `values`, and on the other driver of the first alone.
+    """Parametrise `name` with a list: all `values` on one driver, the first on the other.
 
-    For kinds of one thing that are all alike to whoever waits, shown one after another.
+    For variants that look alike to the driver, tested one after another.
     """
     kinds = list(values)
     cases = [pytest.param("sync", kinds, id="sync"), pytest.param("uvloop", kinds[:1], id="uvloop")]

@@ -1,9 +1,8 @@
-"""An env that breaks on demand.
+"""An env that fails on demand.
 
-An action is a fault and a token; an observation says whose it is, in which life and
-episode, how far it has come, and which token it answers: so whatever is handed out can
-be held against what was asked. What holds it is in `driven`, apart: every worker imports
-this module, and starts the faster the less it brings along.
+An action has a fault and a token. An observation has the env's id, life, episode and step, and the
+token that it answers, so each result can be checked against its request. The checks are in
+`driven`, because every worker imports this module and should start quickly.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
 
 
 class OddConstructor(Exception):
-    """Can't be rebuilt from its arguments."""
+    """An exception that can't be rebuilt from its arguments."""
 
     def __init__(self, code: int, *, where: str) -> None:
         super().__init__()
@@ -43,7 +42,7 @@ class OddConstructor(Exception):
 
 
 class Unpicklable(Exception):
-    """Holds what no pickle takes."""
+    """An exception that holds an object that can't be pickled."""
 
     def __init__(self) -> None:
         super().__init__("it holds a lock")
@@ -51,21 +50,21 @@ class Unpicklable(Exception):
 
 
 class Unprintable(Exception):
-    """Can't even be shown."""
+    """An exception without a usable repr."""
 
     def __str__(self) -> str:
         raise RuntimeError("no words")
 
 
 class Unspeakable(Exception):
-    """Showing it tries to end the program."""
+    """An exception whose text tries to end the program."""
 
     def __str__(self) -> str:
         raise SystemExit(3)
 
 
 class OddText(str):
-    """Text that no pickle takes."""
+    """Text that can't be pickled."""
 
     __slots__ = ()
 
@@ -74,7 +73,7 @@ class OddText(str):
 
 
 class OddlySpoken(Exception):
-    """Its words are no plain text, and neither is where it is from."""
+    """An exception whose text and module are no plain strings."""
 
     def __str__(self) -> str:
         return OddText("odd words")
@@ -85,28 +84,28 @@ OddlySpoken.__qualname__ = OddText("OddlySpoken")
 
 
 class Wordless(Exception):
-    """Its words are none."""
+    """An exception whose text is None."""
 
     def __str__(self) -> str:
         return self.args  # pyright: ignore[reportReturnType]  # That is odd.
 
 
 class OddlyPickled(Exception):
-    """Pickling it tries to end the program."""
+    """An exception that tries to end the program when it is pickled."""
 
     def __reduce__(self) -> str:
         raise SystemExit(4)
 
 
 class Untraceable(Exception):
-    """Nobody gets to see where it came from."""
+    """An exception whose traceback can't be read."""
 
     __cause__ = property(lambda _: 7)  # pyright: ignore[reportAssignmentType]
     __traceback__ = property(lambda _: 1 / 0)  # pyright: ignore[reportAssignmentType]
 
 
 class NotAnException(BaseException):
-    """What ``except Exception`` lets through."""
+    """An exception that ``except Exception`` doesn't catch."""
 
 
 def _raise(kind: type[BaseException], *args: Any, **kwargs: Any) -> Callable[[], None]:
@@ -125,14 +124,14 @@ def _exhaust_memory() -> None:
         resource.setrlimit(resource.RLIMIT_AS, before)
 
 
-def _tell_and_sleep() -> None:
+def _report_and_sleep() -> None:
     sys.stderr.write("asleep\n")
     sys.stderr.flush()
     time.sleep(3600)
 
 
 def _signal_trainer(number: int) -> None:
-    """Send the trainer a signal, once it has gone to sleep to wait for this very reply."""
+    """Send the trainer a signal once it sleeps, waiting for the reply to this request."""
     server = Path(f"/proc/{os.getppid()}/stat").read_text().rpartition(")")[2].split()
     trainer = int(server[1])
     while Path(f"/proc/{trainer}/stat").read_text().rpartition(")")[2].split()[0] != "S":
@@ -141,7 +140,7 @@ def _signal_trainer(number: int) -> None:
 
 
 def _fork(end: Callable[[], object], exit_code: int) -> Callable[[], None]:
-    """Fork a child that goes on by itself from here, and wait until it has ended."""
+    """Fork a child that continues from here, and wait until it has ended."""
 
     def fault() -> None:
         child = os.fork()
@@ -194,9 +193,9 @@ FAULTS: dict[str, Callable[[], object]] = {
     "deadlock": _deadlock,
     "deadlock with the GIL": _deadlock_with_the_gil,
     "close descriptors": lambda: os.closerange(3, 1000),
-    # To this thread: of a process with others it would run on until one of them takes it.
+    # To this thread: in a process with others, this thread would run on until one of them gets it.
     "stop": lambda: signal.pthread_kill(threading.get_ident(), signal.SIGSTOP),
-    "tell and sleep": _tell_and_sleep,
+    "report and sleep": _report_and_sleep,
     "interrupt the trainer": lambda: _signal_trainer(signal.SIGINT),
     "call the trainer": lambda: _signal_trainer(signal.SIGUSR1),
     # Exceptions.
@@ -233,11 +232,11 @@ _BY_CODE = list(FAULTS.values())
 
 @ENVS.register("faulty")
 class FaultyEnv(BaseEnv):
-    """Breaks where it is told to.
+    """Fails where it is asked to.
 
-    ``env_kwargs``: `faults` by place (``building``, ``spaces``, ``resetting``, ``closing``);
-    `only` limits them to one worker index, `while_exists` to the time a file exists. If env
-    0 is built while the FIFO `gate` exists, it waits until somebody has opened and closed it.
+    ``env_kwargs``: `faults` by place (``building``, ``spaces``, ``resetting``, ``closing``); `only`
+    limits them to one worker index, `while_exists` to the time while a file exists. If env 0 is
+    built while the FIFO `gate` exists, it waits until another process has opened and closed it.
     """
 
     def __init__(self, config: Any, worker_index: int = 0, preprocess_fn: Any = None) -> None:
@@ -296,24 +295,24 @@ class FaultyEnv(BaseEnv):
         return EnvRet(**{**fields, **{name: make() for name, make in instead.items()}})
 
     def do(self, fault: str) -> str:
-        """Break in a call."""
+        """Fail in a call."""
         FAULTS[fault]()
         return f"{self.env_id} did {fault}"
 
     def arm(self, place: str, fault: str) -> None:
-        """Break later, at `place`."""
+        """Fail later, at `place`."""
         self._faults[place] = fault
 
     def step_takes(self, seconds: float) -> None:
-        """Be slow, and all right."""
+        """Make steps slow, but otherwise normal."""
         self._seconds = seconds
 
     def answer_with(self, **instead: Callable[[], Any]) -> None:
-        """At the next step, answer with what these make in place of the fields of that name."""
+        """Replace fields of the next step's result by the values of these functions."""
         self._instead = instead
 
     def returns(self, make: Callable[[], Any]) -> Any:
-        """What `make`, called here, returns."""
+        """Call `make` here and return its value."""
         return make()
 
     def on_disconnect(self) -> None:

@@ -1,4 +1,4 @@
-"""Hangs whoever imports it."""
+"""A module whose import hangs."""
 
 import sys
 import threading

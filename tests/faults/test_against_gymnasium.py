@@ -1,6 +1,6 @@
-"""The same faults in Gymnasium's AsyncVectorEnv and here, told apart by what callers get.
+"""The same faults in Gymnasium's AsyncVectorEnv and in this package, compared by results.
 
-Gymnasium's side is asserted, too: once it does better, the README has to say so.
+Gymnasium's side is asserted, too: if it improves, the README must change.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ SCRIPT = Path(__file__).parents[2] / "benchmarks" / "differences.py"
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """What the script saw, by situation and library."""
+    """Return the script's findings by situation and library."""
     out = tmp_path_factory.mktemp("differences") / "found.json"
     run = subprocess.run(
         [sys.executable, SCRIPT, "--json", out],
@@ -33,7 +33,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 def test_late_step_is_not_taken_for_the_next_one(found: dict[str, Any]) -> None:
-    """After a timeout Gymnasium answers the second step with the first one's results."""
+    """After a timeout, Gymnasium answers the second step with the results of the first."""
     theirs, ours = found["a step that comes late"].values()
     assert theirs["raised"].startswith("TimeoutError")
     assert (theirs["asked"], theirs["answered"]) == (2.0, [1.0, 1.0])
@@ -43,7 +43,7 @@ def test_late_step_is_not_taken_for_the_next_one(found: dict[str, Any]) -> None:
 
 
 def test_killed_worker_is_named_with_its_cause_and_replaced(found: dict[str, Any]) -> None:
-    """Gymnasium says neither who nor why, and takes no further step."""
+    """Gymnasium reports neither env nor cause, and can't step any more."""
     theirs, ours = found["a killed worker"].values()
     assert theirs["raised"].split(":")[0] in {"EOFError", "ConnectionResetError"}
     assert "SIGKILL" not in theirs["raised"]
@@ -53,8 +53,8 @@ def test_killed_worker_is_named_with_its_cause_and_replaced(found: dict[str, Any
     assert ours["afterwards"] == "answers [2.0, 2.0]"
 
 
-def test_error_that_cant_be_rebuilt_arrives_whole(found: dict[str, Any]) -> None:
-    """Gymnasium raises what came of rebuilding it; the environment's own words are lost."""
+def test_error_that_cant_be_rebuilt_arrives_complete(found: dict[str, Any]) -> None:
+    """Gymnasium raises the error of rebuilding it, and the original text is lost."""
     theirs, ours = found["an error that can't be rebuilt"].values()
     assert theirs["raised"].startswith("TypeError: OddError.__init__()")
     assert theirs["afterwards"].startswith("AlreadyPendingCallError")

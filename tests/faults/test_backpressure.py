@@ -1,4 +1,4 @@
-"""Who is slow to read or stopped for a while holds up nobody else, and loses nothing."""
+"""A process that reads slowly or is stopped delays no other, and loses nothing."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ if TYPE_CHECKING:
     Start: TypeAlias = Callable[..., Driven]
 
 MEGABYTES = 8 * 2**20
-"""More than any pipe or socket buffers."""
+"""More bytes than any pipe or socket buffers."""
 
 
 def unpacked(response: Any) -> Any:
-    """The action of a response that brings a large array along."""
+    """Return the action of a response that has a large array as an extra."""
     assert response.cargo.sum() == MEGABYTES
     return response.action
 
 
 def loaded(batch: Any) -> Any:
-    """`batch`, with megabytes for each env."""
+    """Return `batch` with megabytes of extras for each env."""
     for response in batch.values():
         response.cargo = np.ones(MEGABYTES, np.uint8)
     return batch
 
 
 def test_worker_that_is_stopped_for_a_while_loses_nothing(start: Start) -> None:
-    """What it was asked before, meanwhile and after is all answered, each by its own reply."""
+    """Requests before, during and after the stop each get their own reply."""
     group, tokens = start(two_workers()), Tokens()
     pid = pid_of(group, "faulty-0")
     for _ in range(20):
@@ -57,7 +57,7 @@ def test_worker_that_is_stopped_for_a_while_loses_nothing(start: Start) -> None:
 
 
 def test_megabytes_for_a_stopped_worker_do_not_block_the_trainer(start: Start) -> None:
-    """They wait until it reads; meanwhile the other worker is asked and answers."""
+    """They wait until the worker reads; meanwhile the other worker replies."""
     group, tokens = start(two_workers(), preprocess_fn=unpacked), Tokens()
     pid = pid_of(group, "faulty-0")
     stop(pid)
@@ -73,8 +73,8 @@ def test_megabytes_for_a_stopped_worker_do_not_block_the_trainer(start: Start) -
     tokens.check(batch)
 
 
-def test_megabytes_for_a_worker_that_dies_go_with_it(start: Start) -> None:
-    """Its replacement is not handed the rest of what the dead one was being sent."""
+def test_megabytes_for_a_worker_that_dies_are_dropped(start: Start) -> None:
+    """The rest is not sent to its replacement."""
     group, tokens = start(two_workers(), preprocess_fn=unpacked), Tokens()
     pid = pid_of(group, "faulty-0")
     stop(pid)
@@ -86,13 +86,13 @@ def test_megabytes_for_a_worker_that_dies_go_with_it(start: Start) -> None:
 
 
 def test_megabytes_for_a_trainer_that_is_busy_wait_in_the_worker(start: Start) -> None:
-    """Every env has more to tell than the channel takes; all of it arrives when it is read."""
+    """Every env sends more than the channel takes; all of it arrives when the trainer reads."""
     group, tokens = start(two_workers()), Tokens()
     for env_id in group.group.env_ids:
         group.call(env_id, "answer_with", info=lambda: {"cargo": np.ones(MEGABYTES, np.uint8)})
     group.step_async(tokens.steps(group.group.env_ids))
     for host in group.group._core.supervisor.hosts:
-        # The first reply of each has begun to fill its channel, which nobody reads yet.
+        # The first reply of each worker has begun to fill its channel, which is not read yet.
         assert select.select([host._link.fileno()], [], [], HANG)[0]
     batch, _ = group.collect_async(wait_all=True)
     assert len(batch) == 4
@@ -101,8 +101,8 @@ def test_megabytes_for_a_trainer_that_is_busy_wait_in_the_worker(start: Start) -
     tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
-def test_stderr_that_nobody_reads_hides_no_death() -> None:
-    """The env that prints into it waits; deaths are noticed; and nothing printed is lost."""
+def test_an_unread_stderr_hides_no_death() -> None:
+    """An env that prints to it waits; deaths are noticed; no output is lost."""
     script = """
         import logging
         logging.disable()

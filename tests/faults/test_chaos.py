@@ -1,4 +1,4 @@
-"""Random faults under load, counted: the short form of a benchmark that anyone can run."""
+"""Random faults under load: the short form of `benchmarks/chaos.py`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 
 
 def report_of(script: str, folder: Path, *arguments: str) -> dict[str, Any]:
-    """What a script that ends well has to report."""
+    """Return the report of a script, which must end well."""
     out = folder / "report.json"
     run = subprocess.run(
         [sys.executable, BENCHMARKS / script, *arguments, "--json", out],
@@ -27,8 +27,10 @@ def report_of(script: str, folder: Path, *arguments: str) -> dict[str, Any]:
     return json.loads(out.read_text())
 
 
-def test_every_request_ends_once_and_truly_whatever_breaks(tmp_path: Path) -> None:
-    """Twenty random faults: no request is lost or answered twice, or with another's data."""
+def test_every_request_ends_once_with_its_own_data(tmp_path: Path) -> None:
+    """With twenty random faults, no request is lost, answered twice, or answered with
+    other data.
+    """
     report = report_of("chaos.py", tmp_path, "--faults", "20")
     assert report["faults"] == dict.fromkeys(("killed", "stopped", "hung", "raised", "exited"), 4)
     assert sum(report["ends"].values()) == sum(report["requests"].values()) > 20
@@ -38,10 +40,10 @@ def test_every_request_ends_once_and_truly_whatever_breaks(tmp_path: Path) -> No
     assert not report["leaks"]
 
 
-def test_groups_side_by_side_keep_their_promises_through_every_kind_of_fault(
+def test_parallel_groups_survive_every_kind_of_fault(
     tmp_path: Path,
 ) -> None:
-    """Sixty faults against three groups, each on a driver of its own, and their clients."""
+    """Sixty faults in three groups, each with its own driver, and in their clients."""
     report = report_of("chaos.py", tmp_path, "--groups", "3", "--faults", "60")
     assert sum(report["faults"].values()) >= 60
     assert sum(report["ends"].values()) == sum(report["requests"].values()) > 60

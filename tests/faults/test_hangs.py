@@ -1,4 +1,4 @@
-"""An env that hangs is found, shows its stack, is killed and replaced; nobody is misled after."""
+"""An env that hangs is found, its stack is shown, and it is killed and replaced."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from patience import HANG
 import rlightning_aio
 from rlightning_aio import registry
 from rlightning_aio.errors import EnvHung, NothingPending, StartFailed, WorkerDied
-from rlightning_aio.group import supervisor
+from rlightning_aio.group import hang_detector
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     Start: TypeAlias = Callable[..., Driven]
 
 LIMIT = 1.0
-"""Seconds; long enough for whoever doesn't hang, on a machine that is busy."""
+"""Seconds; long enough for a worker that doesn't hang, even on a busy machine."""
 
 STACKS = {
     "sleep": "in <lambda>",
@@ -48,13 +48,13 @@ STACKS = {
 
 
 def any_killed(group: Any) -> bool:
-    """Whether a worker was, or is to be once it has written its stacks."""
+    """Return True if a worker was killed, or will be once it has written its stacks."""
     return any(record.dying or record.restarts for record in group._core.supervisor._records)
 
 
 @kinds_on_both_drivers("hangs", STACKS)
 def test_hung_step_raises_with_the_stack_of_the_worker(start: Start, hangs: list[str]) -> None:
-    """What held it is in the error, though it held the interpreter's lock and never returned."""
+    """Even if the step holds the interpreter's lock and never returns."""
     ends = {"step_timeout": LIMIT, "on_worker_death": "raise"}
     group, tokens = start(entry(1 + len(hangs), envs_per_process=1, **ends)), Tokens()
     alive = list(group.group.env_ids)
@@ -76,7 +76,7 @@ def test_hung_step_raises_with_the_stack_of_the_worker(start: Start, hangs: list
 
 @kinds_on_both_drivers("hangs", [*STACKS, "stop"])
 def test_hung_step_is_answered_by_its_replacement(start: Start, hangs: list[str]) -> None:
-    """One marked result each for who owed one; then every env answers what it is asked."""
+    """Each env that owed a reply gets one marked result; then every env replies again."""
     group, tokens = start(two_workers(step_timeout=LIMIT)), Tokens()
     for hang in hangs:
         batch, _ = group.step(tokens.steps(group.group.env_ids, {"faulty-1": hang}))
@@ -91,7 +91,7 @@ def test_hung_step_is_answered_by_its_replacement(start: Start, hangs: list[str]
 
 
 def test_hung_reset_is_found_by_its_own_limit(start: Start) -> None:
-    """A step may take as long as it likes where only resets are limited."""
+    """Steps have no limit if only resets have one."""
     group, tokens = start(two_workers(reset_timeout=LIMIT)), Tokens()
     group.call("faulty-3", "arm", "resetting", "deadlock")
     group.step_async(tokens.steps(["faulty-0"]))
@@ -103,7 +103,7 @@ def test_hung_reset_is_found_by_its_own_limit(start: Start) -> None:
 
 @on_one_driver
 def test_hung_reset_with_options_is_found(start: Start) -> None:
-    """It went through the channel and not through the ring."""
+    """Its request went through the channel, not through the ring."""
     group = start(entry(1, reset_timeout=LIMIT))
     batch, _ = group.reset(options={"fault": "sleep"})
     assert marked(batch["faulty-0"])
@@ -111,7 +111,7 @@ def test_hung_reset_with_options_is_found(start: Start) -> None:
 
 @on_one_driver
 def test_reset_that_hangs_after_a_step_without_limit_is_found(start: Start) -> None:
-    """The worker was looked at while it did something that may take for ever."""
+    """The worker was checked while it executed a request without a limit."""
     group, tokens = start(entry(2, reset_timeout=LIMIT)), Tokens()
     group.call("faulty-1", "arm", "resetting", "sleep")
     group.call("faulty-0", "step_takes", 2 * LIMIT)
@@ -122,7 +122,7 @@ def test_reset_that_hangs_after_a_step_without_limit_is_found(start: Start) -> N
 
 
 def test_worker_that_is_stopped_before_it_is_asked_is_found(start: Start) -> None:
-    """It executes nothing, so nothing takes too long; yet its env has been asked and is late."""
+    """It executes nothing, so no request takes too long; yet its env owes a reply."""
     group, tokens = start(two_workers(step_timeout=LIMIT)), Tokens()
     stop(pid_of(group, "faulty-0"))
     batch, _ = group.step(tokens.steps(group.group.env_ids))
@@ -132,8 +132,8 @@ def test_worker_that_is_stopped_before_it_is_asked_is_found(start: Start) -> Non
 def test_hang_is_ended_though_the_fork_server_has_hung_as_well(
     start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It would kill the worker, and can't; so it goes with all of its workers."""
-    monkeypatch.setattr(supervisor, "_OBEY_SECONDS", LIMIT)
+    """The fork server can't kill the worker, so it is killed with all of its workers."""
+    monkeypatch.setattr(hang_detector, "_OBEY_SECONDS", LIMIT)
     group, tokens = start(two_workers(step_timeout=LIMIT)), Tokens()
     stop(pid_of(group, "faulty-0"))
     stop(fork_server_of(group.group)._process.pid)
@@ -147,7 +147,7 @@ def test_hang_is_ended_though_the_fork_server_has_hung_as_well(
 
 
 def test_hang_is_found_while_others_leave_the_trainer_no_time_to_wait(start: Start) -> None:
-    """Collecting what is always ready must not hide what never comes."""
+    """Results that are always ready must not hide one that never comes."""
     group, tokens = start(two_workers(step_timeout=LIMIT)), Tokens()
     group.step_async(tokens.steps(["faulty-0"], {"faulty-0": "sleep"}))
     until = time.monotonic() + HANG
@@ -155,14 +155,14 @@ def test_hang_is_found_while_others_leave_the_trainer_no_time_to_wait(start: Sta
     while "faulty-0" not in found and time.monotonic() < until:
         group.step_async(tokens.steps(["faulty-2", "faulty-3"]))
         while group.group._core.requests.in_flight[1]:
-            group.group._core._waiting.poll()  # So that the collect finds all it wants.
+            group.group._core._waiting.poll()  # With this, the collect finds enough results.
         batch, _ = group.collect_async(min_results=2)
         found = dict(batch.items())
     assert marked(found["faulty-0"])
 
 
-def test_trainer_that_comes_late_takes_nobody_for_hung(start: Start) -> None:
-    """Time that the trainer spends elsewhere isn't the env's."""
+def test_a_late_trainer_takes_no_worker_for_hung(start: Start) -> None:
+    """Time that the trainer spends elsewhere doesn't count for the env."""
     group, tokens = start(two_workers(step_timeout=LIMIT)), Tokens()
     for _ in range(2):
         group.step_async(tokens.steps(group.group.env_ids))
@@ -173,19 +173,19 @@ def test_trainer_that_comes_late_takes_nobody_for_hung(start: Start) -> None:
         tokens.check(batch)
 
 
-def test_trainer_that_comes_late_for_megabytes_takes_nobody_for_hung(start: Start) -> None:
-    """A worker can't go on before it is read; that time isn't the env's, either."""
+def test_a_trainer_that_reads_megabytes_late_takes_no_worker_for_hung(start: Start) -> None:
+    """A worker can't continue before its reply is read; that time doesn't count, either."""
     group, tokens = start(two_workers(step_timeout=LIMIT)), Tokens()
     pids = [pid_of(group, env_id) for env_id in ("faulty-0", "faulty-2")]
     for env_id in group.group.env_ids:
         group.call(env_id, "answer_with", info=lambda: {"cargo": np.ones(2**23, np.uint8)})
     group.step_async(tokens.steps(group.group.env_ids))
     for host in group.group._core.supervisor.hosts:
-        # Its first reply has begun to fill its channel.
+        # The worker's first reply has begun to fill its channel.
         assert select.select([host._link.fileno()], [], [], HANG)[0]
     threading.Event().wait(2 * LIMIT)  # The trainer has other things to do.
     for pid in pids:
-        stop(pid)  # It needs a moment to go on.
+        stop(pid)  # The worker needs a moment to continue.
     with pytest.raises(TimeoutError):
         group.collect_async(deadline=0.05)
     assert not any_killed(group.group)
@@ -197,13 +197,13 @@ def test_trainer_that_comes_late_for_megabytes_takes_nobody_for_hung(start: Star
     tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
-async def test_reply_that_lies_there_while_the_loop_is_busy_is_no_hang() -> None:
-    """The worker was last seen doing nothing, before it was awake, and has answered since."""
+async def test_an_unread_reply_while_the_loop_is_busy_is_no_hang() -> None:
+    """The worker was idle at the last check, and has replied since."""
     tokens = Tokens()
     async with rlightning_aio.build_env_group(entry(1, step_timeout=LIMIT)) as group:
         batch, _ = await group.reset()
         pid = int(batch["faulty-0"].observation[1])
-        # No row holds a word, so the reply comes by the channel.
+        # Text doesn't fit in a row, so the reply comes through the channel.
         await group["faulty-0"].call("answer_with", info=lambda: {"word": "late"})
         (host,) = group._core.supervisor.hosts
         while host.executing()[0]:
@@ -222,7 +222,7 @@ async def test_reply_that_lies_there_while_the_loop_is_busy_is_no_hang() -> None
 
 @pytest.mark.parametrize("stopped", [False, True])
 def test_worker_that_hangs_or_stops_behind_megabytes_is_found(start: Start, stopped: bool) -> None:
-    """The trainer waits and reads; when there is nothing more to read, the time goes on."""
+    """The trainer waits and reads; once there is nothing to read, the time runs on."""
     group, tokens = start(two_workers(step_timeout=LIMIT)), Tokens()
     pid = pid_of(group, "faulty-0")
     group.call("faulty-0", "answer_with", info=lambda: {"cargo": np.ones(2**23, np.uint8)})
@@ -240,7 +240,7 @@ def test_worker_that_hangs_or_stops_behind_megabytes_is_found(start: Start, stop
 
 
 def test_start_that_hangs_fails_with_the_stack(build: Start) -> None:
-    """`init` says which limit was exceeded and where the constructor stands."""
+    """`init` reports the limit and the position in the constructor."""
     kwargs = {"faults": {"building": "deadlock"}, "only": 3}
     group = build(two_workers(env_kwargs=kwargs, start_timeout=10))
     with pytest.raises(StartFailed, match=r"faulty-3.*did not start within 10") as caught:
@@ -249,10 +249,10 @@ def test_start_that_hangs_fails_with_the_stack(build: Start) -> None:
 
 
 @on_one_driver
-def test_fork_server_that_hangs_in_an_import_fails_the_start(
+def test_a_fork_server_that_hangs_in_an_import_fails_the_start(
     build: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It obeys nobody while it imports; so it is killed, and the error names the modules."""
+    """It reads no messages while it imports, so it is killed; the error names the modules."""
     backend = registry.Backend(
         "faulty", "faults.faulty:FaultyEnv", "faults", "faults", preload=("faults.hanging_import",)
     )
@@ -266,7 +266,7 @@ def test_fork_server_that_hangs_in_an_import_fails_the_start(
 def test_replacement_that_hangs_is_replaced_until_there_are_too_many(
     start: Start, tmp_path: Path
 ) -> None:
-    """`start_timeout` holds for restarts as well."""
+    """`start_timeout` also applies to restarts."""
     broken = tmp_path / "broken"
     kwargs = {"faults": {"building": "sleep"}, "while_exists": str(broken)}
     config = two_workers(env_kwargs=kwargs, max_restarts=1)
@@ -281,10 +281,8 @@ def test_replacement_that_hangs_is_replaced_until_there_are_too_many(
 
 
 @on_one_driver
-def test_replacement_that_hangs_is_found_though_nobody_was_waiting_for_it(
-    start: Start, tmp_path: Path
-) -> None:
-    """The worker died idle, so the first to ask was a plain reset."""
+def test_a_replacement_that_hangs_is_found_without_any_wait(start: Start, tmp_path: Path) -> None:
+    """The worker died idle, so the first request was a plain reset."""
     broken = tmp_path / "broken"
     kwargs = {"faults": {"building": "sleep"}, "while_exists": str(broken)}
     group = start(two_workers(env_kwargs=kwargs, max_restarts=1))
@@ -293,14 +291,14 @@ def test_replacement_that_hangs_is_found_though_nobody_was_waiting_for_it(
         member.config = member.config.model_copy(update={"start_timeout": LIMIT})
     broken.touch()
     os.kill(pid_of(group, "faulty-0"), signal.SIGKILL)
-    while not group.group._core.supervisor.recovering:
+    while not group.group._core.supervisor.any_deaths:
         group.step(tokens.steps(["faulty-2"]))
     with pytest.raises(WorkerDied, match="did not start again"):
         group.reset()
 
 
 def test_after_a_missed_deadline_the_next_results_are_right(start: Start) -> None:
-    """Nothing is lost, nothing comes twice, nothing answers another request."""
+    """Nothing is lost, doubled, or mixed up with another request."""
     group, tokens = start(two_workers(step_timeout=60)), Tokens()
     pid = pid_of(group, "faulty-0")
     waits: list[dict[str, Any]] = [{}, {"wait_all": True}, {"timeout": 5}, {"min_results": 2}]
@@ -324,7 +322,7 @@ def test_after_a_missed_deadline_the_next_results_are_right(start: Start) -> Non
 
 
 async def test_cancelled_step_leaves_its_results_to_collect() -> None:
-    """After a cancellation the next results are right, whoever gets them."""
+    """After a cancellation, the next results are right, in any call."""
     tokens = Tokens()
     async with rlightning_aio.build_env_group(two_workers()) as group:
         batch, _ = await group.reset()
@@ -341,7 +339,7 @@ async def test_cancelled_step_leaves_its_results_to_collect() -> None:
             tokens.check((await group.step(tokens.steps(group.env_ids)))[0])
 
 
-async def test_cancelled_call_answers_nobody_else() -> None:
+async def test_cancelled_call_answers_no_other_request() -> None:
     """Its late value is dropped, and the env's next request gets its own reply."""
     tokens = Tokens()
     async with rlightning_aio.build_env_group(two_workers()) as group:
@@ -353,13 +351,13 @@ async def test_cancelled_call_answers_nobody_else() -> None:
         os.kill(pid, signal.SIGCONT)
         with pytest.raises(NothingPending):
             await group.collect_async()
-        # The worker answers in order: once the other env has, the call is over.
+        # The worker replies in order: once the other env has replied, the call is over.
         assert await group["faulty-1"].call("returns", os.getpid) == pid
         tokens.check((await group.step(tokens.steps(group.env_ids)))[0])
 
 
 async def test_cancelled_collect_loses_nothing() -> None:
-    """Whatever it would have returned is there for the next one."""
+    """The next collect returns everything."""
     tokens = Tokens()
     async with rlightning_aio.build_env_group(two_workers()) as group:
         batch, _ = await group.reset()
@@ -377,8 +375,8 @@ async def test_cancelled_collect_loses_nothing() -> None:
 
 @on_one_driver
 def test_signals_that_the_trainer_blocks_reach_its_workers(build: Start) -> None:
-    """Whatever the thread that starts them keeps from itself: deaths are heard of at once, hangs
-    show their stacks, and SIGTERM ends a worker.
+    """Whatever the starting thread blocks: deaths are noticed at once, hangs show their stacks, and
+    SIGTERM ends a worker.
     """
     every = signal.valid_signals() - {signal.SIGINT, signal.SIGALRM}
     before = signal.pthread_sigmask(signal.SIG_BLOCK, every)

@@ -1,4 +1,4 @@
-"""Inline envs share the trainer's process: what they raise is told, what interrupts them too."""
+"""Inline envs share the trainer's process: their errors are reported, and so are interrupts."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import pytest
 from faults.driven import Driven, Tokens, entry
-from faults.test_env_errors import RAISED, check_told
+from faults.test_env_errors import RAISED, check_error
 
 from rlightning_aio.errors import EnvRaised
 
@@ -17,24 +17,24 @@ if TYPE_CHECKING:
     Start: TypeAlias = Callable[..., Driven]
 
 
-def test_whatever_an_inline_env_raises_is_told_and_it_goes_on(start: Start) -> None:
-    """As if it were elsewhere, the end of the program included."""
+def test_an_error_of_an_inline_env_is_reported_and_it_stays_usable(start: Start) -> None:
+    """As in a worker, SystemExit included."""
     group, tokens = start(entry(2, placement="inline")), Tokens()
     for name in RAISED:
         if name in ("interrupt", "keyboard interrupt"):
             continue
         with pytest.raises(EnvRaised) as caught:
             group.step(tokens.steps(group.group.env_ids, {"faulty-1": name}))
-        check_told(caught.value, name, "step")
+        check_error(caught.value, name, "step")
         with pytest.raises(EnvRaised) as caught:
             group.call("faulty-1", "do", name)
-        check_told(caught.value, name, "the call of do()")
+        check_error(caught.value, name, "the call of do()")
         group.reset(env_ids=["faulty-1"])
         tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
 
 
 def test_interrupt_in_an_inline_step_comes_out_and_ends_its_request() -> None:
-    """Ctrl-C is the program's; the env that it struck has an error to tell, the others results."""
+    """Ctrl-C reaches the program; the interrupted env has an error, the others have results."""
     group, tokens = Driven("sync", entry(3, placement="inline")), Tokens()
     group.init()
     group.reset()

@@ -1,4 +1,4 @@
-"""Ctrl-C in the middle of what the trainer itself does for a synchronous step."""
+"""Ctrl-C in the middle of the trainer's own work for a synchronous step."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ENTRY = {
 
 
 class Strike:
-    """A trace function that interrupts the n-th line of the library's."""
+    """A trace function that raises an interrupt at the n-th line of this library."""
 
     def __init__(self, line: int) -> None:
         self.left = line
@@ -39,10 +39,10 @@ class Strike:
         return self._line
 
 
-# A step runs through some 500 lines; these are a sample, the last of which come after its end.
+# A step executes some 500 lines; these are a sample, and the last ones come after its end.
 @pytest.mark.parametrize("line", range(1, 800, 113))
 def test_a_group_can_be_closed_wherever_its_step_was_interrupted(line: int) -> None:
-    """And the interrupt reaches the program as what it is. (No worker is left: see conftest.)"""
+    """The interrupt reaches the program unchanged; the fixtures check that no worker is left."""
     strike = Strike(line)
     interrupted = False
     with rlightning_aio.sync.build_env_group(ENTRY) as group:

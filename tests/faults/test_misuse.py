@@ -1,4 +1,4 @@
-"""A wrong request is refused by name before anything of it is sent."""
+"""An invalid request is refused with a reason before any part of it is sent."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     Start: TypeAlias = Callable[..., Driven]
 
-# For each what the four actions are, and what the message must say. Envs take Box(2, float64).
+# For each, the four actions and the message. The action space is Box(2, float64).
 BAD_ACTIONS: dict[str, tuple[Any, str]] = {
     "shape": (np.zeros((4, 3)), r"expected shape \(4, 2\) .* found shape \(4, 3\)"),
     "shape of each": (np.zeros((4, 2, 1)), r"expected shape \(4, 2\) .* found shape \(4, 2, 1\)"),
@@ -45,14 +45,14 @@ BAD_ACTIONS: dict[str, tuple[Any, str]] = {
 
 
 def responses(env_ids: list[str], chosen: Any) -> BatchedData:
-    """The same actions as separate values."""
+    """Return the same actions as separate responses."""
     values = [PolicyResponse(id_, action) for id_, action in zip(env_ids, chosen, strict=True)]
     return BatchedData(env_ids, values)
 
 
 @on_one_driver
 def test_bad_actions_are_refused_and_nothing_is_sent(start: Start) -> None:
-    """As columns and as values, waited for or not; the next request is answered rightly."""
+    """As columns and as responses, synchronous or not; the next request is answered correctly."""
     group, tokens = start(two_workers()), Tokens()
     env_ids = group.group.env_ids
     first, _ = group.step(tokens.steps(env_ids))
@@ -68,7 +68,7 @@ def test_bad_actions_are_refused_and_nothing_is_sent(start: Start) -> None:
 
 @on_one_driver
 def test_one_bad_action_of_many_is_named(start: Start) -> None:
-    """The message is about the env whose action is wrong, and no other env has stepped."""
+    """The message names the env of the wrong action, and no other env has stepped."""
     group, tokens = start(two_workers()), Tokens()
     batch = tokens.steps(group.group.env_ids)
     batch.values()[2].action = np.zeros(7)
@@ -81,7 +81,7 @@ def test_one_bad_action_of_many_is_named(start: Start) -> None:
 
 @on_one_driver
 def test_responses_must_be_as_many_as_the_batch(start: Start) -> None:
-    """A column of another length is refused where it is given."""
+    """A column of another length is refused where it is attached."""
     group, tokens = start(two_workers()), Tokens()
     batch, _ = group.step(tokens.steps(group.group.env_ids))
     for count in (0, 3, 5):
@@ -93,8 +93,8 @@ def test_responses_must_be_as_many_as_the_batch(start: Start) -> None:
 
 
 @on_one_driver
-def test_what_is_no_batch_of_responses_is_refused(start: Start) -> None:
-    """It is said what to give; and a handle takes no response to another env."""
+def test_values_that_are_no_batch_of_responses_are_refused(start: Start) -> None:
+    """The error says what to pass; a handle refuses responses to other envs."""
     group, tokens = start(two_workers()), Tokens()
     for ask in (group.step, group.step_async):
         for odd in (np.zeros((4, 2)), None, [PolicyResponse("faulty-0", np.zeros(2))]):
@@ -108,8 +108,8 @@ def test_what_is_no_batch_of_responses_is_refused(start: Start) -> None:
 
 
 @on_one_driver
-def test_unknown_and_doubled_ids_are_named(start: Start) -> None:
-    """Whichever call they are given to, nothing of it is sent."""
+def test_unknown_and_repeated_ids_are_named(start: Start) -> None:
+    """In every call; nothing is sent."""
     group, tokens = start(two_workers()), Tokens()
     for ids, error, message in (
         (["faulty-0", "faulty-9"], UnknownEnv, "'faulty-9'; its envs are faulty-0, faulty-1"),
@@ -130,7 +130,7 @@ def test_unknown_and_doubled_ids_are_named(start: Start) -> None:
 
 
 def test_busy_env_refuses_the_whole_batch(start: Start) -> None:
-    """All or nothing: the other envs of the batch are not asked either."""
+    """The other envs of the batch get no request, either."""
     group, tokens = start(two_workers()), Tokens()
     group.step_async(tokens.steps(["faulty-1"]))
     everyone = responses(group.group.env_ids, np.zeros((4, 2)))
@@ -150,7 +150,7 @@ def test_busy_env_refuses_the_whole_batch(start: Start) -> None:
 
 
 @on_one_driver
-def test_what_can_not_be_sent_is_refused_before_anything_is(start: Start) -> None:
+def test_values_that_cannot_be_sent_are_refused_first(start: Start) -> None:
     """An argument of a call, options of a reset, an extra of one response among many."""
     group, tokens = start(two_workers(), preprocess_fn=lambda response: response.action), Tokens()
     lock = threading.Lock()
@@ -178,8 +178,8 @@ USES: dict[str, Callable[[Any], Any]] = {
 }
 
 
-def test_use_before_init_and_after_close_says_so(build: Start) -> None:
-    """Neither hangs, and each says what to do instead."""
+def test_use_before_init_and_after_close_is_refused(build: Start) -> None:
+    """It doesn't hang, and the error says what to do."""
     group = build(entry())
     for use in USES.values():
         with pytest.raises(GroupClosed, match="call init"):
@@ -193,19 +193,19 @@ def test_use_before_init_and_after_close_says_so(build: Start) -> None:
         group.init()
 
 
-async def test_second_collector_is_refused_and_the_first_goes_on() -> None:
-    """One at a time: two would take each other's results."""
+async def test_second_collect_is_refused_and_the_first_continues() -> None:
+    """Two would take each other's results."""
     tokens = Tokens()
     async with rlightning_aio.build_env_group(two_workers()) as group:
         await group.reset()
-        # Workers that are stopped keep the first collector waiting.
+        # Stopped workers keep the first collect waiting.
         pids = [host.pid for host in group._core.supervisor.hosts]
         for pid in pids:
             stop(pid)
         try:
             group.step_async(tokens.steps(group.env_ids))
             first = asyncio.ensure_future(group.collect_async(wait_all=True))
-            await asyncio.sleep(0)  # It has begun to wait.
+            await asyncio.sleep(0)  # The first collect has begun to wait.
             with pytest.raises(RLightningError, match="one collector at a time"):
                 await group.collect_async()
         finally:
@@ -216,8 +216,8 @@ async def test_second_collector_is_refused_and_the_first_goes_on() -> None:
         assert len(batch) == 4
 
 
-async def test_many_callers_at_once_each_get_their_own() -> None:
-    """Steps, calls and one collector side by side; no reply strays."""
+async def test_many_calls_at_once_each_get_their_own_replies() -> None:
+    """Steps, calls and one collect in parallel; no reply is mixed up."""
 
     async def drive(group: EnvGroup, env_id: str) -> None:
         tokens = Tokens()

@@ -1,4 +1,4 @@
-"""``on_worker_death: resume``: a replaced worker's envs go on from where they were kept last."""
+"""``on_worker_death: resume``: envs of a replaced worker continue from their last checkpoint."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class Walk(gym.Env[Any, Any]):
-    """A walk that draws at every step: what it returns depends on all that came before."""
+    """A random walk: each value depends on all previous ones."""
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
     action_space = gym.spaces.Discrete(2)
@@ -56,12 +56,12 @@ ENTRY: dict[str, Any] = {
 
 
 def actions(observation: Any) -> list[int]:
-    """A policy: what it does depends on what it sees, and so on nothing that was lost."""
+    """Return actions that depend only on observations, so they don't depend on lost steps."""
     return [int(own[1] * 1000) % 2 for own in observation]
 
 
 class Episodes:
-    """Steps a group to so many episodes of each env, and notes how these ended."""
+    """Steps a group for a number of episodes of each env, and records their ends."""
 
     def __init__(self, group: Any) -> None:
         self.group = group
@@ -72,7 +72,7 @@ class Episodes:
         self.batch, _ = group.reset(seed=3)
 
     def run(self, num_episodes: int, strike: Callable[[], bool] = lambda: False) -> None:
-        """Until each env has ended so many, and nobody strikes any more."""
+        """Step until each env has ended that often and no kill is pending."""
         with self.group.auto_reset(100):
             while strike() or min(map(len, self.ended.values())) < num_episodes:
                 request = self.batch.respond(action=actions(self.batch.observation))
@@ -86,7 +86,7 @@ class Episodes:
 
 
 def with_deaths(start: Start, num_episodes: int, num_deaths: int) -> Episodes:
-    """Episodes under deaths of one of the workers, at random turns."""
+    """Return the episodes of a run in which one of the workers is killed at random turns."""
     draw = np.random.default_rng(1)
     group = start(ENTRY)
     hosts = group.group._core.supervisor.hosts
@@ -99,7 +99,7 @@ def with_deaths(start: Start, num_episodes: int, num_deaths: int) -> Episodes:
         if left and draw.random() < 0.15 and pid is not None:
             kill(pid)
             left -= 1
-        return before > 0  # One more step after the last death: it has to be heard of.
+        return before > 0  # One more step after the last death, which reports it.
 
     episodes = Episodes(group)
     episodes.run(num_episodes, strike)
@@ -108,11 +108,11 @@ def with_deaths(start: Start, num_episodes: int, num_deaths: int) -> Episodes:
 
 @on_one_driver
 @pytest.mark.timeout(300 + NUM_DEATHS)
-def test_episodes_go_on_after_deaths_with_the_returns_that_they_would_have_had(
+def test_episodes_after_deaths_have_the_returns_of_a_run_without(
     start: Start,
 ) -> None:
-    """And no more steps are lost at once than the entry says. ``RLIGHTNING_AIO_DEATHS`` says how
-    many deaths there are.
+    """At most the entry's `snapshot_every` steps are lost at once. ``RLIGHTNING_AIO_DEATHS`` is the
+    number of deaths.
     """
     disturbed = with_deaths(start, 5, NUM_DEATHS)
     undisturbed = Episodes(start({**ENTRY, "on_worker_death": "restart", "snapshot_every": None}))
@@ -123,8 +123,8 @@ def test_episodes_go_on_after_deaths_with_the_returns_that_they_would_have_had(
         assert episodes == undisturbed.ended[env_id][: len(episodes)]
 
 
-def test_a_resumed_env_says_how_many_steps_it_has_lost(start: Start) -> None:
-    """It shows what it showed when it was kept: no transition, no new episode, the same info."""
+def test_a_resumed_env_reports_the_number_of_lost_steps(start: Start) -> None:
+    """Its result repeats that of the checkpoint: no transition, no new episode, the same info."""
     group = start({**ENTRY, "num_workers": 2, "on_worker_death": "resume"})
     shown = []
     with group.auto_reset(100):
@@ -148,8 +148,8 @@ def test_a_resumed_env_says_how_many_steps_it_has_lost(start: Start) -> None:
 
 
 @on_one_driver
-def test_a_step_limit_counts_the_steps_that_an_env_knows_of(start: Start) -> None:
-    """What was lost is made once more, and the limit comes as late as it would have."""
+def test_a_step_limit_does_not_count_lost_steps(start: Start) -> None:
+    """They are made again, and the limit comes after as many steps as without the death."""
     group = start({**ENTRY, "num_workers": 1, "make_env": Straight})
     batch, _ = group.reset(seed=3)
     lengths = []
@@ -164,8 +164,8 @@ def test_a_step_limit_counts_the_steps_that_an_env_knows_of(start: Start) -> Non
 
 
 @on_one_driver
-def test_wrappers_and_generators_go_on_after_a_death(start: Start) -> None:
-    """Running means are as they were, whatever was asked when the worker died."""
+def test_wrappers_and_generators_are_resumed(start: Start) -> None:
+    """Running means are restored, whatever request was in progress at the death."""
     entry = {**ENTRY, "make_env": Averaged, "num_workers": 1, "snapshot_every": 1}
     runs = []
     for deaths in ((), (4, 11, 13)):
@@ -185,8 +185,8 @@ def test_wrappers_and_generators_go_on_after_a_death(start: Start) -> None:
 
 
 @on_one_driver
-def test_an_env_that_was_put_back_resumes_there(start: Start) -> None:
-    """A worker that dies after a restore doesn't take its envs to where they were before it."""
+def test_a_restored_env_resumes_from_the_restored_state(start: Start) -> None:
+    """A death after a restore doesn't bring back the state before it."""
     group = start({**ENTRY, "num_workers": 1, "make_env": Straight, "snapshot_every": 50})
     batch, _ = group.reset(seed=3)
     for _ in range(3):
@@ -203,8 +203,8 @@ def test_an_env_that_was_put_back_resumes_there(start: Start) -> None:
 
 
 @on_one_driver
-def test_a_death_in_a_restore_takes_nobody_along(start: Start) -> None:
-    """The others are where they were before it."""
+def test_a_death_in_a_restore_does_not_affect_other_envs(start: Start) -> None:
+    """They keep their previous state."""
     group = start(
         {
             **ENTRY,
@@ -242,7 +242,7 @@ class Averaged(NormalizeObservation):
 
 
 class Deadly(Straight):
-    """Does not survive that its state is put back, once it is prepared."""
+    """Dies when its state is restored, once it is prepared."""
 
     is_prepared = False
 
@@ -259,10 +259,10 @@ class Deadly(Straight):
 
 
 @on_one_driver
-def test_an_env_that_can_not_be_kept_says_so_at_its_first_reset(
+def test_an_env_without_checkpoints_raises_at_its_first_reset(
     build: Callable[..., Driven],
 ) -> None:
-    """Not when it is too late."""
+    """Not only at the first death."""
     group = build({**ENTRY, "make_env": Locked, "num_workers": 1})
     group.init()
     with pytest.raises(EnvRaised, match=r"raised in reset: .*env\.env\.lock of env 'e-0'"):
@@ -282,11 +282,11 @@ class Locked(Straight):
         ({"placement": "inline", "envs_per_process": 1}, "no worker that could die"),
         (
             {"make_env": None, "backend": "piper", "task": "x"},
-            "can't put back what backend 'piper'",
+            "can't restore what backend 'piper'",
         ),
     ],
 )
-def test_what_can_not_be_resumed_is_refused(fields: dict[str, Any], message: str) -> None:
+def test_entries_that_cannot_be_resumed_are_refused(fields: dict[str, Any], message: str) -> None:
     """Before anything starts, with the field."""
     with pytest.raises(ConfigError, match=message):
         parse_configs({**ENTRY, **fields})

@@ -1,4 +1,4 @@
-"""What moves something real is moved by nothing but an explicit reset after a worker's death."""
+"""After a worker's death, only an explicit reset moves real hardware."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ REFUSE, DIE = 6, 7
 
 
 class Robot(BaseEnv):
-    """Counts what moves it, and dies of one action."""
+    """Counts its movements, and dies of one action."""
 
     def __init__(self, config: EnvConfig, worker_index: int = 0, preprocess_fn: Any = None) -> None:
         super().__init__(config, worker_index, preprocess_fn)
@@ -51,14 +51,14 @@ class Robot(BaseEnv):
 
 @pytest.fixture
 def robots() -> Iterator[dict[str, Any]]:
-    """The fields of an entry of two."""
+    """Return the fields of an entry of two robots."""
     ENVS.register("robot", hardware=True)(Robot)
     yield {"name": "robot", "backend": "robot", "task": "any", "num_workers": 2}
     del ENVS._classes["robot"]
 
 
 def test_a_robots_worker_is_not_replaced_by_default(robots: dict[str, Any]) -> None:
-    """The backend's registration says what it is, a built-in one's row likewise."""
+    """The registration of the backend says that it is hardware, or the row of a built-in one."""
     piper = EnvConfig(name="arm", backend="piper", task="any")
     assert (piper.on_worker_death, EnvConfig(**robots).on_worker_death) == ("raise", "raise")
     assert EnvConfig(name="e", backend="mujoco", task="any").on_worker_death == "restart"
@@ -68,7 +68,7 @@ def test_a_robots_worker_is_not_replaced_by_default(robots: dict[str, Any]) -> N
 
 
 def test_a_robot_whose_worker_was_replaced_waits_for_a_reset(robots: dict[str, Any]) -> None:
-    """Its step ends in the death's error, not in a reset, and nothing has moved it until asked."""
+    """A step raises the death's error, and nothing moves before a requested reset."""
     with sync.build_env_group({**robots, "on_worker_death": "restart"}) as group:
         batch, _ = group.reset()
         with pytest.raises(WorkerDied, match="it moves nothing until you reset it") as caught:
@@ -85,7 +85,7 @@ def test_a_robot_whose_worker_was_replaced_waits_for_a_reset(robots: dict[str, A
 
 
 def test_an_action_that_an_env_refuses_is_a_bad_action(robots: dict[str, Any]) -> None:
-    """As one that the group refuses, but for the results of the others, which have stepped."""
+    """Like one that the group refuses, except that the other envs have stepped."""
     with sync.build_env_group({**robots, "placement": "inline"}) as group:
         batch, _ = group.reset()
         with pytest.raises(BadAction, match="BadAction: beyond its limits") as caught:

@@ -1,7 +1,7 @@
-"""However a group or its trainer ends, no worker outlives it by two seconds.
+"""No worker outlives its group or its trainer by more than two seconds.
 
-What the library waits for on purpose adds up to less; how long the machine takes for the
-rest says nothing of the code. So here all that counts is that everything ends by itself.
+The waits in the library add up to less. How long the machine takes for the rest is not tested; the
+tests only check that everything ends by itself.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from patience import HANG
 
 import rlightning_aio
 from rlightning_aio.errors import GroupClosed
-from rlightning_aio.group import supervisor
+from rlightning_aio.group import shutdown
 from rlightning_aio.hosts import fork_server
 from rlightning_aio.protocol.entries import Operation, op_of
 
@@ -35,13 +35,13 @@ if TYPE_CHECKING:
     Start: TypeAlias = Callable[..., Driven]
 
 SECONDS = 2.0
-"""What the contract gives workers."""
+"""The contract's limit for workers."""
 
 
-def test_all_that_is_waited_for_on_purpose_is_less_than_two_seconds() -> None:
-    """For envs that close, for the news of a kill, and for workers whose trainer is gone."""
-    assert supervisor._CLOSE_SECONDS + supervisor._KILL_SECONDS < SECONDS
-    assert max(supervisor._END_SECONDS, fork_server._GRACE_SECONDS) < SECONDS
+def test_all_waits_in_the_library_take_less_than_two_seconds() -> None:
+    """For envs that close, for the report of a kill, and for workers whose trainer is gone."""
+    assert shutdown._CLOSE_SECONDS + shutdown._KILL_SECONDS < SECONDS
+    assert max(shutdown._END_SECONDS, fork_server._GRACE_SECONDS) < SECONDS
 
 
 SCRIPT = """
@@ -59,7 +59,7 @@ tokens = Tokens()
 
 
 def descendants(pid: int) -> set[int]:
-    """Children of a process, and theirs."""
+    """Return the children of a process, and theirs."""
     found: set[int] = set()
     with contextlib.suppress(FileNotFoundError, ProcessLookupError):
         for children in Path(f"/proc/{pid}/task").glob("*/children"):
@@ -69,17 +69,17 @@ def descendants(pid: int) -> set[int]:
 
 
 def processes_of(group: rlightning_aio.EnvGroup) -> set[int]:
-    """Its workers, and the process that forked them."""
+    """Return the group's workers and their fork server."""
     server: int = fork_server_of(group)._process.pid
     return {server} | descendants(server)
 
 
 @contextlib.contextmanager
 def watched(pids: set[int]) -> Iterator[Callable[[], None]]:
-    """A function that fails unless all of `pids` end."""
+    """Yield a function that fails unless all of `pids` end."""
     watches: dict[int, int] = {}
     for pid in pids:
-        with contextlib.suppress(ProcessLookupError):  # It has ended already.
+        with contextlib.suppress(ProcessLookupError):  # The process has ended already.
             watches[pid] = os.pidfd_open(pid)
 
     def ended() -> None:
@@ -101,7 +101,7 @@ def watched(pids: set[int]) -> Iterator[Callable[[], None]]:
 
 @contextlib.contextmanager
 def trainer(script: str, *arguments: str, **options: Any) -> Iterator[subprocess.Popen[str]]:
-    """A trainer in a process of its own."""
+    """Run a trainer in its own process."""
     process = subprocess.Popen(
         [sys.executable, "-c", SCRIPT + textwrap.dedent(script), *arguments],
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
@@ -120,7 +120,7 @@ def trainer(script: str, *arguments: str, **options: Any) -> Iterator[subprocess
 
 
 def read_until(stream: Any, text: str) -> list[str]:
-    """Lines until one holds `text`."""
+    """Return the lines up to one that contains `text`."""
     lines: list[str] = []
     for line in stream:
         lines.append(line)
@@ -137,7 +137,7 @@ MOMENTS = {
     """,
     "stepping": """
         group = build(); group.init(); group.reset()
-        group.step_async(tokens.steps(group.env_ids, {"faulty-1": "tell and sleep"}))
+        group.step_async(tokens.steps(group.env_ids, {"faulty-1": "report and sleep"}))
         group.collect_async(wait_all=True)
     """,
     "looping in C": """
@@ -147,7 +147,7 @@ MOMENTS = {
         group.collect_async(wait_all=True)
     """,
     "starting": """
-        build(env_kwargs={"faults": {"building": "tell and sleep"}, "only": 3}).init()
+        build(env_kwargs={"faults": {"building": "report and sleep"}, "only": 3}).init()
     """,
     "importing": """
         from rlightning_aio import registry
@@ -159,11 +159,11 @@ MOMENTS = {
     """,
     "closing": """
         group = build(); group.init()
-        group["faulty-2"].call("arm", "closing", "tell and sleep")
+        group["faulty-2"].call("arm", "closing", "report and sleep")
         group.close()
     """,
     "restarting": """
-        faults = {"faults": {"building": "tell and sleep"}, "while_exists": sys.argv[1]}
+        faults = {"faults": {"building": "report and sleep"}, "while_exists": sys.argv[1]}
         group = build(env_kwargs=faults); group.init(); group.reset()
         open(sys.argv[1], "w").close()
         group.step_async(tokens.steps(group.env_ids, {"faulty-1": "sigkill"}))
@@ -184,7 +184,7 @@ MOMENTS = {
 
 @pytest.mark.parametrize("moment", MOMENTS)
 def test_killed_trainer_takes_its_workers_along(moment: str, tmp_path: Path) -> None:
-    """SIGKILL gives it no chance to say anything; all notice, at whatever moment it is."""
+    """SIGKILL leaves no time for messages; all workers notice it, at every moment."""
     with trainer(MOMENTS[moment], str(tmp_path / "switch")) as process:
         assert process.stderr is not None
         assert process.stdout is not None
@@ -196,7 +196,7 @@ def test_killed_trainer_takes_its_workers_along(moment: str, tmp_path: Path) -> 
         # The others may have closed already.
         assert len(workers) in {"importing": (1,), "closing": (2, 3)}.get(moment, (3,))
         for pid in (process.pid, *workers):
-            # Of those, some may close just now.
+            # Some of these may be closing.
             with contextlib.suppress(FileNotFoundError, ProcessLookupError):
                 assert "/dev/shm/" not in Path(f"/proc/{pid}/maps").read_text()
         with watched(workers) as ended:
@@ -205,7 +205,7 @@ def test_killed_trainer_takes_its_workers_along(moment: str, tmp_path: Path) -> 
         process.stdin.close()
         last_words = process.stderr.read()
     if moment in ("idle", "with a child of its own"):
-        # A robot's safe stop: every env heard of it in time.
+        # A robot's safe stop: every env was closed in time.
         assert last_words.count("is left alone") == 4
 
 
@@ -221,8 +221,8 @@ LEFT_OPEN = {
 
 
 @pytest.mark.parametrize("end", LEFT_OPEN)
-def test_group_that_nobody_closes_is_ended_with_its_owner(end: str) -> None:
-    """No way of leaving a program leaves workers behind, nor keeps the program from ending."""
+def test_a_group_that_is_not_closed_ends_with_its_owner(end: str) -> None:
+    """However a program ends, it leaves no workers behind, and they don't keep it from ending."""
     script = f"""
         group = build(); group.init(); group.reset()
         group.step_async(tokens.steps(group.env_ids))
@@ -259,7 +259,7 @@ STREAMS = {
 def test_program_without_standard_streams_trains_like_any_other(
     streams: str, tmp_path: Path
 ) -> None:
-    """Nothing of ours lands where stderr would be, in whatever process."""
+    """No descriptor of the library takes the number of stderr, in any process."""
     script, said = tmp_path / "script.py", tmp_path / "said"
     redirected, closed = STREAMS[streams]
     script.write_text(
@@ -289,7 +289,7 @@ def test_program_without_standard_streams_trains_like_any_other(
 
 
 def test_forgotten_group_warns_and_leaves_nothing(build: Start) -> None:
-    """The collector ends what nobody can close any more."""
+    """The garbage collector ends a group without references."""
     group = build(two_workers())
     group.init()
 
@@ -304,7 +304,7 @@ def test_forgotten_group_warns_and_leaves_nothing(build: Start) -> None:
 
 
 def test_child_of_the_trainer_does_not_end_its_group() -> None:
-    """A forked child that drops its copy of the group leaves the parent's alone."""
+    """A forked child that drops its copy of the group doesn't affect the parent's."""
     script = """
         group = build(); group.init(); group.reset()
         for end in ("os._exit(0)", "sys.exit(0)", "del group; os._exit(0)"):
@@ -351,7 +351,7 @@ async def use_in_child(group):
 
 @pytest.mark.parametrize("driver", ["sync", "asyncio"])
 def test_child_of_the_trainer_can_not_use_its_group(driver: str) -> None:
-    """Calls are refused with a reason; leaving a `with` block and ending do nothing to it."""
+    """Calls are refused with a reason; leaving a `with` block and exiting have no effect on it."""
     module, wait = ("rlightning_aio.sync", "") if driver == "sync" else ("rlightning_aio", "await")
     context = "with" if driver == "sync" else "async with"
     script = f"""
@@ -393,7 +393,7 @@ def test_child_of_the_trainer_can_not_use_its_group(driver: str) -> None:
     [*(("sync", moment) for moment in ("new", "up", "busy", "ready", "dead")), ("uvloop", "busy")],
 )
 def test_close_works_at_any_moment_and_twice(build: Start, moment: str) -> None:
-    """Results that nobody has collected are gone; nothing else is left of the group."""
+    """Results that were not collected are dropped; nothing else is left of the group."""
     group, tokens = build(two_workers()), Tokens()
     if moment != "new":
         group.init()
@@ -406,24 +406,24 @@ def test_close_works_at_any_moment_and_twice(build: Start, moment: str) -> None:
         group.step_async(tokens.steps(group.group.env_ids))
     if moment == "dead":
         kill(pid_of(group, "faulty-0"))
-    # A dead worker's envs can't be closed any more, which is told.
-    told = pytest.warns(UserWarning, match="SIGKILL")
-    with told if moment == "dead" else contextlib.nullcontext():
+    # The envs of a dead worker can't be closed; a warning says so.
+    warned = pytest.warns(UserWarning, match="SIGKILL")
+    with warned if moment == "dead" else contextlib.nullcontext():
         group.close()
     for _ in range(2):
         group.close()
 
 
 def test_env_that_hangs_in_close_is_killed(start: Start) -> None:
-    """`close` waits for it no longer than for any other, and says which env would not."""
+    """`close` waits for it as long as for any other, and names the env."""
     group = start(two_workers())
     group.call("faulty-1", "arm", "closing", "deadlock")
     with pytest.warns(UserWarning, match=r"faulty-1.*did not close in time and was killed"):
         group.close()
 
 
-def test_env_that_hangs_in_a_step_does_not_hold_up_close(start: Start) -> None:
-    """Whatever its own timeout says."""
+def test_env_that_hangs_in_a_step_does_not_delay_close(start: Start) -> None:
+    """Whatever its own timeout is."""
     group, tokens = start(two_workers(step_timeout=10 * HANG)), Tokens()
     group.step_async(tokens.steps(["faulty-1"], {"faulty-1": "deadlock with the GIL"}))
     while op_of(group.group._core.supervisor.hosts[0].executing()[0]) != Operation.STEP:
@@ -432,8 +432,8 @@ def test_env_that_hangs_in_a_step_does_not_hold_up_close(start: Start) -> None:
         group.close()
 
 
-def test_stopped_fork_server_does_not_hold_up_close(start: Start) -> None:
-    """Who would kill the workers can't; so it is killed, and the kernel kills them."""
+def test_stopped_fork_server_does_not_delay_close(start: Start) -> None:
+    """It can't kill its workers, so it is killed itself, and the kernel kills them."""
     group = start(two_workers())
     server = fork_server_of(group.group)
     stop(pid_of(group, "faulty-0"))
@@ -444,7 +444,7 @@ def test_stopped_fork_server_does_not_hold_up_close(start: Start) -> None:
 
 
 async def test_close_ends_a_collect_that_waits(tmp_path: Path) -> None:
-    """The collector learns that there is nothing more to come."""
+    """The collect raises GroupClosed."""
     tokens, gate = Tokens(), tmp_path / "gate"
     os.mkfifo(gate)
     group = rlightning_aio.build_env_group(two_workers())
@@ -454,7 +454,7 @@ async def test_close_ends_a_collect_that_waits(tmp_path: Path) -> None:
     group.step_async(tokens.steps(["faulty-0"]))
     collecting = asyncio.ensure_future(group.collect_async())
     await asyncio.sleep(0)
-    with gate.open("w"):  # The env has come to it, and goes on when it is closed.
+    with gate.open("w"):  # The env waits at the gate, and continues when it is closed.
         closing = asyncio.gather(group.close(), group.close())
         await asyncio.sleep(0)
     await closing
@@ -463,7 +463,7 @@ async def test_close_ends_a_collect_that_waits(tmp_path: Path) -> None:
 
 
 async def test_cancelled_close_still_closes() -> None:
-    """Nobody is left to finish it later."""
+    """No later call would finish it."""
     group = rlightning_aio.build_env_group(two_workers())
     await group.init()
     await group["faulty-0"].call("arm", "closing", "sleep")
@@ -475,7 +475,7 @@ async def test_cancelled_close_still_closes() -> None:
 
 
 async def test_start_can_be_closed_from_another_task() -> None:
-    """Whoever starts it is told."""
+    """The call that starts it raises GroupClosed."""
     group = rlightning_aio.build_env_group(two_workers())
     starting = asyncio.ensure_future(group.init())
     await asyncio.sleep(0)
@@ -498,7 +498,7 @@ INTERRUPTED: dict[str, Callable[[Any, Tokens], Any]] = {
 
 @pytest.mark.parametrize("waiting", INTERRUPTED)
 def test_interrupted_wait_loses_nothing(waiting: str) -> None:
-    """KeyboardInterrupt comes out of the wait, and the next results are right."""
+    """The wait raises KeyboardInterrupt, and the next results are right."""
     group, tokens = Driven("sync", two_workers()), Tokens()
     group.init()
     group.reset()
@@ -508,14 +508,14 @@ def test_interrupted_wait_loses_nothing(waiting: str) -> None:
         batch, _ = group.collect_async(wait_all=True)
         assert sorted(batch.ids()) == group.group.env_ids
         tokens.check(batch)
-    group.call("faulty-0", "do", "nothing")  # The same worker: the other call is over.
+    group.call("faulty-0", "do", "nothing")  # In the same worker, so the other call is over.
     for _ in range(3):
         tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
     group.end()
 
 
 def test_replaced_workers_leave_no_zombies(start: Start) -> None:
-    """Whoever has died is buried, and its descriptors are given back."""
+    """Dead workers are reaped, and their descriptors are closed."""
     group, tokens = start(two_workers(max_restarts=100)), Tokens()
     server = fork_server_of(group.group)
 
@@ -536,7 +536,7 @@ def test_replaced_workers_leave_no_zombies(start: Start) -> None:
 
 @pytest.mark.parametrize("waiting", ["init", "step"])
 def test_close_from_a_signal_handler_ends_the_wait_that_it_interrupts(waiting: str) -> None:
-    """As it does from another task: the wait is told that the group is closed."""
+    """As from another task: the wait raises GroupClosed."""
     places = {"building": "call the trainer"} if waiting == "init" else {}
     group, tokens = Driven("sync", two_workers(env_kwargs={"faults": places, "only": 1})), Tokens()
     before = signal.signal(signal.SIGUSR1, lambda *_: group.close())

@@ -1,4 +1,4 @@
-"""Groups that come and go leave nothing behind: the short form of a benchmark."""
+"""Groups that are built and closed leave nothing behind: the short form of `benchmarks/soak.py`."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from patience import HANG
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "soak.py"
 
 
-def test_nothing_piles_up_over_groups(tmp_path: Path) -> None:
-    """Six groups, of both kinds, one after the other: no descriptor or process more."""
+def test_groups_in_a_row_leak_nothing(tmp_path: Path) -> None:
+    """After six groups of both kinds there is no additional descriptor or process."""
     out = tmp_path / "report.json"
     run = subprocess.run(
         [sys.executable, SCRIPT, "--cycles", "6", "--steps", "3000", "--json", out],

@@ -1,4 +1,6 @@
-"""`placement: split`: workers and this process share the envs of an entry, and not their fate."""
+"""`placement: split`: workers and this process share the envs of an entry, but not their
+failures.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,7 @@ if TYPE_CHECKING:
 
 @on_one_driver
 def test_the_last_share_lives_in_this_process(start: Start) -> None:
-    """As many as share a worker; of several entries that of the last one alone."""
+    """It has as many envs as a worker; of several entries, only the last one has such a share."""
     first = entry(3, placement="split", envs_per_process=2, name="first")
     group = start([first, entry(5, placement="split", envs_per_process=2)])
     pids = [pid_of(group, env_id) for env_id in group.group.env_ids]
@@ -30,13 +32,13 @@ def test_the_last_share_lives_in_this_process(start: Start) -> None:
 
 @on_one_driver
 def test_without_a_core_for_workers_all_envs_live_in_this_process(start: Start) -> None:
-    """It is as good as one worker."""
+    """This process does the work of one worker."""
     group = start(entry(2, placement="split", envs_per_process=2))
     assert {pid_of(group, env_id) for env_id in group.group.env_ids} == {os.getpid()}
 
 
-def test_death_of_a_worker_is_told_of_its_own_envs_alone(start: Start) -> None:
-    """Those of this process step on."""
+def test_death_of_a_worker_affects_only_its_own_envs(start: Start) -> None:
+    """Those of this process continue to step."""
     group, tokens = start(entry(2, placement="split", envs_per_process=1)), Tokens()
     for _ in range(2):
         batch, _ = group.step(tokens.steps(group.group.env_ids, {"faulty-0": "exit 3"}))

@@ -1,4 +1,4 @@
-"""What a timeline shows of workers that hang and die."""
+"""Workers that hang and die, as a timeline shows them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def marks(seen: Seen) -> list[tuple[str, str]]:
 
 @on_one_driver
 def test_hangs_deaths_and_restarts_are_marked(start: Start, tmp_path: Path) -> None:
-    """With their cause, and with the time until the worker was replaced."""
+    """With their cause, and the time until the worker was replaced."""
     group, tokens = start(two_workers(step_timeout=1.0)), Tokens()
     trace: Any = group.group.trace(tmp_path / "run.json")
     with trace:
@@ -48,8 +48,8 @@ def test_hangs_deaths_and_restarts_are_marked(start: Start, tmp_path: Path) -> N
 
 
 @on_one_driver
-def test_what_was_not_done_at_the_end_is_shown(start: Start, tmp_path: Path) -> None:
-    """Whoever interrupts a program that hangs sees in which env it does."""
+def test_requests_in_progress_at_the_end_are_shown(start: Start, tmp_path: Path) -> None:
+    """A user who interrupts a hanging program sees in which env it hangs."""
     group, tokens = start(two_workers(on_worker_death="raise")), Tokens()
     with group.group.trace(tmp_path / "run.json"):
         group.step_async(tokens.steps(group.group.env_ids, {"faulty-3": "sleep"}))

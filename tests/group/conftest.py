@@ -1,10 +1,11 @@
-"""One test for all places where envs may live and for both drivers."""
+"""Fixtures that run one test on every placement and on both drivers."""
 
 from __future__ import annotations
 
 import asyncio
 import inspect
 import os
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -13,6 +14,7 @@ import pytest
 import pytest_asyncio
 import ray_cluster
 from group import sample_envs
+from group.awaitable import awaitable_twins
 from patience import HANG
 
 import rlightning_aio
@@ -25,7 +27,7 @@ assert sample_envs  # Registers its envs.
 
 
 class Awaited:
-    """A synchronous group or handle whose methods may be awaited where the others' must be."""
+    """A synchronous group or handle with the awaitable methods of the asynchronous one."""
 
     def __init__(self, wrapped: Any, like: type) -> None:
         self.wrapped = wrapped
@@ -57,44 +59,50 @@ class Awaited:
 
 @dataclass(frozen=True)
 class Place:
-    """Where envs live, and which driver waits for them."""
+    """Where envs live, and the driver that waits for them."""
 
     name: str
     fields: dict[str, Any]
     synchronous: bool = False
+    awaitable: bool = False
 
     @property
     def inline(self) -> bool:
         return self.name == "inline"
 
     def build(self, entries: Any, **kwargs: Any) -> Any:
-        """A group of `entries`, each put in this place."""
+        """Build a group of `entries` in this place."""
         listed = entries if isinstance(entries, list) else [entries]
         placed = [{**entry, **self.fields} for entry in listed]
-        if self.synchronous:
-            group = rlightning_aio.sync.build_env_group(placed, **kwargs)
-            return Awaited(group, rlightning_aio.EnvGroup)
-        return rlightning_aio.build_env_group(placed, **kwargs)
+        with awaitable_twins() if self.awaitable else nullcontext():
+            if self.synchronous:
+                group = rlightning_aio.sync.build_env_group(placed, **kwargs)
+                return Awaited(group, rlightning_aio.EnvGroup)
+            return rlightning_aio.build_env_group(placed, **kwargs)
 
 
+LOOP = Place("loop", {"placement": "loop"}, awaitable=True)
+"""The envs' awaitable twins, on the trainer's event loop."""
 INLINE = Place("inline", {"placement": "inline"})
 INLINE_SYNC = Place("inline", {"placement": "inline"}, synchronous=True)
 SEVERAL = Place("several workers", {"envs_per_process": 2})
 SPLIT_SYNC = Place("split", {"placement": "split", "envs_per_process": 2}, synchronous=True)
 """Two envs in each worker, and the last two in this process."""
-# Each actor is a Python of its own; on a busy machine, four of them may take minutes to start.
+# Each actor is a separate Python; on a busy machine, four of them may take minutes to start.
 ON_ACTORS = {"placement": "ray", "num_cpus": 0, "start_timeout": HANG}
 RAY = Place("ray", {**ON_ACTORS, "envs_per_process": 2})
 RAY_SYNC = Place("ray", {**ON_ACTORS, "envs_per_process": 100}, synchronous=True)
-# Ray takes an environment and some minutes of its own: `make test-ray`.
+# Ray needs a separate environment and takes minutes: `make test-ray`.
 ON_RAY = "RLIGHTNING_AIO_ON_RAY" in os.environ
-PLACES = [RAY, RAY_SYNC] if ON_RAY else [INLINE, INLINE_SYNC, SPLIT_SYNC, SEVERAL]
+AWAITING = Place("awaiting workers", {"envs_per_process": 2}, synchronous=True, awaitable=True)
+"""Awaitable envs in workers. Only `test_stepping` runs on them; it is representative."""
+PLACES = [RAY, RAY_SYNC] if ON_RAY else [INLINE, INLINE_SYNC, SPLIT_SYNC, SEVERAL, LOOP, AWAITING]
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """On Ray, run what is said of every place, once for each facade, and nothing else."""
+    """Deselect redundant tests: on Ray, those that don't hold for every placement."""
     here = Path(__file__).parent
-    other = [item for item in items if ON_RAY and here in item.path.parents and _is_other(item)]
+    other = [item for item in items if here in item.path.parents and _is_other(item)]
     config.hook.pytest_deselected(items=other)
     items[:] = [item for item in items if item not in other]
 
@@ -102,6 +110,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def _is_other(item: pytest.Item) -> bool:
     params = item.callspec.params if hasattr(item, "callspec") else {}
     place = params.get("place")
+    if not ON_RAY:
+        return place is AWAITING and item.path.stem != "test_stepping"
     on_asyncio = any(value is asyncio.new_event_loop for value in params.values())
     return place is None or (on_asyncio and not place.synchronous)
 
@@ -115,20 +125,20 @@ if ON_RAY:
 
     @pytest.fixture(autouse=True)
     def nothing_left_behind() -> Iterator[None]:
-        """Ray keeps connections open for a while, so that descriptors tell nothing."""
+        """Check only for actors: Ray keeps connections open, so descriptors show nothing."""
         yield
         ray_cluster.no_actor_left()
 
 
 @pytest.fixture(params=PLACES, ids=lambda p: f"{p.name}{', sync' if p.synchronous else ''}")
 def place(request: pytest.FixtureRequest) -> Place:
-    """Each host and each driver; the synchronous one thereby inside of a running loop."""
+    """Each placement with each driver; the synchronous driver runs inside a running loop."""
     return request.param
 
 
 @pytest_asyncio.fixture
 async def start(place: Place) -> AsyncIterator[Any]:
-    """Start a group of some entries in the place; it is closed after the test."""
+    """Start groups of given entries in the place, and close them after the test."""
     groups: list[Any] = []
 
     async def start(entries: Any, **kwargs: Any) -> Any:
@@ -143,7 +153,7 @@ async def start(place: Place) -> AsyncIterator[Any]:
 
 @pytest.fixture
 def halved() -> Iterator[rlightning_aio.sync.EnvGroup]:
-    """A group of one inline env whose steps have two halves."""
+    """Yield a group of one inline env whose steps have two halves."""
     sample_envs.Halved.log.clear()
     with rlightning_aio.sync.build_env_group(sample_envs.HALVED) as group:
         yield group

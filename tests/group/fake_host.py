@@ -1,7 +1,7 @@
 """Hosts without a process, and a driver without a clock, for tests of the core.
 
-The fake env's behaviour is a function of its action, so that a model can foresee it.
-Its observations say which env it is and what has happened to it.
+The behaviour of a fake env is a function of its action, so a model can predict it. Its observations
+contain its identity and its history.
 """
 
 from __future__ import annotations
@@ -17,13 +17,18 @@ import pytest
 from gymnasium import spaces
 
 from rlightning_aio.config import EnvConfig
+from rlightning_aio.group.checked import CheckedRequests
+from rlightning_aio.group.conditions import FIRST_RESULTS, Conditions
+from rlightning_aio.group.continuity import Continuity
 from rlightning_aio.group.core import Core
 from rlightning_aio.group.env_table import EnvTable
+from rlightning_aio.group.lifetime import Lifetime
+from rlightning_aio.group.observed import Observed
+from rlightning_aio.group.parts import Parts
 from rlightning_aio.group.poller import Poller
-from rlightning_aio.group.requests import Requests
-from rlightning_aio.group.resumption import Resumption
 from rlightning_aio.group.slab_layout import SlabLayout
 from rlightning_aio.group.supervisor import Supervisor
+from rlightning_aio.group.tables import Tables
 from rlightning_aio.hosts.arena import Arena, map_shared
 from rlightning_aio.hosts.messages import (
     NO_ACTION,
@@ -41,9 +46,10 @@ from rlightning_aio.hosts.messages import (
     Result,
     Value,
 )
-from rlightning_aio.protocol.bell import TrainerBell, WorkerBell, bell_size
 from rlightning_aio.protocol.entries import Operation, op_of, slot_of
+from rlightning_aio.protocol.exchange import TrainerBell, WorkerBell, bell_size
 from rlightning_aio.protocol.info import NO_INFO, PICKLED
+from rlightning_aio.protocol.rings import TrainerRings, WorkerRings, rings_size
 from rlightning_aio.protocol.slab import RowLayout, Slab
 from rlightning_aio.types import EnvMeta
 
@@ -51,9 +57,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from rlightning_aio.group.wait import Procedure
+    from rlightning_aio.protocol.exchange import Ring
 
-PLAIN, TERMINATES, TRUNCATES, RAISES, TELLS = range(5)
-"""What an action does: nothing more, end the episode, raise, bring an info by frame."""
+PLAIN, TERMINATES, TRUNCATES, RAISES, SENDS_INFO = range(5)
+"""Effects of an action: nothing special, end the episode, raise, send an info by frame."""
 
 OBSERVATION_SPACE = spaces.Box(-np.inf, np.inf, (4,), np.float64)
 ACTION_SPACE = spaces.Discrete(5)
@@ -62,11 +69,11 @@ LAYOUT = RowLayout(OBSERVATION_SPACE, ACTION_SPACE, (), ())
 
 @dataclass
 class FakeEnv:
-    """What one env does; the model keeps one of its own to foresee it.
+    """The state of one env; the model has one, too, and predicts results with it.
 
     Attributes:
         identity: its slot in the group.
-        life: how often its worker was started.
+        life: number of starts of its worker.
         requests: executed in this life; steps: since the reset, or -1 before the first.
     """
 
@@ -89,12 +96,13 @@ class FakeEnv:
 
 @dataclass
 class Shared:
-    """What the fake hosts of a group have in common."""
+    """Objects that the fake hosts of a group share."""
 
     completions: Completions
     arena: Arena
     bell: TrainerBell
     bell_memory: memoryview
+    rings: list[Ring | None]
     num_hosts: int
 
 
@@ -103,8 +111,8 @@ class FakeHost:
 
     Attributes:
         waiting: index and execution of requests that are not executed yet, oldest first.
-        extras: by slot, what came beside its last step.
-        life: how often it was started.
+        extras: by slot, the extras of its last step.
+        life: number of starts.
     """
 
     inline = False
@@ -116,7 +124,7 @@ class FakeHost:
         self.first_slot = first_slot
         self.num_envs = num_envs
         self.shared = shared
-        self.tell = shared.completions.append
+        self.post = shared.completions.append
         self.reads_extras = reads_extras
         self.extras: dict[int, dict[str, Any]] = {}
         self.life = 0
@@ -127,7 +135,7 @@ class FakeHost:
         self.waiting: deque[tuple[int, Callable[[], None]]] = deque()
         slots = range(self.first_slot, self.first_slot + self.num_envs)
         self.envs = [FakeEnv(slot, self.life) for slot in slots]
-        self.tell(
+        self.post(
             Built(
                 self.host_id,
                 [
@@ -151,7 +159,7 @@ class FakeHost:
         memory = map_shared(self.shared.arena.descriptor, offset, LAYOUT.size(rows))
         self.slab = Slab(LAYOUT, memory, rows)
         self.row_of = [row for _, row in order.rows]
-        self.tell(Attached(self.host_id))
+        self.post(Attached(self.host_id))
 
     # -- requests
 
@@ -184,7 +192,7 @@ class FakeHost:
             self._raise(entry)
             return
         self.envs[index].step()
-        info = {"told": [self.envs[index].steps]} if action == TELLS else {}
+        info = {"steps": [self.envs[index].steps]} if action == SENDS_INFO else {}
         self._write(index, float(action), action == TERMINATES, action == TRUNCATES, info)
         self.slab.is_reset[at] = False
         self.slab.over[at] |= action in (TERMINATES, TRUNCATES)
@@ -229,15 +237,15 @@ class FakeHost:
             self.answer(Value(self.host_id, entry, (slot_of(entry), name, args)))
 
     def report(self, entry: int) -> None:
-        """The result lies in the row."""
+        """Report a result that is in the row."""
         raise NotImplementedError
 
-    def answer(self, told: Any) -> None:
-        """The result, or a part of it, does not."""
+    def answer(self, reply: Any) -> None:
+        """Send a reply that is not, or not only, in the row."""
         raise NotImplementedError
 
     def finish(self, position: int = 0) -> None:
-        """Execute one waiting request; its reply waits to be read."""
+        """Execute one waiting request; its reply then waits to be read."""
         _, execute = self.waiting[position]
         del self.waiting[position]
         execute()
@@ -249,21 +257,21 @@ class FakeHost:
 
     def close(self) -> None:
         self.waiting.clear()
-        self.tell(Closed(self.host_id, []))
+        self.post(Closed(self.host_id, []))
 
     def release(self) -> None:
         pass
 
 
 class FakeWorker(FakeHost):
-    """See `hosts.base.Polled` and `Killable`.
+    """See `hosts.base.Polled` and `Killable`. Its rings are real.
 
     Attributes:
-        reports, frames: replies that nobody has read.
-        rung: its descriptor would be readable now.
-        killed: whether with a dump, for each time.
+        frames: unread replies.
+        rung: its descriptor is readable.
+        killed: for each kill, True if it was with a dump.
         alive: it was started, and has not died since.
-        refusals: so many more starts fail.
+        refusals: number of further starts that fail.
     """
 
     alive = False
@@ -275,50 +283,46 @@ class FakeWorker(FakeHost):
             self.refusals -= 1
             raise OSError("no more processes")
         self.alive = True
-        self.reports: list[int] = []
         self.frames: list[Any] = []
         self.killed: list[bool] = []
         self.rung = False
-        self.count = 0
         shared = self.shared
-        shared.bell.restart(self.host_id)
+        memory = memoryview(bytearray(rings_size(self.num_envs)))
+        self.rings = TrainerRings(memory, self.num_envs, shared.bell, self.host_id)
+        shared.rings[self.host_id] = self.rings.ring(self.take_requests)
         self.bell = WorkerBell(shared.bell_memory, shared.num_hosts, self.host_id)
+        self.worker_rings = WorkerRings(memory, self.num_envs, self.bell)
+        assert self.worker_rings.fall_asleep()
         super().start()
 
-    def report(self, entry: int) -> None:
-        self.reports.append(entry)
-        self.count += 1
-        if self.bell.publish(self.count) and self.bell.is_due():
-            self.rung = True
+    # -- the trainer's side
 
-    def answer(self, told: Any) -> None:
-        self.frames.append(told)
-        self.rung = True
-
-    def finish(self, position: int = 0) -> None:
-        super().finish(position)
-        if not self.waiting and self.bell.is_due():
-            self.rung = True
+    def submit(self, entries: np.ndarray, arguments: Sequence[Any] | None = None) -> None:
+        if arguments is not None:
+            super().submit(entries, arguments)
+        elif self.rings.request(entries):
+            self.take_requests()
 
     def on_readable(self) -> None:
         self.rung = False
         while self.frames:
-            self.tell(self.frames.pop(0))
-        self.poll()
+            self.rings.frame_seen()
+            self.post(self.frames.pop(0))
 
     def poll(self) -> None:
-        """Frames lie in the channel, which only `on_readable` reads."""
-        if self.reports:
-            self.tell(Reported(self.host_id, np.array(self.reports, np.int64)))
-            self.shared.bell.took(self.host_id, len(self.reports))
-            self.reports.clear()
+        entries = self.rings.reports()
+        if len(entries):
+            if self.rings.has_frame():
+                self.on_readable()
+            self.post(Reported(self.host_id, entries))
 
     def executing(self) -> tuple[int, int]:
         return 0, 0
 
     def catch_up(self) -> bool:
-        found = bool(self.frames or self.reports)
+        found = bool(self.frames) or bool(self.shared.bell.with_news())
         self.on_readable()
+        self.poll()
         return found
 
     def kill(self, *, dump: bool) -> None:
@@ -328,11 +332,35 @@ class FakeWorker(FakeHost):
         raise NotImplementedError("a kill is all it takes")
 
     def die(self, cause: str = "was killed by SIGKILL") -> None:
-        """The worker ends; what it had replied is heard first."""
+        """End the worker; the host reads pending replies first."""
         self.on_readable()
+        self.poll()
         self.alive = False
+        self.shared.rings[self.host_id] = None
         self.waiting.clear()
-        self.tell(Died(self.host_id, Death(cause, -9)))
+        self.post(Died(self.host_id, Death(cause, -9)))
+
+    # -- the worker's side
+
+    def take_requests(self) -> None:
+        """Wake the worker, which reads the requests in its ring."""
+        super().submit(np.array(self.worker_rings.requests(), np.int64))
+
+    def report(self, entry: int) -> None:
+        self.worker_rings.report(entry, self.ring)
+
+    def ring(self) -> None:
+        self.rung = True
+
+    def answer(self, reply: Any) -> None:
+        self.frames.append(reply)
+        self.worker_rings.count_frame()
+        self.rung = True
+
+    def finish(self, position: int = 0) -> None:
+        super().finish(position)
+        if not self.waiting and self.bell.is_due():
+            self.rung = True
 
 
 class FakeInline(FakeHost):
@@ -341,10 +369,10 @@ class FakeInline(FakeHost):
     inline = True
 
     def report(self, entry: int) -> None:
-        self.tell(Result(self.host_id, entry, {}))
+        self.post(Result(self.host_id, entry, {}))
 
-    def answer(self, told: Any) -> None:
-        self.tell(told)
+    def answer(self, reply: Any) -> None:
+        self.post(reply)
 
     def execute_next(self) -> bool:
         if not self.waiting:
@@ -353,7 +381,7 @@ class FakeInline(FakeHost):
         return True
 
     def poll(self) -> None:
-        """All of it is told at once."""
+        """Do nothing: this host posts everything at once."""
 
 
 class FakeGroup:
@@ -361,7 +389,7 @@ class FakeGroup:
 
     Args:
         rows: envs of each host.
-        inline: for each host whether it is inline; reads_extras likewise.
+        inline: for each host, True if it is inline; reads_extras likewise.
     """
 
     def __init__(
@@ -388,22 +416,23 @@ class FakeGroup:
         bell_memory = memoryview(bytearray(bell_size(len(rows))))
         bell = TrainerBell(bell_memory, len(rows))
         envs = EnvTable([self.config] * size, self.env_ids)
-        requests = Requests(np.repeat(np.arange(len(rows)), rows), len(rows))
+        conditions = self.conditions = Conditions()
+        observed = Observed(conditions)
+        requests = CheckedRequests(np.repeat(np.arange(len(rows)), rows), len(rows), conditions)
         layout = SlabLayout(size)
-        resumption = Resumption(requests)
+        continuity = Continuity(envs, conditions)
+        lifetime = Lifetime(conditions)
+        tables = Tables(envs, requests, layout, continuity, conditions, observed, lifetime)
         supervisor = Supervisor(
-            envs,
-            requests,
-            layout,
-            resumption,
+            tables,
             arena,
             completions.append,
             mixed_actions=False,
-            num_cores=0,
             clock=lambda: self.now,
         )
         poller = Poller(requests, bell, 0, clock=lambda: self.now)
-        shared = Shared(completions, arena, bell, bell_memory, len(rows))
+        rings: list[Ring | None] = [None] * len(rows)
+        shared = Shared(completions, arena, bell, bell_memory, rings, len(rows))
         self.hosts: list[Any] = []
         for host_id, count in enumerate(rows):
             kind = FakeInline if inline and inline[host_id] else FakeWorker
@@ -412,32 +441,28 @@ class FakeGroup:
             self.hosts.append(host)
             supervisor.add(host, self.config)
             poller.add(host)
-        self.core = Core(
-            envs,
-            requests,
-            layout,
-            resumption,
-            supervisor,
-            poller,
-            completions,
-            self,
-            zero_copy=False,
-        )
+        parts = Parts(tables, supervisor, poller, bell, rings, completions, self)
+        self.core = Core(parts, zero_copy=False, shares_thread=True)
         self.running: list[Running] = []
         opened = self.begin(self.core.start(self.now))
         self.turn()
-        assert opened.done, "fake hosts are up at once"
+        assert opened.done, "fake hosts start at once"
 
     def begin(self, procedure: Procedure[Any]) -> Running:
-        """Run a procedure until it has to wait; it goes on whenever the driver turns."""
+        """Run a procedure until it waits; the driver's turns resume it."""
         running = Running(procedure)
         self.running.append(running)
-        running.go_on(None)
+        running.resume(None)
         self.turn()
         return running
 
+    def expect_ordinary_steps(self) -> None:
+        """Skip the check of first observations, so that steps take the ordinary path."""
+        self.core._first_observations.left.clear()
+        self.conditions.note(FIRST_RESULTS, False)
+
     def turn(self, *, newest_first: bool = False) -> None:
-        """What a driver does until nothing is readable and no time has come."""
+        """Act as the driver until nothing is readable and no time has come."""
         for _ in range(200):
             for host in self.hosts:
                 if host.rung:
@@ -451,8 +476,8 @@ class FakeGroup:
                 return
             for running in reversed(woken) if newest_first else woken:
                 self.core.drain()
-                running.go_on(self.now)
-        raise AssertionError("the core turns in circles instead of waiting")
+                running.resume(self.now)
+        raise AssertionError("the core loops instead of waiting")
 
     def pass_time(self, seconds: float) -> None:
         self.now += seconds
@@ -474,7 +499,7 @@ class FakeGroup:
         return next(h for h in self.hosts if h.first_slot <= slot < h.first_slot + h.num_envs)
 
     def finish(self, slot: int, *, newest_first: bool = False) -> None:
-        """Have the request of `slot` executed, and the driver turn."""
+        """Execute the request of `slot`, then let the driver act."""
         host = self.host_of(slot)
         rows = [row for row, _ in host.waiting]
         host.finish(rows.index(slot - host.first_slot))
@@ -487,7 +512,7 @@ class FakeGroup:
 
 
 class Running:
-    """A procedure under way."""
+    """A procedure in progress."""
 
     def __init__(self, procedure: Procedure[Any]) -> None:
         self.procedure = procedure
@@ -498,11 +523,11 @@ class Running:
         self.value: Any = None
 
     def is_due(self, now: float) -> bool:
-        # A look a millisecond later is as good as now: no time that matters here is shorter.
+        # A millisecond early is not too early: all times in these tests are longer.
         due = self.until is not None and now + 1e-3 >= self.until
         return not self.done and (self.woken or due)
 
-    def go_on(self, now: float | None) -> None:
+    def resume(self, now: float | None) -> None:
         self.woken = False
         try:
             self.until = self.procedure.send(now).until  # type: ignore[arg-type]
@@ -512,8 +537,8 @@ class Running:
             self.done, self.error = True, error
 
     def result(self) -> Any:
-        """What it has returned; raises what it has raised."""
-        assert self.done, "it still waits"
+        """Return the result of the procedure, or raise its error."""
+        assert self.done, "the procedure still waits"
         if self.error is not None:
             raise self.error
         return self.value

@@ -1,8 +1,8 @@
-"""Envs of the tests' own, which workers import by this module's name.
+"""Envs for tests; workers import this module by name.
 
-Of Gymnasium's kind: `Tree-v0` has observations and actions of every space that travels in
-rows, `Words-v0` observations and `Speech-v0` actions of spaces that don't. Each observation
-is drawn anew, so that seeds matter. The others are registered backends; see each.
+Gymnasium envs: `Tree-v0` has observations and actions of every space that fits in rows, `Words-v0`
+has observations and `Speech-v0` actions of spaces that don't. Each observation is a new sample, so
+seeds matter. The other envs are registered backends.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ MOVES = spaces.Dict(
 
 
 class DrawnEnv(gym.Env[Any, Any]):
-    """Observations are samples of its space; an episode ends by chance in one step of 25."""
+    """Observations are samples of its space; each step ends the episode with a chance of 4 %."""
 
     def __init__(self, observation_space: Any, action_space: Any) -> None:
-        self.observation_space = deepcopy(observation_space)  # Which holds a generator.
+        self.observation_space = deepcopy(observation_space)  # The space holds a generator.
         self.action_space = action_space
         self.steps = 0
 
@@ -84,14 +84,14 @@ gym.register("Words-v0", entry_point=words)
 gym.register("Speech-v0", entry_point=speech)
 
 
-# -- envs of this package's own kind
+# -- subclasses of BaseEnv
 
 
 @ENVS.register("probe")
 class Probe(BaseEnv):
-    """Tells what was done to it: [index in its entry, episodes, steps, seed].
+    """Observes its history: [index in its entry, episodes, steps, seed].
 
-    An action is [what to do, a number that comes back as the reward].
+    An action is [effect, a number that is returned as the reward].
     """
 
     DO_NOTHING, END, TRUNCATE, RAISE = range(4)
@@ -152,14 +152,14 @@ class Probe(BaseEnv):
 
 
 class OddError(Exception):
-    """Can't be made from a message alone."""
+    """An exception that can't be rebuilt from its message alone."""
 
     def __init__(self, code: int, *, where: str) -> None:
         super().__init__(code, where)
 
 
 class ProbedSimulator(gym.Wrapper[Any, Any, Any, Any]):
-    """A wrapper around what it wraps, each with a label of its own."""
+    """A wrapper around an env; each of them has its own label."""
 
     def __init__(self) -> None:
         inner = DrawnEnv(spaces.Discrete(2), spaces.Discrete(2))
@@ -186,7 +186,7 @@ class Gated(Probe):
 
 
 class Gate:
-    """Lets one step of one env through; the env announces each step in another FIFO."""
+    """Lets one step of one env through; opening the FIFO for reading announces the step."""
 
     def __init__(self, folder: str, env_id: str) -> None:
         self._path = Path(folder, env_id)
@@ -201,19 +201,19 @@ class Gate:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Begins once the env has come to the gate, where it waits meanwhile."""
+        """Hold the env at the gate while the context is open."""
         with self._path.open("wb"):
             yield
 
     def open(self) -> None:
-        """Returns once the env has come to the gate, and goes on."""
+        """Let the env through once it waits at the gate."""
         with self.held():
             pass
 
 
 @ENVS.register("chunked")
 class Chunked(Probe):
-    """Takes a list of any length of actions, or a dict with one; returns their sum."""
+    """Takes a list of any number of actions, or a dict with one; the reward is their sum."""
 
     transforms_actions = True
 
@@ -226,7 +226,7 @@ class Chunked(Probe):
 
 @ENVS.register("sloppy")
 class Sloppy(Probe):
-    """Its step returns what its action says, whatever its spaces promise."""
+    """Returns the values in its action, even if they contradict its spaces."""
 
     transforms_actions = True
 
@@ -245,7 +245,7 @@ class Halved(BaseEnv):
     """Adds up its actions, in steps of two halves.
 
     Attributes:
-        log: the halves that were executed.
+        log: the executed halves.
     """
 
     RAISE_IN_START, RAISE_IN_WAIT, INTERRUPT, INTERRUPT_START = 9, 8, 7, 6
@@ -302,9 +302,9 @@ class Halved(BaseEnv):
 
 @ENVS.register("fresh")
 class Fresh(BaseEnv):
-    """Hands out observations of the task's space, and keeps no hand on them.
+    """Returns observations of the task's space without keeping references to them.
 
-    A step gives what ``gives`` of its ``env_kwargs`` says, or a sample of the space.
+    A step returns ``gives`` of its ``env_kwargs``, or a sample of the space.
     """
 
     SPACES: ClassVar[dict[str, gym.Space[Any]]] = {
@@ -343,7 +343,7 @@ class Fresh(BaseEnv):
 
 @ENVS.register("stale")
 class Stale(Fresh):
-    """Its own step has results that it goes on writing to."""
+    """Overwrites the results of its own `step` later."""
 
     def bare_step(self) -> Any:
         return None
@@ -357,7 +357,7 @@ class Stale(Fresh):
 
 @ENVS.register("batched")
 class Batched(BaseEnv):
-    """Three sub-environments that count; every value has them on its first axis."""
+    """Three sub-environments that count; the first axis of every value counts them."""
 
     def get_observation_space(self) -> gym.Space[Any]:
         return spaces.Box(-np.inf, np.inf, (self.num_envs, 2), np.float64)

@@ -1,4 +1,4 @@
-"""Actions as they are checked and written: what has no meaning in its space is refused."""
+"""Checking and writing actions: values that have no meaning in the space are refused."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from rlightning_aio import BatchedData, EnvConfig, PolicyResponse
-from rlightning_aio.batch.data import Origin, batch_of_results
+from rlightning_aio.batch.data import batch_of_results
 from rlightning_aio.errors import BadAction
 from rlightning_aio.group.actions import write_actions
 from rlightning_aio.group.env_table import EnvTable
@@ -24,7 +24,7 @@ IDS = ["e-0", "e-1", "e-2"]
 
 
 class Rows:
-    """Rows for the actions of three envs, who take any action if they are `free`."""
+    """Rows for the actions of three envs, which take any action if they are `free`."""
 
     def __init__(self, space: Any, *, free: bool = False) -> None:
         config = EnvConfig(name="e", backend="gymnasium", task="x", num_workers=3)
@@ -33,13 +33,17 @@ class Rows:
         layout = RowLayout(spaces.Discrete(2), space, (), ())
         self.slab = Slab(layout, memoryview(bytearray(layout.size(3))), 3)
         self.layout: Any = SimpleNamespace(
-            slabs=[self.slab], slab=np.zeros(3, np.intp), row=np.arange(3), row_is_slot=True
+            slabs=[self.slab],
+            slab=np.zeros(3, np.intp),
+            row=np.arange(3),
+            row_is_slot=True,
+            of=lambda slot: (self.slab, slot),
         )
 
     def write(self, actions: Any, form: str = "columns") -> Any:
-        """What is to be sent out of band."""
+        """Write actions; return what must be sent out of band."""
         slots = np.array([2, 0, 1], np.intp)
-        batch = batch_of_results((), Origin(self, slots, self.envs.names)).respond(actions)
+        batch = batch_of_results((), self, slots, self.envs.names).respond(actions)
         if form == "values":
             ids = batch.env_ids()
             pairs = zip(ids, actions, strict=True)
@@ -48,7 +52,7 @@ class Rows:
 
     @property
     def written(self) -> Any:
-        """In the order in which they were given."""
+        """Return the written actions in the order in which they were given."""
         return self.slab.action[[2, 0, 1]]
 
 
@@ -73,8 +77,10 @@ SMALL = spaces.Box(-128, 127, (2,), np.int8)
     ],
     ids=str,
 )
-def test_numbers_without_a_meaning_are_named(space: Any, bad: Any, held: str, form: str) -> None:
-    """With the env and the place; whether they come as columns or one by one."""
+def test_meaningless_numbers_are_refused_by_name(
+    space: Any, bad: Any, held: str, form: str
+) -> None:
+    """The error names the env and the position, for columns and for single actions."""
     actions = np.ones((3, 2), bad.dtype)
     actions[1] = bad
     with pytest.raises(BadAction) as caught:
@@ -92,8 +98,8 @@ def test_numbers_without_a_meaning_are_named(space: Any, bad: Any, held: str, fo
 
 
 @pytest.mark.parametrize("form", ["columns", "values"])
-def test_what_a_cast_keeps_is_written(form: str) -> None:
-    """A policy's int64 for a small dtype, its float64 for a float32, infinity without a bound."""
+def test_a_cast_that_keeps_the_value_is_allowed(form: str) -> None:
+    """An int64 for a small dtype, a float64 for a float32, infinity where there is no bound."""
     for space, actions in (
         (SMALL, np.array([[-128, 127], [0, 1], [2, 3]])),
         (spaces.MultiBinary(2), np.array([[0, 1]] * 3)),
@@ -113,7 +119,7 @@ def test_what_a_cast_keeps_is_written(form: str) -> None:
 
 @pytest.mark.parametrize("free", [False, True])
 def test_a_list_holds_one_action_for_each_env(free: bool) -> None:
-    """Also where a Tuple has as many parts as there are envs: nothing is read crosswise."""
+    """Even if a Tuple has as many parts as there are envs, its parts are not taken for envs."""
     threes = spaces.Tuple([spaces.Discrete(9), spaces.Discrete(9), spaces.Discrete(9)])
     rows = Rows(spaces.Dict(arm=threes, hand=SMALL), free=free)
     drawn = [{"arm": (k, k + 1, k + 2), "hand": np.array([k, -k])} for k in (0, 3, 6)]
@@ -134,10 +140,10 @@ def test_a_list_holds_one_action_for_each_env(free: bool) -> None:
         fill=st.just(1.0),
     )
 )
-def test_nan_and_what_is_beyond_a_bound_is_found_however_many_numbers_there_are(
+def test_nan_and_values_beyond_a_bound_are_found_in_arrays_of_any_size(
     actions: Any,
 ) -> None:
-    """And nothing else is: numbers whose squares overflow are numbers."""
+    """There are no false alarms, for example for numbers whose squares overflow."""
     box = spaces.Box(-INF, 1, actions.shape[1:], np.float32)
     rows = Rows(box)
     if np.isnan(actions).any() or np.isposinf(actions).any():
@@ -149,7 +155,7 @@ def test_nan_and_what_is_beyond_a_bound_is_found_however_many_numbers_there_are(
 
 
 def test_free_actions_may_be_anything() -> None:
-    """What its row can't hold as it is goes to the env out of band."""
+    """An action that doesn't fit in its row is sent to the env out of band."""
     for space, actions in (
         (SMALL, np.array([[1, 2], [1, 300], [3, 4]])),
         (HALF_BOUNDED, np.array([[0, 0], [NAN, INF], [0, 0]], np.float32)),
@@ -162,7 +168,7 @@ def test_free_actions_may_be_anything() -> None:
 
 
 class Tensor:
-    """What can't be shown as an array, as a sparse tensor."""
+    """A tensor that can't be converted to an array, such as a sparse one."""
 
     def __len__(self) -> int:
         return 3
@@ -172,16 +178,16 @@ class Tensor:
 
 
 @pytest.mark.parametrize("form", ["columns", "values"])
-def test_tensors_that_numpy_has_no_form_of_are_bad_actions(form: str) -> None:
-    """Not whatever error torch has for them."""
+def test_tensors_that_cannot_become_arrays_are_bad_actions(form: str) -> None:
+    """The error is BadAction, not an error of torch."""
     actions = Tensor()
     with pytest.raises(BadAction, match="not an array: no dense layout"):
         Rows(SMALL).write(actions if form == "columns" else [Tensor()] * 3, form)
 
 
 @pytest.mark.simulators
-def test_tensors_that_numpy_lacks_are_converted() -> None:
-    """bfloat16, views that are marked as negated; others are bad actions."""
+def test_tensors_without_a_numpy_dtype_are_converted() -> None:
+    """For example bfloat16, and views that are marked as negated; others are bad actions."""
     torch = pytest.importorskip("torch")
     box = spaces.Box(-9, 9, (2,), np.float32)
     numbers = [[1.5, -2.0], [0.0, 3.0], [4.0, 5.0]]

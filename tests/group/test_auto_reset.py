@@ -1,16 +1,20 @@
-"""`auto_reset`: the step limit, the ends of episodes, and what happens instead of a step."""
+"""`auto_reset`: the step limit, the ends of episodes, and resets in place of steps."""
 
 from __future__ import annotations
 
+import math
 import warnings
+from functools import partial
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from rlightning_aio import BatchedData, EnvRaised, PolicyResponse, sync
 
-# What is reset is decided from results, however they came.
+# Resets depend on results only, not on the driver.
 pytestmark = pytest.mark.one_driver_for_each_place
 
 DO_NOTHING, END, TRUNCATE, RAISE = range(4)
@@ -27,7 +31,7 @@ def steps_of(batch: BatchedData) -> list[float]:
 
 
 async def test_a_limit_of_three_has_a_period_of_four_calls(start: Any) -> None:
-    """Two steps, the flagged third, and a reset with reward 0 and no flag in place of a fourth."""
+    """Two steps, the flagged third, then a reset with reward 0 and no flag in place of a fourth."""
     group = await start(ENTRY)
     batch, _ = await group.reset(seed=0)
     with group.auto_reset(max_episode_steps=3):
@@ -39,12 +43,12 @@ async def test_a_limit_of_three_has_a_period_of_four_calls(start: Any) -> None:
                 assert steps_of(batch) == [call % 4] * 3
                 assert batch.reward.tolist() == [float(call != 4)] * 3
                 assert not (batch.terminated | batch.truncated).any()
-                # A reset in a step's place has no seed: episodes go on as they would.
+                # A reset in place of a step has no seed.
                 assert (batch.observation[:, 3] == -1).all() == (period > 0 or call == 4)
 
 
-async def test_the_same_holds_for_what_is_collected(start: Any) -> None:
-    """Each env has its own count, whoever comes first."""
+async def test_collected_results_follow_the_same_limit(start: Any) -> None:
+    """Each env has its own count, in any order of results."""
     group = await start(ENTRY)
     batch, _ = await group.reset()
     calls = dict.fromkeys(IDS, 0)
@@ -61,7 +65,7 @@ async def test_the_same_holds_for_what_is_collected(start: Any) -> None:
 
 
 async def test_only_envs_of_the_batch_advance(start: Any) -> None:
-    """The others' counters stand still, and a reset sets one to 0."""
+    """The counters of other envs don't change, and a reset sets a counter to 0."""
     group = await start(ENTRY)
     await group.reset()
     with group.auto_reset(max_episode_steps=2):
@@ -76,8 +80,8 @@ async def test_only_envs_of_the_batch_advance(start: Any) -> None:
         assert (steps_of(batch), flags) == ([1], [False])
 
 
-async def test_counters_run_outside_of_the_context_too(start: Any) -> None:
-    """A limit that was passed is reached at once; nothing is reset after the context."""
+async def test_counters_also_run_outside_the_context(start: Any) -> None:
+    """A limit that was passed takes effect at once; nothing is reset after the context."""
     group = await start(ENTRY)
     await group.reset()
     for _ in range(3):
@@ -95,8 +99,8 @@ async def test_counters_run_outside_of_the_context_too(start: Any) -> None:
 
 
 @pytest.mark.parametrize("what", [END, TRUNCATE])
-async def test_an_episode_that_ends_by_itself_is_begun_anew(start: Any, what: int) -> None:
-    """By the next call, with no flag; `on_done=False` leaves it to the caller."""
+async def test_an_env_whose_episode_ended_is_reset(start: Any, what: int) -> None:
+    """The next call resets it, without a flag; `on_done=False` leaves it to the caller."""
     group = await start(ENTRY)
     await group.reset()
     with group.auto_reset(max_episode_steps=10):
@@ -114,13 +118,13 @@ async def test_an_episode_that_ends_by_itself_is_begun_anew(start: Any, what: in
 
 
 @pytest.mark.parametrize("what", [END, TRUNCATE])
-async def test_what_was_due_when_the_context_was_left_is_when_another_is_entered(
+async def test_a_reset_that_is_due_survives_from_one_context_to_the_next(
     start: Any, what: int
 ) -> None:
-    """As with one for each rollout: no step goes on after an end, wherever that was seen."""
+    """With one context for each rollout, no step follows an end, wherever the end was seen."""
     group = await start(ENTRY)
     await group.reset()
-    await group.step(responses("probe-0", what=what))  # Ends before there is any context.
+    await group.step(responses("probe-0", what=what))  # These end before the first context.
     with group.auto_reset(max_episode_steps=3):
         batch, flags = await group.step(responses(*IDS, what=what))
         assert (steps_of(batch), flags) == ([0, 1, 1], [False] * 3)
@@ -128,21 +132,21 @@ async def test_what_was_due_when_the_context_was_left_is_when_another_is_entered
         assert (steps_of(batch), flags) == ([1, 0, 0], [False] * 3)
     with group.auto_reset(max_episode_steps=9, on_done=False):
         batch, _ = await group.step(responses("probe-0"))
-        assert steps_of(batch) == [2], "an end is the caller's affair here"
+        assert steps_of(batch) == [2], "outside a context, the caller handles ends"
     with group.auto_reset(max_episode_steps=2):
         batch, flags = await group.step(responses(*IDS))
         assert (steps_of(batch), flags) == ([0, 1, 1], [False] * 3)
         batch, flags = await group.step(responses(*IDS))
         assert (steps_of(batch), flags) == ([1, 2, 2], [False, True, True])
     batch, _ = await group.step(responses("probe-2"))
-    assert steps_of(batch) == [3], "plain steps are plain"
+    assert steps_of(batch) == [3], "steps outside a context have no flags"
     with group.auto_reset(max_episode_steps=4, on_done=False):
         batch, flags = await group.step(responses(*IDS))
         assert (steps_of(batch), flags) == ([2, 0, 4], [False, False, True])
 
 
-async def test_limits_are_each_entrys_own(start: Any) -> None:
-    """Without one everywhere, entering fails, and names the env that has none."""
+async def test_each_entry_has_its_own_limit(start: Any) -> None:
+    """If an env has no limit, entering the context fails and names it."""
     group = await start(
         [
             {**ENTRY, "num_workers": 1, "max_episode_steps": 1},
@@ -159,7 +163,7 @@ async def test_limits_are_each_entrys_own(start: Any) -> None:
 
 
 async def test_envs_that_reset_themselves_keep_to_their_limit(start: Any) -> None:
-    """Each sub-environment in its own time: no count of the group's cuts any of them."""
+    """Each sub-environment has its own limit; the group's count cuts none of them."""
     entry = {"name": "v", "backend": "gymnasium", "task": "CartPole-v1", "num_envs": 4}
     group = await start({**entry, "max_episode_steps": 9})
     batch, _ = await group.reset(seed=0)
@@ -174,12 +178,60 @@ async def test_envs_that_reset_themselves_keep_to_their_limit(start: Any) -> Non
     assert at_different_times
 
 
-def test_a_limit_is_a_positive_int() -> None:
-    """Anything else is refused by value, and the context stays closed."""
+@pytest.mark.parametrize("what", [END, TRUNCATE])
+async def test_without_a_limit_episodes_end_by_themselves(start: Any, what: int) -> None:
+    """An env without a limit is allowed, and no result is flagged."""
+    group = await start(ENTRY)
+    await group.reset()
+    with group.auto_reset(math.inf):
+        for steps in range(1, 30):
+            batch, flags = await group.step(responses(*IDS))
+            assert (steps_of(batch), flags) == ([steps] * 3, [False] * 3)
+        await group.step(responses("probe-1", what=what))
+        batch, flags = await group.step(responses(*IDS))
+        assert (steps_of(batch), flags) == ([30, 0, 30], [False] * 3)
+    with group.auto_reset(max_episode_steps=31):
+        assert (await group.step(responses(*IDS)))[1] == [True, False, True]
+
+
+class Brief(gym.Env[Any, Any]):
+    """Observes the number of steps of its episode; every episode ends with the third."""
+
+    observation_space, action_space = gym.spaces.Discrete(9), gym.spaces.Discrete(2)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        self.steps = 0
+        return 0, {}
+
+    def step(self, action: Any) -> Any:
+        self.steps += 1
+        return self.steps, 1.0, self.steps == 3, False, {}
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+@pytest.mark.parametrize("num_envs", [1, 2])
+@pytest.mark.parametrize("limit", [3, 5])
+async def test_a_limit_counts_the_steps_of_one_episode(
+    start: Any, limit: int, num_envs: int, mode: AutoresetMode
+) -> None:
+    """Steps of the previous episode don't count, even if the env resets itself in between."""
+    make = partial(SyncVectorEnv, [Brief] * num_envs, autoreset_mode=mode)
+    group = await start({"name": "v", "make_env": make})
+    with group.auto_reset(limit):
+        batch, _ = await group.reset()
+        for turn in range(1, 14):
+            batch, flags = await group.step(batch.respond(action=0 * batch.observation))
+            assert flags == [False]
+            in_turn = turn % (3 if mode == AutoresetMode.SAME_STEP else 4)
+            assert batch.observation.tolist() == [[in_turn] * num_envs]
+
+
+def test_a_limit_is_a_positive_int_or_infinite() -> None:
+    """The error names any other value, and the context is not entered."""
     with sync.build_env_group({**ENTRY, "placement": "inline"}) as group:
         group.reset()
-        for limit in (0, -3, 2.5, True, "7"):
-            with pytest.raises(ValueError, match=f"positive int, not {limit!r}"):
+        for limit in (0, -3, 2.5, True, "7", -math.inf, math.nan):
+            with pytest.raises(ValueError, match=f"positive int, or math.inf .*, not {limit!r}"):
                 group.auto_reset(limit).__enter__()
         assert group.step(responses("probe-0"))[1] is None
         with group.auto_reset(np.int64(1)):
@@ -187,7 +239,7 @@ def test_a_limit_is_a_positive_int() -> None:
 
 
 async def test_overriding_configured_limits_warns_once(start: Any) -> None:
-    """At the line of the caller, however many envs there are; an equal limit says nothing."""
+    """The warning points at the caller's line, once for all envs; an equal limit gives none."""
     group = await start({**ENTRY, "max_episode_steps": 5})
     with pytest.warns(UserWarning, match="overrides") as caught, group.auto_reset(2):
         pass
@@ -197,10 +249,12 @@ async def test_overriding_configured_limits_warns_once(start: Any) -> None:
         warnings.simplefilter("error")
         with group.auto_reset(5):
             pass
+    with pytest.warns(UserWarning, match="steps=inf. overrides"), group.auto_reset(math.inf):
+        pass
 
 
 async def test_contexts_do_not_nest_and_an_exception_leaves(start: Any) -> None:
-    """Afterwards, steps are plain again; `async with` works alike."""
+    """After an exception the context is left; `async with` behaves alike."""
     group = await start(ENTRY)
     await group.reset()
     with group.auto_reset(1):
@@ -224,7 +278,7 @@ async def test_contexts_do_not_nest_and_an_exception_leaves(start: Any) -> None:
 
 
 async def test_a_step_that_raises_does_not_count(start: Any) -> None:
-    """It was not completed."""
+    """The step was not completed."""
     group = await start(ENTRY)
     await group.reset()
     with group.auto_reset(2):
@@ -233,4 +287,4 @@ async def test_a_step_that_raises_does_not_count(start: Any) -> None:
             await group.step(responses("probe-0", what=RAISE))
         assert (await group.step(responses("probe-0")))[1] == [True]
         batch, _ = await group.step(responses("probe-0", what=RAISE))
-        assert steps_of(batch) == [0], "the action of a reset is not looked at"
+        assert steps_of(batch) == [0], "the action of a reset is ignored"

@@ -1,4 +1,4 @@
-"""How the envs of a group are spread over hosts, before anything is started."""
+"""How the envs of a group are spread over hosts before anything starts."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ OTHER = {"backend": "probe", "task": "x"}
         (2, [POLE | {"num_workers": 4}] * 3, [[4], [4], [4]]),
         (6, [POLE | {"num_workers": 16}, POLE | {"num_workers": 8}], [[4] * 4, [4] * 2]),
         (8, [POLE | {"num_workers": 100}, POLE], [[14, 14, 14, 15, 14, 14, 15], [1]]),
-        # What says itself where its envs live, or keeps no core busy, takes none of the cores.
+        # Entries that fix where their envs live, or keep no core busy, get no share of the cores.
         (
             2,
             [
@@ -42,7 +42,7 @@ def test_entries_share_the_cores(
     entries: list[dict[str, Any]],
     spread: list[list[int]],
 ) -> None:
-    """By their numbers of envs, and each has a worker at least."""
+    """In proportion to their numbers of envs, with at least one worker each."""
     monkeypatch.setattr(build, "num_cores", lambda: num_cores)
     named = [entry | {"name": f"e{k}"} for k, entry in enumerate(entries)]
     group = sync.build_env_group(named)
@@ -54,9 +54,32 @@ def test_entries_share_the_cores(
 def test_a_placement_whose_package_is_missing_says_how_to_install_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Before anything is started."""
+    """The error comes before anything starts."""
     monkeypatch.delitem(sys.modules, "rlightning_aio.hosts.ray", raising=False)
     monkeypatch.delitem(sys.modules, "rlightning_aio.hosts.ray_host", raising=False)
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ConfigError, match=r"entry 'e'.*pip install 'rlightning-aio\[ray\]'"):
         sync.build_env_group(POLE | {"name": "e", "placement": "ray"})
+
+
+def test_the_repr_of_a_group_lists_its_envs_and_their_placement() -> None:
+    """Before the start and after the close, too."""
+    entries = [
+        POLE | {"name": "pole", "num_workers": 4, "envs_per_process": 2},
+        POLE | {"name": "many", "num_envs": 16, "placement": "inline"},
+        POLE | {"name": "one", "envs_per_process": 1},
+        POLE | {"name": "both", "num_workers": 4, "placement": "split", "envs_per_process": 2},
+        {"name": "arms", "backend": "env_server", "env_kwargs": {"port": 0, "insecure": True}},
+    ]
+    group = sync.build_env_group(entries)
+    said = repr(group)
+    assert repr(group[group.env_ids[0]]) == f"EnvHandle({group.env_ids[0]!r})"
+    assert said == (
+        "EnvGroup(pole: 4 envs, placement process, 2 worker processes; "
+        "many: 1 env of 16 sub-environments, placement inline, 0 worker processes; "
+        "one: 1 env, placement process, 1 worker process; "
+        "both: 4 envs, placement split, 1 worker process; "
+        "arms: env_server)"
+    )
+    group.close()
+    assert repr(group) == said

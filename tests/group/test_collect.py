@@ -1,7 +1,6 @@
 """`collect_async` on real workers, whose envs step when the test opens their gates.
 
-What needs a certain order of events and a clock is in `test_core`; here, workers, channels
-and both drivers have their say.
+Rules that need an exact order of events and a clock are in `test_core`.
 """
 
 from __future__ import annotations
@@ -62,7 +61,7 @@ def entry(tmp_path: Path, **fields: Any) -> dict[str, Any]:
 
 @pytest_asyncio.fixture
 async def group(tmp_path: Path, gates: list[Gate]) -> AsyncIterator[Any]:
-    """Four envs, each in a worker of its own."""
+    """Four envs, each in its own worker."""
     async with rlightning_aio.build_env_group(entry(tmp_path, envs_per_process=1)) as group:
         await group.reset()
         yield group
@@ -70,7 +69,7 @@ async def group(tmp_path: Path, gates: list[Gate]) -> AsyncIterator[Any]:
 
 @pytest.fixture
 def sync_group(tmp_path: Path, gates: list[Gate]) -> Iterator[Any]:
-    """Four envs in one worker, which steps them in the order in which it is asked."""
+    """Four envs in one worker, which steps them in the order of the requests."""
     with rlightning_aio.sync.build_env_group(entry(tmp_path, envs_per_process=4)) as group:
         group.reset()
         yield group
@@ -78,7 +77,7 @@ def sync_group(tmp_path: Path, gates: list[Gate]) -> Iterator[Any]:
 
 @contextmanager
 def opened(*gates: Gate) -> Iterator[None]:
-    """Meanwhile, open the gates one after the other."""
+    """Open the gates one after the other while the context is open."""
     opener = threading.Thread(target=lambda: [gate.open() for gate in gates])
     opener.start()
     yield
@@ -94,7 +93,7 @@ async def open_gates(*gates: Gate) -> None:
 
 
 def test_the_first_ready_result_is_enough(sync_group: Any, gates: list[Gate]) -> None:
-    """The others stay pending, and come with later calls."""
+    """The others stay pending; later calls return them."""
     sync_group.step_async(responses(2, 0))
     with opened(gates[2]):
         batch, flags = sync_group.collect_async()
@@ -105,8 +104,8 @@ def test_the_first_ready_result_is_enough(sync_group: Any, gates: list[Gate]) ->
         sync_group.collect_async()
 
 
-def test_a_minimum_is_waited_for_and_a_maximum_kept(sync_group: Any, gates: list[Gate]) -> None:
-    """A minimum beyond what is pending means all of it; what is left over comes first."""
+def test_a_collect_respects_its_minimum_and_maximum(sync_group: Any, gates: list[Gate]) -> None:
+    """A minimum above the number of pending results means all of them; leftovers come first."""
     sync_group.step_async(responses(0, 1, 2, 3))
     with opened(*gates[:2]):
         batch, _ = sync_group.collect_async(min_results=2)
@@ -125,8 +124,8 @@ def test_a_minimum_is_waited_for_and_a_maximum_kept(sync_group: Any, gates: list
     assert came == ["gated-3", "gated-1", "gated-0"]
 
 
-def test_without_a_minimum_the_configs_holds(tmp_path: Path) -> None:
-    """Those of the entries asked for are summed up; a maximum below lowers it."""
+def test_the_default_minimum_comes_from_the_config(tmp_path: Path) -> None:
+    """It is the sum over the entries; a smaller maximum lowers it."""
     envs = {"backend": "gymnasium", "task": "CartPole-v1", "placement": "inline"}
     entries = [
         {**envs, "name": "a", "num_workers": 3, "min_results": 2},
@@ -149,8 +148,8 @@ def test_without_a_minimum_the_configs_holds(tmp_path: Path) -> None:
                 group.collect_async(wait_all=True)
 
 
-def test_it_is_told_what_each_worker_is_doing(sync_group: Any, gates: list[Gate]) -> None:
-    """Which env it steps, and whose results are outstanding, the oldest first."""
+def test_workers_are_described_with_what_they_are_doing(sync_group: Any, gates: list[Gate]) -> None:
+    """The description has the env that steps, and the outstanding results, oldest first."""
     (worker,) = sync_group.get_workers()
     assert (worker["entry"], worker["env_ids"], worker["state"]) == ("gated", IDS, "up")
     assert (worker["owed"], worker["owed_seconds"]) == ([], 0.0)
@@ -166,8 +165,8 @@ def test_it_is_told_what_each_worker_is_doing(sync_group: Any, gates: list[Gate]
         assert len(sync_group.collect_async(wait_all=True)[0]) == 2
 
 
-def test_results_of_some_entries_are_taken_alone(tmp_path: Path) -> None:
-    """Training beside evaluation: the others' results, and their errors, wait to be asked for."""
+def test_results_of_some_entries_can_be_collected_alone(tmp_path: Path) -> None:
+    """For evaluation during training: results and errors of other entries wait."""
     ids = ["gated-0", "gated-1", "tested-0", "tested-1"]
     gates = [Gate(str(tmp_path), env_id).make() for env_id in ids]
     entries = [
@@ -200,7 +199,7 @@ def test_results_of_some_entries_are_taken_alone(tmp_path: Path) -> None:
 
 
 def test_waiting_for_all_ignores_a_window_and_says_so(sync_group: Any, gates: list[Gate]) -> None:
-    """All that are pending, none less."""
+    """The collect returns all pending results."""
     sync_group.step_async(responses(0, 1, 2))
     with opened(*gates[:3]), pytest.warns(UserWarning, match="ignores timeout"):
         batch, _ = sync_group.collect_async(wait_all=True, timeout=0.001)
@@ -208,7 +207,7 @@ def test_waiting_for_all_ignores_a_window_and_says_so(sync_group: Any, gates: li
 
 
 def test_a_window_ends_while_others_are_pending(sync_group: Any, gates: list[Gate]) -> None:
-    """It is opened by the first result; who is late comes with the next call."""
+    """The first result opens it; results that come later are left to the next call."""
     sync_group.step_async(responses(0, 1))
     with opened(gates[0]):
         batch, _ = sync_group.collect_async(timeout=0.05)
@@ -217,8 +216,8 @@ def test_a_window_ends_while_others_are_pending(sync_group: Any, gates: list[Gat
         assert sync_group.collect_async(timeout=60)[0].ids() == ["gated-1"]
 
 
-def test_past_its_deadline_a_call_is_still_collected(sync_group: Any, gates: list[Gate]) -> None:
-    """Its value is the next call's, and the envs stay in step."""
+def test_a_call_is_collected_after_its_deadline(sync_group: Any, gates: list[Gate]) -> None:
+    """The next call returns its value, and the envs stay in step."""
     sync_group.call_async("wait_at_gate")
     with gates[0].held(), pytest.raises(TimeoutError, match="calls have not returned within"):
         sync_group.collect_calls(deadline=0.02)
@@ -228,8 +227,8 @@ def test_past_its_deadline_a_call_is_still_collected(sync_group: Any, gates: lis
         assert sync_group.collect_calls() == [None] * len(gates)
 
 
-def test_past_its_deadline_a_collect_loses_nothing(sync_group: Any, gates: list[Gate]) -> None:
-    """What was ready, and what gets ready later, comes with the next call."""
+def test_a_collect_that_times_out_loses_nothing(sync_group: Any, gates: list[Gate]) -> None:
+    """The next call returns results that were ready, and those that become ready later."""
     sync_group.step_async(responses(0, 1))
     with pytest.raises(TimeoutError, match="0 of the 1"):
         sync_group.collect_async(deadline=0.02)
@@ -252,8 +251,8 @@ def test_past_its_deadline_a_collect_loses_nothing(sync_group: Any, gates: list[
         ({"min_results": 3, "max_results": 2}, r"min_results \(3\) is above max_results \(2\)"),
     ],
 )
-def test_rules_that_make_no_sense_are_refused(rules: dict[str, Any], said: str) -> None:
-    """Each by its name and value."""
+def test_invalid_arguments_are_refused(rules: dict[str, Any], said: str) -> None:
+    """The error has the argument's name and value."""
     config = {"name": "a", "backend": "probe", "task": "x", "placement": "inline"}
     with rlightning_aio.sync.build_env_group(config) as group:
         batch, _ = group.reset()
@@ -266,8 +265,8 @@ def test_rules_that_make_no_sense_are_refused(rules: dict[str, Any], said: str) 
 # -- awaited (cancellation and a second collector: on either loop in tests/faults)
 
 
-async def test_whoever_is_ready_first_is_first(group: Any, gates: list[Gate]) -> None:
-    """In whatever order the envs were asked."""
+async def test_results_are_ordered_by_readiness(group: Any, gates: list[Gate]) -> None:
+    """Independent of the order of the requests."""
     group.step_async(responses(0, 1, 2, 3))
     for k in (2, 0, 3, 1):
         waiting = asyncio.create_task(group.collect_async(timeout=0.01))
@@ -277,7 +276,7 @@ async def test_whoever_is_ready_first_is_first(group: Any, gates: list[Gate]) ->
 
 
 async def test_results_join_while_the_window_is_open(group: Any, gates: list[Gate]) -> None:
-    """It closes early when nothing more can come."""
+    """The window closes early when nothing more can come."""
     group.step_async(responses(0, 1, 2))
     waiting = asyncio.create_task(group.collect_async(timeout=100))
     await open_gates(gates[1], gates[0])
@@ -290,7 +289,7 @@ async def test_results_join_while_the_window_is_open(group: Any, gates: list[Gat
 
 @pytest.mark.asyncio(loop_factories=["uvloop"])
 async def test_cancelling_a_collect_loses_no_result(group: Any, gates: list[Gate]) -> None:
-    """Neither what was ready already, nor what was still to come."""
+    """Neither ready results nor outstanding ones."""
     group.step_async(responses(0, 1, 2))
     with pytest.raises(TimeoutError):
         async with asyncio.timeout(0.02):
@@ -307,7 +306,7 @@ async def test_cancelling_a_collect_loses_no_result(group: Any, gates: list[Gate
 
 @pytest.mark.asyncio(loop_factories=["uvloop"])
 async def test_a_cancelled_step_is_collected(group: Any, gates: list[Gate]) -> None:
-    """The envs have been asked; their results go to whoever collects."""
+    """The envs have their requests; the next collect returns the results."""
     stepping = asyncio.create_task(group.step(responses(0, 1)))
     await asyncio.sleep(0)
     stepping.cancel()
@@ -317,8 +316,8 @@ async def test_a_cancelled_step_is_collected(group: Any, gates: list[Gate]) -> N
     assert sorted(batch.ids()) == IDS[:2]
 
 
-async def test_the_value_of_a_cancelled_call_goes_to_nobody(group: Any, gates: list[Gate]) -> None:
-    """Nothing is pending; the env goes on once it has answered."""
+async def test_the_value_of_a_cancelled_call_is_dropped(group: Any, gates: list[Gate]) -> None:
+    """Nothing is pending; the env can be used once it has replied."""
     stepping = asyncio.create_task(group.step(responses(0)))
     await asyncio.sleep(0)
     calling = asyncio.create_task(group["gated-1"].call("wait_at_gate"))
@@ -331,7 +330,7 @@ async def test_the_value_of_a_cancelled_call_goes_to_nobody(group: Any, gates: l
         await group["gated-1"].call("double", 1)
     await open_gates(gates[1], gates[0])
     assert (await stepping)[0].ids() == ["gated-0"]
-    while True:  # It is free when its reply was read, which nobody is told of.
+    while True:  # The env is free once its reply was read, and nothing reports that.
         try:
             assert await group["gated-1"].call("double", 1) == 2
             break
@@ -340,8 +339,8 @@ async def test_the_value_of_a_cancelled_call_goes_to_nobody(group: Any, gates: l
 
 
 @pytest.mark.asyncio(loop_factories=["uvloop"])
-async def test_one_collects_at_a_time(group: Any, gates: list[Gate]) -> None:
-    """The second is sent away; the first gets its result."""
+async def test_a_second_collect_at_the_same_time_is_refused(group: Any, gates: list[Gate]) -> None:
+    """The first one gets its result."""
     group.step_async(responses(0))
     first = asyncio.create_task(group.collect_async())
     await asyncio.sleep(0)
@@ -352,7 +351,7 @@ async def test_one_collects_at_a_time(group: Any, gates: list[Gate]) -> None:
 
 
 async def test_callers_wait_for_their_own_envs_alone(group: Any, gates: list[Gate]) -> None:
-    """A step, a reset, a method call and a collect at once, each answered when it is its turn."""
+    """A step, a reset, a method call and a collect at once each return with their own envs."""
     group.step_async(responses(0))
     collecting = asyncio.create_task(group.collect_async())
     stepping = asyncio.create_task(group.step(responses(1)))
@@ -368,8 +367,10 @@ async def test_callers_wait_for_their_own_envs_alone(group: Any, gates: list[Gat
     assert (await collecting)[0].ids() == ["gated-0"]
 
 
-async def test_a_collect_gets_what_is_sent_while_it_waits(group: Any, gates: list[Gate]) -> None:
-    """From a worker that had nothing to do when it began."""
+async def test_a_collect_returns_results_of_requests_sent_while_it_waits(
+    group: Any, gates: list[Gate]
+) -> None:
+    """From a worker that was idle when the collect began."""
     group.step_async(responses(0))
     collecting = asyncio.create_task(group.collect_async())
     await asyncio.sleep(0)
@@ -380,8 +381,8 @@ async def test_a_collect_gets_what_is_sent_while_it_waits(group: Any, gates: lis
     assert (await group.collect_async())[0].ids() == ["gated-0"]
 
 
-async def test_a_collect_gets_what_another_caller_gave_up(group: Any, gates: list[Gate]) -> None:
-    """Also what had arrived before it was given up."""
+async def test_a_collect_returns_results_of_a_cancelled_call(group: Any, gates: list[Gate]) -> None:
+    """Including those that had arrived before the cancellation."""
     group.step_async(responses(0))
     stepping = asyncio.create_task(group.step(responses(1, 2)))
     await asyncio.sleep(0)
@@ -398,7 +399,7 @@ async def test_a_collect_gets_what_another_caller_gave_up(group: Any, gates: lis
 async def test_inline_envs_are_served_while_others_are_waited_for(
     tmp_path: Path, gates: list[Gate]
 ) -> None:
-    """What is sent to them while a collect waits for a worker wakes it."""
+    """A request to an inline env wakes a collect that waits for a worker."""
     inline = {
         "name": "here",
         "backend": "probe",
@@ -422,8 +423,8 @@ async def test_inline_envs_are_served_while_others_are_waited_for(
 
 
 @pytest.mark.asyncio(loop_factories=["uvloop"])
-async def test_closing_wakes_whoever_waits(group: Any, gates: list[Gate]) -> None:
-    """A collector and a stepper learn at once that nothing will come; envs get their time."""
+async def test_closing_wakes_all_waiters(group: Any, gates: list[Gate]) -> None:
+    """A collect and a step raise at once; the envs get time to close."""
     group.step_async(responses(0))
     waiting = [
         asyncio.create_task(group.collect_async()),

@@ -1,4 +1,4 @@
-"""Rules of the core that need a certain order of events, on hosts without processes."""
+"""Rules of the core that need an exact order of events, on hosts without processes."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from group.fake_host import PLAIN, RAISES, FakeGroup
 
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import BadAction, EnvBusy, EnvRaised, GroupClosed, NothingPending
+from rlightning_aio.group.wait import CollectRules
 from rlightning_aio.types import PolicyResponse
 
 if TYPE_CHECKING:
@@ -39,14 +40,7 @@ def steps(*slots: int, action: int = PLAIN) -> BatchedData:
 
 
 def collect(group: FakeGroup, **rules: Any) -> Running:
-    defaults: dict[str, Any] = {
-        "timeout": None,
-        "wait_all": False,
-        "min_results": 1,
-        "max_results": None,
-        "deadline": None,
-    }
-    return group.begin(group.core.collect(group.now, **{**defaults, **rules}))
+    return group.begin(group.core.steps.collect(group.now, CollectRules(**rules)))
 
 
 def ids_of(running: Running) -> list[str]:
@@ -54,9 +48,9 @@ def ids_of(running: Running) -> list[str]:
 
 
 def test_the_window_ends_for_results_that_joined_unnoticed(new_group: NewGroup) -> None:
-    """Past the window a collect returns as soon as the minimum is there, though not all came."""
+    """After the window, a collect returns once it has the minimum."""
     group = new_group(8)
-    group.core.step_async(steps(*range(8)), group.now)
+    group.core.steps.step_async(steps(*range(8)), group.now)
     running = collect(group, timeout=1.0, min_results=3)
     group.finish(0)
     group.pass_time(0.5)
@@ -77,7 +71,7 @@ def test_the_window_opens_when_an_inline_result_is_there(new_group: NewGroup) ->
         return execute_next()
 
     group.hosts[0].execute_next = run_slowly
-    group.core.step_async(steps(0, 1), group.now)
+    group.core.steps.step_async(steps(0, 1), group.now)
     running = collect(group, timeout=1.0)
     group.pass_time(0.5)
     assert not running.done
@@ -89,7 +83,7 @@ def test_the_window_opens_when_an_inline_result_is_there(new_group: NewGroup) ->
 def test_inline_envs_are_not_executed_past_a_deadline_or_a_window(
     new_group: NewGroup, rules: dict[str, float]
 ) -> None:
-    """The wait ends after the env that is being executed; the others stay for the next call."""
+    """The wait ends after the current env; the others are left to the next call."""
     group = new_group(5, inline=[True])
     host = group.hosts[0]
     execute_next = host.execute_next
@@ -99,7 +93,7 @@ def test_inline_envs_are_not_executed_past_a_deadline_or_a_window(
         return execute_next()
 
     host.execute_next = execute_slowly
-    group.core.step_async(steps(*range(5)), group.now)
+    group.core.steps.step_async(steps(*range(5)), group.now)
     running = collect(group, min_results=5 if "deadline" in rules else 1, **rules)
     if "deadline" in rules:
         with pytest.raises(TimeoutError, match="2 of the 5"):
@@ -113,10 +107,10 @@ def test_inline_envs_are_not_executed_past_a_deadline_or_a_window(
 
 
 def test_one_callers_slow_env_does_not_hold_up_another_caller(new_group: NewGroup) -> None:
-    """Two calls at once, on envs of one worker: each returns when its own envs have replied."""
+    """Of two calls on envs of one worker, each returns when its own envs have replied."""
     group = new_group(3)
-    quick = group.begin(group.core.step(steps(0), group.now))
-    slow = group.begin(group.core.step(steps(1, 2), group.now))
+    quick = group.begin(group.core.steps.step(steps(0), group.now))
+    slow = group.begin(group.core.steps.step(steps(1, 2), group.now))
     group.finish(0)
     assert ids_of(quick) == ["fake-0"]
     assert not slow.done
@@ -125,10 +119,10 @@ def test_one_callers_slow_env_does_not_hold_up_another_caller(new_group: NewGrou
     assert ids_of(slow) == ["fake-1", "fake-2"]
 
 
-def test_a_step_given_up_after_its_last_reply_loses_nothing(new_group: NewGroup) -> None:
-    """The replies are there, the caller is not: the next collect gets them."""
+def test_a_step_cancelled_after_its_last_reply_loses_nothing(new_group: NewGroup) -> None:
+    """The next collect returns the results."""
     group = new_group(2)
-    running = group.begin(group.core.step(steps(0, 1), group.now))
+    running = group.begin(group.core.steps.step(steps(0, 1), group.now))
     host = group.hosts[0]
     host.finish()
     host.finish()
@@ -138,10 +132,10 @@ def test_a_step_given_up_after_its_last_reply_loses_nothing(new_group: NewGroup)
     assert ids_of(collect(group)) == ["fake-0", "fake-1"]
 
 
-def test_what_a_step_given_up_raised_reaches_the_collector(new_group: NewGroup) -> None:
-    """An error is an answer too."""
+def test_an_error_of_a_cancelled_step_reaches_the_collector(new_group: NewGroup) -> None:
+    """An error answers a request, too."""
     group = new_group(2)
-    running = group.begin(group.core.step(steps(0, 1, action=RAISES), group.now))
+    running = group.begin(group.core.steps.step(steps(0, 1, action=RAISES), group.now))
     group.finish(1)
     group.cancel(running)
     with pytest.raises(EnvRaised, match="fake-1"):
@@ -155,24 +149,24 @@ def test_what_a_step_given_up_raised_reaches_the_collector(new_group: NewGroup) 
 
 
 @pytest.mark.parametrize("name", ["who", "raise"])
-def test_the_value_of_a_call_given_up_is_dropped(new_group: NewGroup, name: str) -> None:
-    """Nobody collects it, and the env can be stepped once it has replied."""
+def test_the_value_of_a_cancelled_call_is_dropped(new_group: NewGroup, name: str) -> None:
+    """The env can be stepped once it has replied."""
     group = new_group(1)
     running = group.begin(group.core.calls.call(group.now, 0, (name, (), {})))
     group.cancel(running)
     with pytest.raises(NothingPending):
         collect(group).result()
     with pytest.raises(EnvBusy):
-        group.core.step_async(steps(0), group.now)
+        group.core.steps.step_async(steps(0), group.now)
     group.hosts[0].finish()
     group.hosts[0].on_readable()
-    stepped = group.begin(group.core.step(steps(0), group.now))
+    stepped = group.begin(group.core.steps.step(steps(0), group.now))
     group.finish(0)
     assert ids_of(stepped) == ["fake-0"]
 
 
 def test_an_env_is_reset_once_in_one_call(new_group: NewGroup) -> None:
-    """Naming an env twice is refused as a whole, as in a batch of steps."""
+    """A call that names an env twice is refused as a whole, like a batch of steps."""
     group = new_group(2)
     ids = ["fake-1", "fake-0", "fake-1"]
     with pytest.raises(EnvBusy, match="'fake-1' appears twice"):
@@ -181,10 +175,10 @@ def test_an_env_is_reset_once_in_one_call(new_group: NewGroup) -> None:
 
 
 def test_empty_batches_do_nothing(new_group: NewGroup) -> None:
-    """A loop may have nothing to step; only a collect of nothing is refused."""
+    """Only a collect of nothing is refused."""
     group = new_group(2)
-    group.core.step_async(BatchedData(), group.now)
-    batch, flags = group.begin(group.core.step(BatchedData(), group.now)).result()
+    group.core.steps.step_async(BatchedData(), group.now)
+    batch, flags = group.begin(group.core.steps.step(BatchedData(), group.now)).result()
     assert (len(batch), batch.values(), flags) == (0, [], None)
     batch, flags = group.begin(group.core.reset(group.now, 0, None, [])).result()
     assert (len(batch), flags) == (0, [])
@@ -197,7 +191,7 @@ def test_empty_batches_do_nothing(new_group: NewGroup) -> None:
     [-1, [0, -1], {"fake-0": -1}, 1.5, [0.5, 1], True, "01", [None, 1], 2**63, {"fake-1": "x"}],
 )
 def test_a_bad_seed_is_refused_before_anything_is_sent(new_group: NewGroup, seed: Any) -> None:
-    """Seeds are ints from 0 on that fit 63 bits; what else came in is named."""
+    """Seeds are ints from 0 to 63 bits; the error has the value."""
     group = new_group(2)
     with pytest.raises(ValueError, match="seed"):
         group.begin(group.core.reset(group.now, seed, None, None)).result()
@@ -205,7 +199,7 @@ def test_a_bad_seed_is_refused_before_anything_is_sent(new_group: NewGroup, seed
 
 
 def test_seeds_are_counted_for_each_env(new_group: NewGroup) -> None:
-    """A sequence holds one seed for each env that is reset."""
+    """A sequence has one seed for each env that is reset."""
     group = new_group(2)
     with pytest.raises(ValueError, match="3 seeds for 2 envs"):
         group.begin(group.core.reset(group.now, [1, 2, 3], None, None)).result()
@@ -213,19 +207,19 @@ def test_seeds_are_counted_for_each_env(new_group: NewGroup) -> None:
 
 @pytest.mark.parametrize("moment", ["before init", "after close"])
 def test_a_group_that_is_not_open_says_so(moment: str) -> None:
-    """Whatever is asked of it; nothing is confused with an idle group."""
+    """For every operation; the error differs from that of an idle group."""
     group = FakeGroup([1])
     if moment == "before init":
-        group.core.supervisor.open = False
+        group.core.lifetime.open = False
     else:
-        group.core.step_async(steps(0), group.now)
+        group.core.steps.step_async(steps(0), group.now)
         group.finish(0)
         group.close()
     hint = "init" if moment == "before init" else "build a new one"
     with pytest.raises(GroupClosed, match=hint):
         collect(group).result()
     with pytest.raises(GroupClosed, match=hint):
-        group.core.step_async(steps(0), group.now)
+        group.core.steps.step_async(steps(0), group.now)
     with pytest.raises(GroupClosed, match=hint):
         group.begin(group.core.reset(group.now, None, None, None)).result()
     with pytest.raises(GroupClosed, match=hint):
@@ -233,8 +227,10 @@ def test_a_group_that_is_not_open_says_so(moment: str) -> None:
     group.close()
 
 
-def test_what_cannot_be_pickled_is_refused_before_anything_is_sent(new_group: NewGroup) -> None:
-    """Extras, options and arguments: nothing is half-sent, and every env stays usable."""
+def test_values_that_cannot_be_pickled_are_refused_before_anything_is_sent(
+    new_group: NewGroup,
+) -> None:
+    """Extras, options and arguments: nothing is sent in part, and every env stays usable."""
     group = new_group(1, 1, reads_extras=[True, True])
     unpicklable = threading.Lock()
     batch = BatchedData(
@@ -242,15 +238,15 @@ def test_what_cannot_be_pickled_is_refused_before_anything_is_sent(new_group: Ne
         [PolicyResponse("fake-0", 0, good=1), PolicyResponse("fake-1", 0, bad=unpicklable)],
     )
     with pytest.raises(BadAction, match=r"'fake-1'.*nothing was sent"):
-        group.core.step_async(batch, group.now)
+        group.core.steps.step_async(batch, group.now)
     with pytest.raises(BadAction, match="'fake-1'"):
-        group.begin(group.core.step(batch, group.now)).result()
+        group.begin(group.core.steps.step(batch, group.now)).result()
     with pytest.raises(TypeError, match="options for env 'fake-0'"):
         group.begin(group.core.reset(group.now, 0, {"bad": unpicklable}, None)).result()
     with pytest.raises(TypeError, match=r"arguments of who\(\)"):
         group.begin(group.core.calls.call(group.now, 0, ("who", (unpicklable,), {}))).result()
     assert not any(host.waiting for host in group.hosts)
-    running = group.begin(group.core.step(steps(0, 1), group.now))
+    running = group.begin(group.core.steps.step(steps(0, 1), group.now))
     group.finish(0)
     group.finish(1)
     assert ids_of(running) == ["fake-0", "fake-1"]
@@ -259,12 +255,12 @@ def test_what_cannot_be_pickled_is_refused_before_anything_is_sent(new_group: Ne
 def test_extras_for_some_envs_of_a_batch_leave_the_others_in_their_rows(
     new_group: NewGroup,
 ) -> None:
-    """Only what somebody reads travels beside the rows."""
+    """Only extras that an env reads are sent out of band."""
     group = new_group(1, 1, reads_extras=[False, True])
     batch = BatchedData(
         ["fake-0", "fake-1"], [PolicyResponse(f"fake-{k}", 0, value=k) for k in range(2)]
     )
-    running = group.begin(group.core.step(batch, group.now))
+    running = group.begin(group.core.steps.step(batch, group.now))
     group.finish(1)
     group.finish(0)
     assert ids_of(running) == ["fake-0", "fake-1"]
@@ -273,42 +269,42 @@ def test_extras_for_some_envs_of_a_batch_leave_the_others_in_their_rows(
 
 
 def test_an_env_whose_error_was_not_raised_yet_is_busy(new_group: NewGroup) -> None:
-    """Its caller still waits for others; a request in between would get mixed up with them."""
+    """Its caller still waits for other envs; a request in between would be mixed up with them."""
     group = new_group(2)
-    running = group.begin(group.core.step(steps(0, 1, action=RAISES), group.now))
+    running = group.begin(group.core.steps.step(steps(0, 1, action=RAISES), group.now))
     group.finish(0)
     with pytest.raises(EnvBusy, match="was not collected"):
-        group.core.step_async(steps(0), group.now)
+        group.core.steps.step_async(steps(0), group.now)
     group.finish(1)
     with pytest.raises(EnvRaised):
         running.result()
-    group.core.step_async(steps(0, 1), group.now)
+    group.core.steps.step_async(steps(0, 1), group.now)
 
 
-def test_a_collector_waits_for_what_is_sent_meanwhile_too(new_group: NewGroup) -> None:
-    """It has asked one worker to wake it; now another worker has the first result."""
+def test_a_collect_also_waits_for_requests_sent_meanwhile(new_group: NewGroup) -> None:
+    """It armed the bell for one worker; another worker now has the first result."""
     group = new_group(1, 1)
-    group.core.step_async(steps(0), group.now)
+    group.core.steps.step_async(steps(0), group.now)
     waiting = collect(group)
-    group.core.step_async(steps(1), group.now)
+    group.core.steps.step_async(steps(1), group.now)
     group.turn()
     group.finish(1)
     assert ids_of(waiting) == ["fake-1"]
 
 
-def test_a_collector_gets_what_another_caller_gives_up(new_group: NewGroup) -> None:
-    """Results that are there already wake it."""
+def test_a_collect_returns_results_of_a_cancelled_call(new_group: NewGroup) -> None:
+    """Results that are ready wake it."""
     group = new_group(3)
-    group.core.step_async(steps(2), group.now)
-    stepping = group.begin(group.core.step(steps(0, 1), group.now))
+    group.core.steps.step_async(steps(2), group.now)
+    stepping = group.begin(group.core.steps.step(steps(0, 1), group.now))
     waiting = collect(group)
     group.finish(0)
     group.cancel(stepping)
     assert ids_of(waiting) == ["fake-0"]
 
 
-def test_a_result_that_somebody_else_took_in_wakes_its_caller(new_group: NewGroup) -> None:
-    """A collect of nothing looks at every worker's reports, and others still get theirs."""
+def test_a_result_that_another_call_read_wakes_its_caller(new_group: NewGroup) -> None:
+    """A collect of nothing reads every worker's reports; other calls still get their results."""
     group = new_group(2)
     resetting = group.begin(group.core.reset(group.now, 0, None, None))
     group.finish(0)

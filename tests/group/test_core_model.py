@@ -1,4 +1,4 @@
-"""Random use of the core against a naive model: each request is answered exactly once."""
+"""Random use of the core compared with a naive model: each request is answered exactly once."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from group.fake_host import (
     PLAIN,
     RAISES,
-    TELLS,
+    SENDS_INFO,
     TERMINATES,
     TRUNCATES,
     FakeEnv,
@@ -38,17 +38,18 @@ from rlightning_aio.errors import (
     UnknownEnv,
     WorkerDied,
 )
+from rlightning_aio.group.wait import CollectRules
 from rlightning_aio.types import PolicyResponse
 
 if TYPE_CHECKING:
     from group.fake_host import Running
 
-ACTIONS = st.sampled_from((PLAIN, PLAIN, PLAIN, TERMINATES, TRUNCATES, RAISES, TELLS))
+ACTIONS = st.sampled_from((PLAIN, PLAIN, PLAIN, TERMINATES, TRUNCATES, RAISES, SENDS_INFO))
 
 
 @dataclass
 class Answer:
-    """What a request must be answered with; `error` for one that raises."""
+    """The expected answer to a request; `error` if it raises."""
 
     observation: tuple[float, ...] = ()
     reward: float = 0.0
@@ -61,13 +62,13 @@ class Answer:
 
 @dataclass
 class Request:
-    """A request as the model sees it.
+    """The model's view of a request.
 
     Attributes:
         op: ``step``, ``reset`` or ``call``; a step that auto-reset replaces is a ``reset``.
         owner: the operation that waits for it; None for `collect_async`.
         restarts: its worker died before it replied.
-        value: what was attached to the step.
+        value: the extra that was attached to the step.
     """
 
     op: str
@@ -82,11 +83,11 @@ class Request:
 
 @dataclass
 class ModelEnv:
-    """One env as the model sees it.
+    """The model's view of one env.
 
     Attributes:
-        count: of steps since the last reset.
-        cut: its last result reached the limit of auto-reset; ended: it ended by itself.
+        count: number of steps since the last reset.
+        cut: its last result reached the limit of auto-reset; ended: the episode ended by itself.
     """
 
     env: FakeEnv
@@ -100,7 +101,7 @@ class ModelEnv:
 
 @dataclass
 class Collector:
-    """A collect under way, by the rules of the contract."""
+    """A collect in progress, by the rules of the contract."""
 
     running: Running
     timeout: float | None
@@ -112,7 +113,7 @@ class Collector:
 
 
 class CoreMachine(RuleBasedStateMachine):
-    """Each rule does something to the core and to the model; invariants compare them."""
+    """Each rule acts on the core and on the model; invariants compare them."""
 
     @initialize(
         rows=st.lists(st.integers(1, 3), min_size=1, max_size=3),
@@ -127,6 +128,7 @@ class CoreMachine(RuleBasedStateMachine):
             rows, inline, reads_extras, max_episode_steps=limit, max_restarts=10**6
         )
         self.core = self.group.core
+        self.group.expect_ordinary_steps()
         self.envs = [ModelEnv(FakeEnv(slot)) for slot in range(sum(rows))]
         self.operations: list[tuple[Running, list[int], list[Request]]] = []
         self.collector: Collector | None = None
@@ -148,7 +150,7 @@ class CoreMachine(RuleBasedStateMachine):
         return data.draw(st.lists(st.sampled_from(slots), min_size=1, unique=True))
 
     def responses(self, data: st.DataObject, slots: list[int]) -> tuple[BatchedData, list[int]]:
-        """A batch for `slots`: from columns where the last batch holds just them."""
+        """Return a batch for `slots`, made of columns if the last batch has exactly these."""
         actions = [data.draw(ACTIONS) for _ in slots]
         last = self.last_batch
         self.attaches = True
@@ -167,7 +169,7 @@ class CoreMachine(RuleBasedStateMachine):
         return int(env_id.removeprefix("fake-"))
 
     def requests_for(self, slots: list[int], actions: list[int]) -> list[Request]:
-        """Note steps of `slots` in the model."""
+        """Record steps of `slots` in the model."""
         requests: list[Request] = []
         for slot, action in zip(slots, actions, strict=True):
             env = self.envs[slot]
@@ -186,10 +188,10 @@ class CoreMachine(RuleBasedStateMachine):
     # -- what envs do
 
     def run_if_inline(self, slot: int) -> None:
-        """Inline requests are executed as soon as anybody waits; see `settle`."""
+        """Execute inline requests if a call waits; see `settle`."""
 
     def execute(self, slot: int) -> None:
-        """The model's env executes its request."""
+        """Execute a request in the model's env."""
         model = self.envs[slot]
         request, env = model.request, model.env
         assert request is not None
@@ -212,13 +214,13 @@ class CoreMachine(RuleBasedStateMachine):
         else:
             env.step()
             model.over |= request.action in (TERMINATES, TRUNCATES)
-            told = {"told": [env.steps]} if request.action == TELLS else {}
+            info = {"steps": [env.steps]} if request.action == SENDS_INFO else {}
             request.answer = Answer(
                 tuple(env.observation()),
                 float(request.action),
                 request.action == TERMINATES,
                 request.action == TRUNCATES,
-                told,
+                info,
                 over=model.over,
             )
         if request.restarts:
@@ -229,7 +231,7 @@ class CoreMachine(RuleBasedStateMachine):
         return bool(self.operations) or self.collector is not None
 
     def run_inline(self) -> None:
-        """The model's inline hosts, which run while anybody waits: those of the core have run."""
+        """Run the model's inline hosts, as a waiting call runs those of the core."""
         for host in self.group.hosts:
             if not host.inline:
                 continue
@@ -248,7 +250,7 @@ class CoreMachine(RuleBasedStateMachine):
     def step_async(self, data: st.DataObject) -> None:
         slots = self.some(data, self.idle())
         batch, actions = self.responses(data, slots)
-        self.core.step_async(batch, self.group.now)
+        self.core.steps.step_async(batch, self.group.now)
         self.requests_for(slots, actions)
         self.group.turn()
         self.settle()
@@ -259,7 +261,7 @@ class CoreMachine(RuleBasedStateMachine):
         slots = self.some(data, self.idle())
         batch, actions = self.responses(data, slots)
         requests = self.requests_for(slots, actions)
-        self.operate(self.core.step(batch, self.group.now), slots, requests)
+        self.operate(self.core.steps.step(batch, self.group.now), slots, requests)
 
     @precondition(lambda self: self.idle())
     @rule(data=st.data(), seeds=st.sampled_from(("none", "int", "list", "mapping")))
@@ -295,7 +297,7 @@ class CoreMachine(RuleBasedStateMachine):
         self.operate(operation, [slot], [request])
 
     def operate(self, operation: Any, slots: list[int], requests: list[Request]) -> None:
-        """Begin an operation that waits for `requests`, and compare how far it got."""
+        """Begin an operation that waits for `requests`, and compare its progress."""
         running = self.group.begin(operation)
         for request in requests:
             request.owner = running
@@ -306,7 +308,7 @@ class CoreMachine(RuleBasedStateMachine):
 
     @rule(data=st.data())
     def refuse(self, data: st.DataObject) -> None:
-        """A batch with one fault is refused as a whole."""
+        """Submit a batch with one fault; it is refused as a whole."""
         busy = [slot for slot, env in enumerate(self.envs) if env.request is not None]
         faults = ["unknown", "double", "shape", "kind"] + ["busy"] * bool(busy)
         fault = data.draw(st.sampled_from(faults))
@@ -328,13 +330,13 @@ class CoreMachine(RuleBasedStateMachine):
             fault, BadAction if self.idle() else EnvBusy
         )
         with pytest.raises(expected):
-            self.core.step_async(BatchedData(ids, values), self.group.now)
+            self.core.steps.step_async(BatchedData(ids, values), self.group.now)
         self.settle()
 
     @precondition(lambda self: self.collector is not None)
     @rule()
     def collect_twice(self) -> None:
-        """A second collector is sent away and disturbs nobody."""
+        """Start a second collect; it is refused and disturbs no call."""
         with pytest.raises(RLightningError, match="one collector at a time"):
             self.group.begin(self.collect_operation(None, False, 1, None, None)).result()
         self.settle()
@@ -349,13 +351,15 @@ class CoreMachine(RuleBasedStateMachine):
         max_results: int | None,
         deadline: float | None,
     ) -> Any:
-        return self.core.collect(
+        return self.core.steps.collect(
             self.group.now,
-            timeout=timeout,
-            wait_all=wait_all,
-            min_results=min_results,
-            max_results=max_results,
-            deadline=deadline,
+            CollectRules(
+                timeout=timeout,
+                wait_all=wait_all,
+                min_results=min_results,
+                max_results=max_results,
+                deadline=deadline,
+            ),
         )
 
     @precondition(lambda self: self.collector is None)
@@ -389,7 +393,7 @@ class CoreMachine(RuleBasedStateMachine):
     @precondition(lambda self: any(h.waiting and not h.inline for h in self.group.hosts))
     @rule(data=st.data(), newest_first=st.booleans())
     def finish(self, data: st.DataObject, newest_first: bool) -> None:
-        """A worker executes a request, not necessarily the oldest."""
+        """Let a worker execute a request, not necessarily the oldest."""
         slots = [
             host.first_slot + row
             for host in self.group.hosts
@@ -416,9 +420,10 @@ class CoreMachine(RuleBasedStateMachine):
     @precondition(alive)
     @rule(data=st.data(), refusals=st.integers(0, 2))
     def die(self, data: st.DataObject, refusals: int) -> None:
-        """A worker dies: each of its envs that owed a reply gives one marked result.
+        """Let a worker die: each of its envs that owed a reply gets one marked result.
 
-        What is asked until a replacement is up, which may take attempts and time, it executes.
+        Requests sent before a replacement is up, which may take attempts and time, are executed by
+        it.
         """
         host = data.draw(st.sampled_from(self.alive()))
         host.refusals = refusals
@@ -446,7 +451,7 @@ class CoreMachine(RuleBasedStateMachine):
     @precondition(lambda self: self.operations)
     @rule(data=st.data())
     def cancel(self, data: st.DataObject) -> None:
-        """Results of a call that was given up go to whoever collects."""
+        """Cancel a call; a collect returns its results."""
         running, slots, requests = self.operations.pop(
             data.draw(st.integers(0, len(self.operations) - 1))
         )
@@ -477,24 +482,24 @@ class CoreMachine(RuleBasedStateMachine):
         assert configured is not None
         self.limit = configured if own or limit == configured else limit
         if own or limit == configured:
-            self.core.auto.begin(None if own else limit, on_done=on_done)
+            self.core.continuity.begin(None if own else limit, on_done=on_done)
         else:
             with pytest.warns(UserWarning, match="overrides"):
-                self.core.auto.begin(limit, on_done=on_done)
+                self.core.continuity.begin(limit, on_done=on_done)
         self.on_done = on_done
         with pytest.raises(RuntimeError, match="nest"):
-            self.core.auto.begin(1, on_done=True)
+            self.core.continuity.begin(1, on_done=True)
 
     @precondition(lambda self: self.limit is not None)
     @rule()
     def leave_auto_reset(self) -> None:
-        self.core.auto.end()
+        self.core.continuity.end()
         self.limit = None
 
     # -- comparing
 
     def settle(self) -> None:
-        """Whatever must be done by now is done, with the right results; the rest waits."""
+        """Check that all operations that must be done are, with the right results."""
         self.run_inline()
         for entry in list(self.operations):
             self.settle_operation(*entry)
@@ -571,7 +576,7 @@ class CoreMachine(RuleBasedStateMachine):
             assert not running.done, (running.value, running.error)
 
     def check_batch(self, batch: BatchedData, flags: list[bool] | None, slots: list[int]) -> None:
-        """Rows hold what the model foresaw; flags and counters follow."""
+        """Compare rows, flags and counters with the model."""
         self.last_batch = batch
         assert max(Counter(slots).values()) == 1
         expected_flags: list[bool] = []
@@ -604,7 +609,7 @@ class CoreMachine(RuleBasedStateMachine):
 
     @invariant()
     def nothing_is_forgotten(self) -> None:
-        """The core counts as pending what the model does."""
+        """Compare the numbers of pending requests of core and model."""
         if not hasattr(self, "envs"):
             return
         mine = [

@@ -1,4 +1,4 @@
-"""GPUs are dealt out to workers before anything starts; none is needed to see that."""
+"""GPUs are assigned to workers before anything starts; these tests need no GPU."""
 
 from __future__ import annotations
 
@@ -38,18 +38,18 @@ def shares(*wishes: float) -> list[str]:
         ("GPU-a", ["GPU-a"]),
     ],
 )
-def test_the_trainers_own_devices_are_dealt_out(
+def test_the_devices_of_the_trainer_are_assigned(
     monkeypatch: pytest.MonkeyPatch, visible: str, names: list[str]
 ) -> None:
-    """As CUDA reads the variable."""
+    """The variable is read as CUDA reads it."""
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
     assert visible_devices() == (names, f"CUDA_VISIBLE_DEVICES={visible}")
 
 
-def test_devices_are_counted_where_nobody_has_chosen(
+def test_without_the_variable_devices_are_counted(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """By the program that comes with the driver, where there are no device files."""
+    """By the driver's program, if there are no device files."""
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     monkeypatch.setattr("rlightning_aio.group.devices.Path", lambda _: tmp_path)
     monkeypatch.setenv("PATH", str(tmp_path))
@@ -66,7 +66,7 @@ def test_devices_are_counted_where_nobody_has_chosen(
 
 
 def test_each_worker_has_its_share(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whole devices for itself, or a part of one; MuJoCo renders on the first."""
+    """Whole devices, or a part of one; MuJoCo renders on the first."""
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,5,6")
     assert shares(1, 0, 2) == ["4", "", "5,6"]
     assert shares(0.5, 0.5, 1, 0.3) == ["4", "4", "5", "6"]
@@ -77,8 +77,8 @@ def test_each_worker_has_its_share(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @given(st.lists(st.sampled_from([0, 0.25, 0.5, 1, 2]), max_size=8), st.integers(0, 5))
-def test_no_device_is_dealt_out_twice(wishes: list[float], count: int) -> None:
-    """Shares of one add up to it at most, or all is refused."""
+def test_no_device_is_assigned_twice(wishes: list[float], count: int) -> None:
+    """Shares of one device add up to at most 1, or the config is refused."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CUDA_VISIBLE_DEVICES", ",".join(map(str, range(count))) or "-1")
         try:
@@ -95,24 +95,35 @@ def test_no_device_is_dealt_out_twice(wishes: list[float], count: int) -> None:
         ]
 
 
-def test_what_the_machine_lacks_is_refused_before_anything_starts(
+def test_missing_devices_are_refused_before_anything_starts(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """With what was asked for, and what is there."""
+    """The error has the number asked for and the number present."""
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1")
     entry = {"name": "ant", "backend": "mujoco", "task": "Ant-v5", "num_workers": 4}
     with pytest.raises(
         ConfigError,
-        match=r"entry 'ant', num_gpus: .* 4 workers of entry 'ant' with 1 each; visible here: 2 "
-        r"\(0, 1\), by CUDA_VISIBLE_DEVICES=0,1",
+        match=r"entry 'ant', num_gpus: .* 4 workers of entry 'ant' with 1 each; visible here "
+        r"\(CUDA_VISIBLE_DEVICES=0,1\): 2 \(0, 1\);",
     ):
         sync.build_env_group({**entry, "num_gpus": 1, "envs_per_process": 1})
-    with pytest.raises(ConfigError, match=r"whole devices or a fraction of one, not 1\.5"):
+    with pytest.raises(ConfigError, match=r"a whole number or less than 1, not 1\.5"):
         sync.build_env_group({**entry, "num_gpus": 1.5})
 
 
+@pytest.mark.parametrize("placement", ["inline", "split"])
+def test_this_process_needs_a_gpu_to_share(monkeypatch: pytest.MonkeyPatch, placement: str) -> None:
+    entry = {"name": "ant", "backend": "mujoco", "task": "Ant-v5", "num_workers": 2}
+    entry |= {"placement": placement, "num_gpus": 1}
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    with pytest.raises(ConfigError, match=r"entry 'ant', num_gpus: .*visible here"):
+        sync.build_env_group(entry)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
+    sync.build_env_group(entry).close()
+
+
 def test_workers_find_their_share_in_their_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And which of the entry's workers they are, where the entry names it."""
+    """So is the worker's index, if the entry asks for it."""
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2,3")
     entry: dict[str, Any] = {
         "name": "e",

@@ -1,4 +1,4 @@
-"""What goes into an env and what comes out of it: actions, extras and values of all kinds."""
+"""Inputs and outputs of envs: actions, extras and values of all kinds."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from rlightning_aio import (
 )
 from rlightning_aio.group.slab_layout import check_actions
 
-# Values are made and read on this side of any loop.
+# Values are made and read independently of the loop.
 pytestmark = pytest.mark.one_driver_for_each_place
 
 PROBE = {"name": "probe", "backend": "probe", "task": "x", "num_workers": 2}
@@ -60,7 +60,7 @@ def scaled(factor: float, response: PolicyResponse) -> Any:
 
 
 class Adder:
-    """A callable that can't be hashed."""
+    """A callable without a hash."""
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -82,7 +82,7 @@ async def test_one_function_serves_every_env(start: Any) -> None:
 
 
 async def test_functions_are_given_by_entry_or_by_env(start: Any) -> None:
-    """An entry's function is each of its envs'; None stands for the default."""
+    """An entry's function serves all of its envs; None is the default."""
     two = {**PROBE, "name": "two", "num_workers": 1}
     group = await start([PROBE, two], preprocess_fn=[partial(scaled, 2.0), Adder(0.5)])
     batch, _ = await group.reset()
@@ -96,7 +96,7 @@ async def test_functions_are_given_by_entry_or_by_env(start: Any) -> None:
 
 
 async def test_a_function_serves_built_in_backends(start: Any) -> None:
-    """It makes the simulator's action of whatever the policy gives, here of logits."""
+    """It converts the policy's output, here logits, into the simulator's action."""
     group = await start(CARTPOLE, preprocess_fn=lambda response: int(np.argmax(response.logits)))
     plain = await start(CARTPOLE)
     batch, _ = await group.reset(seed=3)
@@ -112,8 +112,8 @@ async def test_a_function_serves_built_in_backends(start: Any) -> None:
         assert (batch.observation == expected.observation).all()
 
 
-def test_a_function_that_cannot_travel_is_named_before_anything_starts() -> None:
-    """With what it captures, or how many there should have been."""
+def test_a_function_that_cannot_be_pickled_is_named_before_anything_starts() -> None:
+    """With what it captures, or with the expected number of functions."""
     lock = threading.Lock()
 
     def locked(response: PolicyResponse) -> Any:
@@ -135,7 +135,7 @@ def test_a_function_that_cannot_travel_is_named_before_anything_starts() -> None
 
 @dataclass
 class Thought:
-    """Something that only the policy understands."""
+    """A class that only the policy knows."""
 
     depth: int
 
@@ -155,8 +155,8 @@ async def test_extras_reach_the_function_and_the_step(start: Any) -> None:
     assert batch.info()[0]["extras"]["thought"].depth == 3
 
 
-async def test_actions_come_with_extras_whole_or_one_by_one(start: Any) -> None:
-    """A column that fits the rows, one that only fits in part, and an entry without readers."""
+async def test_actions_with_extras_arrive_as_columns_and_one_by_one(start: Any) -> None:
+    """A column that fits the rows, one that fits in part, and an entry that reads no extras."""
     plain = {**CARTPOLE, "num_workers": 1}
     group = await start(
         [PROBE, plain],
@@ -178,8 +178,8 @@ async def test_actions_come_with_extras_whole_or_one_by_one(start: Any) -> None:
     assert batch.reward.tolist() == [1.0, 8.0]
 
 
-async def test_extras_that_nothing_can_read_are_not_sent(start: Any) -> None:
-    """A built-in backend with the default function: what is attached stays with the policy."""
+async def test_extras_that_no_env_reads_are_not_sent(start: Any) -> None:
+    """A built-in backend with the default function: extras stay in the trainer."""
     group = await start(CARTPOLE)
     batch, _ = await group.reset(seed=0)
     unpicklable = [threading.Lock(), threading.Lock()]
@@ -195,9 +195,9 @@ async def test_extras_that_nothing_can_read_are_not_sent(start: Any) -> None:
 # -- actions
 
 
-async def test_actions_of_every_space_that_travels_in_rows(start: Any) -> None:
-    """Box, Discrete, MultiBinary and MultiDiscrete in Dict and Tuple, as columns and as lists;
-    the env checks each.
+async def test_actions_of_every_space_that_fits_in_rows(start: Any) -> None:
+    """Box, Discrete, MultiBinary and MultiDiscrete in Dict and Tuple, as columns and as lists; the
+    env checks each.
     """
     from gymnasium.vector.utils import batch_space
 
@@ -221,8 +221,8 @@ async def test_actions_of_every_space_that_travels_in_rows(start: Any) -> None:
         await group["e-0"].step(wrong)
 
 
-async def test_actions_without_a_fixed_size_travel_as_well(start: Any) -> None:
-    """Text in a tuple, say."""
+async def test_actions_without_a_fixed_size_are_sent_out_of_band(start: Any) -> None:
+    """For example Text in a Tuple."""
     group = await start(gym_entry("Speech-v0"))
     batch, _ = await group.reset(seed=0)
     batch, _ = await group.step(batch.respond(action=[("hello", 1), ("you", 0)]))
@@ -232,7 +232,7 @@ async def test_actions_without_a_fixed_size_travel_as_well(start: Any) -> None:
 
 
 async def test_an_env_that_transforms_actions_takes_any(start: Any) -> None:
-    """Chunks of any length, dicts, and what would have fitted its rows."""
+    """Chunks of any length, dicts, and actions that would fit in its row."""
     chunked = {**PROBE, "name": "chunked", "backend": "chunked"}
     group = await start(chunked)
     batch, _ = await group.reset()
@@ -249,8 +249,8 @@ async def test_an_env_that_transforms_actions_takes_any(start: Any) -> None:
 # -- observations
 
 
-async def test_observations_without_a_fixed_size_come_as_the_env_gave_them(start: Any) -> None:
-    """Text, Sequence and Graph, wherever they are, equal those of the bare env."""
+async def test_observations_without_a_fixed_size_arrive_unchanged(start: Any) -> None:
+    """Text, Sequence and Graph, at any depth, equal those of the bare env."""
     group = await start(gym_entry("Words-v0"))
     bare = [sample_envs.words(), sample_envs.words()]
     batch, _ = await group.reset(seed=4)
@@ -272,8 +272,8 @@ async def test_observations_without_a_fixed_size_come_as_the_env_gave_them(start
         ({}, "must return an EnvRet.*not NoneType"),
     ],
 )
-async def test_results_that_break_the_envs_promise_are_refused(result: Any, said: str) -> None:
-    """The env is told apart from the policy: it is its error, by name, shape and dtype."""
+async def test_results_outside_the_spaces_are_refused(result: Any, said: str) -> None:
+    """The error blames the env, with name, shape and dtype."""
     async with build_env_group(
         {**PROBE, "backend": "sloppy", "placement": "inline", "num_workers": 1}
     ) as group:
@@ -287,8 +287,8 @@ async def test_results_that_break_the_envs_promise_are_refused(result: Any, said
 # -- several sub-environments, several agents, several kinds of env
 
 
-async def test_sub_environments_have_an_axis_of_their_own(start: Any) -> None:
-    """And seeds of their own, counted through the group."""
+async def test_sub_environments_have_their_own_axis(start: Any) -> None:
+    """And their own seeds, counted through the group."""
     batched = {**PROBE, "name": "b", "backend": "batched", "num_envs": 3}
     group = await start(batched)
     assert [meta.num_envs for meta in await group.init()] == [3, 3]
@@ -311,8 +311,8 @@ async def test_sub_environments_have_an_axis_of_their_own(start: Any) -> None:
         await group.step(batch.respond(action=np.ones((2, 2), int)))
 
 
-async def test_agents_have_columns_of_their_own(start: Any) -> None:
-    """With different spaces; an episode has ended when it has for all of them."""
+async def test_agents_have_their_own_columns(start: Any) -> None:
+    """With different spaces; an episode ends when it has ended for all of them."""
     group = await start({**PROBE, "name": "c", "backend": "crowd", "max_episode_steps": 9})
     metas = await group.init()
     assert metas[0].agents == ("tall", "small")
@@ -337,7 +337,7 @@ async def test_agents_have_columns_of_their_own(start: Any) -> None:
 
 
 async def test_envs_of_different_observations_work_as_one_group(start: Any) -> None:
-    """Each entry's batch stacks, and is answered by itself."""
+    """Each entry's batch stacks and is answered separately."""
     wide = {"name": "e", "backend": "gymnasium", "task": "Acrobot-v1"}
     poles = {**CARTPOLE, "name": "pole"}
     group = await start([wide, poles])
@@ -356,8 +356,8 @@ async def test_envs_of_different_observations_work_as_one_group(start: Any) -> N
     assert len(batch.info()) == 3
 
 
-def test_spaces_of_the_users_own_are_alike_by_what_they_say_of_themselves() -> None:
-    """An object's address says nothing."""
+def test_custom_spaces_are_compared_by_their_repr() -> None:
+    """Without the object's address."""
 
     class Words(spaces.Space[str]):
         pass
@@ -386,8 +386,8 @@ def test_spaces_of_the_users_own_are_alike_by_what_they_say_of_themselves() -> N
         check(Words(), Sized(2))
 
 
-async def test_actions_of_different_shapes_are_refused_unless_meant(place: Any, start: Any) -> None:
-    """Both envs are named; the axis of sub-environments doesn't count; nothing is left running."""
+async def test_different_action_shapes_need_an_option(place: Any, start: Any) -> None:
+    """The error names both envs; the axis of sub-environments is ignored; nothing stays running."""
     wide = {**PROBE, "name": "wide", "env_kwargs": {"action_shape": [3]}}
     with pytest.raises(ValueError, match=r"'probe-0' and 'wide-0'.*\(2,\).*\(3,\).*mixed_actions"):
         await start([PROBE, wide])
@@ -406,8 +406,8 @@ async def test_actions_of_different_shapes_are_refused_unless_meant(place: Any, 
     assert [space.shape for space in group.get_action_spaces()] == [(2,), (3,)]
 
 
-def test_spaces_cross_processes_as_they_are() -> None:
-    """What a worker reports equals what the simulator has."""
+def test_spaces_of_workers_equal_those_of_the_simulator() -> None:
+    """After the pickling between processes."""
     from rlightning_aio import sync
 
     with sync.build_env_group(gym_entry("Words-v0", num_workers=1)) as group:

@@ -1,4 +1,4 @@
-"""Memory that runs out while results are handed out costs no result."""
+"""Running out of memory while results are handed out loses no result."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from group.fake_host import PLAIN, RAISES, TELLS, TERMINATES, FakeGroup
+from group.fake_host import PLAIN, RAISES, SENDS_INFO, TERMINATES, FakeGroup
 from group.sample_envs import HALVED
 
 import rlightning_aio.sync
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import EnvRaised
+from rlightning_aio.group.wait import CollectRules
 from rlightning_aio.hosts.messages import Result
 from rlightning_aio.types import PolicyResponse
 
@@ -31,12 +32,12 @@ COPYING = {
     "add_episodes",
     "sources",
 }
-"""What a batch is made in."""
+"""Modules whose code makes a batch."""
 
 
 @contextmanager
 def out_of_memory(line: int) -> Iterator[list[bool]]:
-    """At the n-th line that makes a batch; whether it came to that."""
+    """Raise MemoryError at the n-th line that makes a batch; the list has an item if it did."""
     left = line
     struck: list[bool] = []
 
@@ -60,8 +61,8 @@ def out_of_memory(line: int) -> Iterator[list[bool]]:
         sys.settrace(None)
 
 
-def told(results: tuple[BatchedData, Any]) -> str:
-    """All that can be told of a batch."""
+def content(results: tuple[BatchedData, Any]) -> str:
+    """Return the content of a batch as plain data."""
     batch, flags = results
     sent = {name: batch.sent[name] for name in batch.sent}
     rows = (batch.is_reset, batch.limit_reached, batch.restarted, batch.done)
@@ -75,8 +76,7 @@ def steps(*deeds: int) -> BatchedData:
 
 
 def collected(group: FakeGroup) -> tuple[BatchedData, Any]:
-    rules = {"timeout": None, "min_results": 1, "max_results": None, "deadline": None}
-    return group.begin(group.core.collect(group.now, wait_all=True, **rules)).result()
+    return group.begin(group.core.steps.collect(group.now, CollectRules(wait_all=True))).result()
 
 
 def finish_all(group: FakeGroup) -> None:
@@ -86,24 +86,24 @@ def finish_all(group: FakeGroup) -> None:
 
 
 def hard_to_collect() -> FakeGroup:
-    """Results wait that have infos out of band, an end, a limit, and a worker's death to tell."""
+    """Make results wait that have infos out of band, an end, a limit, and a worker's death."""
     group = FakeGroup([2, 2])
-    group.core.auto.begin(2, on_done=True, mark_truncated=True)
-    for deeds in ((PLAIN, PLAIN, PLAIN, PLAIN), (TELLS, TERMINATES, TELLS, PLAIN)):
-        if deeds[0] == TELLS:
+    group.core.continuity.begin(2, on_done=True, mark_truncated=True)
+    for deeds in ((PLAIN, PLAIN, PLAIN, PLAIN), (SENDS_INFO, TERMINATES, SENDS_INFO, PLAIN)):
+        if deeds[0] == SENDS_INFO:
             group.hosts[1].die()
             group.turn()
-        group.core.step_async(steps(*deeds), group.now)
+        group.core.steps.step_async(steps(*deeds), group.now)
         finish_all(group)
         if deeds[0] == PLAIN:
             collected(group)
     return group
 
 
-def test_a_collect_that_fails_leaves_all_results_to_the_next() -> None:
-    """Wherever it fails, and however often: they are handed out as they would have been."""
+def test_a_failed_collect_leaves_all_results_to_the_next() -> None:
+    """Wherever and however often it fails, the results are the same."""
     group = hard_to_collect()
-    expected = told(collected(group))
+    expected = content(collected(group))
     group.close()
     assert "worker_restarted" in expected
     group = hard_to_collect()
@@ -116,18 +116,18 @@ def test_a_collect_that_fails_leaves_all_results_to_the_next() -> None:
         break
     assert not struck
     assert line > 20
-    assert told(results) == expected
+    assert content(results) == expected
     assert group.core.pending() == 0
-    group.core.step_async(steps(PLAIN, PLAIN, PLAIN, PLAIN), group.now)
+    group.core.steps.step_async(steps(PLAIN, PLAIN, PLAIN, PLAIN), group.now)
     finish_all(group)
     assert len(collected(group)[0]) == 4
     group.close()
 
 
-def test_a_step_that_fails_leaves_its_results_to_collect() -> None:
+def test_a_failed_step_leaves_its_results_to_collect() -> None:
     """And its errors, which a collect raises first."""
     group = FakeGroup([2])
-    running = group.begin(group.core.step(steps(TELLS, RAISES), group.now))
+    running = group.begin(group.core.steps.step(steps(SENDS_INFO, RAISES), group.now))
     with out_of_memory(1):
         finish_all(group)
     with pytest.raises(MemoryError):
@@ -135,16 +135,16 @@ def test_a_step_that_fails_leaves_its_results_to_collect() -> None:
     with pytest.raises(EnvRaised, match="fake-1"):
         collected(group)
     (value,) = collected(group)[0].values()
-    assert (value.env_id, value.info) == ("fake-0", {"told": [0]})
+    assert (value.env_id, value.info) == ("fake-0", {"steps": [0]})
     group.close()
 
 
-def test_an_info_that_can_not_be_read_is_its_readers_trouble() -> None:
-    """Statistics look into it where an episode ends, and the result is handed out all the same."""
+def test_an_unreadable_info_raises_only_when_it_is_read() -> None:
+    """Statistics read it where an episode ends; the result is handed out all the same."""
     group = FakeGroup([1])
     (host,) = group.hosts
     host._reply = lambda entry, *_, **__: host.answer(Result(host.host_id, entry, b"no pickle"))
-    group.core.step_async(steps(TERMINATES), group.now)
+    group.core.steps.step_async(steps(TERMINATES), group.now)
     host.slab.episode_length[0] = 1
     finish_all(group)
     batch, _ = collected(group)
@@ -155,8 +155,8 @@ def test_an_info_that_can_not_be_read_is_its_readers_trouble() -> None:
 
 
 @pytest.mark.parametrize("entry", [HALVED, HALVED | {"backend": "fresh", "task": "array"}])
-def test_a_step_on_the_spot_that_fails_leaves_its_result_to_collect(entry: dict[str, Any]) -> None:
-    """Also where the env's own arrays are handed out."""
+def test_a_failed_step_of_a_single_env_leaves_its_result_to_collect(entry: dict[str, Any]) -> None:
+    """Also if the env's own arrays are handed out."""
     with (
         rlightning_aio.sync.build_env_group(entry) as group,
         rlightning_aio.sync.build_env_group(entry) as untroubled,
@@ -169,7 +169,7 @@ def test_a_step_on_the_spot_that_fails_leaves_its_result_to_collect(entry: dict[
                 batch, _ = group.step(batch.respond(action=np.array([line % 2])))
             if struck:
                 batch, _ = group.collect_async()
-            assert told((batch, None)) == told((expected, None))
+            assert content((batch, None)) == content((expected, None))
             if not struck:
                 break
         assert line > 10

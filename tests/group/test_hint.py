@@ -1,4 +1,4 @@
-"""What a group says, once, of settings that cost time."""
+"""The hint that a group logs once about slow settings."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ def entry(**fields: object) -> EnvConfig:
     )
 
 
-def test_more_workers_than_cores_are_told_to_share() -> None:
-    """Short steps in a worker each: several envs in each worker are suggested."""
+def test_more_workers_than_cores_get_a_hint_to_share() -> None:
+    """With short steps and one env in each worker, several envs in each worker are suggested."""
     said = hint([entry(num_workers=8)], {"pole": 8}, 2, latencies(50.0, 100.0))
     assert said is not None
     assert "envs_per_process: 4" in said
 
 
-def test_an_env_that_takes_no_time_is_told_to_stay() -> None:
-    """One tiny env in a worker of its own: the training process is suggested."""
+def test_a_tiny_env_in_a_worker_gets_a_hint_to_be_inline() -> None:
+    """The trainer's process is suggested."""
     said = hint([entry()], {"pole": 1}, 2, latencies(8.0, 60.0))
     assert said is not None
     assert "placement: inline" in said
@@ -42,14 +42,14 @@ def test_an_env_that_takes_no_time_is_told_to_stay() -> None:
     [(2, 50.0, 100.0), (8, 20_000.0, 100.0)],
     ids=["as many workers as cores", "steps that wait"],
 )
-def test_good_settings_are_left_alone(workers: int, step: float, transfer: float) -> None:
-    """Nothing is said where nothing would be gained."""
+def test_good_settings_get_no_hint(workers: int, step: float, transfer: float) -> None:
+    """Other settings would be no faster."""
     config = entry(num_workers=8)
     assert hint([config], {"pole": workers}, 2, latencies(step, transfer)) is None
 
 
 def test_the_hint_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
-    """It comes at INFO, after a while, and never again."""
+    """At INFO, after some steps."""
     measured = {"latency_us": latencies(step=10.0, transfer=100.0)}
     with (
         caplog.at_level(logging.INFO, "rlightning_aio"),

@@ -1,4 +1,4 @@
-"""What inline envs may do beyond a worker's: start early, and hand over what they have made."""
+"""Abilities of inline envs beyond those of workers: start early, and hand over their own arrays."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from group.sample_envs import HALVED
 from gymnasium import spaces
 
 import rlightning_aio.sync
-from rlightning_aio.batch.data import parts_of
+from rlightning_aio.batch.contents import parts_of
 from rlightning_aio.envs.contract import same
 from rlightning_aio.errors import EnvRaised
 
@@ -46,7 +46,7 @@ def test_a_step_of_halves_starts_when_it_is_sent(halved: rlightning_aio.sync.Env
 def test_an_error_of_either_half_is_the_steps(
     halved: rlightning_aio.sync.EnvGroup, action: int
 ) -> None:
-    """It is raised where the result would have come."""
+    """It is raised in place of the result."""
     batch, _ = halved.reset()
     halved.step_async(batch.respond(action=np.array([action])))
     with pytest.raises(EnvRaised, match=r"'one-0'.* raised in step: ValueError: no (start|end)"):
@@ -58,15 +58,15 @@ def test_an_error_of_either_half_is_the_steps(
 def test_an_interrupt_of_the_first_half_comes_with_the_result(
     halved: rlightning_aio.sync.EnvGroup,
 ) -> None:
-    """Of several requests all are sent before anything is raised."""
+    """All requests are sent before anything is raised."""
     batch, _ = halved.reset()
     halved.step_async(batch.respond(action=np.array([sample_envs.Halved.INTERRUPT_START])))
     with pytest.raises(KeyboardInterrupt):
         halved.collect_async()
 
 
-def test_what_the_trainer_does_between_the_halves_is_not_the_envs_time() -> None:
-    """The time of a step is that of its two halves."""
+def test_time_between_the_halves_is_not_part_of_the_step() -> None:
+    """The time of a step is the sum of its two halves."""
     clock = SimpleNamespace(now=0, monotonic_ns=lambda: clock.now)
 
     class Timed(sample_envs.Halved):
@@ -80,6 +80,7 @@ def test_what_the_trainer_does_between_the_halves_is_not_the_envs_time() -> None
 
     with (
         patch.dict(rlightning_aio.ENVS._classes, {"halved": Timed}),
+        patch("rlightning_aio.hosts.env_steps.time", clock),
         patch("rlightning_aio.hosts.runner.time", clock),
         rlightning_aio.sync.build_env_group(HALVED) as group,
     ):
@@ -92,8 +93,8 @@ def test_what_the_trainer_does_between_the_halves_is_not_the_envs_time() -> None
 
 
 @pytest.mark.filterwarnings("ignore:.*Casting input x to numpy array:UserWarning")
-def test_fresh_observations_are_those_of_a_worker() -> None:
-    """Arrays or not, one or several; what they look like doesn't depend on where the env lives."""
+def test_fresh_observations_equal_those_of_a_worker() -> None:
+    """Arrays or not, of one env or several: the placement changes nothing."""
     entries = {
         f"{task} of {count}": fresh(task, name=f"{task} of {count}", num_workers=count)
         for task in sample_envs.Fresh.SPACES
@@ -116,7 +117,9 @@ def test_fresh_observations_are_those_of_a_worker() -> None:
     ) as group:
         in_workers = seen(group)
     for name, entry in entries.items():
-        with rlightning_aio.sync.build_env_group(entry) as group:  # Alone: none is copied.
+        with rlightning_aio.sync.build_env_group(
+            entry
+        ) as group:  # A single env: nothing is copied.
             handed_over = seen(group)
         expected = [{name: found[name]} for found in in_workers]
         assert same(handed_over, expected)
@@ -124,7 +127,7 @@ def test_fresh_observations_are_those_of_a_worker() -> None:
 
 
 def test_fresh_observations_are_handed_over_uncopied() -> None:
-    """The column is a view of the very array that the env has made."""
+    """The column is a view of the env's array."""
     with rlightning_aio.sync.build_env_group(fresh("array")) as group:
         batch = step(group, group.reset()[0])
         assert np.shares_memory(batch.observation, group["array-0"].get_attr("given", "outer"))
@@ -132,7 +135,7 @@ def test_fresh_observations_are_handed_over_uncopied() -> None:
 
 @pytest.mark.filterwarnings("ignore:.*Casting input x to numpy array:UserWarning")
 def test_envs_of_different_spaces_stack_each_for_itself() -> None:
-    """Handed over or not, what doesn't stack isn't put together."""
+    """Observations of different spaces are not stacked, handed over or not."""
     with rlightning_aio.sync.build_env_group([fresh(t) for t in sample_envs.Fresh.SPACES]) as group:
         batch = step(group, group.reset()[0])
         by_name = batch.by_name()
@@ -145,7 +148,7 @@ def test_envs_of_different_spaces_stack_each_for_itself() -> None:
 
 
 def test_fresh_observations_have_the_spaces_dtype_and_shape() -> None:
-    """Others are cast where that loses nothing but precision, and refused elsewhere."""
+    """Others are cast if that loses only precision, and otherwise refused."""
     with rlightning_aio.sync.build_env_group(
         fresh("array", env_kwargs={"gives": [0.5, 0.25, 0.0]})
     ) as group:
@@ -163,7 +166,7 @@ def test_fresh_observations_have_the_spaces_dtype_and_shape() -> None:
         assert group.reset()[0].observation.shape == (1, 3)
 
 
-def test_a_step_of_ones_own_promises_nothing() -> None:
+def test_an_overridden_step_has_its_results_copied() -> None:
     """A subclass may write to its results again; `fresh_results` is about `bare_step`."""
     with rlightning_aio.sync.build_env_group(fresh("array", backend="stale")) as group:
         batch, _ = group.reset()
@@ -172,33 +175,33 @@ def test_a_step_of_ones_own_promises_nothing() -> None:
 
 
 class Telling(gym.Env[Any, Any]):
-    """Its observations are what was done to it, in a space too small for all of them."""
+    """Observes its history, in a space that is too small for all values."""
 
-    observation_space = spaces.Dict(told=spaces.Box(-128, 127, (2,), np.int8))
+    observation_space = spaces.Dict(history=spaces.Box(-128, 127, (2,), np.int8))
     action_space = spaces.Discrete(1000)
 
     def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        return {"told": np.array([0, -128])}, {"none": np.zeros((0, 3), np.float32)}
+        return {"history": np.array([0, -128])}, {"none": np.zeros((0, 3), np.float32)}
 
     def step(self, action: Any) -> Any:
         info = {"none": np.zeros((0, 3), np.float32)}
-        return {"told": np.array([action, 127])}, 1.0, False, False, info
+        return {"history": np.array([action, 127])}, 1.0, False, False, info
 
 
 def test_numbers_that_an_observation_space_can_not_hold_are_an_error() -> None:
-    """Named, and not another number; what it can hold may come in a wider dtype."""
+    """The error has the number; numbers that fit may have a wider dtype."""
     with rlightning_aio.sync.build_env_group(
         {"name": "t", "make_env": Telling, "placement": "inline"}
     ) as group:
         batch, _ = group.reset()
-        assert batch.observation["told"].tolist() == [[0, -128]]
-        with pytest.raises(EnvRaised, match=r"'t-0'.*observation\['told'\] .*holds 300.*int8"):
+        assert batch.observation["history"].tolist() == [[0, -128]]
+        with pytest.raises(EnvRaised, match=r"'t-0'.*observation\['history'\] .*holds 300.*int8"):
             group.step(batch.respond(action=np.array([300])))
         batch, _ = group.step(batch.respond(action=np.array([0])))
-        assert batch.observation["told"].tolist() == [[0, 127]]
+        assert batch.observation["history"].tolist() == [[0, 127]]
 
 
-def test_an_info_of_empty_arrays_alone_comes_as_it_is() -> None:
+def test_an_info_of_empty_arrays_arrives_unchanged() -> None:
     """It takes no byte of a row."""
     with rlightning_aio.sync.build_env_group(
         {"name": "t", "make_env": Telling, "placement": "inline"}

@@ -10,7 +10,7 @@ import rlightning_aio.sync
 
 
 def test_inline_entries_take_turns() -> None:
-    """First come, first served: an entry whose env is sent on at once waits behind the others."""
+    """First come, first served: an env that gets a new request at once waits behind the others."""
     group = rlightning_aio.sync.build_env_group(
         [
             {

@@ -1,4 +1,4 @@
-"""A start that is given up leaves nothing running and shows the reason alone."""
+"""A start that is interrupted leaves nothing running and raises only its cause."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ ENTRY = {"name": "cartpole", "backend": "gymnasium", "task": "CartPole-v1", "num
 
 
 async def test_cancelling_init_closes_the_group_and_raises_the_cancellation() -> None:
-    """Whoever cancels `init` sees CancelledError; the group is closed, with all it started."""
+    """`init` raises CancelledError, and everything that was started is closed."""
     group = rlightning_aio.build_env_group(ENTRY)
     starting = asyncio.ensure_future(group.init())
-    await asyncio.sleep(0)  # It has sent its first request and waits.
+    await asyncio.sleep(0)  # `init` has sent its first request and waits.
     starting.cancel()
     with pytest.raises(asyncio.CancelledError):
         await starting
@@ -30,7 +30,7 @@ async def test_cancelling_init_closes_the_group_and_raises_the_cancellation() ->
 
 
 async def test_cancelling_init_twice_does_not_wait_for_the_workers() -> None:
-    """The second cancellation ends the orderly close; nothing is left either way."""
+    """The second cancellation ends the orderly close; nothing is left in either case."""
     group = rlightning_aio.build_env_group(ENTRY)
     starting = asyncio.ensure_future(group.init())
     await asyncio.sleep(0)
@@ -42,14 +42,14 @@ async def test_cancelling_init_twice_does_not_wait_for_the_workers() -> None:
 
 
 async def test_a_start_that_fails_keeps_no_memory() -> None:
-    """A group whose envs can't be built is gone with its last reference, unclosed or not."""
+    """A group whose envs can't be built is freed with its last reference, closed or not."""
     group = rlightning_aio.build_env_group({**ENTRY, "task": "NoSuchTask-v0"})
     with pytest.raises(StartFailed):
         await group.init()
 
 
 def test_interrupting_a_synchronous_init_raises_the_interrupt() -> None:
-    """Ctrl-C while workers start is a KeyboardInterrupt, and the group is closed."""
+    """Ctrl-C while workers start raises KeyboardInterrupt, and the group is closed."""
     script = textwrap.dedent(f"""
         import rlightning_aio.sync
         from rlightning_aio.hosts import process

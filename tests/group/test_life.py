@@ -1,9 +1,10 @@
-"""How groups begin and end, where env classes may come from, and in which surroundings."""
+"""Start and close of groups, sources of env classes, and the surroundings of a group."""
 
 from __future__ import annotations
 
 import asyncio
 import gc
+import re
 import subprocess
 import sys
 import threading
@@ -29,11 +30,11 @@ def children() -> set[str]:
     return found
 
 
-# -- beginning and end
+# -- start and close
 
 
 def test_building_a_group_starts_nothing() -> None:
-    """Processes come with `init`; a group that is dropped before leaves no trace."""
+    """`init` starts the processes; a group that is dropped before leaves nothing behind."""
     before = children()
     group = sync.build_env_group(PROBE)
     assert (len(group), group.size(), group.env_ids[2]) == (3, 3, "probe-2")
@@ -49,7 +50,7 @@ def test_building_a_group_starts_nothing() -> None:
 
 
 async def test_a_context_initialises_and_closes(place: Any) -> None:
-    """Also when its body raises."""
+    """Also if its body raises."""
     group = place.build(PROBE)
 
     async def use() -> None:
@@ -66,7 +67,7 @@ async def test_a_context_initialises_and_closes(place: Any) -> None:
 
 @pytest.mark.one_driver_for_each_place
 async def test_an_env_that_cannot_be_built_fails_the_start(place: Any) -> None:
-    """With what it raised; all others are closed, and the group with them."""
+    """With its error; all other envs are closed, and so is the group."""
     group = place.build([PROBE, {**PROBE, "name": "bad", "env_kwargs": {"fails": 1}}])
     before = children()
     with pytest.raises(StartFailed, match=r"'bad-1'.*RuntimeError: no simulator here") as caught:
@@ -81,8 +82,8 @@ async def test_an_env_that_cannot_be_built_fails_the_start(place: Any) -> None:
 
 @pytest.mark.one_driver_for_each_place
 @pytest.mark.parametrize("moment", ["before init", "after close"])
-async def test_outside_of_its_life_a_group_says_so(place: Any, moment: str) -> None:
-    """To whatever is asked, with what to do; it can be closed any number of times."""
+async def test_a_group_that_is_not_open_refuses_all_operations(place: Any, moment: str) -> None:
+    """The error says what to do; close can be called any number of times."""
     group = place.build(PROBE)
     if moment == "after close":
         await group.init()
@@ -114,8 +115,8 @@ async def test_outside_of_its_life_a_group_says_so(place: Any, moment: str) -> N
         await group.init()
 
 
-def test_a_group_that_can_not_be_built_holds_nothing() -> None:
-    """What was made before its second entry turned out to be wrong is given back."""
+def test_a_group_that_cannot_be_built_holds_nothing() -> None:
+    """What its first entry had allocated is released when the second one fails."""
     held = len(list(Path("/proc/self/fd").iterdir()))
     wrong = {**PROBE, "name": "other", "env_kwargs": {"lock": threading.Lock()}}
     for build in (sync.build_env_group, rlightning_aio.build_env_group):
@@ -125,8 +126,8 @@ def test_a_group_that_can_not_be_built_holds_nothing() -> None:
     assert len(list(Path("/proc/self/fd").iterdir())) == held
 
 
-def test_a_group_that_is_dropped_open_is_ended_with_a_warning() -> None:
-    """The collector lets go of its workers."""
+def test_an_open_group_that_is_dropped_is_closed_with_a_warning() -> None:
+    """The garbage collector ends its workers."""
     before = children()
     group = sync.build_env_group({**PROBE, "placement": "inline"})
     group.init()
@@ -146,7 +147,7 @@ def use(group: Any) -> list[float]:
 
 
 def test_a_group_may_outlive_the_thread_that_started_it() -> None:
-    """Workers belong to the process; any one thread at a time may use the group."""
+    """Workers belong to the process; one thread at a time may use the group."""
     group = sync.build_env_group(PROBE)
     found: list[list[float]] = []
     starter = threading.Thread(target=lambda: (group.init(), found.append(use(group))))
@@ -160,7 +161,7 @@ def test_a_group_may_outlive_the_thread_that_started_it() -> None:
 
 
 def test_an_async_group_runs_in_a_loop_of_any_thread() -> None:
-    """Also in one that is not the main one."""
+    """Also in a loop that is not in the main thread."""
     found: list[float] = []
 
     async def main() -> None:
@@ -176,7 +177,7 @@ def test_an_async_group_runs_in_a_loop_of_any_thread() -> None:
 
 
 def test_run_picks_the_faster_loop() -> None:
-    """And returns what the coroutine does."""
+    """It returns the coroutine's result."""
 
     async def main() -> str:
         return type(asyncio.get_running_loop()).__module__
@@ -185,20 +186,20 @@ def test_run_picks_the_faster_loop() -> None:
 
 
 async def test_run_says_what_to_do_where_a_loop_runs() -> None:
-    """As in a notebook, whose user may not know of one."""
+    """For example in a notebook."""
     with pytest.raises(RuntimeError, match="`await` the coroutine instead"):
         rlightning_aio.run(asyncio.sleep(0))
 
 
 async def test_groups_of_both_kinds_side_by_side() -> None:
-    """Two async and a sync one in one loop, each with its own workers."""
+    """Two asynchronous groups and a synchronous one in one loop, each with its own workers."""
     async with (
         rlightning_aio.build_env_group(PROBE) as one,
         rlightning_aio.build_env_group({**PROBE, "name": "other"}) as other,
     ):
         threads = threading.active_count()
         with sync.build_env_group({**PROBE, "name": "third"}) as third:
-            assert threading.active_count() == threads, "it needs none, and no loop of its own"
+            assert threading.active_count() == threads, "a synchronous group needs no loop"
             batches = await asyncio.gather(one.reset(seed=1), other.reset(seed=2))
             assert [batch.observation[0, 3] for batch, _ in batches] == [1, 2]
             assert use(third) == [4.0] * 3
@@ -207,7 +208,7 @@ async def test_groups_of_both_kinds_side_by_side() -> None:
                 await other.step(crossed)
 
 
-# -- where env classes come from
+# -- sources of env classes
 
 MODULE = """
 import numpy as np
@@ -275,7 +276,7 @@ if __name__ == "__main__":
 
 
 def test_a_script_may_define_its_own_envs(tmp_path: Path) -> None:
-    """With the classes and functions it uses, spaces too, in `__main__`, for both placements."""
+    """With their classes, functions and spaces in `__main__`, for both placements."""
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
     done = subprocess.run(
@@ -290,17 +291,19 @@ def test_a_script_may_define_its_own_envs(tmp_path: Path) -> None:
 async def test_a_module_that_only_workers_import_may_define_them(
     place: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Named in `imports`, it registers its backend where the env is built."""
+    """It is named in `imports`, and registers its backend where the env is built."""
     module = f"own_envs_{place.name.replace(' ', '_')}_{place.synchronous}"
     path = tmp_path / f"{module}.py"
-    path.write_text(MODULE + f"\nENVS.register({module!r})(Counter)\n")
+    source = MODULE + f"\nENVS.register({module!r})(Counter)\n"
+    on_loop = place.name == "loop"
+    path.write_text(re.sub("def (reset|step)", r"async def \1", source) if on_loop else source)
     monkeypatch.syspath_prepend(tmp_path)
     entry = {"name": "c", "backend": module, "task": "x", "imports": [module]}
     async with place.build(entry) as group:
         batch, _ = await group.reset(seed=3)
         batch, _ = await group.step(batch.respond(action=np.array([4])))
         assert batch.observation.tolist() == [7]
-    assert (module in sys.modules) == place.inline
+    assert (module in sys.modules) == (place.inline or on_loop)
 
 
 def test_an_installed_package_may_announce_them(
@@ -320,7 +323,7 @@ def test_an_installed_package_may_announce_them(
 
 
 def test_a_class_registered_here_reaches_workers_by_value() -> None:
-    """Defined in a function, where no worker could import it from."""
+    """A class defined in a function, which no worker could import."""
 
     class Local(rlightning_aio.BaseEnv):
         def get_observation_space(self) -> Any:
@@ -343,7 +346,7 @@ def test_a_class_registered_here_reaches_workers_by_value() -> None:
 
 
 def test_workers_collect_garbage() -> None:
-    """As any process does; the fork server leaves it off only while it imports."""
+    """The fork server disables it only while it imports."""
 
     class Asked(sample_envs.Probe):
         def collects_garbage(self) -> bool:

@@ -1,4 +1,4 @@
-"""Env classes of users: what they may leave out, return and declare."""
+"""Custom env classes: what they may omit, return and declare."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ NAMES = ("tacit", "listing", "later", "crowd of two")
 
 
 class Tacit(BaseEnv):
-    """Says as little as it may: no metadata from `init`, no reward and no end from `step`."""
+    """Omits whatever has a default: metadata of `init`, and rewards and ends of `step`."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -59,7 +59,7 @@ class Tacit(BaseEnv):
 
 
 class Listing(Tacit):
-    """Returns lists, with a result for each sub-environment; as many as it is told to."""
+    """Returns a list with a result for each sub-environment, or with another number of results."""
 
     def _listed(self, **fields: Any) -> list[EnvRet]:
         return [
@@ -81,7 +81,7 @@ class Listing(Tacit):
 
 
 class Later(Tacit):
-    """Answers in two halves alone."""
+    """Implements only the two halves of a step."""
 
     def step(self, policy_resp: PolicyResponse) -> Any:
         raise NotImplementedError("use step_async and collect_async")
@@ -101,7 +101,7 @@ class Later(Tacit):
 
 
 class CrowdOfTwo(Tacit):
-    """Two agents of whom only observations are told."""
+    """Two agents that report only observations."""
 
     agents = ("a", "b")
 
@@ -131,7 +131,7 @@ def entry(backend: str, **fields: Any) -> dict[str, Any]:
 
 @pytest.mark.parametrize("placement", ["inline", "process"])
 def test_an_env_may_leave_out_what_has_a_default(placement: str) -> None:
-    """Metadata, rewards and ends, of each sub-environment and agent; a list may hold results."""
+    """Metadata, rewards and ends, of each sub-environment and agent; results may be in a list."""
     entries = [
         entry("tacit", num_envs=3),
         entry("listing", num_envs=3),
@@ -167,7 +167,7 @@ def test_an_env_may_leave_out_what_has_a_default(placement: str) -> None:
 
 
 def test_an_inline_env_of_two_halves_starts_when_its_step_is_sent() -> None:
-    """What the trainer does before it collects goes on beside the step."""
+    """The trainer works in parallel until it collects."""
     with sync.build_env_group([entry("later", num_workers=2)]) as group:
         batch, _ = group.reset()
         group.step_async(batch.respond(action=np.array([1, 2])))
@@ -178,23 +178,23 @@ def test_an_inline_env_of_two_halves_starts_when_its_step_is_sent() -> None:
 
 
 def test_a_list_of_the_wrong_length_is_refused() -> None:
-    """The error says how many results it holds and how many it should."""
-    told = r"reset\(\) of env 'listing-0' returned a list of 2 .*3"
+    """The error has the found and the expected number of results."""
+    message = r"reset\(\) of env 'listing-0' returned a list of 2 .*3"
     listing = entry("listing", num_envs=3, env_kwargs={"answers": 2})
-    with sync.build_env_group(listing) as group, pytest.raises(EnvRaised, match=told):
+    with sync.build_env_group(listing) as group, pytest.raises(EnvRaised, match=message):
         group.reset()
 
 
 class Tensor:
-    """All that tells a torch tensor from other values."""
+    """Has what distinguishes a torch tensor from other values."""
 
     __module__ = "torch"
 
     def detach(self) -> None: ...
 
 
-def test_what_is_left_out_is_whole_where_tensors_are_handed_over() -> None:
-    """Those of inline envs go past the row; their rewards and ends are as any other's."""
+def test_defaults_also_hold_for_envs_that_return_tensors() -> None:
+    """Tensors of inline envs bypass the row; their rewards and ends are like any other's."""
 
     class OfTensors(Tacit):
         def _observation(self) -> Any:
@@ -210,8 +210,8 @@ def test_what_is_left_out_is_whole_where_tensors_are_handed_over() -> None:
     assert ret.last_truncated.tolist() == [False] * 3
 
 
-def test_a_class_that_says_it_is_cpu_bound_shares_workers() -> None:
-    """As many workers as cores hold its envs; any other class has one for each env."""
+def test_envs_of_a_cpu_bound_class_share_workers() -> None:
+    """There are as many workers as cores; any other class has one for each env."""
     count = 1000
     shared = sync.build_env_group(entry("tacit", placement="process", num_workers=count))
     alone = sync.build_env_group(entry("later", placement="process", num_workers=7))
@@ -220,7 +220,7 @@ def test_a_class_that_says_it_is_cpu_bound_shares_workers() -> None:
 
 
 def test_memory_is_cleared_without_importing_anything(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Torch's cache is emptied where torch is there already, and has a device."""
+    """Torch's cache is emptied if torch is imported and has a device."""
     emptied: list[str] = []
 
     class Cuda:
@@ -249,7 +249,7 @@ def test_memory_is_cleared_without_importing_anything(monkeypatch: pytest.Monkey
 
 
 def test_only_a_function_that_is_given_to_an_env_server_is_warned_of() -> None:
-    """None and the default function ask for nothing that it can't do."""
+    """None and the default function need nothing that an env_server lacks."""
     server = {"name": "robots", "backend": "env_server"}
     entries = [entry("tacit"), server]
     with warnings.catch_warnings():
@@ -268,8 +268,8 @@ def idle_steps(group: sync.EnvGroup) -> BatchedData:
     return BatchedData(group.env_ids, [PolicyResponse(*pair) for pair in pairs])
 
 
-def test_env_steps_are_those_of_sub_environments_and_no_resets() -> None:
-    """One meaning in rates and counts; a batch of several layouts is one batch."""
+def test_env_steps_count_sub_environments_but_no_resets() -> None:
+    """In rates and counts alike; a batch of several layouts is one batch."""
     entries = [entry("tacit", num_envs=3), entry("later", num_workers=2)]
     with sync.build_env_group(entries, mixed_actions=True) as group:
         group.reset()

@@ -1,4 +1,4 @@
-"""A group belongs to one event loop and one process; each use from elsewhere is refused by name."""
+"""A group belongs to one event loop and one process; other uses are refused with a reason."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ INLINE = {
     "num_workers": 3,
     "placement": "inline",
 }
-# The first loop opens a pipe that libuv keeps for good; no test is to be blamed for it.
+# The first loop opens a pipe that libuv keeps, so it is made before the tests.
 uvloop.new_event_loop().close()
 LOOPS = pytest.mark.parametrize("new_loop", [asyncio.new_event_loop, uvloop.new_event_loop])
 
 
 def run_in(loop: Callable[[], asyncio.AbstractEventLoop], main: Coroutine[Any, Any, Any]) -> Any:
-    """In a loop of its own, as `asyncio.run`; what takes too long is a hang."""
+    """Run in a new loop, like `asyncio.run`; after a long time it counts as hung."""
     with asyncio.Runner(loop_factory=loop) as runner:
         return runner.run(asyncio.wait_for(main, HANG))
 
@@ -53,7 +53,7 @@ async def use(group: rlightning_aio.EnvGroup) -> list[float]:
 
 
 async def begun(group: rlightning_aio.EnvGroup) -> None:
-    """Initialised, and with steps under way."""
+    """Return a group that is initialised and has steps in progress."""
     await group.init()
     batch, _ = await group.reset()
     group.step_async(batch.respond(action=np.array([[0, 4.0]] * 3)))
@@ -63,7 +63,7 @@ async def begun(group: rlightning_aio.EnvGroup) -> None:
 def test_use_from_another_loop_is_refused_and_closing_is_not(
     new_loop: Callable[[], asyncio.AbstractEventLoop],
 ) -> None:
-    """It says which loop, and what to do; nothing that it holds is left. (See conftest.)"""
+    """The error names the loop and says what to do; the fixtures check that nothing is left."""
     group = rlightning_aio.build_env_group(PROBE)
     run_in(new_loop, begun(group))
     expected = r"belongs to the event loop .*[Ll]oop running=False closed=True.*asyncio\.run\(\)"
@@ -82,7 +82,7 @@ def test_use_from_another_loop_is_refused_and_closing_is_not(
 def test_a_loop_that_is_not_closed_may_be_used_again(
     new_loop: Callable[[], asyncio.AbstractEventLoop],
 ) -> None:
-    """Between its runs plain code may send; another loop may close what its tasks wait for."""
+    """Between its runs, plain code may send; another loop may close a group that tasks wait for."""
     group = rlightning_aio.build_env_group(PROBE)
     with asyncio.Runner(loop_factory=new_loop) as own:
         own.run(group.init())
@@ -110,7 +110,7 @@ def test_a_loop_that_is_not_closed_may_be_used_again(
 
 @pytest.mark.parametrize("kind", ["another loop", "no loop"])
 def test_use_from_another_thread_is_refused_while_the_loop_runs(kind: str) -> None:
-    """Closing is, too; the tasks of its own loop go on."""
+    """So is closing; the tasks of its own loop continue."""
     refused: list[BaseException] = []
 
     def elsewhere(group: rlightning_aio.EnvGroup) -> None:
@@ -136,7 +136,7 @@ def test_use_from_another_thread_is_refused_while_the_loop_runs(kind: str) -> No
 
 
 def test_a_synchronous_group_is_one_thread_s_at_a_time() -> None:
-    """While a thread waits in it, another is refused, whatever it asks; the first goes on."""
+    """While a thread waits in it, every call of another is refused; the first continues."""
     with sync.build_env_group(PROBE) as group:
         batch, _ = group.reset()
         worker = group._core.supervisor.hosts[0].pid
@@ -159,7 +159,7 @@ def test_a_synchronous_group_is_one_thread_s_at_a_time() -> None:
 
 @pytest.mark.parametrize("kind", ["sync", "asyncio"])
 def test_a_forked_child_is_refused(kind: str) -> None:
-    """It can neither use nor close its parent's group, which goes on."""
+    """It can neither use nor close the group of its parent, which continues."""
     own = asyncio.Runner()
     group: Any = (sync if kind == "sync" else rlightning_aio).build_env_group(PROBE)
 
@@ -185,11 +185,11 @@ def test_a_forked_child_is_refused(kind: str) -> None:
     own.close()
 
 
-# -- what a callback raises
+# -- errors in callbacks
 
 
 class Broken:
-    """Stands in for `on_readable` of a source: raises so many times, then does what that does."""
+    """Replaces `on_readable` of a source: raises a number of times, then calls the original."""
 
     def __init__(self, source: Any, times: int) -> None:
         self.times = times
@@ -210,10 +210,10 @@ def link_of(group: rlightning_aio.EnvGroup) -> Any:
 
 
 @LOOPS
-def test_an_error_in_a_callback_is_raised_once_to_who_waits(
+def test_an_error_in_a_callback_is_raised_once_in_the_waiting_call(
     new_loop: Callable[[], asyncio.AbstractEventLoop],
 ) -> None:
-    """The group goes on; the results are there for the next call."""
+    """The group continues; the next call returns the results."""
 
     async def main() -> None:
         async with rlightning_aio.build_env_group(PROBE) as group:
@@ -228,8 +228,8 @@ def test_an_error_in_a_callback_is_raised_once_to_who_waits(
 
 
 @pytest.mark.parametrize("times", [1, 10**9])
-def test_an_error_that_nobody_has_heard_of_does_not_keep_a_group_open(times: int) -> None:
-    """`close` closes first and raises then; a source that never reads is let go by force."""
+def test_an_error_that_was_not_raised_yet_does_not_prevent_closing(times: int) -> None:
+    """`close` closes first, then raises; a source that never reads is released by force."""
 
     async def main() -> None:
         group = rlightning_aio.build_env_group(PROBE)

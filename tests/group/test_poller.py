@@ -1,4 +1,4 @@
-"""How the trainer comes by results: what it orders, when it looks, and what it executes itself."""
+"""How the poller finds results: what it orders, when it polls, and what it executes itself."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rlightning_aio.group.poller import Poller
-from rlightning_aio.group.requests import COLLECTOR, Requests
-from rlightning_aio.protocol.bell import TrainerBell, WorkerBell, bell_size
+from rlightning_aio.group.request_states import COLLECTOR
+from rlightning_aio.group.requests import Requests
 from rlightning_aio.protocol.entries import Operation
+from rlightning_aio.protocol.exchange import TrainerBell, WorkerBell, bell_size
 
 
 @dataclass(eq=False)
 class Worker:
-    """As much of a process host as a poller sees."""
+    """The part of a process host that a poller uses."""
 
     host_id: int
     polled: int = 0
@@ -29,7 +30,7 @@ class Worker:
 
 
 class Server(Worker):
-    """As much of an env_server, too."""
+    """The part of an env_server that a poller uses."""
 
     server_id, address, members = "server-0", "tcp://nowhere", ()
 
@@ -51,7 +52,7 @@ class Server(Worker):
 
 @dataclass(eq=False)
 class Inline:
-    """An inline host; it notes what it executes."""
+    """An inline host that records what it executes."""
 
     host_id: int
     waiting: int
@@ -65,11 +66,11 @@ class Inline:
         return True
 
     def poll(self) -> None:
-        """Nothing is told here."""
+        """Do nothing: an inline host posts everything at once."""
 
 
 class Scene:
-    """A poller over hosts with so many requests in flight, and a bell that can be looked at."""
+    """A poller over hosts with given numbers of requests in flight, and a visible bell."""
 
     def __init__(
         self, *in_flight: int, kinds: Any = Worker, num_cores: int = 0, clock: Any = None
@@ -102,15 +103,15 @@ class Scene:
         self.workers[host_id].publish(self.counts[host_id])
 
     def take(self) -> None:
-        """The trainer reads all reports there are."""
+        """Read all reports, as the trainer does."""
         for host_id in self.bell.with_news():
-            count = self.bell.count(host_id) - self.bell._read[host_id]
+            count = self.bell.counters[host_id] - self.bell.read[host_id]
             self.bell.took(host_id, count)
             self.requests.in_flight[host_id] -= count
 
     def arm(self, wanted: int) -> bool:
         self.poller.arm(wanted)
-        return self.poller.came()
+        return self.poller.is_reached()
 
 
 # -- orders
@@ -118,14 +119,14 @@ class Scene:
 
 @pytest.mark.parametrize("wanted", [32, 40])
 def test_for_all_results_workers_look_when_they_have_nothing_left(wanted: int) -> None:
-    """The last to finish rings; nobody looks in between."""
+    """The last worker to finish rings; none looks in between."""
     scene = Scene(16, 16)
     assert not scene.arm(wanted)
     assert scene.orders == [(32, True)]
 
 
-def test_the_same_wait_gives_the_same_order() -> None:
-    """Results that are taken in meanwhile change nothing of what it waits for."""
+def test_results_read_meanwhile_do_not_change_the_order() -> None:
+    """The wait is for the same result."""
     scene = Scene(16, 16)
     scene.arm(32)
     armed = scene.bell._armed
@@ -140,10 +141,10 @@ def test_the_same_wait_gives_the_same_order() -> None:
     wanted=st.integers(1, 512),
     data=st.data(),
 )
-def test_an_order_is_met_by_the_last_result_that_is_wanted(
+def test_the_last_wanted_result_rings_the_bell(
     in_flight: list[int], wanted: int, data: st.DataObject
 ) -> None:
-    """Never more than is in flight, and whichever worker makes it."""
+    """From any worker, and at most as many as are in flight."""
     scene = Scene(*in_flight)
     total = sum(in_flight)
     least = min(wanted, total)
@@ -161,8 +162,8 @@ def test_an_order_is_met_by_the_last_result_that_is_wanted(
         assert (rung > 0) == (number >= least)
 
 
-def test_results_that_are_there_are_not_waited_for() -> None:
-    """However they came between two looks."""
+def test_results_that_are_ready_count_at_once() -> None:
+    """Also those that came between two polls."""
     scene = Scene(4, 4)
     scene.report(0, 4)
     scene.report(1, 1)
@@ -172,18 +173,18 @@ def test_results_that_are_there_are_not_waited_for() -> None:
     assert scene.arm(8)
 
 
-def test_nothing_is_ordered_where_no_worker_has_anything_to_do() -> None:
-    """Clients and inline envs wake the trainer by themselves, or are asked."""
+def test_the_bell_is_not_armed_if_all_workers_are_idle() -> None:
+    """Clients wake the trainer by themselves, and inline envs are executed by the poller."""
     scene = Scene(0, 3, kinds=(Worker, Server))
     assert not scene.arm(2)
     assert scene.orders == []
 
 
-# -- taking in
+# -- reading
 
 
-def test_only_hosts_with_news_are_polled() -> None:
-    """Workers that have reported, and servers that owe something."""
+def test_only_hosts_with_reports_are_polled() -> None:
+    """Workers that have reported, and servers that owe replies."""
     scene = Scene(2, 2, 2, 0, kinds=(Worker, Worker, Server, Server))
     scene.report(1)
     scene.poller.poll()
@@ -191,7 +192,7 @@ def test_only_hosts_with_news_are_polled() -> None:
 
 
 def test_clients_on_this_machine_are_left_the_cores() -> None:
-    """As many of them may want one as owe a result."""
+    """One core for each client that owes a result."""
     scene = Scene(2, kinds=Server, num_cores=2)
     (server,) = scene.hosts
     server.readable = True
@@ -203,7 +204,7 @@ def test_clients_on_this_machine_are_left_the_cores() -> None:
 
 
 def test_workers_are_left_the_cores() -> None:
-    """One each, however many requests it has; the trainer looks only on a core of its own."""
+    """One for each worker with requests; the trainer spins only on a core of its own."""
     scene = Scene(8, 8, num_cores=2)
     scene.report(0, 8)
     assert not scene.poller.spin(1)
@@ -212,8 +213,8 @@ def test_workers_are_left_the_cores() -> None:
     assert scene.poller.spin(1)
 
 
-def test_who_looks_by_itself_is_not_rung() -> None:
-    """It has withdrawn its order."""
+def test_a_spinning_trainer_disarms_the_bell() -> None:
+    """It finds the results itself."""
     scene = Scene(2, num_cores=2)
     scene.arm(2)
     scene.report(0, 2)
@@ -225,7 +226,7 @@ def test_who_looks_by_itself_is_not_rung() -> None:
 
 
 def inline_scene(*waiting: int, workers: int = 0, clock: Any = None) -> Scene:
-    """Inline hosts with so many requests each, and one worker with so many."""
+    """Return a scene with inline hosts and one worker, with given numbers of requests."""
     kinds = tuple(lambda k, n=n: Inline(k, n) for n in waiting)
     scene = Scene(*waiting, workers, kinds=(*kinds, Worker), clock=clock)
     log: list[int] = []
@@ -235,8 +236,10 @@ def inline_scene(*waiting: int, workers: int = 0, clock: Any = None) -> Scene:
 
 
 @given(waiting=st.lists(st.integers(0, 5), min_size=1, max_size=4), wanted=st.integers(1, 12))
-def test_inline_hosts_execute_what_nobody_else_can_give(waiting: list[int], wanted: int) -> None:
-    """No more than is wanted, in turns; whether there was anything to execute is told."""
+def test_inline_hosts_execute_the_results_that_workers_cannot_provide(
+    waiting: list[int], wanted: int
+) -> None:
+    """At most the wanted number, in turns; `execute` returns True if there was anything to do."""
     scene = inline_scene(*waiting)
     assert scene.poller.execute(wanted, None) == (sum(waiting) > 0)
     log = scene.hosts[0].log
@@ -248,7 +251,7 @@ def test_inline_hosts_execute_what_nobody_else_can_give(waiting: list[int], want
 
 
 def test_one_at_a_time_is_executed_while_workers_have_something_to_do() -> None:
-    """Their results may come first."""
+    """The workers' results may come first."""
     scene = inline_scene(3, 3, workers=1)
     for count in range(1, 5):
         assert scene.poller.execute(5, None)
@@ -257,7 +260,7 @@ def test_one_at_a_time_is_executed_while_workers_have_something_to_do() -> None:
 
 
 def test_inline_hosts_stop_when_the_time_is_over() -> None:
-    """Between two envs; one is executed in any case, else nothing would ever come."""
+    """Between two envs; at least one is executed, so that the call makes progress."""
     times = iter([0.0, 1.0, 2.0, 3.0])
     scene = inline_scene(9, clock=lambda: next(times))
     assert scene.poller.execute(9, 2.0)
@@ -267,8 +270,8 @@ def test_inline_hosts_stop_when_the_time_is_over() -> None:
     assert len(scene.hosts[0].log) == 1
 
 
-def test_without_an_end_no_clock_is_asked() -> None:
-    """It would be felt where steps are short."""
+def test_without_a_time_limit_the_clock_is_not_read() -> None:
+    """That would slow short steps."""
 
     def asked() -> float:
         raise AssertionError

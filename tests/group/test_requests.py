@@ -1,12 +1,15 @@
-"""What may happen to a request: every line of `LEGAL`, and why nothing else can.
+"""Transitions of requests: every line of `LEGAL`, and why no other can happen.
 
-`Requests` has no method for each event of its table, so `Driven` says which ones stand for
-it. Then a state machine does all of it at random, over several hosts, beside a naive model.
+`Requests` has no method for each event of its table; `Driven` maps events to calls. A state machine
+then does all of it at random, over several hosts, and compares with a naive model.
 """
 
 from __future__ import annotations
 
 import itertools
+import os
+import subprocess
+import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -17,27 +20,21 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from rlightning_aio.errors import EnvFault
-from rlightning_aio.group.requests import (
-    COLLECTOR,
-    LEGAL,
-    NOBODY,
-    Event,
-    Owner,
-    Requests,
-    State,
-    Ticket,
-)
+from rlightning_aio.group.checked import CheckedRequests
+from rlightning_aio.group.request_states import COLLECTOR, LEGAL, NOBODY, Event, Owner, State
 from rlightning_aio.protocol.entries import Operation
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from rlightning_aio.group.requests import Ticket
 
 Situation: TypeAlias = tuple[State, Owner]
 Combination: TypeAlias = tuple[State, Owner, Event]
 
 HOST_OF = np.array([0, 1, 1])
 SLOT, COMPANION = 1, 2
-"""The slot that is looked at, and another of the same host that its calls wait for, too."""
+"""The slot under test, and another slot of its host that its calls wait for, too."""
 
 
 def fault() -> EnvFault:
@@ -49,14 +46,14 @@ def kind_of(owner: int) -> Owner:
 
 
 class Driven:
-    """A table, and what makes each event happen to `SLOT`.
+    """A table, and a method for each event that can happen to `SLOT`.
 
     Args:
         method: calls are of methods, instead of steps and resets.
     """
 
     def __init__(self, *, method: bool = False) -> None:
-        self.table = Requests(HOST_OF, 2)
+        self.table = CheckedRequests(HOST_OF, 2)
         self.method = method
         self.ticket: Ticket | None = None
         self.settled: list[int] = []
@@ -64,12 +61,13 @@ class Driven:
             Event.SENT: lambda: self._ask([SLOT], Operation.STEP, COLLECTOR),
             Event.SENT_FOR_CALL: self._call,
             Event.JOINED: lambda: self.table.join(SLOT, 1.0),
+            Event.STEPPED_AT_ONCE: self._step_at_once,
             Event.RESULT: self._result,
             Event.VALUE: lambda: self.table.set_value(self._end(), "value"),
             Event.FAULT: self._fail,
             Event.WITHDRAWN: lambda: self.table.withdraw(self._end()),
             Event.RESTARTED: self._restart,
-            Event.HANDED_OUT: lambda: self.table.hand_out(self.table.take(1)),
+            Event.HANDED_OUT: lambda: self.table.hand_out(self.table.collector.take(1)),
             Event.SETTLED: self._settle,
             Event.GIVEN_UP: self._give_up,
             Event.METHOD_GIVEN_UP: self._give_up,
@@ -81,7 +79,7 @@ class Driven:
         return State(self.table.state.item(SLOT)), kind_of(self.table.owner.item(SLOT))
 
     def entry(self, slot: int = SLOT) -> int:
-        return self.table.entry.item(slot)
+        return self.table.numbering.entry.item(slot)
 
     def _ask(self, slots: list[int], op: int, owner: int) -> None:
         asked = np.array(slots)
@@ -91,14 +89,18 @@ class Driven:
 
     def _call(self) -> None:
         slots = [SLOT, COMPANION]
-        self.ticket = self.table.open_ticket(np.array(slots), method="render" * self.method)
+        self.ticket = self.table.tickets.open(np.array(slots), method="render" * self.method)
         op = Operation.CALL if self.method else Operation.RESET
         self._ask(slots, op, self.ticket.owner)
 
     def _claim(self) -> None:
-        self.ticket = self.table.open_ticket(np.array([SLOT, COMPANION]))
+        self.ticket = self.table.tickets.open(np.array([SLOT, COMPANION]))
         self.table.take_joined(self.table.alone(SLOT), self.ticket)
         self._ask([COMPANION], Operation.RESET, self.ticket.owner)
+
+    def _step_at_once(self) -> None:
+        self.table.answer_at_once(SLOT)
+        self.settled = [SLOT]
 
     def _result(self) -> None:
         assert self.table.complete_one(1, self.entry()) == SLOT
@@ -116,9 +118,7 @@ class Driven:
     def _restart(self) -> None:
         owed = self.table.owed(np.arange(3))
         self.table.lose_host(1)
-        self.table.restart(owed)
-        for _ in self.table.by_host(owed):
-            pass
+        self.table.restart(1, owed)
 
     def _settle(self) -> None:
         assert self.ticket is not None
@@ -130,7 +130,7 @@ class Driven:
             self.table.fail(self.table.alone(slot), self.ticket.owner, fault())
         assert self.ticket.remaining == 0
         self.table.settle(self.ticket)
-        # A call hands out at once what it has waited for; nobody can collect it.
+        # A call hands out its results at once; no collect can get them.
         self.settled = self.table.ready(self.ticket.slots).tolist()
 
     def _give_up(self) -> None:
@@ -138,15 +138,15 @@ class Driven:
         self.table.give_up(self.ticket)
 
     def check_counts(self) -> None:
-        """Every count is what the arrays say."""
+        """Compare every count with the arrays."""
         table = self.table
         busy, ready = table.state == State.BUSY, table.state == State.READY
         collected = table.owner == COLLECTOR
         collected[self.settled] = False
         assert table.in_flight == [int(busy[host == HOST_OF].sum()) for host in range(2)]
-        assert table.total_in_flight() == busy.sum()
-        assert table.num_ready == (ready & collected).sum()
-        assert table.num_awaited == (busy & collected).sum()
+        assert sum(table.in_flight) == busy.sum()
+        assert table.collector.num_ready == (ready & collected).sum()
+        assert table.collector.num_awaited == (busy & collected).sum()
         table.hand_out(np.array(self.settled, np.intp))
         for among in (None, np.array([True, True, False]), np.arange(3) == SLOT):
             chosen = collected if among is None else collected & among
@@ -156,7 +156,7 @@ class Driven:
             )
 
 
-# How each situation comes about; of methods' calls where it matters.
+# The events that lead to each situation; of method calls where it matters.
 STEPS: dict[Situation, list[Event]] = {
     (State.IDLE, Owner.COLLECTOR): [],
     (State.BUSY, Owner.COLLECTOR): [Event.SENT],
@@ -190,7 +190,7 @@ REFUSED = [
 
 
 def brought_to(state: State, owner: Owner, event: Event | None = None) -> Driven:
-    """A table whose slot is in that situation, as it is before `event`."""
+    """Return a table whose slot is in the situation, right before `event`."""
     of_methods = event in (Event.VALUE, Event.METHOD_GIVEN_UP) and (state, owner) in METHODS
     method = owner is Owner.NOBODY or of_methods
     driven = Driven(method=method)
@@ -210,7 +210,7 @@ def named(value: object) -> str:
 
 @pytest.mark.parametrize(("state", "owner", "event"), LEGAL, ids=named)
 def test_a_legal_event_does_what_the_table_says(state: State, owner: Owner, event: Event) -> None:
-    """State and owner follow the table, and the counts follow them."""
+    """State, owner and counts follow the table."""
     driven = brought_to(state, owner, event)
     driven.events[event]()
     assert driven.situation() == LEGAL[state, owner, event]
@@ -218,16 +218,18 @@ def test_a_legal_event_does_what_the_table_says(state: State, owner: Owner, even
 
 
 @pytest.mark.parametrize(("state", "owner", "event"), REFUSED, ids=named)
-def test_any_other_event_cannot_come(state: State, owner: Owner, event: Event) -> None:
-    """Who could bring it about is told so before, or finds nothing to do it to."""
+def test_any_other_event_is_refused_or_has_no_effect(
+    state: State, owner: Owner, event: Event
+) -> None:
+    """The call that could cause it raises, or finds no request."""
     driven = brought_to(state, owner, event)
     table = driven.table
     slots = table.alone(SLOT)
-    if event in (Event.SENT, Event.SENT_FOR_CALL, Event.JOINED):
+    if event in (Event.SENT, Event.SENT_FOR_CALL, Event.JOINED, Event.STEPPED_AT_ONCE):
         assert table.first_not_idle(slots) == SLOT
         assert not table.is_idle(SLOT)
     elif event in (Event.RESULT, Event.VALUE, Event.FAULT, Event.WITHDRAWN):
-        # A reply that nobody waits for, like any that is late.
+        # A reply without a request, like a late one.
         assert table.end(1, driven.entry()) is None
         assert table.complete_one(1, driven.entry()) is None
     elif event is Event.RESTARTED:
@@ -235,18 +237,18 @@ def test_any_other_event_cannot_come(state: State, owner: Owner, event: Event) -
     elif event in (Event.CLAIMED, Event.DROPPED):
         assert not table.joined(slots).any()
     elif event is Event.HANDED_OUT:
-        assert table.num_ready == 0
+        assert table.collector.num_ready == 0
     elif event is Event.SETTLED and owner is Owner.TICKET:
         assert driven.ticket is not None
         assert driven.ticket.remaining > 0
     else:
-        assert not any(SLOT in ticket.slots for ticket in table._tickets.values())
+        assert not any(SLOT in ticket.slots for ticket in table.tickets.waiting.values())
     assert driven.situation() == (state, owner)
     driven.check_counts()
 
 
 def test_every_combination_is_accounted_for() -> None:
-    """Legal, refused, not expressible, or of a situation to which nothing legal leads."""
+    """Legal, refused, not expressible, or of an unreachable situation."""
     unreachable = {(state, owner) for state, owner, _ in ALL} - REACHABLE
     assert not unreachable & set(LEGAL.values())
     assert not NOT_EXPRESSIBLE.keys() & LEGAL.keys()
@@ -254,8 +256,8 @@ def test_every_combination_is_accounted_for() -> None:
     assert {*LEGAL, *REFUSED, *NOT_EXPRESSIBLE, *rest} == set(ALL)
 
 
-def test_every_situation_of_the_table_follows_from_it() -> None:
-    """Beginning with an idle slot, legal events lead to all of them."""
+def test_every_situation_of_the_table_is_reachable() -> None:
+    """By legal events, from an idle slot."""
     found: set[Situation] = set()
     new: set[Situation] = {(State.IDLE, Owner.COLLECTOR)}
     while new:
@@ -264,30 +266,87 @@ def test_every_situation_of_the_table_follows_from_it() -> None:
     assert found == REACHABLE
 
 
-def test_a_method_that_was_given_up_is_nobodys() -> None:
-    """Unlike a step or a reset: no collector could make anything of its value."""
+def test_the_value_of_a_cancelled_method_call_has_no_owner() -> None:
+    """Unlike a step or a reset: a collect can't return it."""
     driven = brought_to(State.BUSY, Owner.NOBODY)
     assert driven.table.pending() == (0, 0)
     driven.events[Event.FAULT]()
-    assert not driven.table.faults
+    assert not driven.table.collector.faults
 
 
-def test_a_first_result_that_a_call_has_taken_is_not_offered_again() -> None:
-    """Another call finds its env busy, whatever it would do with a first result."""
-    table = Requests(HOST_OF, 2)
-    ticket = table.open_ticket(np.array([SLOT, COMPANION]))
+def test_a_first_result_is_handed_out_once() -> None:
+    """To any other call the env is busy, whatever it would do with a first result."""
+    table = CheckedRequests(HOST_OF, 2)
+    ticket = table.tickets.open(np.array([SLOT, COMPANION]))
     table.join(SLOT, 1.0)
     assert table.joined(table.alone(SLOT)).all()
     table.take_joined(table.alone(SLOT), ticket)
     assert not table.joined(table.alone(SLOT)).any()
 
 
-# -- everything at once, beside a model
+# -- the debug mode
+
+
+@pytest.mark.parametrize(
+    ("state", "owner", "event"),
+    [
+        (State.IDLE, Owner.COLLECTOR, Event.HANDED_OUT),
+        (State.BUSY, Owner.COLLECTOR, Event.SENT),
+        (State.READY, Owner.COLLECTOR, Event.JOINED),
+        (State.SPENT, Owner.TICKET, Event.RESULT),
+        (State.BUSY, Owner.NOBODY, Event.RESTARTED),
+    ],
+    ids=named,
+)
+def test_the_debug_mode_refuses_an_illegal_event(state: State, owner: Owner, event: Event) -> None:
+    """The error names the event, the slot and its state, and nothing has changed."""
+    table = brought_to(state, owner).table
+    slots = table.alone(SLOT)
+    bring_about: dict[Event, Callable[[], object]] = {
+        Event.HANDED_OUT: lambda: table.hand_out(slots),
+        Event.SENT: lambda: table.submit(slots, Operation.STEP, COLLECTOR, 1.0),
+        Event.JOINED: lambda: table.join(SLOT, 1.0),
+        Event.RESULT: lambda: table.deliver(slots),
+        Event.RESTARTED: lambda: table.restart(1, slots),
+    }
+    message = f"{event.name} can't happen to slot {SLOT}, which is {state.name} for {owner.name}"
+    with pytest.raises(RuntimeError, match=message):
+        bring_about[event]()
+    assert (State(table.state.item(SLOT)), kind_of(table.owner.item(SLOT))) == (state, owner)
+
+
+def test_the_debug_mode_refuses_a_change_without_an_event() -> None:
+    """Whatever writes to the table must say what happened."""
+    table = brought_to(State.BUSY, Owner.COLLECTOR).table
+    table.state[SLOT] = State.IDLE
+    with pytest.raises(RuntimeError, match=f"slot {SLOT} became IDLE for COLLECTOR without"):
+        table.withdraw(SLOT)
+
+
+@pytest.mark.parametrize(("value", "checked"), [("1", True), ("", False)])
+def test_the_debug_mode_is_on_where_the_variable_says_so(value: str, checked: bool) -> None:
+    """A group has the checked table and the checked steps, or neither."""
+    variables = {**os.environ, "RLIGHTNING_AIO_DEBUG": value}
+    program = (
+        "from rlightning_aio.sync import build_env_group\n"
+        "group = build_env_group({'name': 'pole', 'backend': 'gymnasium',"
+        " 'task': 'CartPole-v1', 'placement': 'inline'})\n"
+        "core = group._core\n"
+        "print(type(core.requests).__name__, type(core.steps).__name__)\n"
+        "group.close()\n"
+    )
+    command = [sys.executable, "-c", program]
+    ended = subprocess.run(command, capture_output=True, check=True, text=True, env=variables)
+    names = ["CheckedRequests", "CheckedSteps"] if checked else ["Requests", "Steps"]
+    assert ended.stdout.split() == names
+
+
+# -- everything at once, compared with a model
 
 
 @dataclass
 class Asked:
-    """A slot as the model sees it; `came` counts the moments at which results came."""
+    """The model's view of a slot; `came` counts the moments at which results came."""
 
     op: Operation | None = None
     state: State = State.IDLE
@@ -299,7 +358,7 @@ class Asked:
 
 @dataclass(eq=False)
 class Claim:
-    """A call as the model sees it."""
+    """The model's view of a call."""
 
     ticket: Ticket
     slots: list[int]
@@ -307,12 +366,12 @@ class Claim:
 
 
 class RequestsMachine(RuleBasedStateMachine):
-    """Each rule does something to the table and to the model; the invariant compares them."""
+    """Each rule acts on the table and on the model; the invariant compares them."""
 
     @initialize(counts=st.lists(st.integers(1, 3), min_size=1, max_size=4))
     def begin(self, counts: list[int]) -> None:
         self.host_of = np.repeat(np.arange(len(counts)), counts)
-        self.table = Requests(self.host_of, len(counts))
+        self.table = CheckedRequests(self.host_of, len(counts))
         self.slots = [Asked() for _ in self.host_of]
         self.claims: list[Claim] = []
         self.late: list[int] = []
@@ -335,7 +394,7 @@ class RequestsMachine(RuleBasedStateMachine):
         slot = data.draw(st.sampled_from(self.those(State.BUSY)))
         return slot, self.slots[slot]
 
-    # -- asking
+    # -- requests
 
     def ask(self, slots: list[int], op: Operation, claim: Claim | None) -> None:
         asked = np.array(slots, np.intp)
@@ -343,7 +402,7 @@ class RequestsMachine(RuleBasedStateMachine):
         by_auto_reset = op is Operation.RESET and claim is None
         entries = self.table.submit(asked, Operation.STEP if by_auto_reset else op, owner, 1.0)
         if by_auto_reset:
-            self.table.into_resets(asked, entries, np.ones(len(slots), np.bool_))
+            self.table.numbering.into_resets(asked, entries, np.ones(len(slots), np.bool_))
         parts = list(self.table.by_host(asked))
         given = [slot for _, part in parts for slot in asked[part].tolist()]
         assert given == slots
@@ -360,13 +419,13 @@ class RequestsMachine(RuleBasedStateMachine):
     @precondition(lambda self: self.those(State.IDLE))
     @rule(data=st.data(), op=st.sampled_from((Operation.STEP, Operation.RESET, Operation.CALL)))
     def ask_for_a_call(self, data: st.DataObject, op: Operation) -> None:
-        """A reset has the first results of those that have just joined, too."""
+        """Send requests of a call. A reset also gets the first results of new clients."""
         slots = self.some(data, self.those(State.IDLE))
         joined = self.joined() if op is Operation.RESET else []
         taken = self.some(data, joined) if joined else []
         everyone = np.array(slots + taken, np.intp)
         method = "render" if op is Operation.CALL else ""
-        claim = Claim(self.table.open_ticket(everyone, method=method), slots + taken)
+        claim = Claim(self.table.tickets.open(everyone, method=method), slots + taken)
         self.claims.append(claim)
         if taken:
             self.table.take_joined(np.array(taken), claim.ticket)
@@ -377,9 +436,9 @@ class RequestsMachine(RuleBasedStateMachine):
     @precondition(lambda self: self.those(State.IDLE))
     @rule(data=st.data())
     def refuse(self, data: st.DataObject) -> None:
-        """A call for which nothing was sent."""
+        """Make a call that sends nothing."""
         slots = self.some(data, self.those(State.IDLE))
-        self.table.drop(self.table.open_ticket(np.array(slots)))
+        self.table.tickets.drop(self.table.tickets.open(np.array(slots)))
 
     @precondition(lambda self: self.those(State.IDLE))
     @rule(data=st.data())
@@ -387,7 +446,7 @@ class RequestsMachine(RuleBasedStateMachine):
         slot = data.draw(st.sampled_from(self.those(State.IDLE)))
         self.table.join(slot, 1.0)
         self.moment += 1
-        entry = self.table.entry.item(slot)
+        entry = self.table.numbering.entry.item(slot)
         self.slots[slot] = Asked(Operation.JOIN, State.READY, entry=entry, came=self.moment)
 
     def joined(self) -> list[int]:
@@ -423,10 +482,10 @@ class RequestsMachine(RuleBasedStateMachine):
             if self.slots[slot].op is not Operation.CALL
         ]
         slots = data.draw(st.lists(st.sampled_from(busy), unique=True)) if busy else []
-        told = [self.slots[slot].entry for slot in slots]
+        reported = [self.slots[slot].entry for slot in slots]
         if self.late:
-            told += data.draw(st.lists(st.sampled_from(self.late), max_size=2))
-        entries = np.array(data.draw(st.permutations(told)), np.int64)
+            reported += data.draw(st.lists(st.sampled_from(self.late), max_size=2))
+        entries = np.array(data.draw(st.permutations(reported)), np.int64)
         found = self.table.complete([(host, entries)]).tolist()
         assert sorted(found) == sorted(slots)
         self.deliver(found)
@@ -434,7 +493,7 @@ class RequestsMachine(RuleBasedStateMachine):
     @precondition(lambda self: self.those(State.BUSY))
     @rule(data=st.data())
     def answer(self, data: st.DataObject) -> None:
-        """One request ends in what it was sent for."""
+        """End one request with the kind of reply it was sent for."""
         slot, asked = self.one_busy(data)
         host = int(self.host_of[slot])
         if asked.op is not Operation.CALL:
@@ -448,7 +507,7 @@ class RequestsMachine(RuleBasedStateMachine):
         self.finish(slot)
 
     def finish(self, slot: int) -> None:
-        """Note that a request has ended without a result."""
+        """Record the end of a request without a result."""
         asked = self.slots[slot]
         if asked.owner is None:
             self.slots[slot] = Asked(entry=asked.entry)
@@ -456,7 +515,7 @@ class RequestsMachine(RuleBasedStateMachine):
             asked.state = State.SPENT
 
     def fail(self, slots: list[int]) -> None:
-        """Requests that are in flight no more end in one error for each owner."""
+        """End requests that are no longer in flight in one error for each owner."""
         owners = self.table.owners(np.array(slots, np.intp)).items()
         assert sorted(slot for _, mine in owners for slot in mine.tolist()) == sorted(slots)
         for owner, mine in owners:
@@ -479,7 +538,7 @@ class RequestsMachine(RuleBasedStateMachine):
     @precondition(lambda self: self.those(State.BUSY))
     @rule(data=st.data())
     def withdraw(self, data: st.DataObject) -> None:
-        """A request of the collector's ends in nothing; of a call's, in an error."""
+        """Withdraw a request: a collect gets nothing for it, a call an error."""
         slot, asked = self.one_busy(data)
         assert self.table.end(int(self.host_of[slot]), asked.entry) == slot
         if asked.owner is None and not asked.nobodys:
@@ -491,7 +550,7 @@ class RequestsMachine(RuleBasedStateMachine):
     @precondition(lambda self: self.late)
     @rule(data=st.data())
     def answer_late(self, data: st.DataObject) -> None:
-        """Nothing comes of it."""
+        """Send a late reply, which has no effect."""
         entry = data.draw(st.sampled_from(self.late))
         host = data.draw(st.sampled_from(range(len(self.table.in_flight))))
         assert self.table.end(host, entry) is None
@@ -501,7 +560,9 @@ class RequestsMachine(RuleBasedStateMachine):
 
     @rule(data=st.data(), replaced=st.booleans())
     def die(self, data: st.DataObject, replaced: bool) -> None:
-        """Steps and resets are asked anew of a replacement; all else ends in errors."""
+        """Let a host die: steps and resets are sent again to a replacement; all else ends in
+        errors.
+        """
         host = data.draw(st.sampled_from(range(len(self.table.in_flight))))
         owed = self.those(State.BUSY, host=host)
         again = [s for s in owed if replaced and self.slots[s].op is not Operation.CALL]
@@ -511,8 +572,7 @@ class RequestsMachine(RuleBasedStateMachine):
         if not again:
             return
         asked = np.array(again)
-        entries = self.table.restart(asked).tolist()
-        assert [h for h, _ in self.table.by_host(asked)] == [host]
+        entries = self.table.restart(host, asked).tolist()
         for slot, entry in zip(again, entries, strict=True):
             self.late.append(self.slots[slot].entry)
             self.slots[slot].entry, self.slots[slot].op = entry, Operation.RESET
@@ -522,7 +582,7 @@ class RequestsMachine(RuleBasedStateMachine):
     @precondition(lambda self: self.claims)
     @rule(data=st.data())
     def settle_or_give_up(self, data: st.DataObject) -> None:
-        """A call with nothing left to wait for is settled; any other is given up."""
+        """Settle a call that has nothing left to wait for; cancel any other."""
         claim = data.draw(st.sampled_from(self.claims))
         self.claims.remove(claim)
         if any(self.slots[slot].state is State.BUSY for slot in claim.slots):
@@ -538,7 +598,7 @@ class RequestsMachine(RuleBasedStateMachine):
     @precondition(lambda self: self.claims)
     @rule(data=st.data())
     def interrupt(self, data: st.DataObject) -> None:
-        """A call is given up, perhaps in the moment in which it has all."""
+        """Cancel a call, possibly at the moment when it has all replies."""
         claim = data.draw(st.sampled_from(self.claims))
         self.claims.remove(claim)
         self.give_up(claim)
@@ -567,13 +627,13 @@ class RequestsMachine(RuleBasedStateMachine):
     @precondition(lambda self: self.collectable(list(range(len(self.slots)))))
     @rule(data=st.data(), most=st.integers(1, 6), choosy=st.booleans())
     def take(self, data: st.DataObject, most: int, choosy: bool) -> None:
-        """First come, first served; those that came together in any order."""
+        """Collect: first come, first served; results that came together are in any order."""
         among = list(range(len(self.slots)))
         if choosy:
             among = self.some(data, among)
         mask = np.isin(np.arange(len(self.slots)), among) if choosy else None
         here = self.collectable(among)
-        taken = self.table.take(most, mask).tolist()
+        taken = self.table.collector.take(most, mask).tolist()
         assert len(taken) == len(set(taken)) == min(most, len(here))
         assert set(taken) <= set(here)
         came = [self.slots[slot].came for slot in taken]
@@ -585,10 +645,10 @@ class RequestsMachine(RuleBasedStateMachine):
     @precondition(lambda self: self.num_faults)
     @rule()
     def take_fault(self) -> None:
-        self.table.faults.popleft()
+        self.table.collector.faults.popleft()
         self.num_faults -= 1
 
-    # -- what must be true
+    # -- invariants
 
     @invariant()
     def the_table_is_the_model(self) -> None:
@@ -596,12 +656,12 @@ class RequestsMachine(RuleBasedStateMachine):
         assert table.state.tolist() == [asked.state for asked in slots]
         owners = [NOBODY if a.nobodys else a.owner.ticket.owner if a.owner else 0 for a in slots]
         assert table.owner.tolist() == owners
-        assert table.entry[[a.state is not State.IDLE for a in slots]].tolist() == [
+        assert table.numbering.entry[[a.state is not State.IDLE for a in slots]].tolist() == [
             asked.entry for asked in slots if asked.state is not State.IDLE
         ]
         for slot, asked in enumerate(slots):
             assert table.is_idle(slot) == (asked.state is State.IDLE)
-            assert asked.op in (None, table.op(slot))
+            assert asked.op in (None, table.numbering.op(slot))
 
     @invariant()
     def the_counts_are_the_models(self) -> None:
@@ -609,10 +669,10 @@ class RequestsMachine(RuleBasedStateMachine):
         num_hosts = len(table.in_flight)
         busy = self.those(State.BUSY)
         assert table.in_flight == [len(self.those(State.BUSY, host=h)) for h in range(num_hosts)]
-        assert len(table.faults) == self.num_faults
+        assert len(table.collector.faults) == self.num_faults
         mine = [s for s in busy if slots[s].owner is None and not slots[s].nobodys]
         ready = self.collectable(list(range(len(slots))))
-        assert (table.num_ready, table.num_awaited) == (len(ready), len(mine))
+        assert (table.collector.num_ready, table.collector.num_awaited) == (len(ready), len(mine))
         assert table.pending() == (len(ready), len(ready) + len(mine))
         for host in range(num_hosts):
             here = [int(np.sum(self.host_of[found] == host)) for found in (ready, mine)]

@@ -1,11 +1,10 @@
-"""A group of one inline env: its steps are executed on the spot, and nothing else is different."""
+"""A group of one inline env executes its steps at once, and otherwise behaves as any group."""
 
 from __future__ import annotations
 
 import asyncio
 from contextlib import ExitStack
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -18,38 +17,42 @@ import rlightning_aio
 import rlightning_aio.sync
 from rlightning_aio import BatchedData, PolicyResponse
 from rlightning_aio.errors import EnvRaised
+from rlightning_aio.group.conditions import FIRST_RESULTS, UNLIKE_ENVS
 from rlightning_aio.group.core import Core
-from rlightning_aio.group.single import SingleEnvCore, StepsAtOnce
 
 PROBE = HALVED | {"backend": "probe"}
 CARTPOLE = HALVED | {"backend": "gymnasium", "task": "CartPole-v1"}
 
 
 def action_of(backend: str, number: int) -> Any:
-    """Numbers up to 9 mean something to every backend: steps, ends, errors."""
+    """Return an action of every backend for a number up to 9: a step, an end or an error."""
     if backend == "probe":
         return np.array([number % 4, number], float)
     return number % 2 if backend == "gymnasium" else number
 
 
-class Nothing:
-    """What no host is."""
+def steps_at_once(group: rlightning_aio.sync.EnvGroup) -> bool:
+    """Return True if the only env of a group is stepped without a request."""
+    return group._core.steps._alone is not None
 
 
 class Used:
-    """A group and what is done with it; each deed gives what can be told of its outcome."""
+    """A group and operations on it; each returns its outcome as plain data."""
 
-    def __init__(self, entry: dict[str, Any], core: type[Core]) -> None:
-        kind = StepsAtOnce if core is SingleEnvCore else Nothing
-        with patch("rlightning_aio.group.build.StepsAtOnce", kind):
-            self.group = rlightning_aio.sync.build_env_group(entry)
-        assert type(self.group._core) is core
+    def __init__(self, entry: dict[str, Any], *, ordinary: bool) -> None:
+        self.group = rlightning_aio.sync.build_env_group(entry)
         self.group.init()
+        conditions = self.group._core._conditions
+        assert steps_at_once(self.group)
+        self.group._core._first_observations.left.clear()
+        conditions.note(FIRST_RESULTS, False)
+        if not ordinary:
+            conditions.note(UNLIKE_ENVS, True)
         self.backend = entry["backend"]
         self.batch, _ = self.group.reset(seed=1)
         self.context = ExitStack()
 
-    def told(self, deed: str, number: int) -> Any:
+    def outcome(self, deed: str, number: int) -> Any:
         try:
             return getattr(self, deed)(number)
         except (rlightning_aio.RLightningError, ValueError, RuntimeError) as error:
@@ -58,12 +61,12 @@ class Used:
     def _results(self, results: tuple[BatchedData, Any]) -> Any:
         self.batch, flags = results
         (value,) = self.batch.values()
-        told = value.model_dump(exclude={"ts_env_sent_ns"})
+        outcome = value.model_dump(exclude={"ts_env_sent_ns"})
         batch = self.batch
         columns = (batch.observation, batch.reward, batch.terminated, batch.done, batch.infos)
         rows = (batch.is_reset, batch.limit_reached, batch.restarted, batch.index)
         sent = {name: batch.sent[name] for name in batch.sent}
-        return repr((told, value._extra, columns, rows, sent, flags))
+        return repr((outcome, value._extra, columns, rows, sent, flags))
 
     def step(self, number: int) -> Any:
         action = np.array([action_of(self.backend, number)])
@@ -109,10 +112,10 @@ class Used:
         return stats
 
 
-# Interrupts have tests of their own.
+# Interrupts have their own tests.
 INTERRUPTS = (sample_envs.Halved.INTERRUPT, sample_envs.Halved.INTERRUPT_START)
 NUMBERS = st.sampled_from([number for number in range(10) if number not in INTERRUPTS])
-DEEDS = [name for name in vars(Used) if name[0] != "_" and name not in ("told", "close")]
+DEEDS = [name for name in vars(Used) if name[0] != "_" and name not in ("outcome", "close")]
 
 
 @pytest.mark.parametrize("entry", [HALVED, PROBE, CARTPOLE], ids=lambda entry: entry["backend"])
@@ -120,15 +123,15 @@ DEEDS = [name for name in vars(Used) if name[0] != "_" and name not in ("told", 
 def test_nothing_but_the_time_is_different(
     entry: dict[str, Any], deeds: list[tuple[str, int]]
 ) -> None:
-    """Results, errors, flags and sums are those of the general core."""
-    single, general = Used(entry, SingleEnvCore), Used(entry, Core)
+    """Results, errors, flags and sums equal those of the general path."""
+    single, general = Used(entry, ordinary=True), Used(entry, ordinary=False)
     for deed, number in deeds:
-        assert single.told(deed, number) == general.told(deed, number), deed
+        assert single.outcome(deed, number) == general.outcome(deed, number), deed
     assert single.close() == general.close()
 
 
 def test_a_step_that_raises_counts_towards_no_limit(halved: rlightning_aio.sync.EnvGroup) -> None:
-    """The limit is one of steps that were made."""
+    """The limit counts completed steps."""
     batch, _ = halved.reset()
     with halved.auto_reset(max_episode_steps=3):
         with pytest.raises(EnvRaised):
@@ -139,18 +142,18 @@ def test_a_step_that_raises_counts_towards_no_limit(halved: rlightning_aio.sync.
 
 
 def test_it_is_used_for_one_inline_env_alone() -> None:
-    """Not for two, nor for a worker's."""
-    for fields, core in (
-        ({}, SingleEnvCore),
-        ({"num_workers": 2}, Core),
-        ({"placement": "process"}, Core),
+    """Not for two envs, nor for an env in a worker."""
+    for fields, at_once in (
+        ({}, True),
+        ({"num_workers": 2}, False),
+        ({"placement": "process"}, False),
     ):
-        group = rlightning_aio.sync.build_env_group(HALVED | fields)
-        assert type(group._core) is core
+        with rlightning_aio.sync.build_env_group(HALVED | fields) as group:
+            assert steps_at_once(group) == at_once
 
 
 def test_an_interrupt_ends_the_step_that_it_strikes(halved: rlightning_aio.sync.EnvGroup) -> None:
-    """The program gets it, and the group goes on."""
+    """The program gets it, and the group continues."""
     batch, _ = halved.reset()
     with pytest.raises(KeyboardInterrupt):
         halved.step(batch.respond(action=np.array([sample_envs.Halved.INTERRUPT])))
@@ -159,7 +162,7 @@ def test_an_interrupt_ends_the_step_that_it_strikes(halved: rlightning_aio.sync.
 
 
 async def test_other_tasks_have_their_turns() -> None:
-    """A loop over an env that never waits doesn't keep the event loop to itself."""
+    """A loop over an env that never waits lets other tasks run."""
     turns = 0
 
     async def count() -> None:
@@ -178,6 +181,6 @@ async def test_other_tasks_have_their_turns() -> None:
 
 
 async def test_an_asynchronous_group_has_the_general_core() -> None:
-    """Its other tasks may ask, cancel and collect in the middle of a step."""
+    """Other tasks may send, cancel and collect in the middle of a step."""
     async with rlightning_aio.build_env_group(HALVED) as group:
         assert type(group._core) is Core

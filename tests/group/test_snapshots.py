@@ -1,4 +1,4 @@
-"""An env that is put back goes on exactly as it would have, wherever it lives."""
+"""A restored env continues exactly as the original would have, in any placement."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class Clockless(RecordEpisodeStatistics):
-    """Its infos tell no time, which no snapshot stops."""
+    """Removes times from infos, which a snapshot can't reproduce."""
 
     def step(self, action: Any) -> Any:
         *values, info = super().step(action)
@@ -36,13 +36,13 @@ class Clockless(RecordEpisodeStatistics):
 
 
 def wrapped() -> gym.Env[Any, Any]:
-    """Wrappers with counters, running means and generators."""
+    """Make an env with wrappers that have counters, running means and generators."""
     env = NormalizeReward(NormalizeObservation(gym.make("Pendulum-v1", max_episode_steps=9)))
     return gym.wrappers.TransformReward(Clockless(env), lambda reward: 2 * reward)
 
 
 class Wandering(gym.Env[Any, Any]):
-    """Draws at every step, and acts by its own action space's generator."""
+    """Draws random numbers at every step, also from its own action space."""
 
     observation_space = gym.spaces.Dict(
         {"at": gym.spaces.Box(-99, 99, (2,)), "n": gym.spaces.Discrete(99)}
@@ -72,7 +72,7 @@ ENTRIES: dict[str, dict[str, Any]] = {
 }
 
 
-def told(batch: BatchedData, flags: Any) -> list[Any]:
+def content(batch: BatchedData, flags: Any) -> list[Any]:
     columns = (batch.reward, batch.terminated, batch.truncated, batch.is_reset, batch.done)
     return [batch.observation, *columns, batch.limit_reached, batch.info(), flags]
 
@@ -83,7 +83,9 @@ class Run:
     def __init__(self, group: sync.EnvGroup, seed: int) -> None:
         self.group, self.seed = group, seed
 
-    def go_on(self, batch: BatchedData, num_steps: int, turn: int) -> tuple[BatchedData, list[Any]]:
+    def proceed(
+        self, batch: BatchedData, num_steps: int, turn: int
+    ) -> tuple[BatchedData, list[Any]]:
         space = self.group.get_action_spaces()[0]
         assert space is not None
         space.seed(self.seed + turn)
@@ -92,7 +94,7 @@ class Run:
             batch, flags = self.group.step(
                 batch.respond(action=[space.sample() for _ in batch.ids()])
             )
-            trace.append(told(batch, flags))
+            trace.append(content(batch, flags))
         return batch, trace
 
 
@@ -114,7 +116,7 @@ def entry_of(kind: str, **fields: Any) -> dict[str, Any]:
     ids=", in ".join,
 )
 def groups(request: pytest.FixtureRequest) -> Iterator[tuple[sync.EnvGroup, sync.EnvGroup]]:
-    """One group, and another of an equal entry elsewhere."""
+    """Yield a group, and another group of an equal entry elsewhere."""
     kind, placement = request.param
     with pytest.MonkeyPatch.context() as patch:
         place = Placement("hosts.thread_host:ThreadHost", spreads=True)
@@ -138,7 +140,7 @@ def groups(request: pytest.FixtureRequest) -> Iterator[tuple[sync.EnvGroup, sync
     after=st.integers(1, 25),
     limit=st.integers(2, 30),
 )
-def test_an_env_goes_on_as_it_would_have(
+def test_a_restored_env_continues_as_the_original(
     groups: tuple[sync.EnvGroup, sync.EnvGroup],
     seed: int,
     before: int,
@@ -146,37 +148,37 @@ def test_an_env_goes_on_as_it_would_have(
     after: int,
     limit: int,
 ) -> None:
-    """To the last bit: in its place, and in another env of another group, in another process."""
+    """Bit for bit: in its place, and in another env of another group, in another process."""
     for group in groups:
-        group.reset()  # The other has been elsewhere.
+        group.reset()  # The other env has a different state.
     one, other = groups
     run = Run(one, seed)
     first, _ = one.reset(seed=seed)
     with one.auto_reset(limit):
-        batch, _ = run.go_on(first, before, 0)
+        batch, _ = run.proceed(first, before, 0)
         snapshot = one.snapshot()
-        _, expected = run.go_on(batch, after, 1)
-        run.go_on(batch, between, 2)
+        _, expected = run.proceed(batch, after, 1)
+        run.proceed(batch, between, 2)
         shown, flags = one.restore(snapshot)
         assert shown.is_reset.all()
         assert not any([*shown.done.ravel(), *shown.reward.ravel(), *flags])
         np.testing.assert_equal(shown.observation, batch.observation)
-        shown, found = run.go_on(shown, after, 1)
+        shown, found = run.proceed(shown, after, 1)
         np.testing.assert_equal(found, expected)
     with other.auto_reset(limit):
         shown, _ = other.restore(snapshot)
-        _, found = Run(other, seed).go_on(shown, after, 1)
+        _, found = Run(other, seed).proceed(shown, after, 1)
         np.testing.assert_equal(found, expected)
 
 
-def test_an_env_goes_on_in_another_run(tmp_path: Path) -> None:
-    """A snapshot is a file like any other; the env that it goes into was never reset."""
+def test_a_snapshot_can_be_restored_in_another_run(tmp_path: Path) -> None:
+    """A snapshot is a plain file; the env that it is restored into was never reset."""
     config = entry_of("mujoco")
     with sync.build_env_group(config) as group:
         batch, _ = group.reset(seed=1)
-        batch, _ = Run(group, 0).go_on(batch, 7, 0)
+        batch, _ = Run(group, 0).proceed(batch, 7, 0)
         (tmp_path / "snapshot").write_bytes(group.snapshot())
-        batch, _ = Run(group, 0).go_on(batch, 5, 1)
+        batch, _ = Run(group, 0).proceed(batch, 5, 1)
     program = tmp_path / "program.py"
     program.write_text(
         "from rlightning_aio import sync\n"
@@ -193,7 +195,7 @@ def test_an_env_goes_on_in_another_run(tmp_path: Path) -> None:
 
 
 async def test_some_envs_of_an_asynchronous_group() -> None:
-    """The others go on; an env takes another's place."""
+    """The others continue; an env can be restored into another's place."""
     async with rl.build_env_group(entry_of("gymnasium", num_workers=3)) as group:
         first, _ = await group.reset(seed=0)
         snapshot = await group.snapshot(env_ids=["e-1"])
@@ -205,15 +207,15 @@ async def test_some_envs_of_an_asynchronous_group() -> None:
         np.testing.assert_equal(twin.observation[2], batch.observation[1])
 
 
-def test_sums_and_counters_come_back() -> None:
-    """The episode ends after as many steps as it would have, with the same return."""
+def test_sums_and_counters_are_restored() -> None:
+    """The episode ends after the same number of steps, with the same return."""
     with sync.build_env_group(entry_of("gymnasium", num_workers=1, placement="inline")) as group:
         batch, _ = group.reset(seed=0)
         with group.auto_reset(4):
             for _ in range(4):
                 batch, flags = group.step(batch.respond(action=[0]))
             assert flags == [True]
-            due = group.snapshot()  # A reset is due, and comes next.
+            due = group.snapshot()  # A reset is due in the next step.
             for _ in range(3):
                 batch, _ = group.step(batch.respond(action=[0]))
             assert batch.info()[0] == {}
@@ -238,7 +240,7 @@ def spoilt(snapshot: bytes) -> list[bytes]:
 
 
 def test_a_spoilt_snapshot_is_refused() -> None:
-    """Before anything in it is read."""
+    """Before its content is read."""
     with sync.build_env_group(entry_of("gymnasium", placement="inline")) as group:
         group.reset(seed=0)
         for data in spoilt(group.snapshot()):
@@ -258,7 +260,7 @@ def test_a_spoilt_snapshot_is_refused() -> None:
     ],
 )
 def test_a_snapshot_of_something_else_is_refused(changed: dict[str, Any], message: str) -> None:
-    """The message says what differs; the envs go on from where they are."""
+    """The message says what differs; the envs continue unchanged."""
     with (
         sync.build_env_group(entry_of("gymnasium", placement="inline")) as one,
         sync.build_env_group(entry_of("gymnasium", placement="inline", **changed)) as other,
@@ -270,7 +272,7 @@ def test_a_snapshot_of_something_else_is_refused(changed: dict[str, Any], messag
 
 
 def test_another_version_of_the_simulator_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It need not compute the same."""
+    """It might compute something else."""
     with sync.build_env_group(entry_of("mujoco", placement="inline")) as group:
         group.reset(seed=0)
         snapshot = group.snapshot()
@@ -281,8 +283,8 @@ def test_another_version_of_the_simulator_is_refused(monkeypatch: pytest.MonkeyP
             group.restore(snapshot)
 
 
-def test_what_does_not_match_in_number_is_refused() -> None:
-    """As many envs as the snapshot is of, each once, idle, and known."""
+def test_a_wrong_number_of_envs_is_refused() -> None:
+    """As many envs as the snapshot has, each once, idle, and known."""
     with sync.build_env_group(entry_of("gymnasium", placement="inline")) as group:
         with pytest.raises(SnapshotError, match="env 'e-0' has no state yet: reset it"):
             group.snapshot()
@@ -302,7 +304,7 @@ def test_what_does_not_match_in_number_is_refused() -> None:
 
 
 class Fragile(gym.Env[Any, Any]):
-    """Counts; its state can be taken, but the second env's can't be put back once."""
+    """Counts; its state can be taken, but restoring the second env fails once."""
 
     observation_space = gym.spaces.Box(0, 99, (1,), np.int64)
     action_space = gym.spaces.Discrete(2)
@@ -327,8 +329,8 @@ class Fragile(gym.Env[Any, Any]):
             raise OSError("the disk is gone")
 
 
-def test_all_are_put_back_or_none() -> None:
-    """One fails at it; the others are where they were, and so is it."""
+def test_all_envs_are_restored_or_none() -> None:
+    """If one fails, all of them keep their previous state."""
     entry = {"name": "e", "make_env": Fragile, "num_workers": 3, "envs_per_process": 1}
     with sync.build_env_group(entry) as group:
         batch, _ = group.reset()
@@ -345,7 +347,7 @@ def test_all_are_put_back_or_none() -> None:
 
 
 class Lost(Fragile):
-    """Can't even go back."""
+    """Can't even return to its previous state."""
 
     def load_state(self, state: int) -> None:
         if self.fails:
@@ -353,8 +355,8 @@ class Lost(Fragile):
         self.count = state
 
 
-def test_one_that_can_not_even_go_back_begins_anew() -> None:
-    """It alone."""
+def test_an_env_that_cannot_go_back_begins_a_new_episode() -> None:
+    """The other envs keep their state."""
     entry = {"name": "e", "make_env": Lost, "num_workers": 2, "placement": "inline"}
     with sync.build_env_group(entry) as group:
         batch, _ = group.reset()
@@ -368,8 +370,8 @@ def test_one_that_can_not_even_go_back_begins_anew() -> None:
         assert batch.info()[1]["worker_restarted"] == "could not be put back"
 
 
-def test_an_env_that_has_yet_to_make_its_parts_says_so() -> None:
-    """It holds nothing of a library whose version it would tell, which is no difference."""
+def test_an_env_without_parts_has_no_versions_to_compare() -> None:
+    """It holds no object of a library yet; that is not a different version."""
     with (
         sync.build_env_group(entry_of("of its own", placement="inline")) as one,
         sync.build_env_group(entry_of("of its own", placement="inline")) as other,
@@ -383,7 +385,7 @@ def test_an_env_that_has_yet_to_make_its_parts_says_so() -> None:
 
 
 class Hidden(Fragile):
-    """Holds what nobody can pickle."""
+    """Holds an object that can't be pickled."""
 
     save_state = load_state = property()  # type: ignore[assignment]  # As if it had none.
 
@@ -391,9 +393,29 @@ class Hidden(Fragile):
         self.handle = threading.Lock()
 
 
-def test_what_can_not_be_saved_says_so() -> None:
-    """With the attribute that stands in the way."""
+def test_an_env_that_cannot_be_saved_names_the_attribute() -> None:
+    """The attribute that can't be pickled."""
     with sync.build_env_group({"name": "e", "make_env": Hidden, "placement": "inline"}) as group:
         group.reset()
         with pytest.raises(EnvRaised, match=r"env\.env\.handle of env 'e-0', a lock"):
             group.snapshot()
+
+
+def test_a_snapshot_of_fewer_envs_or_of_others_is_refused() -> None:
+    """Unless each target env is named."""
+    fields = entry_of("gymnasium", placement="inline")
+    with (
+        sync.build_env_group({**fields, "num_workers": 2}) as two,
+        sync.build_env_group({**fields, "num_workers": 3}) as three,
+        sync.build_env_group({**fields, "num_workers": 2, "name": "f"}) as others,
+    ):
+        for group in (two, three, others):
+            group.reset(seed=0)
+        snapshot = two.snapshot()
+        with pytest.raises(SnapshotError, match="of 2 envs, but should go into 3; name"):
+            three.restore(snapshot)
+        with pytest.raises(SnapshotError, match=r"of 'e-0', and this group has no such env; name"):
+            others.restore(snapshot)
+        for group, env_ids in ((three, ["e-2", "e-0"]), (others, ["f-0", "f-1"])):
+            shown, _ = group.restore(snapshot, env_ids=env_ids)
+            assert shown.ids() == env_ids

@@ -1,4 +1,4 @@
-"""Resets, steps, handles and errors, wherever envs live and whoever waits."""
+"""Resets, steps, handles and errors, in every placement and with every driver."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ from rlightning_aio import (
     PolicyResponse,
     UnknownEnv,
 )
+from rlightning_aio.batch import joined
 
-# For what is decided before anything is waited for, or made of a result that has come.
+# For decisions before any wait, and for handling results that have come.
 one_driver = pytest.mark.one_driver_for_each_place
 
 DO_NOTHING, END, TRUNCATE, RAISE = range(4)
@@ -42,7 +43,7 @@ def responses(ids: list[str], *rewards: float, what: int = DO_NOTHING) -> Batche
 
 @one_driver
 async def test_init_describes_every_env_in_order(start: Any) -> None:
-    """Ids, spaces and counts, before anything is reset; asked again, it tells the same."""
+    """Ids, spaces and counts, before any reset; a second call returns the same."""
     group = await start([ENTRY, {**ENTRY, "name": "more", "num_workers": 1}])
     metas = await group.init()
     assert [meta.env_id for meta in metas] == group.env_ids == [*IDS, "more-0"]
@@ -55,8 +56,8 @@ async def test_init_describes_every_env_in_order(start: Any) -> None:
 
 
 @one_driver
-async def test_a_reset_answers_for_the_envs_it_was_asked_for(start: Any) -> None:
-    """All in order, or some in the order given; rewards are 0, flags and ends False."""
+async def test_a_reset_returns_the_envs_that_it_names(start: Any) -> None:
+    """All in order, or some in the given order; rewards are 0, flags and ends False."""
     group = await start(ENTRY)
     batch, flags = await group.reset(seed=5)
     assert batch.ids() == IDS
@@ -71,8 +72,8 @@ async def test_a_reset_answers_for_the_envs_it_was_asked_for(start: Any) -> None
 
 
 @one_driver
-async def test_seeds_are_counted_named_or_listed(start: Any) -> None:
-    """An int counts through the whole group, whichever of its envs are reset."""
+async def test_seeds_are_an_int_or_a_list(start: Any) -> None:
+    """An int counts over the whole group, whichever envs are reset."""
     group = await start(ENTRY)
 
     async def seeds(**how: Any) -> list[float]:
@@ -105,7 +106,7 @@ async def test_options_reach_every_env_of_a_reset(start: Any) -> None:
 
 
 async def test_a_step_returns_the_same_ids_in_the_same_order(start: Any) -> None:
-    """From columns or single responses, for all envs or some; there are no flags."""
+    """For columns and single responses, for all envs and some; there are no flags."""
     group = await start(ENTRY)
     batch, _ = await group.reset()
     batch, flags = await group.step(batch.respond(action=actions(1, 2, 3, 4)))
@@ -124,7 +125,7 @@ async def test_a_step_returns_the_same_ids_in_the_same_order(start: Any) -> None
 
 @one_driver
 async def test_flags_extras_and_times_of_a_result(start: Any) -> None:
-    """Each part of an `EnvRet` arrives as the env gave it."""
+    """Each part of an `EnvRet` arrives as the env returned it."""
     group = await start(ENTRY)
     batch, _ = await group.reset()
     batch, _ = await group.step(responses(["probe-0", "probe-1"], 0.5, 1.5, what=END))
@@ -138,7 +139,7 @@ async def test_flags_extras_and_times_of_a_result(start: Any) -> None:
 
 
 async def test_each_result_is_collected_once(start: Any) -> None:
-    """Until none is pending; then there is nothing to wait for, and it is said at once."""
+    """When none is pending, a collect raises at once."""
     group = await start(ENTRY)
     batch, _ = await group.reset()
     group.step_async(batch.respond(action=actions(1, 2, 3, 4)))
@@ -156,7 +157,7 @@ async def test_each_result_is_collected_once(start: Any) -> None:
 
 @one_driver
 async def test_a_bad_batch_is_refused_as_a_whole(start: Any) -> None:
-    """Nothing is sent: each env can be stepped afterwards, and has not moved."""
+    """Nothing is sent: no env has moved, and each can be stepped afterwards."""
     group = await start(ENTRY)
     batch, _ = await group.reset()
     good = actions(1, 2, 3, 4)
@@ -166,6 +167,9 @@ async def test_a_bad_batch_is_refused_as_a_whole(start: Any) -> None:
         (batch.respond(action=[[0, 1], [0, 1], [0, 1], [0]]), BadAction, "not an array"),
         (responses([*IDS, "probe-9"], 1, 2, 3, 4, 5), UnknownEnv, "'probe-9'.*probe-0"),
         (responses([*IDS, "probe-1"], 1, 2, 3, 4, 5), EnvBusy, "'probe-1' appears twice"),
+        (batch.take([1, 1]).respond(action=good[:2]), EnvBusy, "'probe-1' appears twice"),
+        (batch.respond(action=good).take([0, 2, -4]), EnvBusy, "'probe-0' appears twice"),
+        (joined([batch, batch]).respond(action=[*good, *good]), EnvBusy, "'probe-0' appears twice"),
         (BatchedData(IDS[:2], [PolicyResponse("probe-0", [0, 1]), 3]), BadAction, "int"),
         (
             BatchedData(IDS[:1], [PolicyResponse("probe-1", [0, 1])]),
@@ -188,7 +192,7 @@ async def test_a_bad_batch_is_refused_as_a_whole(start: Any) -> None:
 
 @one_driver
 async def test_an_env_that_owes_a_reply_is_busy(start: Any) -> None:
-    """Until it was collected; the other envs of the refused batch are untouched."""
+    """Until it is collected; the other envs of the refused batch are unaffected."""
     group = await start(ENTRY)
     await group.reset()
     group.step_async(responses(["probe-1"], 1))
@@ -211,8 +215,8 @@ async def test_an_env_that_owes_a_reply_is_busy(start: Any) -> None:
 
 
 @one_driver
-async def test_what_an_env_raises_arrives_with_its_traceback(start: Any) -> None:
-    """Named, with what the others returned; the exception's own type is not rebuilt."""
+async def test_an_error_of_an_env_arrives_with_its_traceback(start: Any) -> None:
+    """With the env's name and the others' results; the type of the exception is not rebuilt."""
     group = await start(ENTRY)
     batch, _ = await group.reset()
     bad = actions(1, 2, 3, 4)
@@ -235,7 +239,7 @@ async def test_what_an_env_raises_arrives_with_its_traceback(start: Any) -> None
 
 
 async def test_an_error_answers_one_request_of_a_collect(start: Any) -> None:
-    """The others' results are there for the next one."""
+    """The next collect returns the others' results."""
     group = await start(ENTRY)
     batch, _ = await group.reset()
     bad = actions(1, 2, 3, 4)
@@ -256,7 +260,7 @@ async def test_an_error_answers_one_request_of_a_collect(start: Any) -> None:
 
 @one_driver
 async def test_a_handle_is_one_env(start: Any) -> None:
-    """It resets, steps and calls methods, with bare actions and seeds of its own."""
+    """It resets, steps and calls methods, with single actions and its own seeds."""
     group = await start(ENTRY)
     env = group["probe-2"]
     assert env.env_id == "probe-2"
@@ -270,7 +274,7 @@ async def test_a_handle_is_one_env(start: Any) -> None:
     assert await env.call("double", 4) == 8
     assert await env.call("double", "ab", times=3) == "ababab"
     assert await env.call("stack") == "wrapped"
-    assert await env.call("weigh", 2) == 6, "of the simulator, within two wrappers"
+    assert await env.call("weigh", 2) == 6, "an attribute of the simulator, inside two wrappers"
     with pytest.raises(EnvRaised, match=r"nor its simulator.*has no_such_method\(\)"):
         await env.call("no_such_method")
     with pytest.raises(UnknownEnv, match="'probe-9'"):
@@ -279,7 +283,7 @@ async def test_a_handle_is_one_env(start: Any) -> None:
 
 @one_driver
 async def test_resets_can_be_sent_and_collected_like_steps(start: Any) -> None:
-    """Beside steps of other envs; what can't be sent is refused as a whole."""
+    """Next to steps of other envs; an invalid batch is refused as a whole."""
     group = await start(ENTRY)
     batch, _ = await group.reset(seed=5)
     group.reset_async(seed={"probe-2": 9}, env_ids=["probe-2", "probe-0"])
@@ -297,7 +301,7 @@ async def test_resets_can_be_sent_and_collected_like_steps(start: Any) -> None:
 
 @one_driver
 async def test_calls_of_methods_run_at_once_and_are_collected_together(start: Any) -> None:
-    """Their values come in the order in which they were sent; an error leaves none behind."""
+    """Values are in the order of sending; an error leaves none behind."""
     group = await start(ENTRY)
     with pytest.raises(NothingPending, match="no call is outstanding"):
         await group.collect_calls()
@@ -318,7 +322,7 @@ async def test_calls_of_methods_run_at_once_and_are_collected_together(start: An
 
 @one_driver
 async def test_attributes_of_the_simulator_or_its_wrapper(start: Any) -> None:
-    """The target is told, and a value that was set is there when the call returns."""
+    """The target can be chosen; a new value is set when the call returns."""
     group = await start(ENTRY)
     env = group["probe-1"]
     assert await env.get_attr("label") == "inner"
@@ -336,7 +340,7 @@ async def test_attributes_of_the_simulator_or_its_wrapper(start: Any) -> None:
 
 @one_driver
 async def test_frames_memory_and_what_has_none(start: Any) -> None:
-    """`render` returns a frame; offload and reload reach every env, or name the one that can't."""
+    """`render` returns a frame; offload and reload reach every env, or name one without them."""
     others = {**ENTRY, "name": "b", "backend": "batched"}
     group = await start([{**ENTRY, "num_workers": 2}, others], mixed_actions=True)
     frame = await group["probe-0"].render()
@@ -357,7 +361,7 @@ async def test_frames_memory_and_what_has_none(start: Any) -> None:
 
 @one_driver
 async def test_results_are_never_overwritten(start: Any) -> None:
-    """Neither arrays, nor infos, nor what envs return in place of new objects."""
+    """Neither arrays nor infos, even if envs return the same objects each time."""
     group = await start(
         [ENTRY, {**ENTRY, "name": "reusing", "backend": "reusing"}], mixed_actions=True
     )
@@ -378,7 +382,7 @@ async def test_results_are_never_overwritten(start: Any) -> None:
 
 @one_driver
 async def test_a_sent_action_may_be_changed(start: Any) -> None:
-    """What was sent is what is stepped with, also where an env runs only later."""
+    """The env is stepped with the action at the time of sending, even if it runs later."""
     group = await start([ENTRY, {**ENTRY, "name": "chunked", "backend": "chunked"}])
     batch, _ = await group.reset()
     probes, chunked = batch.by_name().values()
@@ -394,7 +398,7 @@ async def test_a_sent_action_may_be_changed(start: Any) -> None:
 
 @one_driver
 async def test_zero_copy_lends_read_only_views(start: Any) -> None:
-    """They live until the env's next request; without it, an observation is the caller's own."""
+    """They are valid until the env's next request; without the option, observations are copies."""
     group = await start(ENTRY, zero_copy=True)
     batch, _ = await group.reset()
     lent = batch.observation
@@ -402,7 +406,7 @@ async def test_zero_copy_lends_read_only_views(start: Any) -> None:
         lent[0, 0] = 1.0
     copies = [copy.deepcopy(batch), pickle.loads(pickle.dumps(batch))]
     await group.step(batch.respond(action=actions(1, 2, 3, 4)))
-    assert lent[:, 2].tolist() == [1] * 4, "it is a view of the rows"
+    assert lent[:, 2].tolist() == [1] * 4, "the observation is a view of the rows"
     for owned in copies:
         assert owned.observation[:, 2].tolist() == [0] * 4
         owned.observation[0, 0] = 7.0
@@ -414,7 +418,7 @@ async def test_zero_copy_lends_read_only_views(start: Any) -> None:
 
 
 @one_driver
-async def test_what_a_group_has_measured(start: Any, capsys: pytest.CaptureFixture[str]) -> None:
+async def test_statistics_of_a_group(start: Any, capsys: pytest.CaptureFixture[str]) -> None:
     """Throughput by entry and kind, batch sizes, latencies, and episodes by env."""
     group = await start([ENTRY, {**ENTRY, "name": "more", "num_workers": 1}])
     assert group.get_stats()["steps_per_second"] == 0.0
@@ -454,8 +458,8 @@ async def test_what_a_group_has_measured(start: Any, capsys: pytest.CaptureFixtu
 
 
 @one_driver
-async def test_what_comes_after_an_end_that_nobody_reset_belongs_to_no_episode(start: Any) -> None:
-    """Whoever steps on gets results, and a single episode is counted."""
+async def test_steps_after_an_end_belong_to_no_episode(start: Any) -> None:
+    """They have results, but only one episode is counted."""
     entry = {
         "name": "tree",
         "backend": "gymnasium",

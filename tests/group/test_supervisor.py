@@ -1,4 +1,4 @@
-"""The life of hosts, with stand-ins for them: no process, no driver, and a clock of our own."""
+"""The life of hosts, with stand-ins: no process, no driver, and a manual clock."""
 
 from __future__ import annotations
 
@@ -12,12 +12,17 @@ from group.fake_host import ACTION_SPACE, LAYOUT, OBSERVATION_SPACE, Running
 
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.errors import ConfigError, EnvHung, GroupClosed, StartFailed, WorkerDied
-from rlightning_aio.group import supervisor
+from rlightning_aio.group import hang_detector
+from rlightning_aio.group.conditions import Conditions
+from rlightning_aio.group.continuity import Continuity
 from rlightning_aio.group.env_table import EnvTable
-from rlightning_aio.group.requests import COLLECTOR, Requests
-from rlightning_aio.group.resumption import Resumption
+from rlightning_aio.group.lifetime import Lifetime
+from rlightning_aio.group.observed import Observed
+from rlightning_aio.group.request_states import COLLECTOR
+from rlightning_aio.group.requests import Requests
 from rlightning_aio.group.slab_layout import SlabLayout
 from rlightning_aio.group.supervisor import GivenUp, Replaced, Supervisor
+from rlightning_aio.group.tables import Tables
 from rlightning_aio.hosts.arena import Arena
 from rlightning_aio.hosts.messages import (
     Attached,
@@ -43,24 +48,24 @@ KILLED = Death("was killed by SIGKILL", -9)
 
 @dataclass
 class StandIn:
-    """See `hosts.base.Killable`. It does what the test says, and notes what it is told.
+    """See `hosts.base.Killable`. It does what the test says, and records its orders.
 
     Attributes:
-        tell: takes its completions; log: takes what it is told.
-        builds, closes: it does so at once; otherwise not before it is killed.
-        dies: a kill works.
-        refusal: what a start raises.
-        asked: entries that it was given.
+        post: takes its completions; log: its orders.
+        builds, closes: at once; otherwise not before it is killed.
+        dies: a kill ends it.
+        refusal: the error of a start.
+        asked: its entries.
         close_errors: of its envs.
         current: the entry that it executes, and since when (ns).
         traffic: see `hosts.base.Killable.traffic`.
-        unheard: what it has told, each by a call, and nobody has taken in.
+        unread: completions that wait to be read, each as a call.
     """
 
     host_id: int
     first_slot: int
     num_envs: int
-    tell: Callable[[Any], None]
+    post: Callable[[Any], None]
     log: list[str]
     builds: bool = True
     closes: bool = True
@@ -69,7 +74,7 @@ class StandIn:
     close_errors: list[tuple[int, ErrorText]] = field(default_factory=list)
     current: tuple[int, int] = (0, 0)
     traffic: int = 0
-    unheard: list[Callable[[], object]] = field(default_factory=list)
+    unread: list[Callable[[], object]] = field(default_factory=list)
     closing: bool = False
     built: bool = False
     asked: list[int] = field(default_factory=list[int])
@@ -95,13 +100,13 @@ class StandIn:
         started = [
             EnvStarted(meta, LAYOUT, reads_extras=False, transforms_actions=False) for meta in metas
         ]
-        self.tell(Built(self.host_id, started))
+        self.post(Built(self.host_id, started))
 
     def attach(self, order: Any) -> None:
         self.log.append(f"attach {self.host_id}")
         assert len(order.rows) == self.num_envs
         if self.built:
-            self.tell(Attached(self.host_id))
+            self.post(Attached(self.host_id))
 
     def submit(self, entries: np.ndarray, arguments: Any = None) -> None:
         assert len(arguments or entries) == len(entries)
@@ -111,10 +116,10 @@ class StandIn:
         return self.current
 
     def catch_up(self) -> bool:
-        unheard, self.unheard = self.unheard, []
-        for tell in unheard:
-            tell()
-        return bool(unheard)
+        unread, self.unread = self.unread, []
+        for post in unread:
+            post()
+        return bool(unread)
 
     def kill(self, *, dump: bool) -> None:
         self.log.append(f"dump and kill {self.host_id}" if dump else f"kill {self.host_id}")
@@ -127,7 +132,7 @@ class StandIn:
     def end(self) -> None:
         self.current = (0, 0)
         ended = Closed(self.host_id, self.close_errors) if self.closing else None
-        self.tell(ended or Died(self.host_id, KILLED))
+        self.post(ended or Died(self.host_id, KILLED))
 
     def close(self) -> None:
         self.log.append(f"close {self.host_id}")
@@ -140,18 +145,18 @@ class StandIn:
 
 
 class Fleet:
-    """A supervisor over stand-ins, what the core would do for it, and a clock.
+    """A supervisor over stand-ins, with a clock and the core's part of the work.
 
     Args:
         counts: envs of each host.
 
     Attributes:
-        verdicts: what became of each death.
+        verdicts: the outcome of each death.
     """
 
     def __init__(self, counts: tuple[int, ...] = (1, 1), **fields: Any) -> None:
         self.now = 1000.0
-        self.told: deque[Any] = deque()
+        self.completions: deque[Any] = deque()
         self.log: list[str] = []
         self.verdicts: list[GivenUp | Replaced | None] = []
         self.running: list[Running] = []
@@ -160,55 +165,64 @@ class Fleet:
         )
         size = sum(counts)
         envs = EnvTable([config] * size, [f"e-{slot}" for slot in range(size)])
+        conditions = Conditions()
         self.requests = Requests(np.repeat(np.arange(len(counts)), counts), len(counts))
-        self.supervisor = Supervisor(
+        self.lifetime = Lifetime(conditions)
+        tables = Tables(
             envs,
             self.requests,
             SlabLayout(size),
-            Resumption(self.requests),
+            Continuity(envs),
+            conditions,
+            Observed(conditions),
+            self.lifetime,
+        )
+        self.supervisor = Supervisor(
+            tables,
             Arena(),
-            self.told.append,
+            self.completions.append,
             mixed_actions=False,
-            num_cores=1,
             clock=lambda: self.now,
         )
         self.hosts: list[StandIn] = []
         for host_id, count in enumerate(counts):
-            host = StandIn(host_id, sum(counts[:host_id]), count, self.told.append, self.log)
+            host = StandIn(host_id, sum(counts[:host_id]), count, self.completions.append, self.log)
             self.hosts.append(host)
             self.supervisor.add(host, config)
 
     def begin(self, procedure: Procedure[Any]) -> Running:
         running = Running(procedure)
         self.running.append(running)
-        running.go_on(None)
+        running.resume(None)
         self.turn()
         return running
 
     def turn(self) -> None:
-        """What a driver does until nothing is told and no time has come."""
+        """Act as the driver until nothing is posted and no time has come."""
         for _ in range(50):
             self.drain()
             due = [running for running in self.running if running.is_due(self.now)]
             if not due:
                 return
             for running in due:
-                running.go_on(self.now)
+                running.resume(self.now)
         raise AssertionError("the supervisor turns in circles instead of waiting")
 
     def drain(self) -> None:
-        """As the core does; what is owed is asked anew of a replacement."""
-        while self.told:
-            told = self.told.popleft()
+        """Act as the core: send owed requests again to a replacement."""
+        while self.completions:
+            completion = self.completions.popleft()
             for running in self.running:
                 running.woken = True
-            if not isinstance(told, Died):
-                self.supervisor.handle(told)
+            if not isinstance(completion, Died):
+                self.supervisor.handle(completion)
                 continue
-            verdict = self.supervisor.bury(told)
+            verdict = self.supervisor.handle_exit(completion)
             self.verdicts.append(verdict)
             if isinstance(verdict, Replaced):
-                self._hand_over(verdict.owed, self.requests.restart(verdict.owed))
+                host_id = verdict.host.host_id
+                entries = self.requests.restart(host_id, verdict.owed)
+                self.supervisor.submit(host_id, entries, None)
             elif verdict is not None:
                 self.requests.fail(verdict.owed, COLLECTOR, verdict.error_for(verdict.owed))
 
@@ -220,7 +234,7 @@ class Fleet:
         self.turn()
 
     def ask(self, *slots: int) -> list[int]:
-        """Send steps; their entries."""
+        """Send steps; return their entries."""
         asked = np.array(slots)
         entries = self.requests.submit(asked, Operation.STEP, COLLECTOR, self.now)
         self._hand_over(asked, entries)
@@ -235,7 +249,7 @@ class Fleet:
         self.drain()
 
     def wait(self) -> float:
-        """Let the time pass until the supervisor has something to do; how long that takes."""
+        """Let time pass until the supervisor has something to do; return how long that took."""
         due = self.supervisor.next_check()
         assert due is not None
         passed, self.now = due - self.now, due
@@ -243,25 +257,25 @@ class Fleet:
         return passed
 
     def die(self, host_id: int, *requests: int) -> GivenUp | Replaced | None:
-        """A worker dies while it executes `requests`; what becomes of that."""
-        self.told.append(Died(host_id, Death(KILLED.cause, -9, "last words", requests)))
+        """Let a worker die while it executes `requests`; return the outcome."""
+        self.completions.append(Died(host_id, Death(KILLED.cause, -9, "last words", requests)))
         self.drain()
         return self.verdicts[-1]
 
     def reply(self, slot: int) -> None:
-        """A step is done, and collected."""
-        host_id = self.requests.host_of(slot)
-        assert self.requests.complete_one(host_id, self.requests.entry.item(slot)) == slot
-        self.requests.hand_out(self.requests.take(1))
+        """Complete a step and collect it."""
+        host_id = self.requests.hosts.item(slot)
+        assert self.requests.complete_one(host_id, self.requests.numbering.entry.item(slot)) == slot
+        self.requests.hand_out(self.requests.collector.take(1))
         self.supervisor.note_step(slot)
 
     def close(self) -> Running:
-        return self.begin(self.supervisor.close(self.now))
+        return self.begin(self.supervisor.shutdown.close(self.now))
 
 
 @pytest.fixture
 def fleet() -> Iterator[Callable[..., Fleet]]:
-    """Makes fleets, which are up unless the test has to start them; and closes them."""
+    """Make fleets, started unless the test starts them, and close them after the test."""
     made: list[Fleet] = []
 
     def make(counts: tuple[int, ...] = (1, 1), *, up: bool = True, **fields: Any) -> Fleet:
@@ -283,7 +297,7 @@ def fleet() -> Iterator[Callable[..., Fleet]]:
 
 
 def test_all_are_started_before_any_is_waited_for(fleet: Callable[..., Fleet]) -> None:
-    """Rows are known, and given, when the last is built; metas come in the order of slots."""
+    """Rows are assigned when the last host is built; metadata is in the order of slots."""
     ours = fleet((2, 1, 1), up=False)
     ours.hosts[1].builds = False
     start = ours.start()
@@ -301,7 +315,7 @@ def test_all_are_started_before_any_is_waited_for(fleet: Callable[..., Fleet]) -
 
 @pytest.mark.parametrize("dies", [True, False])
 def test_a_late_one_is_dumped_killed_and_given_up(fleet: Callable[..., Fleet], dies: bool) -> None:
-    """It has a second to write its stacks; then the start fails, whether or not it has died."""
+    """It has a second to write its stacks; then the start fails, dead or not."""
     ours = fleet(up=False)
     ours.hosts[1].builds = ours.hosts[1].closes = False
     ours.hosts[1].dies = dies
@@ -324,7 +338,7 @@ def test_a_late_one_is_dumped_killed_and_given_up(fleet: Callable[..., Fleet], d
 
 
 def test_a_host_that_cannot_be_started_fails_the_start(fleet: Callable[..., Fleet]) -> None:
-    """Those before it are closed, those behind it were never started."""
+    """Hosts before it are closed, hosts after it are never started."""
     ours = fleet((1, 1, 1), up=False)
     ours.hosts[1].refusal = OSError("no such program")
     with pytest.raises(StartFailed, match="entry 'e': no such program; check its `interpreter`"):
@@ -341,11 +355,11 @@ def test_a_host_that_cannot_be_started_fails_the_start(fleet: Callable[..., Flee
 def test_an_env_that_cannot_be_built_fails_the_start(
     fleet: Callable[..., Fleet], type_name: str, kind: type[Exception]
 ) -> None:
-    """What is wrong with a config keeps its type; all else names the env."""
+    """A config error keeps its type; any other error names the env."""
     ours = fleet((1, 2), up=False)
     ours.hosts[1].builds = False
     start = ours.start()
-    ours.told.append(NotBuilt(1, 1, ErrorText(type_name, "no licence", "Traceback\n")))
+    ours.completions.append(NotBuilt(1, 1, ErrorText(type_name, "no licence", "Traceback\n")))
     ours.turn()
     with pytest.raises(kind, match="no licence") as caught:
         start.result()
@@ -354,7 +368,7 @@ def test_an_env_that_cannot_be_built_fails_the_start(
 
 
 def test_a_death_in_the_start_fails_it(fleet: Callable[..., Fleet]) -> None:
-    """Nothing is replaced before it has worked once; its last words are told."""
+    """Nothing is replaced before it has worked once; the error has the last output."""
     ours = fleet(up=False)
     ours.hosts[0].builds = False
     start = ours.start()
@@ -365,7 +379,7 @@ def test_a_death_in_the_start_fails_it(fleet: Callable[..., Fleet]) -> None:
 
 
 def test_closing_ends_a_start(fleet: Callable[..., Fleet]) -> None:
-    """Whoever starts it is told."""
+    """The start raises."""
     ours = fleet(up=False)
     ours.hosts[0].builds = False
     start = ours.start()
@@ -380,20 +394,20 @@ def test_closing_ends_a_start(fleet: Callable[..., Fleet]) -> None:
 # -- hangs
 
 
-def test_what_a_kill_does_not_end_is_ended_with_what_it_stands_on(
+def test_a_host_that_survives_a_kill_is_destroyed_with_its_fork_server(
     fleet: Callable[..., Fleet],
 ) -> None:
-    """A few seconds after it was first seen to live on, and again if that has no effect, either."""
+    """Some seconds after the kill, and again if that has no effect, either."""
     ours = fleet((1,), step_timeout=5.0)
     (entry,) = ours.ask(0)
     ours.hosts[0].current = (entry, int(ours.now * 1e9))
     ours.hosts[0].dies = False
-    ours.now += 60  # However late the trainer comes.
+    ours.now += 60  # However late the trainer is.
     ours.check()
     for destroyed in range(1, 3):
         ours.check()
         due = ours.supervisor.next_check()
-        assert due == pytest.approx(ours.now + supervisor._OBEY_SECONDS)
+        assert due == pytest.approx(ours.now + hang_detector._OBEY_SECONDS)
         ours.now = due - 0.1
         ours.check()
         assert len(ours.log) == destroyed
@@ -411,7 +425,7 @@ def test_what_a_kill_does_not_end_is_ended_with_what_it_stands_on(
 
 
 def test_an_env_that_executes_too_long_is_killed(fleet: Callable[..., Fleet]) -> None:
-    """After its limit, once, with a dump; the error says which env and how long."""
+    """After its limit, once, with a dump; the error has the env and the time."""
     ours = fleet((1, 2), step_timeout=5.0)
     entries = ours.ask(1, 2)
     ours.hosts[1].current = (entries[1], int(ours.now * 1e9))
@@ -434,7 +448,7 @@ def test_an_env_that_executes_too_long_is_killed(fleet: Callable[..., Fleet]) ->
 
 
 def ended_as_hung(ours: Fleet) -> Replaced:
-    """What becomes of host 0, whose time is up in a moment."""
+    """Return the outcome for host 0, whose time is almost over."""
     ours.now += 0.2
     ours.check()
     assert ours.log[0] == "dump and kill 0"
@@ -444,7 +458,7 @@ def ended_as_hung(ours: Fleet) -> Replaced:
 
 
 def test_a_stopped_process_is_found_by_its_doing_nothing(fleet: Callable[..., Fleet]) -> None:
-    """It owes a reply and executes none; every reply begins its time anew."""
+    """It owes a reply and executes nothing; every reply restarts the time."""
     ours = fleet((2, 1), step_timeout=5.0)
     ours.ask(0, 1)
     ours.check()
@@ -459,10 +473,10 @@ def test_a_stopped_process_is_found_by_its_doing_nothing(fleet: Callable[..., Fl
     assert verdict.error_for(verdict.owed).env_id == "e-1"
 
 
-def test_what_waits_for_the_trainer_to_read_has_its_time_anew_with_each_part(
+def test_each_part_that_is_read_restarts_the_time_of_a_large_reply(
     fleet: Callable[..., Fleet],
 ) -> None:
-    """However many it takes. One that stops halfway is found, and its env is named."""
+    """A host that stops halfway is found, and its env is named."""
     ours = fleet((2,), step_timeout=5.0)
     entries = ours.ask(0, 1)
     ours.hosts[0].current = (entries[1], 0)
@@ -477,8 +491,8 @@ def test_what_waits_for_the_trainer_to_read_has_its_time_anew_with_each_part(
     assert verdict.error_for(verdict.owed).env_id == "e-1"
 
 
-def test_what_has_been_answered_already_is_not_what_hangs(fleet: Callable[..., Fleet]) -> None:
-    """A worker was stopped between two requests: the one that it has yet to begin is named."""
+def test_an_answered_request_is_not_blamed_for_a_hang(fleet: Callable[..., Fleet]) -> None:
+    """A worker was stopped between two requests: the one that it has not begun is named."""
     ours = fleet((2,), step_timeout=5.0)
     entries = ours.ask(0, 1)
     ours.hosts[0].current = (entries[0], 0)
@@ -491,40 +505,40 @@ def test_what_has_been_answered_already_is_not_what_hangs(fleet: Callable[..., F
     assert verdict.error_for(verdict.owed).env_id == "e-1"
 
 
-def test_a_trainer_that_is_late_hears_a_host_before_it_ends_it(
+def test_a_late_trainer_reads_pending_replies_before_it_kills(
     fleet: Callable[..., Fleet],
 ) -> None:
-    """One that was seen to do nothing, and one that was seen to execute, have answered since."""
+    """For a host that seemed idle and one that seemed to execute; both have replied since."""
     ours = fleet((1, 1), step_timeout=5.0)
     entries = ours.ask(0, 1)
     ours.hosts[1].current = (entries[1], int(ours.now * 1e9))
     ours.check()
     ours.now += 60
-    ours.hosts[0].unheard.append(lambda: ours.reply(0))
-    ours.hosts[1].unheard.append(lambda: ours.reply(1))
+    ours.hosts[0].unread.append(lambda: ours.reply(0))
+    ours.hosts[1].unread.append(lambda: ours.reply(1))
     ours.check()
     assert ours.requests.in_flight == [0, 0]
     assert ours.log == []
 
 
-def test_a_death_that_a_late_trainer_has_not_heard_of_costs_no_fork_server(
+def test_an_unread_death_does_not_cost_the_fork_server(
     fleet: Callable[..., Fleet],
 ) -> None:
-    """The kill has worked; others stand on what would be ended next."""
+    """The kill has worked; other workers depend on the fork server."""
     ours = fleet((1,), step_timeout=5.0)
     (entry,) = ours.ask(0)
     ours.hosts[0].current = (entry, int(ours.now * 1e9))
     ours.hosts[0].dies = False
     ours.now += 5
     ours.check()
-    ours.hosts[0].unheard.append(ours.hosts[0].end)
+    ours.hosts[0].unread.append(ours.hosts[0].end)
     ours.now += 60
     ours.check()
     assert ours.log == ["dump and kill 0", "start 0", "attach 0"]
 
 
-def test_what_has_no_limit_may_take_for_ever(fleet: Callable[..., Fleet]) -> None:
-    """So may a call, and a reset where steps alone have a limit."""
+def test_without_a_limit_a_request_may_take_any_time(fleet: Callable[..., Fleet]) -> None:
+    """So may a call, and a reset if only steps have a limit."""
     free, limited = fleet(), fleet(step_timeout=5.0)
     for ours in (free, limited):
         (entry,) = ours.ask(0)
@@ -533,7 +547,7 @@ def test_what_has_no_limit_may_take_for_ever(fleet: Callable[..., Fleet]) -> Non
             ours.requests.withdraw(0)
             ours.requests.submit(np.array([0]), Operation.RESET, COLLECTOR, ours.now)
             assert list(ours.requests.by_host(np.array([0])))
-            entry = ours.requests.entry.item(0)
+            entry = ours.requests.numbering.entry.item(0)
         ours.hosts[0].current = (entry, int(ours.now * 1e9))
         ours.now += 1e6
         ours.check()
@@ -544,16 +558,16 @@ def test_what_has_no_limit_may_take_for_ever(fleet: Callable[..., Fleet]) -> Non
 
 
 def test_a_dead_host_is_replaced(fleet: Callable[..., Fleet]) -> None:
-    """It is started, and given its rows again; what it owed is told, and owed no more by it."""
+    """It is started and gets its rows again; the verdict has what it owed."""
     ours = fleet((1, 3))
     entries = ours.ask(1, 3)
-    ours.told.append(Died(1, Death("left", 3, "last words", (entries[1],))))
-    verdict = ours.supervisor.bury(ours.told.popleft())
+    ours.completions.append(Died(1, Death("left", 3, "last words", (entries[1],))))
+    verdict = ours.supervisor.handle_exit(ours.completions.popleft())
     assert isinstance(verdict, Replaced)
     assert (verdict.host, verdict.owed.tolist(), verdict.cause) == (ours.hosts[1], [1, 3], "left")
     assert ours.requests.in_flight == [0, 0]
     assert ours.log == ["start 1", "attach 1"]
-    assert ours.supervisor.recovering
+    assert ours.supervisor.any_deaths
     error = verdict.error_for(np.array([1]))
     assert (error.env_id, error.env_ids, error.exit_code) == ("e-3", ("e-1",), 3)
     assert "restart 1 of 3 in a row" in str(error)
@@ -570,7 +584,7 @@ def test_a_dead_host_is_replaced(fleet: Callable[..., Fleet]) -> None:
 def test_a_dead_host_may_be_given_up(
     fleet: Callable[..., Fleet], fields: dict[str, Any], why: str
 ) -> None:
-    """Whoever asks its envs from then on is told why, and the others can be used."""
+    """Later requests to its envs raise the cause; the other envs can be used."""
     ours = fleet((2, 1), **fields)
     ours.ask(1, 2)
     verdict = ours.die(0)
@@ -578,25 +592,24 @@ def test_a_dead_host_may_be_given_up(
     assert (verdict.host, verdict.owed.tolist()) == (ours.hosts[0], [1])
     assert ours.log == []
     with pytest.raises(WorkerDied, match=why):
-        raise ours.requests.faults[0]
+        raise ours.requests.collector.faults[0]
     with pytest.raises(WorkerDied, match=why):
         ours.supervisor.check_usable(np.array([2, 0]))
     ours.supervisor.check_usable(np.array([2]))
-    ours.supervisor.note_recovery(any_telling=False)
-    assert not ours.supervisor.recovering
+    assert not ours.supervisor.any_deaths
 
 
 def test_restarts_are_counted_for_each_culprit(fleet: Callable[..., Fleet]) -> None:
-    """Neighbours don't add up; an env that completes a step is forgiven, and it alone."""
+    """Neighbours don't add up; a completed step resets the count of its env only."""
     ours = fleet((2,), max_restarts=2)
     for slot in (0, 1, 0, 1):
         (entry,) = ours.ask(slot)
         assert isinstance(ours.die(0, entry), Replaced)
         if ours.supervisor.next_check() is not None:
             ours.wait()
-        # Its replacement's reset: that shows nothing yet.
-        assert ours.requests.complete_one(0, ours.requests.entry.item(slot)) == slot
-        ours.requests.hand_out(ours.requests.take(1))
+        # A reset of the replacement proves nothing yet.
+        assert ours.requests.complete_one(0, ours.requests.numbering.entry.item(slot)) == slot
+        ours.requests.hand_out(ours.requests.collector.take(1))
     ours.ask(0)
     ours.reply(0)
     (entry,) = ours.ask(0)
@@ -606,56 +619,72 @@ def test_restarts_are_counted_for_each_culprit(fleet: Callable[..., Fleet]) -> N
     assert isinstance(ours.die(0, entry), GivenUp)
 
 
-def test_restarts_that_fail_are_put_off_for_longer_each_time(fleet: Callable[..., Fleet]) -> None:
-    """Each counts; the last says why it failed. Others go on, and no attempt comes too soon."""
-    ours = fleet(max_restarts=9)
+def test_a_shortage_of_half_a_minute_costs_no_restarts(fleet: Callable[..., Fleet]) -> None:
+    """Attempts become rarer, other hosts continue, and only then it counts as a death."""
+    ours = fleet(max_restarts=2)
     ours.hosts[0].refusal = OSError("too many open files")
     ours.ask(0, 1)
-    verdict = ours.die(0)
-    assert verdict is None, "a replacement that was never up owes nothing"
-    assert isinstance(ours.verdicts[0], Replaced)
+    assert isinstance(ours.die(0), Replaced)
     pauses = []
-    while not isinstance(verdict, GivenUp):
+    for _ in range(10):
         ours.reply(1)
         ours.ask(1)
         ours.now += 1e-3
         ours.check()
         pauses.append(round(ours.wait() + 1e-3, 6))
-        verdict = ours.verdicts[-1]
-    assert pauses == [0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0]
+    assert pauses == [0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0, 5.0, 5.0]
+    assert len(ours.verdicts) == 1 + 1, "the last attempt was one too many"
+    assert ours.verdicts[-1] is None, "a replacement that was never up owes nothing"
+    assert round(ours.wait(), 6) == 0.1, "this must be the second restart in a row"
+    verdict = ours.verdicts[-1]
+    assert isinstance(verdict, GivenUp)
     assert verdict.owed.tolist() == [0]
     error = str(verdict.error_for(verdict.owed))
     assert "could not be replaced: can't start a worker for entry 'e': too many open" in error
-    assert "after 9 restarts in a row" in error
+    assert "after 2 restarts in a row" in error
     assert ours.requests.in_flight == [0, 1]
-    ours.supervisor.note_recovery(any_telling=False)
     assert ours.supervisor.next_check() is None
 
 
-def test_thousands_of_restarts_are_attempts_like_the_first(fleet: Callable[..., Fleet]) -> None:
-    """They are as many as were allowed, one after the other."""
-    ours = fleet(max_restarts=5000)
-    ours.hosts[0].refusal = OSError("no such program")
-    ours.ask(0)
-    ours.die(0)
-    attempts = 1
-    while not isinstance(ours.verdicts[-1], GivenUp):
+def test_each_shortage_has_its_own_half_minute(fleet: Callable[..., Fleet]) -> None:
+    """A replacement that could be started ends the previous shortage."""
+    ours = fleet(max_restarts=1)
+    for _ in range(3):
+        ours.hosts[0].refusal = OSError("too many open files")
+        (entry,) = ours.ask(0)
+        assert isinstance(ours.die(0, entry), Replaced)
+        while ours.now < ours.supervisor._records[0].refused_since + 20:
+            ours.wait()
+        ours.hosts[0].refusal = None
         ours.wait()
-        attempts += 1
-    assert attempts == 5000
-    assert "after 5000 restarts in a row" in str(ours.requests.faults[0])
+        ours.reply(0)
+    assert ours.supervisor._records[0].restarts == 3
 
 
-def test_what_is_asked_of_a_host_that_is_down_waits_for_its_replacement(
+def test_thousands_of_restarts_are_attempts_like_the_first(fleet: Callable[..., Fleet]) -> None:
+    """As many as the config allows, one after the other."""
+    ours = fleet(max_restarts=5000)
+    ours.ask(0)
+    for _ in range(5000):
+        ours.die(0)
+        if ours.supervisor._records[0].restart_at is not None:
+            ours.wait()
+    ours.die(0)
+    assert isinstance(ours.verdicts[-1], GivenUp)
+    assert ours.log.count("start 0") == 5000
+    assert "after 5000 restarts in a row" in str(ours.requests.collector.faults[0])
+
+
+def test_requests_to_a_host_that_is_down_wait_for_its_replacement(
     fleet: Callable[..., Fleet],
 ) -> None:
-    """No attempt that fails touches it; what the dead worker owed is asked anew, once."""
+    """Failed attempts don't affect them; requests that the dead worker owed are sent again."""
     ours = fleet((2, 1), max_restarts=9, step_timeout=1.0)
     (entry,) = ours.ask(0)
     ours.hosts[0].refusal = OSError("no more processes")
     ours.die(0, entry)
     (later,) = ours.ask(1)
-    asked = [ours.requests.entry.item(0), later]
+    asked = [ours.requests.numbering.entry.item(0), later]
     ours.wait()
     ours.hosts[0].refusal, ours.hosts[0].builds = None, False
     ours.wait()
@@ -667,15 +696,15 @@ def test_what_is_asked_of_a_host_that_is_down_waits_for_its_replacement(
     ours.wait()
     assert ours.hosts[0].asked == [entry, *asked]
     assert ours.requests.in_flight == [2, 0]
-    assert [type(verdict) for verdict in ours.verdicts] == [Replaced] + 3 * [type(None)]
-    # Its time begins when it is up: until then it had nothing to execute.
+    assert [type(verdict) for verdict in ours.verdicts] == [Replaced, type(None)]
+    # The time begins when the replacement is up: until then it had nothing to execute.
     ours.check()
     assert ours.log[-2:] == ["start 0", "attach 0"]
     assert ours.supervisor.next_check() == ours.now + 1
 
 
 def test_the_time_of_a_start_counts_from_the_death(fleet: Callable[..., Fleet]) -> None:
-    """Not from when anybody looked last, which may be long ago."""
+    """Not from the last time that the supervisor ran."""
     ours = fleet()
     ours.now += 1000
     ours.hosts[0].attach = lambda _: None  # type: ignore[method-assign]
@@ -687,20 +716,20 @@ def test_the_time_of_a_start_counts_from_the_death(fleet: Callable[..., Fleet]) 
 
 
 def test_a_replacement_that_cannot_be_built_is_killed(fleet: Callable[..., Fleet]) -> None:
-    """Its death says what was wrong, and it is no more up than one that could not be started."""
+    """Its death has the error, and it counts as not started."""
     ours = fleet(max_restarts=1)
     ours.hosts[0].builds = False
     (entry,) = ours.ask(0)
     ours.die(0)
-    ours.told.append(NotBuilt(0, 0, ErrorText("ValueError", "no licence", "")))
+    ours.completions.append(NotBuilt(0, 0, ErrorText("ValueError", "no licence", "")))
     ours.drain()
     assert ours.log == ["start 0", "attach 0", "kill 0"]
     assert ours.hosts[0].asked == [entry]
-    assert "could not be rebuilt: ValueError: no licence" in str(ours.requests.faults[0])
+    assert "could not be rebuilt: ValueError: no licence" in str(ours.requests.collector.faults[0])
 
 
-def test_a_replacement_with_other_spaces_is_asked_nothing(fleet: Callable[..., Fleet]) -> None:
-    """Its rows would not fit, though it had taken them before it was told to die."""
+def test_a_replacement_with_other_spaces_gets_no_requests(fleet: Callable[..., Fleet]) -> None:
+    """Its results would not fit the rows."""
     ours = fleet(max_restarts=1)
     ours.hosts[0].dies = False
     (entry,) = ours.ask(0)
@@ -712,11 +741,11 @@ def test_a_replacement_with_other_spaces_is_asked_nothing(fleet: Callable[..., F
     assert ours.hosts[0].asked == [entry]
     ours.hosts[0].end()
     ours.drain()
-    assert "its spaces changed with the restart" in str(ours.requests.faults[0])
+    assert "its spaces changed with the restart" in str(ours.requests.collector.faults[0])
 
 
 def test_a_replacement_that_is_late_is_killed(fleet: Callable[..., Fleet]) -> None:
-    """With a dump, and by the clock of its own start."""
+    """With a dump, measured from its own start."""
     ours = fleet(max_restarts=1)
     ours.hosts[0].attach = lambda _: None  # type: ignore[method-assign]
     ours.ask(0)
@@ -726,10 +755,10 @@ def test_a_replacement_that_is_late_is_killed(fleet: Callable[..., Fleet]) -> No
     ours.check()
     assert ours.log == ["start 0", "dump and kill 0"]
     assert isinstance(ours.verdicts[1], GivenUp)
-    assert "did not start again within 10.0 s" in str(ours.requests.faults[0])
+    assert "did not start again within 10.0 s" in str(ours.requests.collector.faults[0])
 
 
-def test_a_replacement_that_a_late_trainer_has_not_heard_of_is_not_late(
+def test_a_replacement_is_not_late_if_the_trainer_is(
     fleet: Callable[..., Fleet],
 ) -> None:
     """It was up in time."""
@@ -738,7 +767,7 @@ def test_a_replacement_that_a_late_trainer_has_not_heard_of_is_not_late(
     host.builds = False
     ours.ask(0)
     ours.die(0)
-    host.unheard += [host.build, lambda: ours.told.append(Attached(0))]
+    host.unread += [host.build, lambda: ours.completions.append(Attached(0))]
     ours.now += 60
     ours.check()
     assert ours.log == ["start 0", "attach 0"]
@@ -749,7 +778,7 @@ def test_a_replacement_that_a_late_trainer_has_not_heard_of_is_not_late(
 
 
 def test_closing_kills_what_takes_too_long(fleet: Callable[..., Fleet]) -> None:
-    """After a second and a half, without a dump; errors are told with ids."""
+    """After 1.5 seconds, without a dump; errors have ids."""
     ours = fleet((2, 2))
     stuck = ErrorText("ValueError", "stuck", "")
     ours.hosts[0].close_errors = [(1, stuck)]
@@ -757,7 +786,7 @@ def test_closing_kills_what_takes_too_long(fleet: Callable[..., Fleet]) -> None:
     closing = ours.close()
     assert ours.log == ["close 0", "close 1"]
     with pytest.raises(GroupClosed):
-        ours.supervisor.check_open()
+        ours.lifetime.check_open()
     ours.pass_time(1.4)
     assert not closing.done
     ours.pass_time(0.1)
@@ -769,7 +798,7 @@ def test_closing_kills_what_takes_too_long(fleet: Callable[..., Fleet]) -> None:
 
 
 def test_closing_never_hangs(fleet: Callable[..., Fleet]) -> None:
-    """Not even with what can't be killed."""
+    """Not even with a host that can't be killed."""
     ours = fleet()
     ours.hosts[0].closes = ours.hosts[0].dies = False
     closing = ours.close()
@@ -781,8 +810,8 @@ def test_closing_never_hangs(fleet: Callable[..., Fleet]) -> None:
     assert ours.log[-3:] == ["kill 0", "release 0", "release 1"]
 
 
-def test_a_death_while_closing_is_an_end_like_any_other(fleet: Callable[..., Fleet]) -> None:
-    """Nothing is replaced, and nobody waits for more; what was given up is closed already."""
+def test_a_death_while_closing_closes_the_host(fleet: Callable[..., Fleet]) -> None:
+    """Nothing is replaced, and no wait goes on; a host that was given up is closed already."""
     ours = fleet((1, 1), max_restarts=0)
     assert isinstance(ours.die(1), GivenUp)
     ours.hosts[0].closes = False
@@ -795,8 +824,8 @@ def test_a_death_while_closing_is_an_end_like_any_other(fleet: Callable[..., Fle
         ours.check()
 
 
-def test_closing_waits_for_no_restart(fleet: Callable[..., Fleet]) -> None:
-    """A host that is down has nothing to close, and is not started any more."""
+def test_closing_does_not_wait_for_a_restart(fleet: Callable[..., Fleet]) -> None:
+    """A host that is down has nothing to close, and is not started again."""
     ours = fleet(max_restarts=9)
     ours.hosts[0].refusal = OSError("no more processes")
     ours.die(0)

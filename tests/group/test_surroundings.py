@@ -1,4 +1,4 @@
-"""Where a worker runs: its Python, its environment variables, its core, its threads."""
+"""Where a worker runs: its Python, environment variables, core and threads."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def maker_of_witnesses() -> Any:
-    """What makes an env that tells of its worker; no module is needed for it there."""
+    """Return a maker of envs that describe their worker; it needs no module there."""
 
     class Witness(gym.Env[Any, Any]):
         observation_space = action_space = gym.spaces.Discrete(2)
@@ -29,14 +29,16 @@ def maker_of_witnesses() -> Any:
             return os.sched_getaffinity(0)
 
         def seen_by(self, module: str) -> str | None:
-            """What a module found when it was imported."""
+            """Return what a module saw when it was imported."""
             return sys.modules[module].FOUND
 
     return Witness
 
 
-def test_each_entry_has_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """And workers one thread for mathematics, whatever the trainer has."""
+def test_each_entry_has_its_own_surroundings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Workers use one thread for mathematics, whatever the trainer uses."""
     program = tmp_path / "python-of-another-environment"
     program.write_text(f'#!/bin/sh\nSTARTED_BY="$0" exec {sys.executable} "$@"\n')
     program.chmod(0o755)
@@ -72,6 +74,8 @@ def test_each_entry_has_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         assert other.call("variable", "STARTED_BY") == str(program)
         assert other.call("seen_by", "flavoured") == "sugar"
         assert other.call("variable", "OMP_NUM_THREADS") == "1"
-        assert other.call("variable", "MKL_NUM_THREADS") == "3", "what is configured holds"
+        assert other.call("variable", "MKL_NUM_THREADS") == "3", (
+            "the configured values are in effect"
+        )
         assert other.call("cores") == set(cores)
     assert "flavoured" not in sys.modules

@@ -1,4 +1,4 @@
-"""Torch tensors in results: untouched inline, NumPy on the CPU across a process."""
+"""Torch tensors in results: unchanged inline, NumPy on the CPU from a process."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ def group(request: pytest.FixtureRequest) -> Iterator[Any]:
         yield group, torch.Tensor if request.param == "inline" else np.ndarray
 
 
-def test_results_hold_what_the_placement_promises(group: Any) -> None:
-    """Columns and single results alike, also in the step that ends an episode."""
+def test_results_have_the_type_that_their_placement_gives(group: Any) -> None:
+    """In columns and single results, also in the step that ends an episode."""
     group, kind = group
     for step in (1, 2):
         actions = np.ones((2, 2), np.float32)

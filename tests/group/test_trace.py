@@ -1,4 +1,4 @@
-"""Timelines: what is in them agrees with what the group has done, and nothing is left behind."""
+"""Timelines: their content agrees with what the group did, and nothing is left behind."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from timelines import Seen
 
 import rlightning_aio
 from rlightning_aio import sync
+from rlightning_aio.group.conditions import RECORDING
 from rlightning_aio.group.trace_records import KEPT, Records
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ ROUNDS = 40
 
 @pytest.fixture(scope="module")
 def group() -> Iterator[Any]:
-    """Envs of two layouts, in workers."""
+    """Yield a group with envs of two layouts, in workers."""
     entries = [{**entry, "envs_per_process": 2} for entry in (POLES, CARS)]
     with sync.build_env_group(entries, mixed_actions=True) as group:
         yield group
@@ -37,7 +38,7 @@ def step(group: Any, batch: Any) -> None:
 
 
 def test_a_timeline_agrees_with_what_was_collected(group: Any, tmp_path: Path) -> None:
-    """Every result is in it once, on its env's track, with the time that the statistics have."""
+    """Every result is in it once, on its env's track, with the time of the statistics."""
     counted = dict.fromkeys(group.env_ids, 0)
     with group.trace(tmp_path / "run.json"), group.auto_reset(max_episode_steps=7):
         batch, _ = group.reset(seed=0)
@@ -59,8 +60,8 @@ def test_a_timeline_agrees_with_what_was_collected(group: Any, tmp_path: Path) -
     assert {one.name for one in seen.results()} == {"step", "reset"}
     steps = [(one.ended - one.began) / 1e3 for one in seen.called("step") if one.args]
     for percent in (50, 99):
-        told = stats["latency_us"]["step"][f"p{percent}"]
-        assert np.percentile(steps, percent) == pytest.approx(told, rel=0.02)
+        reported = stats["latency_us"]["step"][f"p{percent}"]
+        assert np.percentile(steps, percent) == pytest.approx(reported, rel=0.02)
     limits = [track for name, _, track, _ in seen.marks if name == "step limit"]
     assert set(limits) == set(group.env_ids)
     assert len(seen.called("policy")) == ROUNDS
@@ -75,7 +76,7 @@ def test_a_timeline_agrees_with_what_was_collected(group: Any, tmp_path: Path) -
 
 
 def test_a_worker_waits_for_work_between_its_requests_alone(group: Any, tmp_path: Path) -> None:
-    """No env of a worker steps while it waits."""
+    """No env of a worker steps while the worker waits."""
     batch, _ = group.reset()
     with group.trace(tmp_path / "run.json"):
         for _ in range(10):
@@ -90,23 +91,23 @@ def test_a_worker_waits_for_work_between_its_requests_alone(group: Any, tmp_path
 
 
 def test_nothing_is_left_behind(group: Any, tmp_path: Path) -> None:
-    """After a trace the core's methods are its class's again, and spans are nothing."""
+    """After a trace, nothing observes the core, steps are ordinary again, and spans do nothing."""
     core = group._core
-    before, told = vars(core).keys(), core.supervisor.tell_of
-    names = set(before)
+    before = core._conditions.active
     trace = group.trace(tmp_path / "run.json")
     trace.start()
-    assert set(vars(core)) > names
+    assert core.observed.observer is trace
+    assert core._conditions.active == before | RECORDING
     trace.stop()
     trace.stop()
-    assert set(vars(core)) == names
-    assert core.supervisor.tell_of is told
+    assert core.observed.observer is None
+    assert core._conditions.active == before
     assert group.span("policy") is group.span("learner")
     assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
 
 
 def test_an_interrupted_run_leaves_a_whole_file(group: Any, tmp_path: Path) -> None:
-    """Whatever ends it, what was recorded until then is there; another may follow."""
+    """With all events until the interrupt; another trace may follow."""
     for _ in range(2):
         with pytest.raises(KeyboardInterrupt), group.trace(tmp_path / "run.json"):  # noqa: PT012
             batch, _ = group.reset()
@@ -116,11 +117,11 @@ def test_an_interrupted_run_leaves_a_whole_file(group: Any, tmp_path: Path) -> N
         assert len(Seen(tmp_path / "run.json").called("reset")) == 6
 
 
-def test_what_cannot_be_written_is_refused_at_once(group: Any, tmp_path: Path) -> None:
-    """The message names the file and what is in the way."""
-    with pytest.raises(FileNotFoundError, match=r"run\.json: there is no folder .*missing"):
+def test_a_file_that_cannot_be_written_is_refused_at_once(group: Any, tmp_path: Path) -> None:
+    """The message has the file and the reason."""
+    with pytest.raises(FileNotFoundError, match=r"there is no folder .*missing"):
         group.trace(tmp_path / "missing" / "run.json")
-    with pytest.raises(IsADirectoryError, match="it is a folder"):
+    with pytest.raises(IsADirectoryError, match="it is a folder, not a regular file"):
         group.trace(tmp_path)
     with (
         group.trace(tmp_path / "run.json"),
@@ -131,7 +132,7 @@ def test_what_cannot_be_written_is_refused_at_once(group: Any, tmp_path: Path) -
 
 @pytest.mark.one_driver_for_each_place
 def test_closing_the_group_ends_its_trace(tmp_path: Path) -> None:
-    """It begins before the envs do, and the steps of a single env are in it."""
+    """A trace may begin before the envs start; it has the steps of a single env."""
     group = sync.build_env_group({**POLES, **INLINE, "num_workers": 1})
     group.trace(tmp_path / "run.json").start()
     with group:
@@ -149,7 +150,7 @@ def test_closing_the_group_ends_its_trace(tmp_path: Path) -> None:
 
 
 async def test_tasks_and_threads_have_tracks_of_their_own(tmp_path: Path) -> None:
-    """What overlaps lies on different tracks; a task that is over leaves its to the next."""
+    """Overlapping spans are on different tracks; a finished task leaves its track to the next."""
 
     def learn(group: Any) -> None:
         with group.span("learner"):
@@ -182,8 +183,8 @@ async def test_tasks_and_threads_have_tracks_of_their_own(tmp_path: Path) -> Non
     assert [one.name for one in seen.of("beside")] == ["policy", "learner"] * 2
 
 
-def test_of_a_long_run_the_newest_is_kept() -> None:
-    """Memory is bounded, and what is missing is known."""
+def test_the_newest_events_of_a_long_run_are_kept() -> None:
+    """Memory is bounded, and the file says how much is missing."""
     records = Records()
     name = records.name("collect")
     count = 1000

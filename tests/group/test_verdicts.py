@@ -1,4 +1,4 @@
-"""How an env judges its episodes, in the group's statistics."""
+"""Successes that envs report, in the group's statistics."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def backend() -> Iterator[str]:
 
 
 class JudgingEnv(BaseEnv):
-    """Sub-environment k ends in every step that k + 1 divides, in success every other time."""
+    """Sub-environment k ends in every step that k + 1 divides, every other time with success."""
 
     autoreset = "same_step"
 
@@ -66,9 +66,9 @@ class JudgingEnv(BaseEnv):
 
 @pytest.mark.parametrize("placement", ["process", "inline"])
 def test_success_is_counted_where_an_episode_ends(backend: str, placement: str) -> None:
-    """Only what is said at an end counts, for each sub-environment that has ended.
+    """Only reports at an end count, for each sub-environment that has ended.
 
-    Whether infos travel in the row or pickled.
+    For infos in the row and pickled ones.
     """
     episodes = {1: 12, 3: 12 + 6 + 4}
     configs = [

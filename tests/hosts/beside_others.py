@@ -1,4 +1,4 @@
-"""What holds of any kind of host in one group with others; its tests say where envs live."""
+"""Checks that every kind of host passes in one group with others; callers choose the hosts."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def steps(**actions: Any) -> BatchedData:
 
 
 async def both_ways(number: int, group: Any, batch: Any, action: Any) -> tuple[Any, Any]:
-    """Every other step by `step`, the others by `step_async` and `collect_async`."""
+    """Step by `step` for odd numbers, and by `step_async` and `collect_async` for even ones."""
     if number % 2:
         return await group.step(batch.respond(action=action))
     group.step_async(batch.respond(action=action))
@@ -35,7 +35,7 @@ async def both_ways(number: int, group: Any, batch: Any, action: Any) -> tuple[A
 
 
 def check_three_are_equal(batch: Any, flags: Any) -> None:
-    """A batch of as many envs in each of three places, which have done the same."""
+    """Check that a batch has equal thirds, from three places with equal envs and actions."""
     for values in (
         *(batch.observation, batch.reward, batch.terminated, batch.truncated),
         *(batch.is_reset, batch.limit_reached, np.array(flags)),
@@ -49,7 +49,7 @@ def check_three_are_equal(batch: Any, flags: Any) -> None:
 
 
 async def check_usable_after_an_error(group: Any) -> None:
-    """A group of ``one-0`` and ``one-1``, which share a host."""
+    """Check a group of ``one-0`` and ``one-1``, which share a host."""
     await group.reset()
     with pytest.raises(EnvRaised, match=r"env 'one-1'.* raised in step") as caught:
         await group.step(steps(one_0=[0.0, 5.0], one_1=[Probe.RAISE, 0.0]))
@@ -61,7 +61,7 @@ async def check_usable_after_an_error(group: Any) -> None:
 
 
 async def check_methods(group: Any) -> None:
-    """Of ``one-0``: values come back, and what a call raises is the caller's alone."""
+    """Check that calls of ``one-0`` return values, and that only the caller gets their errors."""
     handle = group["one-0"]
     assert await handle.call("double", [4], times=3) == [4, 4, 4]
     with pytest.raises(EnvRaised, match=r"raised in the call of double\(\): TypeError"):
@@ -73,16 +73,16 @@ async def check_methods(group: Any) -> None:
 
 
 async def check_first_ready(facade: Any, places: tuple[str, ...], slow: str, gates: Path) -> None:
-    """An env that waits at a gate in place `slow` keeps nobody waiting, wherever they live."""
+    """Check that an env that waits at a gate in place `slow` delays no other place."""
     gate = Gate(str(gates), "slow-0").make()
     quick = [entry(f"quick_{place}", "probe", place) for place in places]
     held = entry("slow", "gated", slow, env_kwargs={"gates": str(gates)})
     async with facade.build([held, *quick]) as group:
         batch, _ = await group.reset()
         group.step_async(batch.respond(action=np.zeros((1 + len(places), 2))))
-        came: set[str] = set()
-        while len(came) < len(places):
-            came.update((await group.collect_async())[0].ids())
-        assert came == {f"quick_{place}-0" for place in places}
+        ready: set[str] = set()
+        while len(ready) < len(places):
+            ready.update((await group.collect_async())[0].ids())
+        assert ready == {f"quick_{place}-0" for place in places}
         gate.open()
         assert (await group.collect_async())[0].ids() == ["slow-0"]

@@ -1,4 +1,4 @@
-"""What an actor does, without Ray: batches in, columns and words out."""
+"""Actors without Ray: batches of requests in, columns and errors out."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ def rewards(reply: Reply) -> list[float]:
     return reply.columns[1].tolist()
 
 
-def test_an_error_is_one_envs_alone() -> None:
-    """The others' results are in the columns, in the order of the entries that are done."""
+def test_an_error_concerns_one_env_only() -> None:
+    """The results of the others are in the columns, in the order of their entries."""
     batch = steps([[Probe.RAISE, 1], [0, 2]])
     reply = actor().execute(batch)
     assert reply.with_rows().tolist() == [batch.entries[1]]
@@ -62,8 +62,8 @@ def test_an_error_is_one_envs_alone() -> None:
     assert not reply.values
 
 
-def test_arguments_may_come_out_of_band() -> None:
-    """A call's value is no result; a value that no pickle takes is that call's error."""
+def test_arguments_may_be_out_of_band() -> None:
+    """A value of a call is not a result; if it can't be pickled, only that call fails."""
     made = actor()
     calls = [("double", (4,), {}), ("__getattribute__", ("_preprocess_fn",), {})]
     entries = [entry(2, FIRST_SLOT, Operation.CALL), entry(3, FIRST_SLOT + 1, Operation.CALL)]
@@ -73,25 +73,25 @@ def test_arguments_may_come_out_of_band() -> None:
     reset = entry(4, FIRST_SLOT, Operation.RESET)
     given = pickle.dumps((6, {"nested": [1]}))
     reply = made.execute(Batch(np.array([reset]), [], [given]))
-    ((told, beside),) = reply.beside
-    assert told == reset
-    assert pickle.loads(beside)["info"] == {"options": {"nested": [1]}}
+    ((answered, out_of_band),) = reply.partial
+    assert answered == reset
+    assert pickle.loads(out_of_band)["info"] == {"options": {"nested": [1]}}
     assert reply.columns[0].tolist() == [[0, 1, 0, 6]]
 
 
-def test_an_env_that_cannot_be_built_is_told_by_its_index() -> None:
-    """So is an order that this place can't read."""
+def test_an_env_that_cannot_be_built_is_reported_by_index() -> None:
+    """An order that can't be unpickled is reported, too."""
     made = EnvActor(FIRST_SLOT, {}, [])
-    told = made.build(order(env_kwargs={"fails": 1}))
-    assert isinstance(told, NotStarted)
-    assert (told.env_index, told.error.summary) == (1, "RuntimeError: no simulator here")
-    told = EnvActor(FIRST_SLOT, {}, []).build(b"cnot_there\nEnv\n.")
-    assert isinstance(told, NotStarted)
-    assert "not_there" in told.error.summary
+    failure = made.build(order(env_kwargs={"fails": 1}))
+    assert isinstance(failure, NotStarted)
+    assert (failure.env_index, failure.error.summary) == (1, "RuntimeError: no simulator here")
+    failure = EnvActor(FIRST_SLOT, {}, []).build(b"cnot_there\nEnv\n.")
+    assert isinstance(failure, NotStarted)
+    assert "not_there" in failure.error.summary
 
 
-def test_a_request_that_takes_too_long_is_told_with_stacks(tmp_path: Path) -> None:
-    """Which, for how long, and what it was doing; what has no limit may take its time."""
+def test_a_late_request_is_reported_with_stacks(tmp_path: Path) -> None:
+    """The report has its entry and duration; operations without a limit are never late."""
     gate = Gate(str(tmp_path), "one-1").make()
     made = actor({Operation.STEP: 0.05}, backend="gated", env_kwargs={"gates": str(tmp_path)})
     reset = entry(1, FIRST_SLOT, Operation.RESET)
@@ -109,13 +109,13 @@ def test_a_request_that_takes_too_long_is_told_with_stacks(tmp_path: Path) -> No
     assert "wait_at_gate" in late.stacks
 
 
-def test_envs_are_closed_whatever_another_raises(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each of them once, and told by index."""
+def test_all_envs_are_closed_even_if_one_raises(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each is closed once, and errors are reported by index."""
 
     def close(env: Probe) -> None:
         raise ValueError(f"stuck at {env.worker_index}")
 
     made = actor()
     monkeypatch.setattr(Probe, "close", close)
-    told = [(index, error.summary) for index, error in made.close()]
-    assert told == [(k, f"ValueError: stuck at {k}") for k in range(2)]
+    errors = [(index, error.summary) for index, error in made.close()]
+    assert errors == [(k, f"ValueError: stuck at {k}") for k in range(2)]

@@ -1,4 +1,4 @@
-"""What counts as an episode, whoever resets it."""
+"""Sums of episodes, for every kind of autoreset."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ SHAPES: list[tuple[int, ...]] = [(), (3,), (2, 3)]
 
 @dataclass
 class Stream:
-    """One sub-environment (of one agent), told step by step.
+    """A naive model of one sub-environment (of one agent).
 
     Attributes:
-        total, length: of the episode that is under way or has just ended; length 0 where the
-            last step belongs to none.
+        total, length: of the current episode, or the last one; length 0 if the last step belongs
+            to no episode.
         over: it has ended and was not reset since.
-        reset: the last step was a reset of its own.
+        reset: it reset itself in the last step.
     """
 
     mode: Autoreset
@@ -44,12 +44,12 @@ class Stream:
     def step(self, reward: float, *, ended: bool) -> None:
         self.reset = False
         if self.over and self.mode == "disabled":
-            self.total, self.length = 0.0, 0
+            self.length = 0
             return
         if self.over and self.mode == "next_step":
             self.total, self.length, self.over, self.reset = 0.0, 0, False, True
             return
-        if self.over:  # It has reset itself in the step of its end.
+        if self.over:  # It reset itself in the step that ended the episode.
             self.total, self.length = 0.0, 0
         self.total += reward
         self.length += 1
@@ -57,7 +57,7 @@ class Stream:
 
 
 class Both:
-    """Sums and, for each of them, a stream of its own; they must agree after every event."""
+    """Sums with one stream for each; they must agree after every event."""
 
     def __init__(self, shape: tuple[int, ...], mode: Autoreset) -> None:
         self.row = np.zeros(shape), np.zeros(shape, np.int64), np.zeros(shape, np.bool_)
@@ -97,7 +97,7 @@ class Both:
 def drawn_step(data: st.DataObject, shape: tuple[int, ...]) -> tuple[Any, Any]:
     size = int(np.prod(shape))
     rewards = data.draw(st.lists(st.integers(-9, 9), min_size=size, max_size=size))
-    # Often none ends, which goes a shorter way.
+    # Often no episode ends, which takes a shorter path.
     ends = st.just([False] * size) | st.lists(st.booleans(), min_size=size, max_size=size)
     ended = data.draw(ends)
     return np.array(rewards, float).reshape(shape), np.array(ended, bool).reshape(shape)
@@ -106,13 +106,10 @@ def drawn_step(data: st.DataObject, shape: tuple[int, ...]) -> tuple[Any, Any]:
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
 @given(data=st.data())
-def test_sums_are_those_of_each_stream_alone(
+def test_sums_equal_those_of_separate_streams(
     mode: Autoreset, shape: tuple[int, ...], data: st.DataObject
 ) -> None:
-    """Sub-environments and agents that run together count as if each ran alone.
-
-    They stand in the very arrays that were given, of which nobody else knows when to change.
-    """
+    """Sub-environments and agents count as if each ran alone, in the given arrays."""
     both = Both(shape, mode)
     for _ in range(data.draw(st.integers(0, 20))):
         if data.draw(st.integers(0, 5)) == 0:
@@ -123,12 +120,10 @@ def test_sums_are_those_of_each_stream_alone(
 
 @pytest.mark.parametrize("mode", MODES)
 @given(data=st.data())
-def test_sub_environments_that_take_turns_keep_their_own_sums(
-    mode: Autoreset, data: st.DataObject
-) -> None:
-    """Which of them a step is about decides, not where in the batch it stands.
+def test_partial_results_update_only_their_own_sums(mode: Autoreset, data: st.DataObject) -> None:
+    """The indices decide, not the order in the result.
 
-    A reset tells of some; the first that is heard of the others after it is their start.
+    A partial reset covers some sub-environments; the next result of any other one is its start.
     """
     both = Both((4,), mode)
 
@@ -145,8 +140,8 @@ def test_sub_environments_that_take_turns_keep_their_own_sums(
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_a_reset_forgets_the_episodes_under_way(mode: Autoreset) -> None:
-    """What came before it is in no sum after it."""
+def test_a_reset_drops_the_current_episodes(mode: Autoreset) -> None:
+    """No earlier step counts afterwards."""
     both = Both((2,), mode)
     both.step(np.array([5.0, 5.0]), np.array([True, False]))
     both.begin()
@@ -156,7 +151,7 @@ def test_a_reset_forgets_the_episodes_under_way(mode: Autoreset) -> None:
 
 
 def test_an_episode_may_begin_with_a_later_result() -> None:
-    """The first that is heard of a sub-environment after a reset is its start, not a step."""
+    """The first result of a sub-environment after a partial reset is its start, not a step."""
     both = Both((3,), "next_step")
     both.begin(begun=np.array([2]))
     which = np.array([0, 2])

@@ -1,4 +1,4 @@
-"""A fork server, and the trainer's handle on it: whatever kind of program that turns out to be."""
+"""The fork server and the trainer's handle on it, with all kinds of interpreters."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class Asker:
-    """A host that is told why its fork server is gone; and a watcher."""
+    """A host that records why its fork server ended; and a watcher."""
 
     host_id = 0
     why = ""
@@ -37,7 +37,7 @@ class Asker:
 
 
 def lost(interpreter: str) -> str:
-    """Why a fork server is gone, as it is told to a trainer that comes late."""
+    """Return the reason why a fork server ended, as a trainer gets it that reads late."""
     asker: Any = Asker()
     server = ForkServer(interpreter, {}, ("gymnasium",), asker)
     channel, worker = socket.socketpair()
@@ -57,16 +57,16 @@ def script(path: Path, text: str) -> str:
     return str(path)
 
 
-def test_what_an_interpreter_lacks_is_told_to_a_trainer_that_comes_late(tmp_path: Path) -> None:
-    """It has ended by then, with orders unread: its reason is heard before its end."""
+def test_missing_packages_are_reported_to_a_trainer_that_reads_late(tmp_path: Path) -> None:
+    """The fork server has ended by then, with unread orders; the reason comes before its exit."""
     bare = script(tmp_path / "bare", f'#!/bin/sh\nexec {sys.executable} -I -S "$@"\n')
     why = lost(bare)
     assert why.startswith("Traceback")
     assert "ModuleNotFoundError: No module named" in why.splitlines()[-1]
 
 
-def test_an_interpreter_that_is_too_old_is_told_with_its_version(tmp_path: Path) -> None:
-    """It knows no option of a later one, and none of our code."""
+def test_an_old_interpreter_is_reported_with_its_version(tmp_path: Path) -> None:
+    """It supports no new options, and can't import our code."""
     old = script(
         tmp_path / "old",
         f"#!{sys.executable}\n"
@@ -83,18 +83,20 @@ def test_an_interpreter_that_is_too_old_is_told_with_its_version(tmp_path: Path)
 
 
 @pytest.mark.parametrize(("program", "code"), [("true", 0), ("false", 1)])
-def test_a_program_that_is_no_interpreter_ends_with_its_exit_code(program: str, code: int) -> None:
-    """It leaves no zombie behind, either."""
+def test_a_program_that_is_no_interpreter_is_reported_with_its_exit_code(
+    program: str, code: int
+) -> None:
+    """It leaves no zombie."""
     assert lost(f"/bin/{program}") == (
         f"it exited with code {code} while it was importing gymnasium; is /bin/{program} a Python "
         "with the packages that workers need?"
     )
 
 
-def test_a_death_is_told_though_another_process_goes_on_writing(
+def test_an_exit_is_reported_even_if_another_process_continues_to_write(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """It was started by the worker, has its stderr, and fills that faster than it is read."""
+    """The worker started it; it fills the stderr of the worker faster than that is read."""
     reader, writer = os.pipe()
     os.set_blocking(reader, False)
     os.write(writer, b"x" * 50_000 + b"last words")
@@ -109,18 +111,18 @@ def test_a_death_is_told_though_another_process_goes_on_writing(
         return data
 
     monkeypatch.setattr(os, "read", read_what_is_refilled)
-    told: list[Any] = []
+    sent: list[Any] = []
     pid = os.posix_spawn("/bin/false", ["false"], {})
     os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)
     server: Any = object.__new__(fork_server._ForkServer)
     server._poll = select.poll()
     server._outlet = fork_server._Outlet(server._poll)
-    server._trainer = type("Trainer", (), {"send": told.append})
+    server._trainer = type("Trainer", (), {"send": sent.append})
     channel = os.open(os.devnull, os.O_RDONLY)
     server._children = {pid: fork_server._Child(7, pid, reader, channel)}
-    server._bury()
+    server._handle_exits()
     os.close(writer)
-    (exited,) = told
+    (exited,) = sent
     assert isinstance(exited, Exited)
     assert (exited.host_id, exited.exit_code) == (7, 1)
     assert exited.stderr_tail.endswith("last words")

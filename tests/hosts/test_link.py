@@ -1,4 +1,4 @@
-"""A process host and its link: what comes by rings, by the channel, and from the fork server."""
+"""A process host and its link: data from the rings, the channel, and the fork server."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ from rlightning_aio.hosts.messages import (
     Value,
 )
 from rlightning_aio.hosts.process import ForkServer, ProcessHost, _surroundings
-from rlightning_aio.protocol.bell import TrainerBell, WorkerBell, bell_size
 from rlightning_aio.protocol.entries import Operation, entry
+from rlightning_aio.protocol.exchange import TrainerBell, WorkerBell, bell_size
 from rlightning_aio.protocol.frames import BELL, FrameKind, FrameReader, encode
 from rlightning_aio.protocol.info import InfoSchema
 from rlightning_aio.protocol.rings import WorkerRings, rings_size
@@ -47,14 +47,14 @@ SCHEMA = InfoSchema.of({"x": 1.5})
 
 
 class EndsTheProgram:
-    """Where it is unpickled, it tries to."""
+    """It calls `sys.exit` where it is unpickled."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return sys.exit, (3,)
 
 
 class StandIn(ForkServer):
-    """Starts nothing; notes what it is asked."""
+    """Starts nothing, and records orders."""
 
     def __init__(self) -> None:
         self.orders: list[Fork] = []
@@ -72,7 +72,7 @@ class StandIn(ForkServer):
 
 
 class Scene:
-    """A host of two envs, its watcher, and the other ends of what it shares with its worker."""
+    """A host of two envs, its watcher, and the worker's ends of rings and channel."""
 
     def __init__(self) -> None:
         self.completions: Any = deque()
@@ -89,6 +89,7 @@ class Scene:
             arena=self.arena,
             bell=self.bell,
             bell_offset=self.bell_offset,
+            rings=[None],
             num_hosts=1,
             configs=[CONFIG],
             objection=lambda meta: None,
@@ -133,27 +134,27 @@ class Scene:
         self.rings.count_frame()
 
     def serve(self, *in_rows: int) -> None:
-        """Execute what waits; all of it is reported, or only some."""
-        self.rings.serve(lambda one: not in_rows or one in in_rows, self.ring)
+        """Execute waiting requests; report those of `in_rows`, by default all."""
+        self.rings.serve(lambda one: not in_rows or one in in_rows, self.ring, lambda: None)
 
     def ring(self) -> None:
         self.rung += 1
         self.channel.send(BELL)
 
     def received(self) -> list[Any]:
-        """Frames from the trainer."""
+        """Return the frames from the trainer."""
         return self.frames.feed(self.channel.recv(1 << 20))
 
     # -- the trainer
 
     def read(self) -> None:
-        """As the driver does when the channel is readable, and then who waits for reports."""
+        """Read as the driver does when the channel is readable, then poll as waiters do."""
         for source in list(self.watched):
             source.on_readable()
         self.host.poll()
 
-    def told(self) -> list[Any]:
-        """What the host has told since the last time; entries of reports as lists."""
+    def posted(self) -> list[Any]:
+        """Return new completions; entries of reports as lists."""
         found = [
             ("reported", one.entries.tolist()) if isinstance(one, Reported) else one
             for one in self.completions
@@ -167,7 +168,7 @@ class Scene:
         for channel in self.fork_server.channels:
             channel.close()
         self.arena.close()
-        # What is mapped holds the arena, too.
+        # Mapped parts keep the arena, too.
         self.bell.release()
         vars(self).pop("rings", None)
 
@@ -196,8 +197,8 @@ def steps(number: int) -> np.ndarray:
 # -- rings and channel
 
 
-def test_a_bell_that_is_read_along_with_a_frame_can_be_ordered_again(started: Scene) -> None:
-    """Whoever takes it for a part of the frame's news hears the next one all the same."""
+def test_a_bell_that_is_read_with_a_frame_can_be_armed_again(started: Scene) -> None:
+    """The next one arrives even if the trainer read this one together with a frame."""
     scene, bell = started, started.bell
     for number in (1, 2, 3):
         scene.host.submit(steps(number))
@@ -206,56 +207,56 @@ def test_a_bell_that_is_read_along_with_a_frame_can_be_ordered_again(started: Sc
         scene.serve()
         assert scene.rung == number
         scene.send(FrameKind.INFO_SCHEMA, number, pickle.dumps(SCHEMA))
-        # Not by the channel: something else has woken the trainer.
+        # The channel did not wake the trainer, but something else.
         scene.host.poll()
-        assert scene.told() == [
+        assert scene.posted() == [
             NewSchema(0, number, SCHEMA),
             ("reported", steps(number).tolist()),
         ]
         assert bell.unread() == 0
 
 
-def test_reports_come_after_the_frames_that_were_sent_before_them(started: Scene) -> None:
-    """A row can be read only by a schema that is known, however the trainer comes to look."""
+def test_frames_come_before_later_reports(started: Scene) -> None:
+    """A row can be read only with a known schema, and the trainer reads by either way."""
     for number, look in ((1, started.host.poll), (2, started.read)):
         started.host.submit(steps(number))
         started.send(FrameKind.INFO_SCHEMA, number, pickle.dumps(SCHEMA))
-        started.send(FrameKind.RESULT, step(number, 0), b"beside")
+        started.send(FrameKind.RESULT, step(number, 0), b"out of band")
         started.serve(step(number, 1))
         look()
-        assert started.told() == [
+        assert started.posted() == [
             NewSchema(0, number, SCHEMA),
-            Result(0, step(number, 0), b"beside"),
+            Result(0, step(number, 0), b"out of band"),
             ("reported", [step(number, 1)]),
         ]
 
 
-def test_a_frame_alone_waits_for_the_channel_to_be_read(started: Scene) -> None:
-    """It wakes the trainer by itself; looking for reports costs no system call."""
+def test_polling_for_reports_reads_no_frame(started: Scene) -> None:
+    """A frame wakes the trainer by itself, so a poll needs no system call."""
     started.host.submit(steps(1))
-    started.send(FrameKind.RESULT, step(1, 0), b"beside")
+    started.send(FrameKind.RESULT, step(1, 0), b"out of band")
     started.host.poll()
-    assert started.told() == []
+    assert started.posted() == []
     started.read()
-    assert started.told() == [Result(0, step(1, 0), b"beside")]
+    assert started.posted() == [Result(0, step(1, 0), b"out of band")]
 
 
-def test_a_frame_in_pieces_is_told_when_it_is_whole(started: Scene) -> None:
-    """What is reported meanwhile was sent before it."""
-    frame = encode(FrameKind.RESULT, step(1, 0), b"beside")
+def test_a_partial_frame_is_posted_when_it_is_whole(started: Scene) -> None:
+    """Reports that arrive meanwhile were sent before it."""
+    frame = encode(FrameKind.RESULT, step(1, 0), b"out of band")
     started.host.submit(steps(1))
     started.channel.send(frame[:20])
     started.serve(step(1, 1))
     started.read()
-    assert started.told() == [("reported", [step(1, 1)])]
+    assert started.posted() == [("reported", [step(1, 1)])]
     started.channel.send(frame[20:])
     started.rings.count_frame()
     started.read()
-    assert started.told() == [Result(0, step(1, 0), b"beside")]
+    assert started.posted() == [Result(0, step(1, 0), b"out of band")]
 
 
-def test_each_frame_is_told_as_what_it_is(started: Scene) -> None:
-    """What can't be unpickled is the request's own failure."""
+def test_each_kind_of_frame_becomes_its_completion(started: Scene) -> None:
+    """If a payload can't be unpickled, its request fails."""
     error = ErrorText("ValueError", "text", "traceback")
     broken = b"\x80not a pickle"
     for kind, number, payload, expected in (
@@ -267,19 +268,19 @@ def test_each_frame_is_told_as_what_it_is(started: Scene) -> None:
     ):
         started.send(kind, number, payload)
         started.read()
-        assert started.told() == [expected]
+        assert started.posted() == [expected]
     started.send(FrameKind.VALUE, step(4, 0), broken)
     started.send(FrameKind.VALUE, step(4, 1), pickle.dumps(EndsTheProgram()))
     started.send(FrameKind.STARTED, 0, broken)
     started.read()
-    raised, ended, not_built = started.told()
+    raised, ended, not_built = started.posted()
     assert (type(raised), raised.entry) == (Raised, step(4, 0))
     assert (ended.entry, ended.error.type_name) == (step(4, 1), "SystemExit")
     assert (type(not_built), not_built.env_index) == (NotBuilt, 0)
 
 
-def test_requests_go_by_the_ring_or_the_channel_as_they_have_to(started: Scene) -> None:
-    """A worker that sleeps is rung for either, and told of a frame when all of it is there."""
+def test_requests_travel_by_ring_or_channel(started: Scene) -> None:
+    """Both wake a sleeping worker, and a frame is counted when all of it is written."""
     (start,) = started.received()
     assert start.kind == FrameKind.START
     started.rings.frame_seen()
@@ -296,8 +297,8 @@ def test_requests_go_by_the_ring_or_the_channel_as_they_have_to(started: Scene) 
     assert pickle.loads(frame.payload) == (3, {"x": 1})
 
 
-def test_what_the_channel_does_not_take_at_once_is_written_later(started: Scene) -> None:
-    """In order; the worker is told of nothing that is not there yet."""
+def test_data_that_the_channel_has_no_room_for_is_written_later(started: Scene) -> None:
+    """The order stays, and a frame is counted only when all of it is written."""
     started.received()
     started.rings.frame_seen()
     large = bytes(3 << 20)
@@ -320,9 +321,9 @@ def test_what_the_channel_does_not_take_at_once_is_written_later(started: Scene)
     assert not started.rings.has_frame()
 
 
-def test_who_catches_up_hears_all_and_says_whether_there_was_anything(started: Scene) -> None:
-    """A part of a frame, the rest of it, and a report: none of them had woken the trainer."""
-    frame = encode(FrameKind.RESULT, step(1, 0), b"beside")
+def test_catching_up_reads_everything_and_returns_whether_anything_moved(started: Scene) -> None:
+    """It reads part of a frame, the rest of it, and a report, before they wake the trainer."""
+    frame = encode(FrameKind.RESULT, step(1, 0), b"out of band")
     started.host.submit(steps(1))
     traffic = started.host.traffic
     assert not started.host.catch_up()
@@ -334,15 +335,15 @@ def test_who_catches_up_hears_all_and_says_whether_there_was_anything(started: S
     started.channel.send(frame[20:])
     started.rings.count_frame()
     assert started.host.catch_up()
-    assert started.told() == [
-        Result(0, step(1, 0), b"beside"),
+    assert started.posted() == [
+        Result(0, step(1, 0), b"out of band"),
         ("reported", [step(1, 1)]),
     ]
     assert not started.host.catch_up()
 
 
-def test_who_catches_up_writes_what_waits(started: Scene) -> None:
-    """As far as it goes: a worker that reads nothing gives no news."""
+def test_catching_up_writes_pending_data(started: Scene) -> None:
+    """It writes as far as the worker reads."""
     started.received()
     started.host.submit(steps(1)[:1], [bytes(3 << 20)])
     assert not started.host.catch_up()
@@ -356,8 +357,8 @@ def test_who_catches_up_writes_what_waits(started: Scene) -> None:
 # -- life
 
 
-def test_a_start_forks_a_worker_and_says_what_to_build(scene: Scene) -> None:
-    """And where its rings and its bell are."""
+def test_a_start_forks_a_worker_and_sends_its_order(scene: Scene) -> None:
+    """The worker also gets the offsets of its rings and its bell."""
     scene.start()
     (order,) = scene.fork_server.orders
     place = order.place
@@ -369,8 +370,8 @@ def test_a_start_forks_a_worker_and_says_what_to_build(scene: Scene) -> None:
     assert pickle.loads(attach.payload) == AttachOrder((), ())
 
 
-def test_a_death_is_told_once_with_what_may_have_been_its_last_request(started: Scene) -> None:
-    """What the worker had said before comes first; what is unanswered is all among the last."""
+def test_a_death_is_posted_once_with_its_possible_last_requests(started: Scene) -> None:
+    """Earlier messages of the worker come first; all unanswered requests are among the last."""
     started.host.submit(steps(1))
     started.serve()
     started.host.submit(steps(2))
@@ -380,7 +381,7 @@ def test_a_death_is_told_once_with_what_may_have_been_its_last_request(started: 
     started.channel.close()
     started.read()
     started.host.on_exit(-signal.SIGSEGV, "last words")
-    schema, reported, died = started.told()
+    schema, reported, died = started.posted()
     assert schema == NewSchema(0, 1, SCHEMA)
     assert reported == ("reported", steps(1).tolist())
     assert isinstance(died, Died)
@@ -389,13 +390,13 @@ def test_a_death_is_told_once_with_what_may_have_been_its_last_request(started: 
     assert died.death.requests == (step(2, 1), *steps(1).tolist(), *steps(2).tolist())
     started.host.on_exit(0, "")
     started.host.on_fork_server_lost("it ended")
-    assert started.told() == []
+    assert started.posted() == []
     assert not started.watched
     assert started.host.executing() == (0, 0)
-    # Nobody is there to be asked, which is no fault of the asker.
+    # Requests to a dead worker are dropped without an error.
     started.host.submit(steps(3))
     started.host.poll()
-    assert started.told() == []
+    assert started.posted() == []
 
 
 @pytest.mark.parametrize(
@@ -406,28 +407,28 @@ def test_a_death_is_told_once_with_what_may_have_been_its_last_request(started: 
         (-250, "was killed by signal 250"),
     ],
 )
-def test_a_cause_of_death_is_put_in_words(started: Scene, exit_code: int, cause: str) -> None:
-    """Signals by their names."""
+def test_a_cause_of_death_is_described(started: Scene, exit_code: int, cause: str) -> None:
+    """Signals have their names."""
     started.host.on_exit(exit_code, "")
-    (died,) = started.told()
+    (died,) = started.posted()
     assert died.death.cause.startswith(cause)
 
 
 def test_workers_end_with_their_fork_server(started: Scene) -> None:
-    """Which says why, where it knows."""
+    """The cause includes that of the fork server."""
     started.host.on_fork_server_lost("it crashed")
-    (died,) = started.told()
+    (died,) = started.posted()
     assert died.death.cause == "ended with its fork server: it crashed"
     assert died.death.exit_code is None
 
 
-def test_a_replacement_begins_anew(started: Scene) -> None:
-    """Neither reports nor frames of the worker before it are heard, and counting goes on right."""
+def test_a_replacement_has_a_new_link(started: Scene) -> None:
+    """Reports and frames of the former worker are dropped, and counts are correct."""
     bell, old = started.bell, started.channel
     started.host.submit(steps(1))
     started.serve(step(1, 0))
     started.host.on_exit(1, "")
-    started.told()
+    started.posted()
     started.host.submit(steps(2))
     started.start()
     assert started.rings.requests() == []
@@ -439,56 +440,56 @@ def test_a_replacement_begins_anew(started: Scene) -> None:
     started.serve()
     assert started.rung == 1
     started.read()
-    assert started.told() == [("reported", steps(3).tolist())]
+    assert started.posted() == [("reported", steps(3).tolist())]
 
 
-def test_a_close_is_told_once_with_what_the_envs_have_raised(started: Scene) -> None:
-    """When the worker has gone, and not before."""
+def test_a_close_is_posted_once_with_the_errors_of_the_envs(started: Scene) -> None:
+    """It is posted when the worker has exited, and not before."""
     errors = [(1, ErrorText("ValueError", "text", "traceback"))]
     started.host.close()
     assert [frame.kind for frame in started.received()] == [FrameKind.START, FrameKind.CLOSE]
     started.send(FrameKind.CLOSED, 0, pickle.dumps(errors))
     started.read()
-    assert started.told() == []
+    assert started.posted() == []
     started.host.on_exit(0, "")
-    assert started.told() == [Closed(0, errors)]
+    assert started.posted() == [Closed(0, errors)]
     started.host.on_exit(0, "")
-    assert started.told() == []
+    assert started.posted() == []
 
 
-def test_who_dies_in_closing_has_closed_with_an_error(started: Scene) -> None:
-    """Of the env that it was about."""
+def test_a_death_while_closing_is_an_error_of_the_close(started: Scene) -> None:
+    """The error names the env that was being closed."""
     started.host.close()
     started.rings.begin(entry(0, 1, 0), 5)
     started.host.on_exit(-signal.SIGSEGV, "last words")
-    (closed,) = started.told()
+    (closed,) = started.posted()
     ((index, error),) = closed.errors
     assert index == 1
     assert error.text == "its worker was killed by SIGSEGV"
     assert error.traceback == "last words"
 
 
-def test_who_does_not_close_in_time_is_said_to_have_been_killed(started: Scene) -> None:
-    """By us; only then is a SIGKILL no riddle."""
+def test_a_worker_that_does_not_close_in_time_is_reported_as_killed(started: Scene) -> None:
+    """The error explains the SIGKILL."""
     started.host.close()
     started.host.kill(dump=True)
     assert started.fork_server.killed == [True]
     started.host.on_exit(-signal.SIGKILL, "")
-    (closed,) = started.told()
+    (closed,) = started.posted()
     ((_, error),) = closed.errors
     assert error.text == "its worker did not close in time and was killed"
 
 
-def test_a_host_without_a_worker_has_closed_at_once(started: Scene) -> None:
-    """After a death that nobody repaired."""
+def test_a_host_without_a_worker_closes_immediately(started: Scene) -> None:
+    """As after a death without a replacement."""
     started.host.on_exit(1, "")
-    started.told()
+    started.posted()
     started.host.close()
-    assert started.told() == [Closed(0, [])]
+    assert started.posted() == [Closed(0, [])]
 
 
 def test_a_host_that_was_never_started_can_be_closed(scene: Scene) -> None:
-    """As when another one could not be."""
+    """As when another host could not be started."""
     scene.host.close()
-    assert scene.told() == [Closed(0, [])]
+    assert scene.posted() == [Closed(0, [])]
     scene.host.release()

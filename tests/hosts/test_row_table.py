@@ -1,4 +1,4 @@
-"""What a request or a result consists of crosses between two slabs as columns."""
+"""Requests and results travel between two slabs as columns."""
 
 from __future__ import annotations
 
@@ -55,12 +55,12 @@ envs = st.lists(st.integers(0, len(LAYOUTS) - 1), min_size=1, max_size=6)
 
 
 @given(kinds=envs, data=st.data(), seed=st.integers(0, 2**32 - 1), seeds=st.booleans())
-def test_rows_that_are_asked_for_cross_and_no_others(
+def test_only_the_rows_of_the_entries_travel(
     kinds: list[int], data: Any, seed: int, seeds: bool
 ) -> None:
-    """Whichever envs are asked, of whatever layouts, wherever their rows are on either side."""
+    """This holds for all envs, layouts, and positions of rows on either side."""
     draw = np.random.default_rng(seed)
-    # The trainer's slabs hold other hosts' envs as well, and the rows are in any order.
+    # The slabs of the trainer also hold envs of other hosts, and the rows are in any order.
     ours = {kind: slab(LAYOUTS[kind], 9, draw) for kind in set(kinds)}
     theirs = {kind: slab(LAYOUTS[kind], kinds.count(kind)) for kind in set(kinds)}
     our_rows = {kind: draw.permutation(9).tolist() for kind in ours}
@@ -100,15 +100,15 @@ def test_rows_that_are_asked_for_cross_and_no_others(
             assert s.done_ns[row] == 99
 
 
-def test_infos_cross_only_where_there_are_any() -> None:
-    """They are most of a row."""
+def test_empty_infos_do_not_travel() -> None:
+    """Their space is most of a row."""
     table = RowTable(FIRST_SLOT, [(slab(LAYOUTS[0], 2), 0)])
     (*_, info) = table.results(np.array([entry(1, FIRST_SLOT, Operation.STEP)]), 40)
     assert info.nbytes == 0
 
 
-def test_spaces_are_those_of_the_row() -> None:
-    """What has no fixed size has no column: it goes out of band."""
+def test_spaces_without_a_fixed_size_have_no_column() -> None:
+    """Their values travel out of band."""
     table = RowTable(FIRST_SLOT, [(slab(LAYOUTS[2], 1), 0)])
     asked = np.array([entry(1, FIRST_SLOT, Operation.STEP)])
     assert table.requests(asked, seeds=True) == []

@@ -1,4 +1,4 @@
-"""Rows: what one says of itself, by whichever way its result came there."""
+"""Rows and their flags, however a result gets there."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ infos = st.one_of(
     st.just({}),
     st.fixed_dictionaries({"x": st.floats(-9, 9)}),
     st.fixed_dictionaries({"x": st.integers(-9, 9), "where": st.just(np.arange(3.0))}),
-    # What doesn't fit a row: nested, a text, an int of more than 64 bits, and too much of it.
+    # Infos that don't fit a row: nested, a text, an int of more than 64 bits, and a large one.
     st.just({"nested": {"a": [1]}}),
     st.just({"text": "hi"}),
     st.just({"x": 1 << 70}),
@@ -44,7 +44,7 @@ histories = st.lists(
 
 
 class Scripted(gym.Env[Any, Any]):
-    """Does what it was told to do next; its observation counts that."""
+    """Returns what the test set; its observation counts resets and steps."""
 
     observation_space = SPACE
     action_space = spaces.Discrete(3)
@@ -77,7 +77,7 @@ class Plain(GymnasiumEnv):
 
 
 class Renewed(Plain):
-    """What it tells of a step that ends an episode is the next one's begin."""
+    """The observation of a step that ends an episode begins the next one."""
 
     mode = AutoresetMode.SAME_STEP
 
@@ -87,7 +87,7 @@ def new_slab(layout: RowLayout, rows: int = 2) -> Slab:
 
 
 class Row:
-    """Row 1 of a slab, and the schemas that its writer has announced."""
+    """Row 1 of a slab, and the schemas that its writer announced."""
 
     def __init__(self, layout: RowLayout) -> None:
         self.slab = new_slab(layout)
@@ -100,7 +100,7 @@ class Row:
             return (out_of_band or {}).get("info", {})
         return self.schemas[mark].decode(memoryview(self.slab.info[1]))
 
-    def told(self, out_of_band: Any) -> str:
+    def contents(self, out_of_band: Any) -> str:
         slab = self.slab
         length = int(slab.episode_length[1])
         return repr(
@@ -121,7 +121,7 @@ class Row:
 def runner_and_row(
     kind: type[Plain] = Plain, *, inline: bool = False
 ) -> tuple[EnvRunner, Scripted, Row]:
-    """A plain env that goes the short way."""
+    """Return the runner of a plain env, which takes the short way."""
     runner = EnvRunner(kind(CONFIG), inline=inline)
     row = Row(runner.layout)
     runner.attach(row.slab, 1, row.announce)
@@ -130,8 +130,8 @@ def runner_and_row(
 
 @pytest.mark.parametrize("kind", [Plain, Renewed])
 @given(history=histories)
-def test_the_short_way_writes_what_the_long_way_does(kind: type[Plain], history: list[Any]) -> None:
-    """Whatever happens: ends, steps after an end, resets at any time, infos of any kind."""
+def test_the_short_way_writes_the_same_rows(kind: type[Plain], history: list[Any]) -> None:
+    """This holds for ends, steps after an end, resets at any time, and infos of any kind."""
     runner, env, row = runner_and_row(kind)
     long = Row(runner.layout)
     mode = runner.meta.autoreset
@@ -150,17 +150,17 @@ def test_the_short_way_writes_what_the_long_way_does(kind: type[Plain], history:
             reward, terminated, truncated, info = then
             writer.write_ends(*writer.checked_ends(float(reward), terminated, truncated), info)
             expected = writer.write_data(observation, info)
-        assert row.told(found) == long.told(expected)
+        assert row.contents(found) == long.contents(expected)
         assert not row.slab.flags[0].any()
         assert row.slab.done_ns[1] >= row.slab.busy_ns[1] >= 0
 
 
 @pytest.mark.parametrize("kind", [Plain, Renewed])
 @given(history=histories, apart=st.sets(st.integers(0, 30)))
-def test_requests_out_of_band_count_as_those_in_the_row_do(
+def test_requests_out_of_band_have_the_same_effect_as_those_in_the_row(
     kind: type[Plain], history: list[Any], apart: set[int]
 ) -> None:
-    """An env may be asked in either way at any time; its episodes are the same."""
+    """They may alternate in any order; the episodes are the same."""
     runner, env, row = runner_and_row(kind)
     other, other_env, other_row = runner_and_row(kind)
     for number, (what, then) in enumerate(history):
@@ -174,11 +174,11 @@ def test_requests_out_of_band_count_as_those_in_the_row_do(
             op, arguments = Operation.STEP, (NO_ACTION, {})
             in_row = other.step
         expected = other.execute(op, arguments) if number in apart else in_row()
-        assert row.told(found) == other_row.told(expected)
+        assert row.contents(found) == other_row.contents(expected)
 
 
-def test_a_reward_is_one_number_in_whatever_form() -> None:
-    """An array of one is one, as on the long way; what is none is named."""
+def test_a_reward_is_one_number_in_any_form() -> None:
+    """An array of one element is a number, as on the long way; an error names other values."""
     runner, env, row = runner_and_row()
     for number, reward in enumerate((2, np.float32(2), np.array(2.0), np.array([2.0])), 1):
         env.next = reward, False, False, {}
@@ -194,7 +194,7 @@ def test_a_reward_is_one_number_in_whatever_form() -> None:
 
 
 def test_the_seed_of_a_reset_is_the_one_in_the_row() -> None:
-    """Once; the next reset has none."""
+    """The seed counts once; the next reset has none."""
     runner, env, row = runner_and_row()
     env.next = {}
     row.slab.seed[1] = 7 + 1
@@ -203,8 +203,8 @@ def test_the_seed_of_a_reset_is_the_one_in_the_row() -> None:
     assert env.seeds == [7, None]
 
 
-def test_what_an_inline_env_tells_may_be_kept() -> None:
-    """Its info may be the env's own dict, which goes on changing."""
+def test_infos_of_an_inline_env_are_copied() -> None:
+    """An info may be a dict that the env continues to change."""
     runner, env, _ = runner_and_row(inline=True)
     env.next = {"nested": {"list": [1]}}
     out_of_band = runner.reset_from_row()
@@ -215,8 +215,8 @@ def test_what_an_inline_env_tells_may_be_kept() -> None:
 # -- what a row says, in each mode
 
 
-def said(slab: Slab, row: int = 0) -> list[Any]:
-    """is_reset, over, return and length; the return only where there is a length."""
+def flags_and_sums(slab: Slab, row: int = 0) -> list[Any]:
+    """Return is_reset, over, return and length; the return only if there is a length."""
     lengths = slab.episode_length[row]
     returns = np.where(lengths > 0, slab.episode_return[row], 0)
     return [
@@ -238,72 +238,74 @@ def writer_of(
 @pytest.mark.parametrize(
     ("mode", "after_the_end", "then"),
     [
-        # Nobody resets: what comes after belongs to no episode.
+        # Without a reset, later steps belong to no episode.
         ("disabled", [[False, False], [False, True], [3, 0], [3, 0]],
                      [[False, False], [False, True], [4, 0], [4, 0]]),
         # The step after the end is a reset.
         ("next_step", [[False, True], [False, False], [3, 0], [3, 0]],
                       [[False, False], [False, False], [4, 1], [4, 1]]),
-        # The result of the end was the first observation of the next episode already.
+        # The result of the end has the first observation of the next episode.
         ("same_step", [[False, False], [False, False], [3, 1], [3, 1]],
                       [[False, False], [False, False], [4, 2], [4, 2]]),
     ],
 )  # fmt: skip
-def test_a_row_says_what_it_is(mode: Autoreset, after_the_end: list[Any], then: list[Any]) -> None:
-    """Of two sub-environments the second ends in the second step."""
+def test_a_row_has_flags_and_sums(
+    mode: Autoreset, after_the_end: list[Any], then: list[Any]
+) -> None:
+    """The second of two sub-environments ends in the second step."""
     writer, slab = writer_of(mode, (2,))
     writer.begin_episode({})
-    assert said(slab) == [[True] * 2, [False] * 2, [0] * 2, [0] * 2]
+    assert flags_and_sums(slab) == [[True] * 2, [False] * 2, [0] * 2, [0] * 2]
     assert slab.reward[0].tolist() == [0, 0]
     no = np.zeros(2, bool)
     writer.write_ends(np.ones(2), no, no, {})
-    assert said(slab) == [[False] * 2, [False] * 2, [1] * 2, [1] * 2]
+    assert flags_and_sums(slab) == [[False] * 2, [False] * 2, [1] * 2, [1] * 2]
     writer.write_ends(np.ones(2), np.array([False, True]), no, {})
-    assert said(slab) == [[False] * 2, [False, True], [2] * 2, [2] * 2]
+    assert flags_and_sums(slab) == [[False] * 2, [False, True], [2] * 2, [2] * 2]
     assert slab.terminated[0].tolist() == [False, True]
     writer.write_ends(np.ones(2), no, no, {})
-    assert said(slab) == after_the_end
+    assert flags_and_sums(slab) == after_the_end
     writer.write_ends(np.ones(2), no, no, {})
-    assert said(slab) == then
+    assert flags_and_sums(slab) == then
     writer.begin_episode({})
-    assert said(slab) == [[True] * 2, [False] * 2, [0] * 2, [0] * 2]
+    assert flags_and_sums(slab) == [[True] * 2, [False] * 2, [0] * 2, [0] * 2]
 
 
 def test_a_sub_environment_resets_itself_for_all_of_its_agents() -> None:
-    """Where only one of them has ended, the step is a step."""
+    """If only one of them ended, the result is a step."""
     writer, slab = writer_of("next_step", (2, 3), ("ann", "bob"))
     writer.begin_episode({})
     assert slab.is_reset[0].all()
     no = np.zeros((2, 3), bool)
-    # Nobody ends in sub-environment 0, one agent in 1, both in 2.
+    # No agent ends in sub-environment 0, one in 1, both in 2.
     writer.write_ends(np.ones((2, 3)), np.array([[0, 1, 1], [0, 0, 1]], bool), no, {})
     assert not slab.is_reset[0].any()
     writer.write_ends(np.ones((2, 3)), no, no, {})
     assert slab.is_reset[0].tolist() == [[False, False, True]] * 2
 
 
-def test_sub_environments_that_take_turns_have_their_own_sums_in_the_row() -> None:
-    """Those that the result is about, in its order."""
-    writer, slab = writer_of("next_step", (2,), turns=4)
+def test_a_partial_result_has_the_sums_of_its_own_sub_environments() -> None:
+    """They are in the order of the result."""
+    writer, slab = writer_of("next_step", (2,), partial_of=4)
     no = np.zeros(2, bool)
     writer.begin_episode({"env_id": np.array([3, 1])})
-    assert said(slab) == [[True] * 2, [False] * 2, [0] * 2, [0] * 2]
+    assert flags_and_sums(slab) == [[True] * 2, [False] * 2, [0] * 2, [0] * 2]
     writer.write_ends(np.ones(2), no, no, {"env_id": np.array([1, 2])})
-    # 2 is heard of for the first time: its first observation.
-    assert said(slab) == [[False, True], [False, False], [1, 0], [1, 0]]
+    # The first result of sub-environment 2 is its first observation.
+    assert flags_and_sums(slab) == [[False, True], [False, False], [1, 0], [1, 0]]
     writer.write_ends(
         np.array([5.0, 6.0]), np.array([True, False]), no, {"env_id": np.array([2, 1])}
     )
-    assert said(slab) == [[False, False], [True, False], [5, 7], [1, 2]]
+    assert flags_and_sums(slab) == [[False, False], [True, False], [5, 7], [1, 2]]
     writer.write_ends(np.ones(2), no, no, {"env_id": np.array([3, 2])})
-    assert said(slab) == [[False, True], [False, False], [1, 0], [1, 0]]
+    assert flags_and_sums(slab) == [[False, True], [False, False], [1, 0], [1, 0]]
 
 
 # -- what has no place in the row
 
 
 def test_infos_that_do_not_fit_go_out_of_band() -> None:
-    """So do extras, and observations without a fixed size; the row holds the rest."""
+    """So do extras and observations without a fixed size; the row holds the rest."""
     row = Row(RowLayout(SPACE, spaces.Discrete(2), (), ()))
     writer = RowWriter(row.slab, 1, env_id="e-0", autoreset="disabled", announce=row.announce)
     observation = np.array([1.0, 2.0])
@@ -323,15 +325,15 @@ def test_infos_that_do_not_fit_go_out_of_band() -> None:
     assert texts.info(None) == {"x": 2.5}
 
 
-def test_who_announces_no_schemas_packs_no_infos() -> None:
-    """As an env_server, whose clients' infos come in bytes of their own."""
+def test_without_schemas_infos_are_not_packed() -> None:
+    """An env_server writes so: infos of clients arrive in their own bytes."""
     writer, slab = writer_of("disabled", ())
     assert writer.write_data(np.zeros(2), {"x": 1.5}) == {"info": {"x": 1.5}}
     assert slab.info_mark[0] == PICKLED
 
 
 def test_observations_that_are_handed_over_stay_out_of_the_row() -> None:
-    """They are copied where they stay in this process, for the env may go on writing to them."""
+    """They are copied if they stay in this process, because the env may write to them again."""
     layout = RowLayout(SPACE, spaces.Discrete(2), (), (), observations_out_of_band=True)
     slab, observation = new_slab(layout, 1), np.array([1.0, 2.0])
     writer = RowWriter(
@@ -358,7 +360,7 @@ def test_observations_that_are_handed_over_stay_out_of_the_row() -> None:
 def test_rewards_of_any_container_get_the_shape_of_the_row(
     head: Any, agents: Any, value: Any
 ) -> None:
-    """An axis of one too many is dropped."""
+    """An extra axis of length one is dropped."""
     writer, slab = writer_of("disabled", head, agents)
     ends = dict.fromkeys(agents, False) if agents else False
     if head and not agents:
@@ -370,8 +372,8 @@ def test_rewards_of_any_container_get_the_shape_of_the_row(
 
 
 @pytest.mark.parametrize("what", ["reward", "terminated", "truncated"])
-def test_what_does_not_fit_is_named(what: str) -> None:
-    """With both shapes."""
+def test_a_value_with_a_wrong_shape_is_named(what: str) -> None:
+    """The error has both shapes."""
     writer, _ = writer_of("disabled", (3,))
     good = {"reward": np.zeros(3), "terminated": np.zeros(3, bool), "truncated": np.zeros(3, bool)}
     with pytest.raises(ValueError, match=rf"{what} of env 'e-0' has shape \(2,\), expected \(3,\)"):

@@ -1,6 +1,6 @@
-"""A new kind of host needs one short module; `thread_host` is it, and here it is put to use.
+"""A new kind of host in one short module, `thread_host`, which nothing in the package depends on.
 
-It stands beside processes and inline envs in one group, and nothing in the package knows it.
+Here it runs in one group with processes and inline envs.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from hosts.thread_host import EnvThread
 import rlightning_aio.sync
 from rlightning_aio import ENVS, PolicyResponse
 from rlightning_aio.errors import StartFailed
-from rlightning_aio.group import supervisor
+from rlightning_aio.group import shutdown
 from rlightning_aio.registry import PLACEMENTS, Placement
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ THREE_PLACES = ("inline", "thread", "process")
 
 @pytest.fixture(autouse=True)
 def registered(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """All that it takes to use the new host; and no thread of it outlives a test."""
+    """Register the host, and check that no thread of it outlives a test."""
     monkeypatch.setitem(
         PLACEMENTS, "thread", Placement("hosts.thread_host:ThreadHost", spreads=True)
     )
@@ -53,7 +53,7 @@ FACADES = [Place("wherever", {}), Place("wherever", {}, synchronous=True)]
 
 @pytest.fixture(params=FACADES, ids=["async", "sync"])
 def facade(request: pytest.FixtureRequest) -> Place:
-    """Groups of either facade, whose methods are awaited; the entries say where they live."""
+    """Groups of either facade, with awaitable methods; the entries choose the placement."""
     return request.param
 
 
@@ -66,15 +66,15 @@ def entry(name: str, backend: str = "probe", placement: str = "thread", **fields
 
 
 def test_it_is_short() -> None:
-    """CONTRIBUTING.md promises less than 250 lines."""
+    """CONTRIBUTING.md promises fewer than 250 lines."""
     assert len(Path(thread_host.__file__).read_text().splitlines()) < 250
 
 
-# -- what envs do in a thread
+# -- envs in a thread
 
 
-async def test_trajectories_are_those_of_inline_envs_and_of_processes(facade: Place) -> None:
-    """In one group, to the last bit, however results are waited for."""
+async def test_trajectories_equal_those_of_inline_envs_and_processes(facade: Place) -> None:
+    """They are equal to the last bit in one group, with both ways of waiting."""
     entries = [
         entry(place, "gymnasium", place, **CARTPOLE, num_workers=2, **apart)
         for place, apart in zip(
@@ -98,13 +98,13 @@ async def test_trajectories_are_those_of_inline_envs_and_of_processes(facade: Pl
 
 
 async def test_an_env_that_raises_stays_usable(facade: Place) -> None:
-    """Its neighbour's result comes with the error, and both go on."""
+    """The result of its neighbour comes with the error, and both continue."""
     async with facade.build(entry("one", num_workers=2, envs_per_process=2)) as group:
         await check_usable_after_an_error(group)
 
 
-async def test_what_has_no_place_in_a_row_comes_beside_it(facade: Place) -> None:
-    """Copied: the env changes in place what it returns, and earlier results stay as they were."""
+async def test_results_out_of_band_are_copied(facade: Place) -> None:
+    """The env changes its results in place, and earlier results don't change."""
     async with facade.build(entry("one", "reusing")) as group:
         await group.reset()
         results = [(await group.step(steps(one_0=0)))[0].values()[0] for _ in range(3)]
@@ -112,8 +112,8 @@ async def test_what_has_no_place_in_a_row_comes_beside_it(facade: Place) -> None
     assert [ret.observation["items"][0].tolist() for ret in results] == [[1, 1], [2, 2], [3, 3]]
 
 
-async def test_what_lies_packed_in_a_row_is_decoded(facade: Place) -> None:
-    """A new form of an info is announced before the first that has it, options travel beside."""
+async def test_packed_infos_are_decoded(facade: Place) -> None:
+    """A new schema is announced before its first info; options travel out of band."""
     async with facade.build(entry("one", "gymnasium", task="Tree-v0")) as group:
         batch, _ = await group.reset(seed=3, options={"nested": [1]})
         assert batch.values()[0].info == {"seed": 3, "options": {"nested": [1]}}
@@ -123,15 +123,13 @@ async def test_what_lies_packed_in_a_row_is_decoded(facade: Place) -> None:
 
 
 async def test_methods_are_called_in_the_thread(facade: Place) -> None:
-    """Values come back as they are; what a call raises is the caller's alone."""
+    """Calls return values, and only the caller gets their errors."""
     async with facade.build([entry("one"), entry("two", placement="process")]) as group:
         await check_methods(group)
 
 
-async def test_the_first_result_is_not_kept_waiting_by_a_slow_env(
-    facade: Place, tmp_path: Path
-) -> None:
-    """Whoever is ready comes first, from a thread, a process or inline."""
+async def test_a_slow_env_does_not_delay_the_first_result(facade: Place, tmp_path: Path) -> None:
+    """Ready results come first, from a thread, a process or inline."""
     await check_first_ready(facade, THREE_PLACES, "thread", tmp_path)
 
 
@@ -139,7 +137,7 @@ async def test_the_first_result_is_not_kept_waiting_by_a_slow_env(
 
 
 async def test_an_env_that_cannot_be_built_is_named(facade: Place) -> None:
-    """Nothing is left running, whatever the others were about."""
+    """No thread is left, whatever state the other hosts are in."""
     fails = entry("bad", num_workers=3, envs_per_process=3, env_kwargs={"fails": 1})
     others = [entry(f"good_{place}", placement=place) for place in THREE_PLACES]
     group = facade.build([*others, fails])
@@ -148,7 +146,7 @@ async def test_an_env_that_cannot_be_built_is_named(facade: Place) -> None:
     assert env_threads() == []
 
 
-async def test_a_thread_that_the_system_refuses_fails_the_start(
+async def test_a_thread_that_cannot_be_started_fails_the_start(
     facade: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As a process would."""
@@ -164,7 +162,7 @@ async def test_a_thread_that_the_system_refuses_fails_the_start(
 async def test_a_thread_that_ends_while_it_starts_fails_the_start(
     facade: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nobody waits for what it would have told."""
+    """No caller waits for its completions."""
 
     def attach(*_: Any) -> None:
         raise MemoryError("no more rows")
@@ -177,7 +175,7 @@ async def test_a_thread_that_ends_while_it_starts_fails_the_start(
 async def test_a_thread_that_ends_is_replaced(
     facade: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Restarts come for free: a host tells of its death, and is started again."""
+    """A host gets restarts without code of its own: it posts `Died` and is started again."""
     async with facade.build(entry("one")) as group:
         await group.reset(seed=1)
         with monkeypatch.context() as patch:
@@ -194,16 +192,16 @@ async def test_a_thread_that_ends_is_replaced(
 
 
 class Closing(Probe):
-    """Says in which thread it does what, and raises in the end."""
+    """Logs its threads, and raises in `close`."""
 
     log: ClassVar[list[tuple[str, str]]] = []
     begun: ClassVar[threading.Event]
-    may_go_on: ClassVar[threading.Event]
+    may_continue: ClassVar[threading.Event]
 
     def step(self, policy_resp: PolicyResponse) -> Any:
         self.log.append((f"step {self.worker_index}", threading.current_thread().name))
         self.begun.set()
-        assert self.may_go_on.wait(60)
+        assert self.may_continue.wait(60)
         return super().step(policy_resp)
 
     def close(self) -> None:
@@ -216,26 +214,26 @@ class Closing(Probe):
 def closing(monkeypatch: pytest.MonkeyPatch) -> type[Closing]:
     monkeypatch.setitem(ENVS._classes, "closing", Closing)
     Closing.log.clear()
-    Closing.begun, Closing.may_go_on = threading.Event(), threading.Event()
+    Closing.begun, Closing.may_continue = threading.Event(), threading.Event()
     return Closing
 
 
 async def test_envs_are_closed_in_order_in_their_thread(
     facade: Place, closing: type[Closing]
 ) -> None:
-    """Errors are told with ids."""
+    """Errors name the env."""
     group = facade.build(entry("one", "closing", num_workers=3, envs_per_process=2))
     with pytest.warns(UserWarning, match=r"close\(\) of env 'one-1' raised ValueError: stuck"):
         async with group:
             await group.reset()
     names = ["envs from slot 0 on", "envs from slot 1 on", "envs from slot 1 on"]
-    told = [("close 0", names[0]), ("close 1", names[1]), ("close 2", names[2])]
-    assert sorted(closing.log) == told
-    assert closing.log.index(told[1]) < closing.log.index(told[2])
+    closes = [("close 0", names[0]), ("close 1", names[1]), ("close 2", names[2])]
+    assert sorted(closing.log) == closes
+    assert closing.log.index(closes[1]) < closing.log.index(closes[2])
 
 
-async def test_what_has_not_begun_is_dropped(closing: type[Closing]) -> None:
-    """Closing waits for one step at most."""
+async def test_a_close_drops_requests_that_have_not_begun(closing: type[Closing]) -> None:
+    """It waits for at most one step."""
     group = rlightning_aio.build_env_group(
         entry("one", "closing", num_workers=2, envs_per_process=2)
     )
@@ -244,31 +242,31 @@ async def test_what_has_not_begun_is_dropped(closing: type[Closing]) -> None:
     group.step_async(batch.respond(action=np.zeros((2, 2))))
     await asyncio.to_thread(closing.begun.wait)
     task = asyncio.create_task(group.close())
-    await asyncio.sleep(0)  # It has told its hosts.
-    closing.may_go_on.set()
+    await asyncio.sleep(0)  # It has closed its hosts.
+    closing.may_continue.set()
     with pytest.warns(UserWarning, match="stuck"):
         await task
-    assert [deed for deed, _ in closing.log] == ["step 0", "close 0", "close 1"]
+    assert [event for event, _ in closing.log] == ["step 0", "close 0", "close 1"]
 
 
 async def test_a_step_that_hangs_does_not_keep_a_group_from_closing(
     facade: Place, closing: type[Closing], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its thread is left to itself, and gives back what it holds when it ends."""
-    monkeypatch.setattr(supervisor, "_CLOSE_SECONDS", 0.05)
-    monkeypatch.setattr(supervisor, "_KILL_SECONDS", 0.05)
+    """Its thread continues, and releases its resources when it ends."""
+    monkeypatch.setattr(shutdown, "_CLOSE_SECONDS", 0.05)
+    monkeypatch.setattr(shutdown, "_KILL_SECONDS", 0.05)
     monkeypatch.setattr(thread_host, "JOIN_SECONDS", 0.05)
     async with facade.build(entry("one", "closing")) as group:
         await group.reset()
         group.step_async(steps(one_0=[0.0, 0.0]))
         await asyncio.to_thread(closing.begun.wait)
     (thread,) = env_threads()
-    closing.may_go_on.set()
+    closing.may_continue.set()
     thread.join()
 
 
-def test_a_group_that_is_dropped_takes_its_threads_along() -> None:
-    """As it does with workers."""
+def test_a_group_that_is_dropped_ends_its_threads() -> None:
+    """It ends its workers in the same way."""
     groups = [rlightning_aio.sync.build_env_group(entry("one", num_workers=2))]
     groups[0].init()
     with pytest.warns(ResourceWarning, match="was not closed"):

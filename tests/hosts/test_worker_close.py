@@ -1,4 +1,4 @@
-"""A worker that is told to close while requests still wait for it."""
+"""A worker that gets `CLOSE` while requests still wait."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from rlightning_aio.protocol.entries import Operation, entry
 from rlightning_aio.protocol.frames import FrameKind, FrameReader, encode
 
 
-def test_closing_leaves_waiting_requests_alone() -> None:
-    """A close that is heard before a request of the ring was begun ends the worker in order."""
+def test_a_close_comes_before_waiting_requests() -> None:
+    """A close that is read before a request in the ring begins ends the worker in good order."""
     _, trainer, rings = both_sides(1)
     ours, theirs = socket.socketpair()
     with ours, theirs:

@@ -1,4 +1,4 @@
-"""A worker that has more to tell than its channel takes."""
+"""A worker that sends more than its channel has room for."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from rlightning_aio.protocol.entries import Operation, entry
 from rlightning_aio.protocol.frames import FrameKind, FrameReader
 
 
-def test_its_clock_stands_still_while_it_waits_to_be_read() -> None:
-    """The trainer sees that it waits, and with what; the clock of what fits at once runs on."""
+def test_the_time_of_a_request_excludes_the_wait_for_the_trainer() -> None:
+    """The trainer sees which request waits. Time passes for data that fits into the channel."""
     _, trainer, rings = both_sides(1)
     ours, theirs = socket.socketpair()
     with ours, theirs:

@@ -1,4 +1,4 @@
-"""Envs as programs for RLightning define them."""
+"""Envs written for RLightning."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from rlightning.utils.registry import ENVS  # noqa: E402
 
 @dataclass
 class RichRet(EnvRet):
-    """A result with a field of the program's own."""
+    """A result with a field of its own."""
 
     belief: list[Any] = field(default_factory=list[Any])
 
@@ -30,7 +30,7 @@ class RichRet(EnvRet):
 
 @ENVS.register("counting")
 class CountingEnv(BaseEnv):
-    """Counts, and tells in its observation; `reset` takes what RLightning's may take."""
+    """Counts its steps in its observation; `reset` takes any of RLightning's arguments."""
 
     def __init__(self, config: Any, worker_index: int = 0, preprocess_fn: Any = None) -> None:
         super().__init__(config, worker_index, preprocess_fn)
@@ -76,7 +76,7 @@ class CountingEnv(BaseEnv):
 
 @ENVS.register("plain_reset")
 class PlainResetEnv(CountingEnv):
-    """Its `reset` takes nothing, its spaces are not known before `init`, and it has two of them."""
+    """Two sub-environments, a `reset` without arguments, and no spaces before `init`."""
 
     def get_observation_space(self) -> Any:
         return None

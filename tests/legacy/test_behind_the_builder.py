@@ -1,7 +1,7 @@
-"""Where RLightning is installed: its own builder and values, and groups of ours between them.
+"""RLightning's own builder and values with our groups, where RLightning is installed.
 
-A package of a few lines stands for RLightning, which needs gigabytes of others: it has the modules
-that are touched, with classes of its own. tests/peers/run_rlightning.py takes the real one.
+RLightning needs gigabytes of other packages, so this test writes a package of the modules that
+matter, with classes of its own. tests/peers/run.py uses the real one.
 """
 
 from __future__ import annotations
@@ -119,8 +119,8 @@ print("with", rlightning.__file__)
 """
 
 
-def test_rlightnings_own_engine_gets_its_own_values(tmp_path: Path) -> None:
-    """In the trainer and in workers; its own group is never made."""
+def test_rlightnings_engine_gets_rlightnings_values_from_our_group(tmp_path: Path) -> None:
+    """So do its envs in workers; its own group is never made."""
     for name, text in MODULES.items():
         file = tmp_path / "rlightning" / f"{name}.py"
         file.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""RLightning's names where RLightning is not installed."""
+"""RLightning's names, where RLightning is not installed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rlightning_aio.legacy.names import is_rlightning_installed
 if TYPE_CHECKING:
     from pathlib import Path
 
-pytestmark = pytest.mark.skipif(is_rlightning_installed(), reason="RLightning itself is here")
+pytestmark = pytest.mark.skipif(is_rlightning_installed(), reason="RLightning itself is installed")
 
 
 @pytest.fixture(autouse=True)
@@ -23,8 +23,8 @@ def _installed() -> None:
     install()
 
 
-def test_importing_the_package_brings_none_of_it() -> None:
-    """Neither legacy nor its names are there before somebody asks for them."""
+def test_importing_rlightning_aio_does_not_import_legacy() -> None:
+    """Its names are made on first use."""
     program = "import rlightning_aio, sys; print([m for m in sys.modules if 'legacy' in m])"
     found = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=HANG, check=True
@@ -32,8 +32,8 @@ def test_importing_the_package_brings_none_of_it() -> None:
     assert found.stdout.strip() == "[]"
 
 
-def test_every_name_of_the_table_is_there() -> None:
-    """Each path imports, and has all of its names, once and for all."""
+def test_every_name_of_the_table_can_be_imported() -> None:
+    """Each path has all of its names, and each name is one object."""
     import importlib
 
     from rlightning_aio.legacy.finder import ALIASED
@@ -61,21 +61,21 @@ def test_every_name_of_the_table_is_there() -> None:
         "from rlightning.env.libero_env import LiberoEnv",
     ],
 )
-def test_what_is_rlightnings_alone_says_so(statement: str) -> None:
-    """An ImportError with the reason and the remedy, not one about a file."""
-    with pytest.raises(ImportError, match="RLightning's own and not installed"):
+def test_a_name_that_only_rlightning_has_raises_an_import_error(statement: str) -> None:
+    """The message has the reason and the remedy."""
+    with pytest.raises(ImportError, match="belongs to RLightning, which is not installed"):
         exec(statement)
 
 
-def test_looking_for_a_name_is_no_error() -> None:
-    """As whoever pickles a function does, in every module."""
+def test_hasattr_of_a_missing_name_is_false() -> None:
+    """Pickling a function looks for its name in every module."""
     import rlightning.types
 
     assert not hasattr(rlightning.types, "no_such_thing")
 
 
 def test_results_are_built_by_position_and_converted() -> None:
-    """An `EnvRet` has RLightning's order of fields, methods and hash."""
+    """An `EnvRet` has RLightning's order of fields, its methods and its hash."""
     import numpy as np
     from rlightning.types import EnvRet
 
@@ -91,8 +91,8 @@ def test_results_are_built_by_position_and_converted() -> None:
         ret.to_dict()
 
 
-def test_responses_hold_anything_and_pickle() -> None:
-    """An action is not obligatory; what is attached is data."""
+def test_responses_hold_any_data_and_can_be_pickled() -> None:
+    """An action is optional."""
     import pickle
 
     from rlightning.types import MultiAgentPolicyResponse, PolicyResponse
@@ -112,8 +112,8 @@ def _space() -> Any:
     return gym.spaces.Discrete(3)
 
 
-def test_batches_are_tuples_with_ids() -> None:
-    """`ids` and `data`, by these names; an id that is missing is a ValueError."""
+def test_batches_hold_tuples() -> None:
+    """Arguments are named `ids` and `data`; a missing id raises ValueError."""
     from rlightning.types import BatchedData
 
     batch = BatchedData(ids=["a", "b", "a"], data=[1, 2, 3])
@@ -128,7 +128,7 @@ def test_batches_are_tuples_with_ids() -> None:
 
 
 def test_configs_are_mutable_open_and_nested(tmp_path: Path) -> None:
-    """Extra fields become sections, and are read as attributes, items, or with `get`."""
+    """Extra mappings become sections; fields can be read as attributes, items, or with `get`."""
     from omegaconf import OmegaConf
     from rlightning.utils.config import EnvConfig, MainConfig
 
@@ -159,8 +159,8 @@ def test_configs_are_mutable_open_and_nested(tmp_path: Path) -> None:
     assert (whole.env[0].name, whole.buffer.sampler.type) == ("one", "uniform")
 
 
-def test_a_registry_takes_a_name_once() -> None:
-    """By its class's name if none is given; what is built in may be replaced."""
+def test_a_registry_accepts_a_name_once() -> None:
+    """The default is the name of the class; a built-in env may be replaced."""
     from rlightning.utils.registry import ENVS, Registry
 
     registry = Registry("toys")
@@ -176,8 +176,8 @@ def test_a_registry_takes_a_name_once() -> None:
     assert {"mujoco", "ale", "maniskill", "piper"} <= ENVS.module_dict.keys()
 
 
-def test_counts_begin_below_the_reset() -> None:
-    """-1 before the first reset, 0 after it; past the limit there is no step."""
+def test_step_counts_begin_at_minus_one() -> None:
+    """They are 0 after the first reset; a step beyond the limit raises."""
     from rlightning.env.env_group import EnvStepCounter
 
     counter = EnvStepCounter(["a", "b"], [1, 5])
@@ -193,8 +193,8 @@ def test_counts_begin_below_the_reset() -> None:
         EnvStepCounter(["a"], [1, 2])
 
 
-def test_flags_are_read_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each time anew."""
+def test_flags_are_read_from_environment_variables(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each access reads the variable again."""
     from rlightning.utils.utils import InternalFlag
 
     monkeypatch.setenv("RLIGHTNING_REMOTE_ENV", "1")
@@ -205,8 +205,8 @@ def test_flags_are_read_from_the_environment(monkeypatch: pytest.MonkeyPatch) ->
         InternalFlag.REMOTE_CAFE  # noqa: B018
 
 
-def test_timers_sum_up_what_methods_take() -> None:
-    """In the object's own `timing_raw`."""
+def test_timers_add_up_durations_of_methods() -> None:
+    """The sums are in the object's `timing_raw`."""
     from rlightning.utils.profiler import profiler
 
     class Timed:

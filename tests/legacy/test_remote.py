@@ -1,4 +1,4 @@
-"""RLightning's two ends of a network."""
+"""RLightning's client and server of remote envs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from rlightning_aio.legacy.names import is_rlightning_installed, names_in_use
 
 if is_rlightning_installed():
-    pytest.skip("RLightning itself is here", allow_module_level=True)
+    pytest.skip("RLightning itself is installed", allow_module_level=True)
 names_in_use()
 
 from rlightning.env import BaseEnv  # noqa: E402
@@ -26,7 +26,7 @@ STEPS = 3
 
 
 class Robot(BaseEnv):
-    """Knows no spaces, and is finished after some steps."""
+    """A robot without spaces that is finished after some steps."""
 
     resets = steps = 0
 
@@ -52,7 +52,7 @@ class Robot(BaseEnv):
 
 
 def serving(address: tuple[str, int], times: int) -> tuple[threading.Thread, Robot]:
-    """A robot that dials in and serves so many times, in a thread of its own."""
+    """Start a thread in which a robot connects and serves `times` times."""
     config = EnvConfig(name="arm", backend="piper", task="any")
     robot = Robot(config, preprocess_fn=lambda response: response.action * 2)
 
@@ -73,8 +73,8 @@ def answers(batch: BatchedData) -> BatchedData:
     return BatchedData(batch.ids(), responses)
 
 
-def test_a_robot_serves_a_group_and_comes_back() -> None:
-    """Its results have its own id, and batches the server's; it may leave and dial in again."""
+def test_a_robot_serves_a_group_and_reconnects() -> None:
+    """Its results have its own id, and batches have the server's."""
     group = build_env_group(
         EnvConfig(name="robots", backend="env_server", task="real", zmq_port="0")
     )
@@ -101,8 +101,8 @@ def test_a_robot_serves_a_group_and_comes_back() -> None:
     assert robot.steps == STEPS
 
 
-def test_a_server_by_itself_waits_for_clients() -> None:
-    """`collect_async` with a time may come back with nothing."""
+def test_a_server_without_a_group_waits_for_clients() -> None:
+    """`collect_async` with a timeout may return no result."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         config = EnvConfig(name="robots", backend="env_server", task="real")

@@ -1,7 +1,7 @@
-"""Scripts written for RLightning run through ``python -m rlightning_aio.legacy``.
+"""Scripts for RLightning, run by ``python -m rlightning_aio.legacy``.
 
-The examples of RLightning's own texts run as they stand, where a checkout has these texts beside it
-(``../shared/reference``); scripts of our own show the same where it has not.
+The examples of RLightning's documentation run unchanged where its texts are next to the checkout
+(``../shared/reference``); the scripts of this file run everywhere.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from patience import HANG
 
 from rlightning_aio.legacy.names import is_rlightning_installed
 
-pytestmark = pytest.mark.skipif(is_rlightning_installed(), reason="RLightning itself is here")
+pytestmark = pytest.mark.skipif(is_rlightning_installed(), reason="RLightning itself is installed")
 
 TEXTS = Path(__file__).parents[2].parent / "shared" / "reference"
 
@@ -131,8 +131,8 @@ print("ran as", __name__, os.path.isabs(__file__), sys.argv[1:])
 """
 
 
-def test_a_script_of_our_own(tmp_path: Path) -> None:
-    """Its own env from a module that its config names, its own functions, its arguments."""
+def test_a_script_runs_with_its_own_env_and_arguments(tmp_path: Path) -> None:
+    """Its config names the env's module, and its preprocess functions run in workers."""
     (tmp_path / "my_swings.py").write_text(MODULE)
     (tmp_path / "entries.yaml").write_text(ENTRIES)
     script = tmp_path / "script.py"
@@ -141,8 +141,8 @@ def test_a_script_of_our_own(tmp_path: Path) -> None:
     assert told == "ran as __main__ True ['entries.yaml', '0.5']\n"
 
 
-def test_a_script_that_is_not_there(tmp_path: Path) -> None:
-    """It is named; without one, there is a line on the usage."""
+def test_a_missing_script_is_named(tmp_path: Path) -> None:
+    """Without an argument, the usage is printed."""
     missing = run(tmp_path / "missing.py")
     assert (missing.returncode, "missing.py: no such file" in missing.stderr) == (1, True)
     usage = subprocess.run(
@@ -155,21 +155,21 @@ def test_a_script_that_is_not_there(tmp_path: Path) -> None:
     assert "usage" in usage.stderr
 
 
-# -- the examples of RLightning's texts
+# -- the examples of RLightning's documentation
 
 needs_texts = pytest.mark.skipif(
-    not TEXTS.is_dir(), reason="RLightning's texts are not beside this checkout"
+    not TEXTS.is_dir(), reason="RLightning's documentation is not next to this checkout"
 )
 
 
 class Text:
-    """One of the texts, from which examples are cut."""
+    """A page of the documentation, from which examples are cut."""
 
     def __init__(self, name: str) -> None:
         self._lines = (TEXTS / name).read_text().splitlines()
 
     def cut(self, first: str, last: str, skip: int = 0) -> str:
-        """The lines from one that reads `first` to the next that reads `last`."""
+        """Return the lines from the one equal to `first` to the next one equal to `last`."""
         begin = -1
         for _ in range(skip + 1):
             begin = self._lines.index(first, begin + 1)
@@ -177,13 +177,13 @@ class Text:
 
 
 def whole(*parts: str) -> str:
-    """A program of cuts, which stand as they are, and of what goes between them."""
+    """Return a program of these parts, each without its indentation."""
     return "\n".join(textwrap.dedent(p) if p.startswith("\n") else p for p in parts)
 
 
 @needs_texts
-def test_the_text_on_custom_envs(tmp_path: Path) -> None:
-    """Functions, a class of one's own in a module that the YAML names, and the built-in one."""
+def test_the_examples_on_custom_envs_run(tmp_path: Path) -> None:
+    """They use preprocess functions, an env from a module that the YAML names, and MuJoCo."""
     text = Text("customize_env.txt")
     core = text.cut(
         "from rlightning.env.base_env import BaseEnv",
@@ -305,8 +305,8 @@ def test_the_text_on_custom_envs(tmp_path: Path) -> None:
 
 
 @needs_texts
-def test_the_text_on_groups(tmp_path: Path) -> None:
-    """The YAML, both loops, `auto_reset`, and what a group tells of itself."""
+def test_the_examples_on_groups_run(tmp_path: Path) -> None:
+    """They use the YAML, both loops, `auto_reset`, and a group's attributes."""
     text = Text("env_and_env_group.txt")
     (tmp_path / "entries.yaml").write_text(text.cut("envs:", "    num_workers: 4"))
     auto_reset = text.cut(

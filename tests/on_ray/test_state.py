@@ -31,26 +31,26 @@ PLACES: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("kind", ["mujoco, several", "of its own"])
-def test_an_env_goes_on_as_it_would_have(kind: str) -> None:
+def test_a_restored_env_continues_as_the_original(kind: str) -> None:
     """To the last bit: in its actor, in another place, and from there in an actor."""
     groups = {name: sync.build_env_group(entry_of(kind, **at)) for name, at in PLACES.items()}
     with groups["ray"] as one, groups["inline"], groups["process"]:
         run = Run(one, 5)
         first, _ = one.reset(seed=5)
         with one.auto_reset(7):
-            batch, _ = run.go_on(first, 10, 0)
+            batch, _ = run.proceed(first, 10, 0)
             snapshot = one.snapshot()
-            _, expected = run.go_on(batch, 20, 1)
+            _, expected = run.proceed(batch, 20, 1)
             shown, _ = one.restore(snapshot)
             np.testing.assert_equal(shown.observation, batch.observation)
-            np.testing.assert_equal(run.go_on(shown, 20, 1)[1], expected)
+            np.testing.assert_equal(run.proceed(shown, 20, 1)[1], expected)
         for name in ("inline", "process", "ray"):
             group = groups[name]
             group.reset()  # It has been elsewhere, and has made its parts.
             with group.auto_reset(7):
                 shown, _ = group.restore(snapshot)
                 snapshot = group.snapshot()
-                np.testing.assert_equal(Run(group, 5).go_on(shown, 20, 1)[1], expected)
+                np.testing.assert_equal(Run(group, 5).proceed(shown, 20, 1)[1], expected)
 
 
 async def test_a_snapshot_is_a_file_like_any_other(facade: Place, tmp_path: Path) -> None:
@@ -94,7 +94,7 @@ KEPT = {
 }
 
 
-def test_all_are_put_back_or_none() -> None:
+def test_all_envs_are_restored_or_none() -> None:
     """One fails at it; those in other actors are where they were."""
     entry = {"name": "e", "make_env": Fragile, "num_workers": 2, **IN_ACTORS}
     with sync.build_env_group(entry) as group:
@@ -109,7 +109,7 @@ def test_all_are_put_back_or_none() -> None:
         assert not batch.is_reset.any()
 
 
-def test_episodes_go_on_after_deaths_with_the_returns_that_they_would_have_had() -> None:
+def test_episodes_after_deaths_have_the_returns_of_a_run_without() -> None:
     """Of actors at random turns; no more steps are lost at once than the entry says."""
     group = Driven("sync", KEPT)
     local = {"name": "e", "make_env": Mortal, "num_workers": 4, "placement": "inline"}

@@ -1,60 +1,134 @@
-"""Gymnasium's and Stable-Baselines3's own tests, run against this library's classes in their place.
+"""Run other projects' own tests against this library, in place of the classes they are about.
 
-    python tests/peers/run.py gymnasium SOURCE
-    python tests/peers/run.py sb3 SOURCE
+    python tests/peers/run.py SOURCES [PEER ...] [arguments of pytest]
 
-SOURCE is a folder with the peer's sources, `tests` among them, of the version that is installed
-(a clone for Gymnasium, whose source package has no tests; `pip download --no-binary :all:` for
-Stable-Baselines3). Their tests need further packages, without which some fail: box2d, moviepy,
-pandas, pygame-ce and a library of OpenGL, as with `MUJOCO_GL=osmesa`. Further arguments, as
-`-k PART`, are pytest's.
+SOURCES is a folder that holds one folder with the sources of each project, its `tests` among them:
+a clone of Gymnasium's repository, Stable-Baselines3's source package, a clone of RLightning's
+repository. The first two must be of the versions that are installed. A project whose sources are
+not there is not run, and the summary says so. Further arguments, such as `-k PART`, are pytest's.
 
-The tests of the interface get our class for the one with worker processes, those of the wrappers
-for the one without, too. What can't apply is named in `PEERS` with the reason, and left out.
+Tests of an interface get our class for the one with worker processes; tests of wrappers get it for
+the one without workers, too. `PEERS` names the tests that can't apply, with the reason.
+RLightning's tests meet the names of `rlightning_aio.legacy`; `rlightning-builder` imports
+RLightning's own source instead (which needs its dependencies), and its builder makes our groups.
 """
 
 from __future__ import annotations
 
 import argparse
+import ast
 import importlib
 import os
+import re
 import shutil
+import subprocess
 import sys
 import tempfile
+import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 import pytest
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 
 @dataclass(frozen=True)
 class Part:
-    """Some of a peer's test files, and the classes that ours stands in for there."""
+    """Some of a peer's test files, and the names in the peer's module that our class replaces."""
 
     title: str
     files: tuple[str, ...]
-    replaced: tuple[str, ...]
+    replaced: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Adapted:
+    """A test that is run without its assertions on a variable, and with an argument replaced."""
+
+    file: str
+    test: str
+    variable: str
+    argument: str
+    replacement: str
+
+    def rewrite(self, tests: Path) -> None:
+        """Rewrite the test in the folder `tests`."""
+        file = tests / self.file
+        if not file.exists():
+            return
+        tree = ast.parse(file.read_text())
+        (function,) = (node for node in ast.walk(tree) if getattr(node, "name", "") == self.test)
+        assert isinstance(function, ast.FunctionDef)
+        function.body = [node for node in function.body if not self._is_left_out(node)]
+        text = ast.unparse(function)
+        assert self.argument in text
+        (rewritten,) = ast.parse(text.replace(self.argument, self.replacement)).body
+        tree.body[tree.body.index(function)] = rewritten
+        file.write_text(ast.unparse(tree))
+
+    def _is_left_out(self, node: ast.stmt) -> bool:
+        names = {part.id for part in ast.walk(node) if isinstance(part, ast.Name)}
+        return isinstance(node, ast.Assert) and self.variable in names
 
 
 @dataclass(frozen=True)
 class Peer:
-    """A library whose tests are run.
+    """A project whose tests are run.
 
     Attributes:
+        folder: the start of the name of its folder, in lower case with hyphens.
         home: the module where tests find the classes that are replaced.
         ours: the class in their place, as ``module:name``.
-        left_out: parts of tests' names, and why they can't apply.
+        left_out: parts of tests' ids, and why these tests can't apply.
+        adapted: tests of which a part can't apply.
+        prepare: called with the folder of the sources, before any test is imported.
     """
 
+    folder: str
     home: str
     ours: str
     parts: tuple[Part, ...]
     left_out: dict[str, str]
+    adapted: tuple[Adapted, ...] = ()
+    prepare: Callable[[Path], None] = lambda _source: None
 
+
+def use_names_of_legacy(_source: Path) -> None:
+    """Let tests import RLightning's names from us, without Ray."""
+    ray: Any = ModuleType("ray")
+    ray.ObjectRef = type("ObjectRef", (), {})
+    ray.init = ray.shutdown = lambda **_: None
+    ray.is_initialized = lambda: False
+    sys.modules["ray"] = ray
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        importlib.import_module("rlightning_aio.legacy").install()
+
+
+def use_own_source(source: Path) -> None:
+    """Let tests import RLightning's own source, whose builder then makes our groups."""
+    if not (source / "rlightning").is_dir():
+        raise ModuleNotFoundError("these sources have no folder 'rlightning'")
+    sys.path.insert(0, str(source))
+    importlib.import_module("rlightning_aio.legacy").install()
+
+
+NOT_RUN = 3
+VERDICTS = {0: "passed", 1: "failed", NOT_RUN: "not run, for the reason above"}
+OF_RLIGHTNING = (
+    "integration/env/test_env_group.py", "integration/env/test_basic_mujoco.py",
+    "integration/env/test_basic_ale.py", "unit/test_env_group_stats.py", "unit/test_config.py",
+    "unit/test_registry.py",
+)  # fmt: skip
+OF_RAY = "it expects Ray's references, and results here are values"
 
 PEERS = {
     "gymnasium": Peer(
+        "gymnasium",
         "gymnasium.vector",
         "rlightning_aio.vector:VectorEnv",
         (
@@ -75,18 +149,21 @@ PEERS = {
             ),
         ),
         {
-            "test_async_vector_subenv_error": "what an env raises comes as EnvRaised, and the env "
-            "stays; theirs is the class itself, and warnings in colour",
             "test_custom_space_async_vector_env_shared_memory": "spaces of one's own are no reason "
             "to refuse shared memory; they travel pickled",
             "test_step_timeout_async_vector_env": "it sleeps for an action that is no element of "
             "its space, and Python can't sleep for one that is; ours are cast to its dtype",
-            "test_normalize_reward.py::test_equivalence_with_wrapper": "it looks into `envs`, "
-            "which AsyncVectorEnv doesn't have either",
-            "test_normalize_observation.py::test_normalize_obs_with_vector": "likewise",
         },
+        (
+            # Theirs warns that a worker is shut down; ours stays. Ours checks the shape of actions.
+            Adapted(
+                "vector/test_async_vector_env.py", "test_async_vector_subenv_error",
+                "caught_warnings", "step([0, 1, 2])", "step([[0], [1], [2]])",
+            ),
+        ),
     ),
     "sb3": Peer(
+        "stable-baselines3",
         "stable_baselines3.common.vec_env",
         "rlightning_aio.sb3:VecEnv",
         (
@@ -105,15 +182,43 @@ PEERS = {
             "test_check_nan": "it sends more actions than there are envs, which are refused here",
             "test_get_original": "DummyVecEnv's rewards are float32; SubprocVecEnv's and ours "
             "are float64",
-            "test_vec_normalize.py::test_discrete_obs": "its task, CliffWalking-v0, is no more",
+            "test_vec_normalize.py::test_discrete_obs": "Gymnasium no longer has CliffWalking-v0",
         },
+    ),
+    "rlightning": Peer(
+        "rlightning",
+        "rlightning",
+        "rlightning_aio.legacy.group:EnvGroup",
+        (Part("names of ours", OF_RLIGHTNING),),
+        {
+            "test_feed_into_env_client[True": OF_RAY,
+            "test_feed_into_env_group[True": OF_RAY,
+            "validate_config_for_placement": "it is about placement on Ray's nodes",
+        },
+        prepare=use_names_of_legacy,
+    ),
+    "rlightning-builder": Peer(
+        "rlightning",
+        "rlightning",
+        "rlightning_aio.legacy.group:EnvGroup",
+        (
+            Part(
+                "its own builder",
+                (*OF_RLIGHTNING, "integration/env/test_env_group_performance.py"),
+            ),
+        ),
+        {
+            "test_feed_into_env_client[True": OF_RAY,
+            "test_feed_into_env_group[True": OF_RAY,
+        },
+        prepare=use_own_source,
     ),
 }  # fmt: skip
 
 
-@dataclass
+@dataclass(eq=False)  # pytest keeps its plugins in sets.
 class Watch:
-    """A plugin of pytest: leaves out what can't apply, and counts the rest."""
+    """A plugin of pytest that leaves out what can't apply and counts the rest."""
 
     left_out: dict[str, str]
     made: list[int]
@@ -124,6 +229,10 @@ class Watch:
         out = [item for item in items if any(part in item.nodeid for part in self.left_out)]
         items[:] = [item for item in items if item not in out]
         config.hook.pytest_deselected(items=out)
+
+    def pytest_collectreport(self, report: Any) -> None:
+        if report.failed:
+            self.outcomes[report.nodeid] = "failed"
 
     def pytest_runtest_logreport(self, report: Any) -> None:
         if report.when == "call" or report.outcome != "passed":
@@ -143,10 +252,10 @@ class Watch:
 
 
 def replace(peer: Peer, names: tuple[str, ...]) -> list[int]:
-    """Put our class in the place of theirs; the number of its instances is returned in a list."""
+    """Put our class in the place of theirs. Return a list whose one item counts its instances."""
     module, _, name = peer.ours.partition(":")
     ours = getattr(importlib.import_module(module), name)
-    home, made = importlib.import_module(peer.home), [0]
+    made = [0]
     make = ours.__init__
 
     def counted(self: Any, *args: Any, **kwargs: Any) -> None:
@@ -155,15 +264,22 @@ def replace(peer: Peer, names: tuple[str, ...]) -> list[int]:
 
     ours.__init__ = counted
     for replaced in names:
-        setattr(home, replaced, ours)
+        setattr(importlib.import_module(peer.home), replaced, ours)
     return made
 
 
-def run(peer: Peer, part: Part, more: list[str]) -> bool:
-    """Run a part; whether all that applies has passed."""
-    watch = Watch(peer.left_out, replace(peer, part.replaced))
+def run_part(peer: Peer, part: Part, more: list[str]) -> bool:
+    """Run a part, print its counts, and return True if all that applies has passed."""
     files = [f"tests/{name}" for name in part.files]
-    pytest.main(["-q", "-p", "no:cacheprovider", "--tb=short", *more, *files], plugins=[watch])
+    present = [name for name in files if Path(name).exists()]
+    for name in files:
+        if name not in present:
+            print(f"{part.title}: {name} is missing from these sources")
+    if not present:
+        return False
+    watch = Watch(peer.left_out, replace(peer, part.replaced))
+    options = ["-q", "-p", "no:cacheprovider", "--tb=short", "--continue-on-collection-errors"]
+    pytest.main([*options, *more, *present], plugins=[watch])
     passed, failed = watch.count("passed"), watch.count("failed")
     print(
         f"{part.title}: {passed} passed, {failed} failed, {watch.count('skipped')} skipped; "
@@ -173,26 +289,64 @@ def run(peer: Peer, part: Part, more: list[str]) -> bool:
     return passed > 0 and not failed
 
 
+def run_peer(peer: Peer, source: Path, more: list[str]) -> int:
+    """Run all parts of a peer in this process, and return its exit code."""
+    try:
+        peer.prepare(source)
+    except ModuleNotFoundError as missing:
+        print(f"{source} can't be imported here: {missing}")
+        return NOT_RUN
+    # Away from the sources, or they would be imported in place of what is installed.
+    with tempfile.TemporaryDirectory() as folder:
+        shutil.copytree(source / "tests", Path(folder, "tests"))
+        Path(folder, "pytest.ini").write_text("[pytest]\n")
+        for adapted in peer.adapted:
+            adapted.rewrite(Path(folder, "tests"))
+        os.chdir(folder)
+        sys.path.insert(0, folder)
+        well = [run_part(peer, part, more) for part in peer.parts]
+        os.chdir(source)
+    for part, reason in peer.left_out.items():
+        print(f"left out: {part}: {reason}")
+    return 0 if all(well) else 1
+
+
+def source_of(peer: Peer, sources: Path) -> Path | None:
+    """Return the folder in `sources` that holds the peer's tests, or None."""
+    for folder in sorted(sources.iterdir()):
+        name = folder.name.lower().replace("_", "-")
+        if re.fullmatch(rf"{peer.folder}(-v?[0-9].*)?", name) and (folder / "tests").is_dir():
+            return folder
+    return None
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("peer", choices=PEERS)
-    parser.add_argument("source", type=Path, metavar="SOURCE")
+    parser.add_argument("sources", type=Path, metavar="SOURCES")
+    parser.add_argument("--only", choices=PEERS, help="run one project's tests")
     given, more = parser.parse_known_args()
-    peer = PEERS[given.peer]
-    if not (given.source / "tests").is_dir():
-        parser.error(f"{given.source} has no folder 'tests'")
-    # Away from the sources, or they would be imported in place of what is installed.
-    with tempfile.TemporaryDirectory() as folder:
-        shutil.copytree(given.source / "tests", Path(folder, "tests"))
-        Path(folder, "pytest.ini").write_text("[pytest]\n")
-        os.chdir(folder)
-        sys.path.insert(0, folder)
-        well = [run(peer, part, more) for part in peer.parts]
-    for part, reason in peer.left_out.items():
-        print(f"left out: {part}: {reason}")
-    return 0 if all(well) else 1
+    if not given.sources.is_dir():
+        parser.error(f"there is no folder {given.sources}")
+    if given.only is not None:
+        peer = PEERS[given.only]
+        source = source_of(peer, given.sources.resolve())
+        if source is None:
+            print(f"no folder of {given.sources} is named {peer.folder} and has a folder 'tests'")
+            return NOT_RUN
+        return run_peer(peer, source, more)
+    # Each peer gets a process of its own: what one replaces, the next would import.
+    codes = {
+        name: subprocess.run(
+            [sys.executable, __file__, str(given.sources), "--only", name, *more], check=False
+        ).returncode
+        for name in PEERS
+    }
+    for name, code in codes.items():
+        print(f"{name}: {VERDICTS.get(code, 'failed')}")
+    ran = [code for code in codes.values() if code != NOT_RUN]
+    return 1 if any(ran) or not ran else 0
 
 
 if __name__ == "__main__":

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from rlightning_aio.protocol.bell import TrainerBell, WorkerBell, bell_size
+from rlightning_aio.protocol.exchange import TrainerBell, WorkerBell, bell_size
 from rlightning_aio.protocol.rings import TrainerRings, WorkerRings, rings_size
 
 
 def both_sides(
     num_envs: int, memory: memoryview | None = None
 ) -> tuple[TrainerBell, TrainerRings, WorkerRings]:
-    """The trainer's side and the worker's, of a group of one worker.
+    """The trainer's side and the worker's, for a group of one worker.
 
     Args:
         num_envs: of the worker.
@@ -24,5 +24,5 @@ def both_sides(
 
 
 def memory_size(num_envs: int) -> int:
-    """Bytes of a group of one worker."""
+    """Size in bytes for a group of one worker."""
     return bell_size(1) + rings_size(num_envs)

@@ -1,4 +1,4 @@
-"""The bell: somebody rings when there is enough, and nobody before."""
+"""The bell: a worker rings when the goal is reached, and not before."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from rlightning_aio.protocol.bell import TrainerBell, WorkerBell, bell_size
 from rlightning_aio.protocol.entries import Operation, entry
+from rlightning_aio.protocol.exchange import TrainerBell, WorkerBell, bell_size
 from rlightning_aio.protocol.rings import TrainerRings, WorkerRings, rings_size
 
 
 class Worker:
-    """One worker between its memory accesses.
+    """A worker, divided at its memory accesses.
 
     Attributes:
-        waiting: requests that it has still to execute; count: reports in this life.
-        looks: it is about to look at the order.
-        rung: orders that it has rung for in this life.
+        waiting: requests to execute; count: reports since its start.
+        looks: True if it is about to check the bell.
+        rung: goals for which it has rung since its start.
     """
 
     def __init__(self, bell: WorkerBell) -> None:
@@ -38,10 +38,10 @@ class Worker:
 
 
 class BellMachine(RuleBasedStateMachine):
-    """A trainer that arms, disarms, reads and restarts, and workers that report and look.
+    """A trainer that arms, disarms, reads and restarts, and workers that report and check.
 
-    Looks come between the events of others: what happens at the same time, happens here in
-    one order or another.
+    Checks may come between the events of others: concurrent events are tested in every
+    order.
     """
 
     @initialize(num_workers=st.sampled_from([1, 2, 3, 12, 13, 20]))
@@ -81,7 +81,7 @@ class BellMachine(RuleBasedStateMachine):
         if order != self.order:
             self.order, self.rung = order, False
         if sum(self.unread()) >= wanted:
-            self.rung = True  # Seen by the trainer itself, which does not sleep then.
+            self.rung = True  # The trainer sees it and does not sleep.
 
     @rule()
     def disarm(self) -> None:
@@ -92,7 +92,7 @@ class BellMachine(RuleBasedStateMachine):
     def take(self, data: st.DataObject) -> None:
         for index in self.trainer.with_news():
             if data.draw(st.booleans()):
-                count = self.trainer.count(index) - self.read[index]
+                count = self.trainer.counters[index] - self.read[index]
                 self.trainer.took(index, count)
                 self.read[index] += count
 
@@ -121,7 +121,7 @@ class BellMachine(RuleBasedStateMachine):
         worker.count += 1
         looks = worker.bell.publish(worker.count)
         assert not (looks and self.order is not None and self.order[2])
-        # It looks in any case when it has nothing left to do.
+        # It also checks when it runs out of work.
         worker.looks = looks or not worker.waiting
 
     @precondition(lambda self: self.can_look())
@@ -137,7 +137,7 @@ class BellMachine(RuleBasedStateMachine):
         worker.rung.append(self.order)
         self.rung = True
 
-    # -- what always holds
+    # -- invariants
 
     @invariant()
     def nobody_sleeps_on_enough(self) -> None:
@@ -146,7 +146,7 @@ class BellMachine(RuleBasedStateMachine):
         _, goal, at_last = self.order
         if self.rung or sum(w.count for w in self.workers) < goal:
             return
-        # Whoever came to it is about to look, or has more to do and looks at last.
+        # The worker that reached it is about to check, or has more work and checks afterwards.
         assert self.can_look() or (at_last and any(w.waiting for w in self.workers))
 
     @invariant()
@@ -158,9 +158,7 @@ class BellMachine(RuleBasedStateMachine):
         reached = self.order is not None and sum(w.count for w in self.workers) >= self.order[1]
         assert self.trainer.reached() == reached
         assert self.trainer.with_news() == [k for k, count in enumerate(unread) if count]
-        assert [self.trainer.count(k) for k in range(len(unread))] == [
-            w.count for w in self.workers
-        ]
+        assert list(self.trainer.counters) == [w.count for w in self.workers]
 
 
 TestBell = BellMachine.TestCase
@@ -175,8 +173,8 @@ def bells(num_workers: int) -> tuple[TrainerBell, list[WorkerBell]]:
 
 @pytest.mark.parametrize("num_workers", [2, 13])
 @pytest.mark.parametrize("at_last", [False, True])
-def test_of_workers_that_finish_at_the_same_time_one_rings(num_workers: int, at_last: bool) -> None:
-    """Whichever order their last reports and looks come in, each one's report before its look."""
+def test_one_of_several_workers_that_finish_together_rings(num_workers: int, at_last: bool) -> None:
+    """In any order of reports and checks, with each worker's report before its check."""
     events = [("publish", 0), ("look", 0), ("publish", 1), ("look", 1)]
     orders = [
         order
@@ -194,13 +192,13 @@ def test_of_workers_that_finish_at_the_same_time_one_rings(num_workers: int, at_
             else:
                 rung[index] += workers[index].is_due()
         assert sum(rung) >= 1, order
-        # Two where neither looked before both had published: that is not told apart.
+        # Two if neither checked before both had published.
         both_first = {what for what, _ in order[:2]} == {"publish"}
         assert sum(rung) == 1 + both_first, order
 
 
-def test_for_all_results_workers_look_when_they_have_nothing_left_to_do() -> None:
-    """Not after each report, which would cost each of them a fence."""
+def test_for_all_results_workers_check_when_they_run_out_of_work() -> None:
+    """Not after each report, which would need a fence each time."""
     trainer, (worker, _) = bells(2)
     trainer.arm(trainer.goal(300), at_last=True)
     assert not any(worker.publish(count) for count in range(1, 300))
@@ -208,8 +206,8 @@ def test_for_all_results_workers_look_when_they_have_nothing_left_to_do() -> Non
     assert worker.publish(300)
 
 
-def test_an_order_that_is_withdrawn_is_rung_for_by_nobody() -> None:
-    """The trainer is awake already; the next order, be it the same, is another one."""
+def test_a_disarmed_bell_is_not_rung() -> None:
+    """The trainer is already awake; arming again, even with the same goal, is new."""
     trainer, (worker,) = bells(1)
     trainer.arm(trainer.goal(2), at_last=False)
     trainer.disarm()
@@ -225,8 +223,8 @@ def test_an_order_that_is_withdrawn_is_rung_for_by_nobody() -> None:
         trainer.disarm()
 
 
-def test_a_bell_that_was_released_keeps_quiet() -> None:
-    """Its memory may be gone; who asks all the same gets nothing of it."""
+def test_a_released_bell_is_silent() -> None:
+    """Its memory may be gone, and it no longer reads it."""
     trainer, (worker,) = bells(1)
     worker.publish(3)
     trainer.release()
@@ -238,9 +236,9 @@ def test_a_bell_that_was_released_keeps_quiet() -> None:
 
 
 def _work(rings: WorkerRings, channel: socket.socket) -> None:
-    """What a worker does, without envs: ends with its trainer's end of the channel."""
+    """A worker without envs, which ends when the trainer closes the channel."""
     while True:
-        if rings.serve(lambda _: True, lambda: channel.send(b"!")):
+        if rings.serve(lambda _: True, lambda: channel.send(b"!"), lambda: None):
             continue
         if rings.fall_asleep():
             if not channel.recv(1 << 16):
@@ -268,7 +266,7 @@ def _work_and_exit(
 @pytest.mark.timeout(60)
 @pytest.mark.parametrize(("num_workers", "rounds"), [(3, 1500), (13, 300)])
 def test_a_trainer_of_several_processes_is_never_left_asleep(num_workers: int, rounds: int) -> None:
-    """Thousands of rounds in which all finish at about the same time."""
+    """In thousands of rounds with workers that finish nearly together."""
     envs = 4
     bell_bytes, ring_bytes = bell_size(num_workers), rings_size(envs)
     memory = memoryview(mmap.mmap(-1, bell_bytes + num_workers * ring_bytes))
@@ -310,7 +308,7 @@ def test_a_trainer_of_several_processes_is_never_left_asleep(num_workers: int, r
 
 
 def _any_bell(channels: list[socket.socket]) -> None:
-    """Sleep until a worker rings; take its bells away."""
+    """Sleep until a worker rings, and read its bells."""
     readable: list[Any] = select.select(channels, [], [])[0]
     for channel in readable:
         channel.recv(1 << 16)

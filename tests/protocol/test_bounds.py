@@ -1,4 +1,4 @@
-"""What lies outside of its space is said in words, and nothing is refused."""
+"""Values outside of their space are described, without an error."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TREE = spaces.Dict(a=spaces.Tuple(LEAVES), b=spaces.Dict(c=BOX))
 
 @given(st.integers(0, 2**31))
 def test_members_are_within(seed: int) -> None:
-    """Whatever the space, nothing is said of what it holds."""
+    """Samples of any space are within it."""
     TREE.seed(seed)
     assert out_of_bounds(TREE, TREE.sample(), "it") is None
 
@@ -43,8 +43,8 @@ def test_members_are_within(seed: int) -> None:
         (TREE, {"a": (np.full(2, 7.0),)}, "it['a'][0] holds 7.0, and"),
     ],
 )
-def test_what_is_outside_is_named(space: Any, value: Any, said: str) -> None:
-    """Where it is, what it is, and what it should have been."""
+def test_values_outside_are_described(space: Any, value: Any, said: str) -> None:
+    """With position, value and bounds."""
     found = out_of_bounds(space, value, "it")
     assert found is not None
     assert found.startswith(said)
@@ -54,6 +54,6 @@ def test_what_is_outside_is_named(space: Any, value: Any, said: str) -> None:
     "value", [None, "words", {}, (), np.zeros(3), np.array(["a", "b"]), [5, 5]]
 )
 @pytest.mark.parametrize("space", [BOX, TREE, TREE["a"]])
-def test_what_has_another_form_is_passed_over(space: Any, value: Any) -> None:
-    """That is for others to say."""
+def test_values_with_another_structure_are_skipped(space: Any, value: Any) -> None:
+    """Other checks report these."""
     assert out_of_bounds(space, value, "it") is None

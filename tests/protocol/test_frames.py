@@ -1,4 +1,4 @@
-"""Frames: whatever the pieces in which a stream arrives, the same messages come out."""
+"""Frames: a stream is parsed to the same messages, in pieces of any size."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ FRAMES = st.lists(
 
 
 @given(frames=FRAMES, sizes=st.lists(st.integers(1, 64), min_size=1))
-def test_a_stream_is_cut_into_its_frames(frames: list[Frame], sizes: list[int]) -> None:
-    """In order, complete, and without the bells, for any sizes of the pieces."""
+def test_a_stream_is_split_into_its_frames(frames: list[Frame], sizes: list[int]) -> None:
+    """In order, complete, and without bells, for pieces of any size."""
     stream = b"".join(encode(FrameKind(f.kind), f.number, f.payload) for f in frames)
     reader, found = FrameReader(), list[Frame]()
     position, k = 0, 0
@@ -32,7 +32,7 @@ def test_a_stream_is_cut_into_its_frames(frames: list[Frame], sizes: list[int]) 
 
 
 @given(payload=st.binary(min_size=1, max_size=2000), at=st.integers(0, 2000))
-def test_a_bell_between_two_pieces_of_a_frame_is_part_of_it(payload: bytes, at: int) -> None:
+def test_bytes_of_a_bell_inside_a_frame_are_part_of_it(payload: bytes, at: int) -> None:
     """A bell is only a bell at the beginning of a frame."""
     frame = encode(FrameKind.RESULT, 9, BELL + payload)
     reader = FrameReader()

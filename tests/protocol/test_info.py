@@ -1,4 +1,4 @@
-"""Infos in rows: what comes out is what went in, to the type."""
+"""Infos in rows are read as written, with their types."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def same(one: Any, other: Any) -> bool:
 
 
 class Row:
-    """A writer, and the reading end that knows only what was announced to it."""
+    """A writer, and a reader that knows only the announced schemas."""
 
     def __init__(self) -> None:
         self.announced: dict[int, InfoSchema] = {}
@@ -69,7 +69,7 @@ class Row:
         self.writer = InfoWriter(self.memory, self.schemas.announce)
 
     def through(self, info: dict[str, Any]) -> dict[str, Any] | None:
-        """The info as it is read from the row; None if the row could not hold it."""
+        """Write and read an info; None if it doesn't fit the row."""
         mark = self.writer.write(info)
         if mark == PICKLED:
             return None
@@ -77,8 +77,8 @@ class Row:
 
 
 @given(infos=st.lists(INFOS, max_size=8))
-def test_infos_that_fit_a_row_come_back_as_they_were(infos: list[dict[str, Any]]) -> None:
-    """One after the other through one row, in any mixture of shapes: keys, order, types."""
+def test_infos_that_fit_a_row_are_read_unchanged(infos: list[dict[str, Any]]) -> None:
+    """In sequence through one row, with any mixture of schemas: keys, order, types."""
     row = Row()
     for info in infos + infos:
         found = row.through(info)
@@ -88,16 +88,16 @@ def test_infos_that_fit_a_row_come_back_as_they_were(infos: list[dict[str, Any]]
 
 
 @given(info=st.dictionaries(st.text(max_size=3), st.floats(allow_nan=False), min_size=1))
-def test_an_info_is_announced_once(info: dict[str, float]) -> None:
-    """Infos of one shape share a schema, and only values travel from then on."""
+def test_a_schema_is_announced_once(info: dict[str, float]) -> None:
+    """Infos with the same keys and types share a schema."""
     row = Row()
     assert row.through(info) == info
     assert row.through(info) == info
     assert len(row.announced) == 1
 
 
-def test_what_is_read_is_a_copy() -> None:
-    """The row may be written again without changing what was handed out."""
+def test_a_decoded_info_is_a_copy() -> None:
+    """Writing the row again doesn't change it."""
     row = Row()
     first = row.through({"x": np.arange(3)})
     assert first is not None
@@ -119,15 +119,15 @@ def test_what_is_read_is_a_copy() -> None:
     ],
     ids=["big int", "text", "nested", "int key", "big array", "objects", "many"],
 )
-def test_what_does_not_fit_a_row_is_left_to_the_channel(info: Any) -> None:
-    """The mark says so; the next info that fits is written as ever."""
+def test_an_info_that_does_not_fit_a_row_is_pickled(info: Any) -> None:
+    """The mark says so; the next info that fits is written to the row."""
     row = Row()
     assert row.through(info) is None
     assert row.through({"y": 1.5}) == {"y": 1.5}
 
 
-def test_a_worker_that_has_announced_too_many_goes_on_by_the_channel() -> None:
-    """An env whose keys never repeat costs time, not correctness."""
+def test_a_worker_with_too_many_schemas_pickles_infos() -> None:
+    """An env with ever-changing keys is slower, but correct."""
     row = Row()
     found = [row.through({f"key {k}": k}) for k in range(300)]
     announced = len(row.announced)

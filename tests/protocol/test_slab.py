@@ -1,4 +1,4 @@
-"""Rows: values of any space go in and come out as they were, and disturb no other row."""
+"""Rows: values of any space are read as written, and don't affect other rows."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ HEADS = st.sampled_from([((), ()), ((3,), ()), ((2,), ("a", "b")), ((2, 3), ("a"
 def test_values_go_through_rows_unchanged(
     observations: Any, actions: Any, head: Any, rows: int, seed: int
 ) -> None:
-    """What one side writes the other reads, to the dtype; every row keeps its own."""
+    """One side reads what the other wrote, with the same dtype; each row keeps its value."""
     layout = RowLayout(observations, actions, *head)
     memory = memoryview(bytearray(layout.size(rows)))
     ours, theirs = Slab(layout, memory, rows), Slab(layout, memory, rows)
@@ -74,10 +74,10 @@ def test_values_go_through_rows_unchanged(
 
 @given(space=fixed_space, rows=st.integers(2, 5), data=st.data())
 @settings(deadline=None)
-def test_what_is_gathered_is_a_copy_in_the_order_asked_for(
+def test_gathered_rows_are_a_copy_in_the_requested_order(
     space: Any, rows: int, data: st.DataObject
 ) -> None:
-    """Also for a contiguous range, which could be had as a view."""
+    """Also for a contiguous range, which could be a view."""
     layout = RowLayout(space, spaces.Discrete(2), (), ())
     slab = Slab(layout, memoryview(bytearray(layout.size(rows))), rows)
     values = [sampled(space, row) for row in range(rows)]
@@ -96,8 +96,8 @@ def test_what_is_gathered_is_a_copy_in_the_order_asked_for(
 
 @given(space=fixed_space)
 @settings(deadline=None)
-def test_a_value_read_for_an_env_is_its_own(space: Any) -> None:
-    """The next request may write the row while the env still holds the last action."""
+def test_a_value_read_for_an_env_is_a_copy(space: Any) -> None:
+    """The next request may write the row while the env still uses the last action."""
     layout = RowLayout(spaces.Discrete(2), space, (), ())
     slab = Slab(layout, memoryview(bytearray(layout.size(1))), 1)
     one, other = sampled(space, 1), sampled(space, 2)
@@ -110,8 +110,8 @@ def test_a_value_read_for_an_env_is_its_own(space: Any) -> None:
 
 @given(space=fixed_space, other=fixed_space)
 @settings(deadline=None)
-def test_rows_of_one_key_have_one_layout(space: Any, other: Any) -> None:
-    """Envs share a slab exactly where their rows have the same arrays at the same places."""
+def test_rows_with_equal_keys_have_the_same_layout(space: Any, other: Any) -> None:
+    """Envs share a slab exactly if their rows have the same arrays at the same offsets."""
     one = RowLayout(space, spaces.Discrete(2), (), ())
     two = RowLayout(other, spaces.Discrete(2), (), ())
     assume(one.observation_leaves != two.observation_leaves)
@@ -135,8 +135,8 @@ def test_rows_of_one_key_have_one_layout(space: Any, other: Any) -> None:
         (spaces.Box(0, 1, (1,)), "text", "dtype <U4"),
     ],
 )
-def test_a_misfit_says_where_and_what(space: Any, value: Any, said: str) -> None:
-    """Its place, and shape and dtype of both what was expected and what was found."""
+def test_a_misfit_names_position_and_difference(space: Any, value: Any, said: str) -> None:
+    """Position, and shape and dtype both expected and found."""
     layout = RowLayout(space, spaces.Discrete(2), (), ())
     slab = Slab(layout, memoryview(bytearray(layout.size(1))), 1)
     with pytest.raises(Misfit, match=said):
@@ -167,7 +167,7 @@ def test_doubles_are_narrowed_as_gymnasium_does() -> None:
     ids=str,
 )
 def test_spaces_without_a_fixed_size_have_no_rows(space: Any) -> None:
-    """One such part makes the whole value travel by the channel."""
+    """One such part makes the whole value pickled."""
     assert leaves(space) is None
     layout = RowLayout(space, spaces.Discrete(2), (), ())
     slab = Slab(layout, memoryview(bytearray(layout.size(2))), 2)
@@ -177,7 +177,7 @@ def test_spaces_without_a_fixed_size_have_no_rows(space: Any) -> None:
 
 @given(head=HEADS, rows=st.integers(1, 3), data=st.data())
 def test_the_flags_are_columns_of_one_array(head: Any, rows: int, data: st.DataObject) -> None:
-    """So that one copy takes all of them along; each is written alone."""
+    """One copy reads all flags; each is written separately."""
     layout = RowLayout(spaces.Discrete(2), spaces.Discrete(2), *head)
     slab = Slab(layout, memoryview(bytearray(layout.size(rows))), rows)
     names = ("terminated", "truncated", "is_reset", "over")
@@ -189,15 +189,15 @@ def test_the_flags_are_columns_of_one_array(head: Any, rows: int, data: st.DataO
     assert (slab.flags == expected).all()
 
 
-def test_a_seed_is_good_for_one_reset() -> None:
-    """The next finds none; 0 is a seed."""
+def test_a_seed_is_used_for_one_reset() -> None:
+    """The next reset finds none; 0 is a seed."""
     layout = RowLayout(spaces.Discrete(2), spaces.Discrete(2), (), ())
     slab = Slab(layout, memoryview(bytearray(layout.size(2))), 2)
     slab.seed[1] = 0 + 1
     assert [slab.take_seed(0), slab.take_seed(1), slab.take_seed(1)] == [None, 0, None]
 
 
-def test_a_tree_keeps_its_shape_when_its_arrays_are_mapped() -> None:
+def test_mapping_a_tree_keeps_its_structure() -> None:
     """Dicts stay dicts and tuples tuples."""
     tree = {"a": (np.ones(2), np.zeros(2)), "b": np.ones(2)}
     found = mapped(lambda array: array.sum(), tree)

@@ -1,6 +1,6 @@
-"""``client_processes.py ADDRESS COUNT TASK [KEYS]``: that many clients, named c0, c1, …
+"""``client_processes.py ADDRESS COUNT TASK [KEYS]``: runs COUNT clients, named c0, c1, …
 
-It loads what they need once and forks them; it prints their pids and ends with them all.
+It imports their modules once and forks them. It prints their pids and ends with them.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def main(address: str, count: int, task: str, keys: str | None = None) -> None:
     for k in range(count):
         pid = os.fork()
         if not pid:
-            # Whoever started all this may be killed.
+            # The program that started this one may be killed.
             try:
                 serve(address, f"c{k}", task, keys)
             finally:

@@ -1,4 +1,4 @@
-"""An env that knows who it is and how often it was stepped, and clients around it."""
+"""An env that counts its steps, and clients that serve it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 class CountingEnv(BaseEnv):
     """Its observation is (identity, seed of the reset, steps since the reset).
 
-    It is finished once the server is gone, so that a client of it ends with its server.
+    It is finished once the server is gone, so that its client ends with the server.
     """
 
     def __init__(self, identity: int = 0, on_step: Callable[[], None] = lambda: None) -> None:
@@ -87,7 +87,7 @@ class ClientThread:
         try:
             with self.client:
                 self.client.run()
-        except BaseException as error:  # noqa: BLE001  # It is raised again in `join`.
+        except BaseException as error:  # noqa: BLE001  # `join` raises it again.
             self.error = error
 
     def join(self) -> None:

@@ -1,4 +1,4 @@
-"""A trainer with an honest client, and strangers who send what they like: for tests and figures."""
+"""A trainer with an honest client, disturbed by unauthenticated peers: for tests and figures."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ _TESTS = Path(__file__).parents[1]
 def disturbed(
     *, curve: bool, messages: int, rate: int, seed: int = 0
 ) -> Iterator[tuple[Any, Any, subprocess.Popen[str]]]:
-    """A group with one CartPole client, its listener, and the process of the strangers.
+    """Yield a group with one CartPole client, its listener, and the process of the peers.
 
     Args:
-        curve: the env_server has keys, and the strangers have none that it knows.
-        messages: of the strangers, who end with the last of them.
-        rate: messages a second, at most.
-        seed: of what they say.
+        curve: the env_server has keys, and the peers have none that it knows.
+        messages: number of messages of the peers, which then end.
+        rate: upper limit of messages per second.
+        seed: of the messages.
     """
     with tempfile.TemporaryDirectory() as directory:
         kwargs: dict[str, Any] = {"connect_timeout": HANG, "heartbeat": 5.0}
@@ -45,16 +45,16 @@ def disturbed(
             client = _start("client_processes.py", address, "1", "CartPole-v1", *keys)
             try:
                 group.reset()
-                strangers = _start(
-                    "strangers.py", address, str(messages), str(rate), str(seed),
+                peers = _start(
+                    "unauthenticated_peers.py", address, str(messages), str(rate), str(seed),
                     *(["curve"] if curve else []),
                 )  # fmt: skip
                 try:
-                    yield group, group["robots-0"]._server[0]._listener, strangers
+                    yield group, group["robots-0"]._server[0]._listener, peers
                 finally:
-                    strangers.kill()
-                    strangers.wait()
-                    strangers.stdout.close()
+                    peers.kill()
+                    peers.wait()
+                    peers.stdout.close()
             finally:
                 client.terminate()
                 client.wait()

@@ -1,4 +1,4 @@
-"""A TCP proxy that knows ZMTP's frames, and mistreats the messages that pass it.
+"""A TCP proxy that knows ZMTP's frames and disturbs the messages that it forwards.
 
 Whole messages are dropped, repeated, delayed and reordered; connections are cut, or
 fall silent without being closed (half-open), as if a cable had been pulled. ZMTP's own
@@ -26,7 +26,7 @@ _MORE, _LONG, _COMMAND = 1, 2, 4
 
 @dataclass(frozen=True)
 class Faults:
-    """Probabilities, for each message."""
+    """Probabilities for each message."""
 
     drop: float = 0.0
     repeat: float = 0.0
@@ -48,8 +48,8 @@ class _Flow:
     greeting_left: int = _GREETING_BYTES
 
     def messages(self) -> Any:
-        """Whole messages and commands that have come in: (bytes, is it a message)."""
-        # Each side sends its greeting piecemeal, as it learns of the other's.
+        """Return the whole messages and commands that have arrived: (bytes, is it a message)."""
+        # Each side sends its greeting in parts, as it receives the other's.
         if self.greeting_left:
             piece = self._taken(min(self.greeting_left, len(self.unread)))
             self.greeting_left -= len(piece)
@@ -82,11 +82,11 @@ class _Pair:
 
 
 class FaultyProxy:
-    """Forwards between clients and `target` in a thread of its own, as faultily as told.
+    """Forwards between clients and `target` in its own thread, with `faults`.
 
     Attributes:
-        address: where clients connect to.
-        tally: how many messages passed, and how many met each fate.
+        address: for clients.
+        tally: number of messages that passed, and number for each fault.
     """
 
     def __init__(self, target: str, faults: Faults, seed: int = 0) -> None:
@@ -185,7 +185,7 @@ class FaultyProxy:
         self._delay(flow, message)
 
     def _delay(self, flow: _Flow, message: bytes) -> None:
-        # What comes meanwhile overtakes it.
+        # Messages that arrive meanwhile overtake it.
         due = time.monotonic() + self._rng.random() * self.faults.delay_seconds
         heapq.heappush(self._late, (due, next(self._order), flow, message))
 

@@ -1,6 +1,6 @@
-"""Spoilt messages against both ends, with a service in between that has to go on.
+"""Corrupted messages for both ends, while requests between them must still be answered.
 
-The tests run a few thousand; ``benchmarks/fuzz_remote.py`` runs as many as asked for.
+The tests run a few thousand; ``benchmarks/fuzz_remote.py`` runs any number.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from remote.random_spaces import mutation
-from remote.strangers import hello
+from remote.unauthenticated_peers import hello
 from remote.unreliable import World
 
 from rlightning_aio.protocol.net.client_session import Refused
@@ -28,12 +28,12 @@ _KEPT = 200
 
 @dataclass
 class Findings:
-    """What came of a run.
+    """Results of a run.
 
     Attributes:
-        frames: spoilt messages that were delivered.
-        steps: steps that were answered meanwhile.
-        malformed: spoilt messages that were recognised as no messages.
+        frames: corrupted messages that were delivered.
+        steps: steps that were answered.
+        malformed: corrupted messages that were recognised as malformed.
         grown: bytes by which memory grew over the second half.
     """
 
@@ -44,7 +44,7 @@ class Findings:
 
 
 def fuzz(frames: int, seed: int) -> Findings:
-    """Deliver `frames` spoilt messages to each end; every fiftieth time, expect service."""
+    """Deliver `frames` corrupted messages to each end; step a client after every fiftieth."""
     rng = np.random.default_rng(seed)
     world = World()
     world.join_all()
@@ -58,11 +58,11 @@ def fuzz(frames: int, seed: int) -> Findings:
             name = "ab"[findings.frames % 2]
             number += 1
             step(world, name, number, findings)
-            for (_, to_server), said in world.said.items():
+            for (_, to_server), said in world.delivered.items():
                 seen[to_server].extend(said)
-            world.said.clear()
+            world.delivered.clear()
             for client in world.clients.values():
-                # Notes of the test's own, which would pass for growth.
+                # The test's own records, which would count as growth.
                 client.executed.clear()
                 client.ended.clear()
             for _ in range(25):
@@ -73,14 +73,14 @@ def fuzz(frames: int, seed: int) -> Findings:
         findings.grown = tracemalloc.get_traced_memory()[0] - held
     finally:
         tracemalloc.stop()
-    findings.malformed = world.server.malformed + sum(
-        client.session.malformed for client in world.clients.values()
+    findings.malformed = world.server.num_malformed + sum(
+        client.session.num_malformed for client in world.clients.values()
     )
     return findings
 
 
 def fuzz_keys(files: int, seed: int, directory: Path) -> int:
-    """Write `files` spoilt key files beside an honest one; how often that was not known."""
+    """Write `files` corrupted key files next to a good one; count how often that was unknown."""
     rng = np.random.default_rng(seed)
     (arm,) = make_keys(directory, ["arm"])
     allowed = directory / "server" / "clients"
@@ -102,10 +102,10 @@ def fuzz_keys(files: int, seed: int, directory: Path) -> int:
 def spoil(
     world: World, name: str, seen: dict[bool, deque[list[bytes]]], rng: np.random.Generator
 ) -> None:
-    """One spoilt message to each end."""
+    """Deliver one corrupted message to each end."""
     client = world.clients[name]
     for to_server, said in seen.items():
-        # What is said last is seldom a hello.
+        # The last message is seldom a hello.
         is_hello = to_server and rng.random() < 0.2
         whole = hello(rng) if is_hello else said[int(rng.integers(len(said)))]
         parts = mutation(rng)(whole)
@@ -119,11 +119,11 @@ def spoil(
 
 
 def step(world: World, name: str, number: int, findings: Findings) -> None:
-    """Have the client step; it may have been driven out, but must come back and serve."""
+    """Step the client, which may have lost its session but must come back and serve."""
     for _ in range(200):
         client = world.clients[name]
         if isinstance(client.todo, Refused):
-            # A process that was sent away ends; somebody starts it again.
+            # A refused process ends and is started again.
             client.kill()
             client.connect()
         world.settle()

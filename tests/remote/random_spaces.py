@@ -1,4 +1,4 @@
-"""Random spaces and values, for whatever has to hold for all of them."""
+"""Random spaces and values, for properties that must hold for all of them."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def sampled(space: gym.Space[Any], seed: int) -> Any:
 
 
 def same(one: Any, other: Any) -> bool:
-    """Whether two values are equal in structure, dtype, shape and content."""
+    """Return True if two values are equal in structure, dtype, shape and content."""
     if isinstance(one, dict):
         return one.keys() == other.keys() and all(same(one[k], other[k]) for k in one)
     if isinstance(one, tuple | list):
@@ -101,7 +101,7 @@ any_info: st.SearchStrategy[dict[str, Any]] = st.dictionaries(
 
 
 def mutation(rng: np.random.Generator) -> Callable[[list[bytes]], list[bytes]]:
-    """A random way to spoil a message."""
+    """Return a random way to corrupt a message."""
 
     def flip(parts: list[bytes]) -> list[bytes]:
         k = int(rng.integers(len(parts)))

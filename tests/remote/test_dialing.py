@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 def test_an_interrupt_while_dialing_closes_what_is_open(
     owner: object, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Wherever a signal comes between the first socket and the last, the env is closed."""
+    """The env is closed wherever a signal arrives between the first socket and the last."""
     real: Callable[..., object] = getattr(owner, name)
 
     def interrupted(*args: object, **kwargs: object) -> object:

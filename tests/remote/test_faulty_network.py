@@ -1,4 +1,4 @@
-"""Through a proxy that mistreats messages and connections: once executed, once answered."""
+"""Through a proxy that disturbs messages and connections: executed once, answered once."""
 
 from __future__ import annotations
 
@@ -59,10 +59,10 @@ NETWORKS = {
 
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("network", NETWORKS)
-def test_none_is_executed_twice_and_each_ends_once(
+def test_no_request_is_executed_twice_and_each_ends_once(
     network: str, record_property: Callable[[str, Any], None]
 ) -> None:
-    """Every number that a trainer sends ends in its own result, a marked one, or a return."""
+    """Every request of the trainer ends in its own result, a marked one, or a first result."""
     envs = [RecordingEnv(k) for k in range(CLIENTS)]
     config = {
         "name": "robots",
@@ -91,23 +91,27 @@ def test_none_is_executed_twice_and_each_ends_once(
     assert ends["answered"] <= len(executed) <= REQUESTS
     fates = [name for name in ("drop", "repeat", "delay", "cut", "silence")
              if getattr(NETWORKS[network], name)]  # fmt: skip
-    assert all(proxy.tally[name] for name in fates), "the network was too kind"
+    assert all(proxy.tally[name] for name in fates), "the network had too few faults"
     if not {"cut", "silence"} & set(fates):
         assert ends["answered"] == REQUESTS
 
 
 def exchange(group: Any, requests: int) -> dict[str, int]:
-    """Step whoever has answered until so many requests have ended; what they ended in."""
+    """Step clients that have answered until `requests` have ended; count how they ended."""
     ends = {"answered": 0, "marked": 0, "returned": 0}
     asked: dict[str, int] = {}
     sent = 0
     batch, _ = group.reset()
     while True:
-        for ret in batch.values():
+        for ret, action in zip(batch.values(), batch.sent.action, strict=True):
             number = asked.pop(ret.env_id, None)
+            if number is None:
+                assert np.isnan(action).all(), "a result that answers nothing"
+            else:
+                assert action[0] == number / 2**20, "the answer to another request"
             if "client_lost" in ret.info:
                 assert ret.last_truncated
-                assert number is not None, "a loss that nobody waited for"
+                assert number is not None, "a loss without a request"
                 ends["marked"] += 1
             elif number is not None:
                 fresh = ret.observation[1] == -1

@@ -1,4 +1,4 @@
-"""Clients in a group: what a trainer sees of them, awaited or not."""
+"""Clients in a group, asynchronous and synchronous."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +19,7 @@ from patience import HANG
 from remote.counting import ClientThread, CountingEnv
 
 import rlightning_aio
-from rlightning_aio import sync
+from rlightning_aio import registry, sync
 from rlightning_aio.errors import (
     BadAction,
     ClientRefused,
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from rlightning_aio.types import EnvRet, PolicyResponse
 
 HEARTBEAT = 5.0
-"""Seconds; nobody who is merely waiting for its turn is taken for dead."""
+"""Seconds; a client that only waits must not count as dead."""
 TRAJECTORY_STEPS = int(os.environ.get("RLIGHTNING_AIO_TRAJECTORY_STEPS", "800"))
 """Steps to compare, of all clients together."""
 
@@ -49,7 +50,7 @@ CARTPOLE = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1", "num_
 
 @contextmanager
 def clients(group: Any, *envs: CountingEnv, server: str = "robots-0") -> Iterator[list[Any]]:
-    """Clients c0, c1, … of the envs; they end when the group is closed within."""
+    """Yield clients c0, c1, … of the envs; they end when the block closes the group."""
     threads = [ClientThread(group[server].address, f"c{k}", env) for k, env in enumerate(envs)]
     yield threads
     for thread in threads:
@@ -61,7 +62,7 @@ def actions(batch: Any) -> np.ndarray[Any, Any]:
 
 
 def test_clients_are_reset_with_their_seeds_and_stepped_by_their_names() -> None:
-    """Results carry the server's id in the batch, and the client's in themselves."""
+    """The batch has the server's id for each result, and the result has the client's."""
     envs = [CountingEnv(k) for k in range(3)]
     with sync.build_env_group(entry(min_clients=3)) as group, clients(group, *envs):
         batch, flags = group.reset(seed=10)
@@ -77,8 +78,8 @@ def test_clients_are_reset_with_their_seeds_and_stepped_by_their_names() -> None
     assert all(env.disconnects == 1 and env.closed for env in envs)
 
 
-async def test_the_same_awaited() -> None:
-    """The asynchronous group sees the same clients in the same way, on either loop."""
+async def test_an_asynchronous_group_sees_the_same_clients() -> None:
+    """With the same results, on either event loop."""
     envs = [CountingEnv(k) for k in range(3)]
     async with rlightning_aio.build_env_group(entry(min_clients=3)) as group:
         with clients(group, *envs):
@@ -93,8 +94,8 @@ async def test_the_same_awaited() -> None:
             await group.close()
 
 
-def test_results_say_when_their_client_sent_them_by_its_own_clock() -> None:
-    """However wrong that goes, and however late the trainer reads; statistics go by its own."""
+def test_results_have_the_time_of_their_clients_clock() -> None:
+    """However wrong that clock is and however late the trainer reads; statistics use its own."""
     year_ns = 365 * 24 * 3600 * 10**9
 
     class Behind(CountingEnv):
@@ -129,8 +130,8 @@ def test_a_step_of_a_client_must_be_asynchronous() -> None:
         group.close()
 
 
-def test_options_that_cannot_travel_to_a_client_are_refused_before_anything_is_sent() -> None:
-    """Although local envs could have them; all of them can be asked again."""
+def test_options_that_cannot_be_sent_to_a_client_are_refused_before_anything_is_sent() -> None:
+    """Although local envs would accept them; all envs can be reset again."""
     with (
         sync.build_env_group([CARTPOLE, entry()], mixed_actions=True) as group,
         clients(group, CountingEnv()),
@@ -145,7 +146,7 @@ def test_options_that_cannot_travel_to_a_client_are_refused_before_anything_is_s
 
 
 def test_extras_that_are_too_large_together_are_refused_before_anything_is_sent() -> None:
-    """Although each of them is not; the clients can be stepped with less."""
+    """Although each of them alone is small enough; the clients can be stepped with less."""
     large = ["x" * (3 << 20)] * 2
     with (
         sync.build_env_group(entry(min_clients=2)) as group,
@@ -173,19 +174,19 @@ def test_lengths_count_each_server_once() -> None:
 
 
 def test_a_client_with_other_actions_than_the_local_envs_is_refused() -> None:
-    """It is told why; the group waits for one that fits."""
+    """It receives the reason; the group waits for one that fits."""
     with sync.build_env_group([CARTPOLE, entry(connect_timeout=0.2)]) as group:
-        stranger = ClientThread(group["robots-0"].address, "c0")
-        while stranger.error is None:
+        other = ClientThread(group["robots-0"].address, "c0")
+        while other.error is None:
             with pytest.raises(TimeoutError, match="0 of 1 clients"):
                 group.reset()
         group.close()
         with pytest.raises(ClientRefused, match="different action spaces"):
-            stranger.join()
+            other.join()
 
 
 def test_local_envs_and_clients_mix_in_one_batch() -> None:
-    """First ready, first served, whoever it is; by_name() makes stackable parts."""
+    """First ready, first served; by_name() makes stackable parts."""
     envs = [CountingEnv(k) for k in range(2)]
     seen: dict[str, int] = {}
     with (
@@ -193,7 +194,7 @@ def test_local_envs_and_clients_mix_in_one_batch() -> None:
         clients(group, *envs),
     ):
         batch, _ = group.reset(seed=0)
-        # On a busy machine a worker may not get its turn for a while.
+        # On a busy machine a worker may not run for a while.
         for _ in range(20_000):
             for name, part in batch.by_name().items():
                 for ret in part.values():
@@ -209,7 +210,7 @@ def test_local_envs_and_clients_mix_in_one_batch() -> None:
 
 
 def test_a_reset_waits_for_min_clients_and_no_longer_than_connect_timeout() -> None:
-    """The message says how many are there, and where they are expected."""
+    """The message has the number of clients and the address."""
     with (
         sync.build_env_group(entry(min_clients=2, connect_timeout=0.3)) as group,
         clients(group, CountingEnv()),
@@ -231,8 +232,8 @@ def test_a_reset_without_seed_takes_the_reset_that_comes_with_joining() -> None:
         group.close()
 
 
-def test_a_client_that_joins_a_running_group_comes_through_collect() -> None:
-    """Its first result is unasked, and from then on it is an env like the others."""
+def test_a_client_that_joins_a_running_group_is_collected() -> None:
+    """Its first result answers no request; then it is an env like the others."""
     with (
         sync.build_env_group(entry()) as group,
         clients(group, CountingEnv(7), CountingEnv(8)),
@@ -246,8 +247,8 @@ def test_a_client_that_joins_a_running_group_comes_through_collect() -> None:
         group.close()
 
 
-def test_a_server_to_which_nobody_has_come_yet_is_no_obstacle_to_the_next() -> None:
-    """Whatever goes along with actions, they reach the clients for whom they are."""
+def test_a_server_without_clients_does_not_disturb_the_next_one() -> None:
+    """Actions reach their clients, whatever is attached to them."""
 
     class Telling(CountingEnv):
         def step(self, policy_resp: PolicyResponse) -> EnvRet:
@@ -270,7 +271,7 @@ def test_a_server_to_which_nobody_has_come_yet_is_no_obstacle_to_the_next() -> N
 
 
 def test_a_client_that_finishes_leaves_one_marked_result_and_no_hang() -> None:
-    """Stepping the one that left is answered once; then the others go on alone."""
+    """One step of the client that left is answered; then the others continue alone."""
     leaver, stayer = CountingEnv(0), CountingEnv(1)
 
     def leave_after_three() -> None:
@@ -296,7 +297,7 @@ def test_a_client_that_finishes_leaves_one_marked_result_and_no_hang() -> None:
 
 
 def test_a_client_that_returns_starts_a_new_episode() -> None:
-    """The trainer sees the end of the old one first, whatever loop it runs."""
+    """The trainer sees the end of the old episode first."""
     with sync.build_env_group(entry()) as group:
         address = group["robots-0"].address
         with clients(group, env := CountingEnv(0)):
@@ -315,11 +316,55 @@ def test_a_client_that_returns_starts_a_new_episode() -> None:
         again.join()
 
 
-def test_a_client_that_takes_anothers_place_takes_nothing_else_of_it(
+def test_first_results_have_columns_for_what_was_sent_and_hold_nothing() -> None:
+    """Also before the first response, and for a client that joins while another is stepped."""
+    with (
+        sync.build_env_group([entry(), entry("others")]) as group,
+        clients(group, CountingEnv(0)),
+    ):
+        batch, _ = group.collect_async(deadline=HANG)
+        assert batch.sent.action.shape == (1, 2)
+        assert batch.sent.action.dtype == np.float32
+        assert np.isnan(batch.sent.action).all()
+        sent = batch.respond(action=actions(batch), log_prob=np.array([[0.5, 1.0]]), tag=["a"])
+        group.step_async(sent)
+        assert batch.sent.log_prob.shape == (1, 2)
+        answer, _ = group.collect_async(deadline=HANG)
+        assert answer.sent.log_prob.tolist() == [[0.5, 1.0]]
+        with clients(group, CountingEnv(1), server="others-0"):
+            joined, _ = group.collect_async(deadline=HANG)
+            assert joined.ids() == ["others-0"]
+            assert np.isnan(joined.sent.action).all()
+            group.close()
+        assert list(answer.sent) == ["action", "log_prob", "tag"]
+
+
+def test_the_first_result_after_a_loss_carries_what_was_sent_while_the_client_was_away() -> None:
+    """The marked result carries what was sent before; a reset that follows carries nothing."""
+    with sync.build_env_group(entry()) as group:
+        with clients(group, env := CountingEnv(0)):
+            batch, _ = group.reset()
+            env.on_step = lambda: setattr(env, "finished", True)
+            while "client_lost" not in batch.info()[0]:
+                group.step_async(batch.respond(action=actions(batch), tag=["before"]))
+                batch, _ = group.collect_async(deadline=HANG)
+        assert batch.sent.tag == ["before"]
+        group.step_async(batch.respond(action=actions(batch), tag=["while away"]))
+        with clients(group, env := CountingEnv(1)):
+            batch, _ = group.collect_async(deadline=HANG)
+            assert batch.observation.tolist() == [[1, -1, 0]]
+            assert batch.sent.tag == ["while away"]
+            batch, _ = group.reset(seed=1)
+            assert batch.sent.tag == [None]
+            group.close()
+
+
+def test_a_client_that_takes_the_slot_of_another_takes_nothing_else(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Batches that are held, handles and statistics go on naming the one whose they are."""
-    monkeypatch.setattr("rlightning_aio.group.build.MAX_CLIENTS", 1)
+    """Earlier batches, handles and statistics still name the earlier client."""
+    place = replace(registry.placement_of("env_server", "process"), max_members=1)
+    monkeypatch.setitem(registry._PLACED_BY_BACKEND, "env_server", place)
     with sync.build_env_group(entry()) as group:
         address = group["robots-0"].address
         with clients(group, env := CountingEnv(0)), group.auto_reset(2):
@@ -337,7 +382,7 @@ def test_a_client_that_takes_anothers_place_takes_nothing_else_of_it(
         assert held.env_ids() == ["robots-0/c0"]
         assert held.values()[0].env_id == "robots-0/c0"
         assert batch.env_ids() == ["robots-0/other"]
-        # What answers the old one is not for the new one.
+        # Responses to the old client do not step the new one.
         for answered in (held, first):
             group.step_async(answered.respond(action=actions(answered)))
         with pytest.raises(UnknownEnv, match="robots-0/c0"):
@@ -347,7 +392,7 @@ def test_a_client_that_takes_anothers_place_takes_nothing_else_of_it(
         group.step_async(batch.respond(action=actions(batch)))
         batch, _ = group.collect_async(deadline=HANG)
         assert batch.observation.tolist() == [[5, -1, 1]]
-        # The first result, which nobody asked for, counts as an answered request, too.
+        # The first result counts as an answered request, too.
         assert {id_: one["requests"] for id_, one in group.get_env_stats().items()} == {
             "robots-0/other": 2
         }
@@ -359,11 +404,11 @@ def test_a_client_that_takes_anothers_place_takes_nothing_else_of_it(
         other.join()
 
 
-def test_a_client_that_is_forgotten_is_asked_in_vain_and_harms_no_other(
+def test_a_response_to_a_forgotten_client_disturbs_no_other(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Whoever needed its seat is stepped in the same call."""
-    monkeypatch.setattr("rlightning_aio.protocol.net.server_session._MAX_SEATS", 1)
+    """The client that needed its record is stepped in the same call."""
+    monkeypatch.setattr("rlightning_aio.protocol.net.client_registry._MAX_RECORDS", 1)
     with sync.build_env_group(entry()) as group:
         address = group["robots-0"].address
         with clients(group, env := CountingEnv(0)):
@@ -389,7 +434,7 @@ def test_a_client_that_is_forgotten_is_asked_in_vain_and_harms_no_other(
 
 
 async def test_a_client_that_returns_while_the_trainer_thinks_is_no_error() -> None:
-    """An answer to the old life's last result is not taken for one to the new life's first."""
+    """A response to the last result of the old session does not step the new one."""
     async with rlightning_aio.build_env_group(entry()) as group:
         address = group["robots-0"].address
         with clients(group, env := CountingEnv(0)):
@@ -402,12 +447,13 @@ async def test_a_client_that_returns_while_the_trainer_thinks_is_no_error() -> N
         assert "client_lost" in marked.info()[0]
         again = ClientThread(address, "c0", CountingEnv(5))
         async with asyncio.timeout(HANG):
-            # The trainer thinks, and the event loop goes on.
-            while not group["robots-0"].clients:  # noqa: ASYNC110  # Nothing tells of it.
+            # The trainer is busy while the event loop runs.
+            while not group["robots-0"].clients:  # noqa: ASYNC110  # There is no event for it.
                 await asyncio.sleep(0)
-        group.step_async(marked.respond(action=actions(marked)))
+        group.step_async(marked.respond(action=actions(marked), tag=["while back"]))
         batch, _ = await group.collect_async(deadline=HANG)
         assert batch.observation.tolist() == [[5, -1, 0]]
+        assert batch.sent.tag == ["while back"]
         group.step_async(batch.respond(action=actions(batch)))
         batch, _ = await group.collect_async(deadline=HANG)
         assert batch.observation.tolist() == [[5, -1, 1]]
@@ -416,7 +462,7 @@ async def test_a_client_that_returns_while_the_trainer_thinks_is_no_error() -> N
 
 
 async def test_a_client_that_returns_before_its_loss_is_collected_waits_its_turn() -> None:
-    """First the mark that it was gone, as it was left; then the first result of its new life."""
+    """The marked result comes first, then the first result of the new session."""
 
     def leave() -> None:
         raise SystemExit
@@ -430,8 +476,8 @@ async def test_a_client_that_returns_before_its_loss_is_collected_waits_its_turn
             await asyncio.to_thread(gone.join)
         again = ClientThread(address, "c0", CountingEnv(5))
         async with asyncio.timeout(HANG):
-            # Nobody collects, and the event loop goes on.
-            while not group["robots-0"].clients:  # noqa: ASYNC110  # Nothing tells of it.
+            # Nothing is collected while the event loop runs.
+            while not group["robots-0"].clients:  # noqa: ASYNC110  # There is no event for it.
                 await asyncio.sleep(0)
         lost, _ = await group.collect_async(deadline=HANG)
         assert lost.observation.tolist() == [[0, -1, 0]]
@@ -446,8 +492,8 @@ async def test_a_client_that_returns_before_its_loss_is_collected_waits_its_turn
         again.join()
 
 
-async def test_closing_a_group_tells_a_collector_that_waits_for_clients() -> None:
-    """With time limits to watch, it looks at all hosts again; the env_server is gone by then."""
+async def test_closing_a_group_ends_a_collect_that_waits_for_clients() -> None:
+    """With time limits it checks all hosts again, although the env_server is gone by then."""
     released = threading.Event()
     env = CountingEnv(on_step=lambda: released.wait(HANG))
     timed = {**CARTPOLE, "num_workers": 1, "step_timeout": HANG}
@@ -465,7 +511,7 @@ async def test_closing_a_group_tells_a_collector_that_waits_for_clients() -> Non
 
 
 def test_an_env_that_raises_at_the_client_can_be_reset_and_used_again() -> None:
-    """`EnvRaised` with the remote traceback, in the client's name."""
+    """The group raises `EnvRaised` with the client's name and the remote traceback."""
     env = CountingEnv(0)
 
     def fail() -> None:
@@ -501,7 +547,7 @@ def test_auto_reset_reaches_clients() -> None:
 
 
 def test_a_server_that_is_restarted_gets_its_clients_back() -> None:
-    """Clients that reconnect survive; each is told once that its server was gone."""
+    """Clients reconnect; `on_disconnect` is called once for each lost server."""
     env = CountingEnv(0)
     env.stays = True
     with sync.build_env_group(entry()) as group:
@@ -520,7 +566,7 @@ def test_a_server_that_is_restarted_gets_its_clients_back() -> None:
 
 @contextmanager
 def client_processes(address: str, count: int, task: str) -> Iterator[list[int]]:
-    """`count` clients in processes of their own; their pids."""
+    """Run `count` clients in their own processes; yield the pids."""
     script = Path(__file__).with_name("client_processes.py")
     process = subprocess.Popen(
         [sys.executable, str(script), address, str(count), task],
@@ -538,7 +584,7 @@ def client_processes(address: str, count: int, task: str) -> Iterator[list[int]]
 
 
 def local_path(task: str, seed: int, actions: np.ndarray[Any, Any]) -> list[Any]:
-    """Observations of a plain env, reset in place of the step after an end."""
+    """Return the observations of a plain env that is reset in place of the step after an end."""
     import gymnasium as gym
 
     env = gym.make(task)
@@ -586,7 +632,7 @@ async def test_trajectories_of_clients_equal_local_ones() -> None:
 def test_a_client_process_that_dies_or_stops_is_found_by_its_silence(
     signal_name: str,
 ) -> None:
-    """Its request ends in one marked result; the others go on."""
+    """Its request ends in one marked result; the other client continues."""
     import signal
 
     with (

@@ -1,4 +1,4 @@
-"""Whatever a hello says, it is let in or refused, and costs next to nothing."""
+"""Every hello is admitted or refused, whatever it contains, and costs next to nothing."""
 
 from __future__ import annotations
 
@@ -22,7 +22,14 @@ from rlightning_aio.errors import EnvRaised
 from rlightning_aio.protocol.net import wire
 from rlightning_aio.protocol.net.server_session import ServerSessions
 from rlightning_aio.protocol.net.space_description import describe, space_from
-from rlightning_aio.protocol.net.wire import MAX_BYTES_IN_ALL, Bye, Failure, Hello, Result, Writer
+from rlightning_aio.protocol.net.wire import (
+    MAX_BYTES_IN_ALL,
+    Bye,
+    ClientHello,
+    ClientResult,
+    Failure,
+    Writer,
+)
 
 if TYPE_CHECKING:
     from rlightning_aio.types import EnvRet, PolicyResponse
@@ -35,11 +42,11 @@ ESCAPES = "\x1b[2J\r\nfake: \u202e line\x07"
 
 def hello(name: str = "x", nonce: int = 1, **fields: Any) -> list[bytes]:
     said = {"observation_space": SMALL, "action_space": SMALL, **fields}
-    return Writer().write(Hello(version=1, name=name, nonce=nonce, **said))
+    return Writer().write(ClientHello(version=1, name=name, nonce=nonce, **said))
 
 
 def answers(server: ServerSessions) -> list[dict[str, Any]]:
-    """What the server has said since it was asked last."""
+    """Return the messages of the server since the last call."""
     said = [msgspec.msgpack.decode(outgoing.parts[0]) for outgoing in server.outbox]
     server.outbox.clear()
     return said
@@ -78,7 +85,7 @@ HOSTILE: list[Any] = [
 
 @pytest.mark.parametrize("place", ["observation_space", "action_space"])
 def test_every_hello_is_answered(place: str) -> None:
-    """Although the trainer has arithmetic and warnings raise."""
+    """Also if arithmetic errors and warnings raise in the trainer."""
     server = ServerSessions("srv", heartbeat=5.0)
     with np.errstate(all="raise"), warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -89,7 +96,7 @@ def test_every_hello_is_answered(place: str) -> None:
             assert answer["nonce"] == nonce
             assert answer.get("text", "").isprintable()
             assert len(answer.get("text", "")) < 1100
-    assert server.malformed == 0
+    assert server.num_malformed == 0
 
 
 _BIG = st.sampled_from([0, 1, 2, 127, 255, 2**31, 2**62, TOP, 2**64 - 1, -1, -(2**63)])
@@ -108,10 +115,10 @@ def test_a_description_with_any_field_changed_is_answered(space: Any, data: st.D
     with np.errstate(all="raise"), warnings.catch_warnings():
         warnings.simplefilter("error")
         server.receive(b"r", None, hello(observation_space=description), 0.0)
-    assert len(server.outbox) + server.malformed == 1
+    assert len(server.outbox) + server.num_malformed == 1
 
 
-def test_a_large_space_costs_what_was_said_of_it() -> None:
+def test_a_large_space_costs_only_its_description() -> None:
     """Twenty clients that announce 64 MiB take no memory before they send a result."""
     server = ServerSessions("srv", heartbeat=5.0)
     server.receive(b"r", None, hello("first"), 0.0)
@@ -125,7 +132,7 @@ def test_a_large_space_costs_what_was_said_of_it() -> None:
 
 
 def test_all_clients_together_have_a_limit(caplog: pytest.LogCaptureFixture) -> None:
-    """The one too many is told why, and to try later; the log has one line."""
+    """One client too many is refused for now, with the reason; the log has one line."""
     server = ServerSessions("srv", heartbeat=5.0)
     each = (64 << 20) + 8 + 8 + 2  # Observation, action, reward and two flags.
     most = MAX_BYTES_IN_ALL // each
@@ -142,25 +149,25 @@ def test_all_clients_together_have_a_limit(caplog: pytest.LogCaptureFixture) -> 
     assert answers(server)[-1]["type"] == "welcome"
 
 
-def test_those_who_are_away_make_room() -> None:
-    """Whoever joins and leaves under ever new names takes no more than the limit."""
+def test_absent_clients_make_room() -> None:
+    """A client that joins and leaves under new names never takes more than the limit."""
     server = ServerSessions("srv", heartbeat=5.0)
     half = {**BOX, "shape": [32 << 20], "low": 0}
     frame = bytes(32 << 20)
     for k in range(40):
         server.receive(b"r", None, hello(f"c{k}", observation_space=half), 0.0)
         (said,) = answers(server)
-        first = Result(session=said["session"], number=0, reward=0.0, terminated=False,
+        first = ClientResult(session=said["session"], number=0, reward=0.0, terminated=False,
                        truncated=False)  # fmt: skip
         server.receive(b"r", None, Writer().write(first, [frame]), 0.0)
         server.receive(b"r", None, Writer().write(Bye(session=said["session"])), 0.0)
         server.take()
-    assert len(server._seats) == MAX_BYTES_IN_ALL // ((32 << 20) + 18)
-    assert server._reserved <= MAX_BYTES_IN_ALL
+    assert len(server._registry.records) == MAX_BYTES_IN_ALL // ((32 << 20) + 18)
+    assert server._registry._reserved <= MAX_BYTES_IN_ALL
 
 
 def test_a_hello_of_any_length_costs_little() -> None:
-    """It is refused before anything is made of it."""
+    """It is refused before its spaces are read."""
     server = ServerSessions("srv", heartbeat=5.0)
     long = {"type": "multi_discrete", "nvec": [1] * 300_000}
     server.receive(b"r", None, hello(observation_space=long), 0.0)
@@ -172,7 +179,7 @@ def test_a_hello_of_any_length_costs_little() -> None:
 def test_texts_of_clients_are_shown_without_control_characters(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """Reasons, errors and what is wrong with a message, in logs, infos and errors."""
+    """Reasons and errors in logs, infos and exceptions."""
     server = ServerSessions("srv", heartbeat=5.0)
     long = ESCAPES * 10_000
     with caplog.at_level(logging.INFO, "rlightning_aio"):
@@ -183,16 +190,16 @@ def test_texts_of_clients_are_shown_without_control_characters(
         server.receive(b"r", None, Writer().write(failure), 0.0)
         server.receive(b"r", None, hello("leaves"), 0.0)
         (said,) = answers(server)
-        first = Result(session=said["session"], number=0, reward=0.0, terminated=False,
+        first = ClientResult(session=said["session"], number=0, reward=0.0, terminated=False,
                        truncated=False)  # fmt: skip
         server.receive(b"r", None, Writer().write(first, [bytes(8)]), 0.0)
-        server.submit("leaves", 1, 0, {}, 0.0)
+        server.requests.step("leaves", 1, 0, {}, 0.0)
         server.receive(b"r", None, Writer().write(Bye(session=said["session"], reason=long)), 0.0)
         server.receive(b"r", None, hello(ESCAPES), 0.0)
         server.receive(b"r", None, hello(observation_space={"type": ESCAPES}), 0.0)
         server.receive(b"r", None, [msgspec.msgpack.encode({"type": ESCAPES})], 0.0)
     messages = [record.getMessage() for record in caplog.records]
-    assert len(messages) == 5
+    assert len(messages) == 6
     assert all(message.isprintable() and len(message) < 2500 for message in messages)
     (_, lost) = server.take()
     assert lost.info["client_lost"].isprintable()
@@ -200,7 +207,7 @@ def test_texts_of_clients_are_shown_without_control_characters(
 
 
 class _Hostile(CountingEnv):
-    """Its rewards overflow what is summed up, and its words are a terminal's."""
+    """Its rewards overflow sums, and its texts contain terminal codes."""
 
     def step(self, policy_resp: PolicyResponse) -> EnvRet:
         super().step(policy_resp)
@@ -212,8 +219,8 @@ class _Hostile(CountingEnv):
         return ret
 
 
-def test_numbers_of_clients_raise_nothing_in_a_trainer_that_has_them_raise() -> None:
-    """And an error of the env's is shown in plain words."""
+def test_numbers_of_clients_raise_nothing_in_a_trainer_with_strict_arithmetic() -> None:
+    """An error of the env is shown without control characters."""
     with (
         np.errstate(all="raise"),
         sync.build_env_group(
@@ -239,7 +246,7 @@ def test_numbers_of_clients_raise_nothing_in_a_trainer_that_has_them_raise() -> 
 
 
 class _Deep(CountingEnv):
-    """What it tells takes a stack to be taken apart that no process has."""
+    """Its infos are nested deeper than any stack can process."""
 
     def step(self, policy_resp: PolicyResponse) -> EnvRet:
         ret = super().step(policy_resp)
@@ -248,9 +255,9 @@ class _Deep(CountingEnv):
         return ret
 
 
-def test_an_info_of_any_depth_costs_its_own_client_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_info_of_any_depth_affects_only_its_own_client(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its session ends, and the others' results arrive."""
-    # As a client that knows no limit would.
+    # Like a client without limits.
     monkeypatch.setattr(wire, "_OPEN_FIELDS", {}, raising=False)
     settings = {"connect_timeout": HANG, "min_clients": 2}
     with sync.build_env_group(
@@ -273,7 +280,7 @@ def test_an_info_of_any_depth_costs_its_own_client_alone(monkeypatch: pytest.Mon
 
 
 def test_a_space_made_of_a_description_is_a_box_like_any_other() -> None:
-    """It can be compared, sampled and written to a file."""
+    """It can be compared, sampled and pickled."""
     said = {"type": "box", "shape": [3, 2], "dtype": "float32", "low": [0, 1], "high": "inf"}
     space = space_from(said)
     assert space.sample().shape == (3, 2)

@@ -1,25 +1,29 @@
-"""Which keys count: those that lie in the directory now."""
+"""The allowed keys are those in the directory now."""
 
 from __future__ import annotations
 
 import os
 import shutil
+import stat
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
+import pytest
+
+from rlightning_aio.errors import ConfigError
 from rlightning_aio.remote import make_keys
 from rlightning_aio.remote.keys import AllowedKeys, read_client_keys, read_keys
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    import pytest
-
 
 def laid_out(tmp_path: Path) -> tuple[AllowedKeys, Path, bytes, bytes]:
-    """The allowed keys, their directory, and the public keys of arm and leg."""
+    """Return the allowed keys, their directory, and the public keys of arm and leg."""
     arm, leg = make_keys(tmp_path, ["arm", "leg"])
     allowed = tmp_path / "server" / "clients"
-    # As if they had been made long ago.
+    # Make them look old.
     for path in allowed.iterdir():
         os.utime(path, ns=(0, 0))
     return (
@@ -28,6 +32,34 @@ def laid_out(tmp_path: Path) -> tuple[AllowedKeys, Path, bytes, bytes]:
         read_client_keys(arm).public,
         read_client_keys(leg).public,
     )
+
+
+def test_keys_that_cannot_be_written_leave_nothing(tmp_path: Path) -> None:
+    """A client has all of its files, or none; those who already had keys keep them."""
+    make_keys(tmp_path, ["arm"])
+    secret = tmp_path / "server" / "server.key_secret"
+    before = secret.read_bytes()
+    os.mkfifo(tmp_path / "server" / "clients" / "leg.key")
+    with pytest.raises(ConfigError, match=r"a FIFO, not a regular file: .*leg\.key"):
+        make_keys(tmp_path, ["leg"])
+    assert not (tmp_path / "leg").exists()
+    assert secret.read_bytes() == before
+    assert stat.S_IMODE(secret.stat().st_mode) == 0o600
+    assert stat.S_IMODE((tmp_path / "arm" / "client.key_secret").stat().st_mode) == 0o600
+
+
+def test_keys_made_at_once_are_of_one_server(tmp_path: Path) -> None:
+    names = [f"arm-{index}" for index in range(8)]
+    together = threading.Barrier(len(names))
+
+    def make(name: str) -> Path:
+        together.wait()
+        return make_keys(tmp_path, [name])[0]
+
+    with ThreadPoolExecutor(len(names)) as pool:
+        made = [read_client_keys(folder) for folder in pool.map(make, names)]
+    server = read_keys(tmp_path / "server" / "server.key_secret").public
+    assert {keys.server for keys in made} == {server}
 
 
 def test_each_change_of_a_file_counts_at_once(tmp_path: Path) -> None:
@@ -45,7 +77,7 @@ def test_each_change_of_a_file_counts_at_once(tmp_path: Path) -> None:
 
 
 def test_a_file_that_is_written_over_within_one_tick_of_the_clock_counts(tmp_path: Path) -> None:
-    """Its stamps are then what they were, size and all."""
+    """Although its stamps have not changed, the size included."""
     keys, directory, arm, leg = laid_out(tmp_path)
     path = directory / "arm.key"
     os.utime(path)
@@ -60,14 +92,14 @@ def test_a_file_that_is_written_over_within_one_tick_of_the_clock_counts(tmp_pat
 def test_files_that_have_not_changed_are_not_read_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A question costs a look at their stamps."""
+    """A lookup only compares their stamps."""
     keys, _, arm, _ = laid_out(tmp_path)
     assert keys.owner(arm) == "arm"
     monkeypatch.setattr("rlightning_aio.remote.keys.read_keys", None)
     assert keys.owner(arm) == "arm"
 
 
-def test_what_holds_no_key_is_left_out_with_one_warning(
+def test_a_file_without_a_key_is_skipped_with_one_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A bad name, a bad content, a directory, a pipe, a link to nowhere."""
@@ -90,15 +122,15 @@ def test_what_holds_no_key_is_left_out_with_one_warning(
     assert len(messages) == 6
 
 
-def test_a_directory_that_cannot_be_read_lets_nobody_in(
+def test_a_directory_that_cannot_be_read_admits_no_client(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """It is said once, and a directory that comes back counts again."""
+    """One warning; a directory that comes back counts again."""
     keys, directory, arm, _ = laid_out(tmp_path)
     away = directory.rename(tmp_path / "away")
     assert [keys.owner(arm), keys.owner(arm)] == [None, None]
     assert len(caplog.records) == 1
-    assert "no client gets in" in caplog.text
+    assert "no client is let in" in caplog.text
     away.rename(directory)
     assert keys.owner(arm) == "arm"
     assert read_keys(directory / "arm.key").public == arm

@@ -1,4 +1,4 @@
-"""Whatever kind of env dials in, the trainer sees what it would see of a local one."""
+"""Clients of every kind of env give the same results as local envs."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ class Speaking(_Sampling):
 
 
 class Chunked(_Sampling):
-    """Its actions may be anything."""
+    """It accepts any action."""
 
     transforms_actions = True
 
@@ -145,7 +145,7 @@ def actions_of(kind: type[_Sampling], step: int) -> Any:
 
 
 def trajectory(group: Any, kind: type[_Sampling]) -> Iterator[Any]:
-    """A seeded reset, eight steps with extras, and a reset with options: all that is told."""
+    """Return all results of a seeded reset, eight steps with extras, and a reset with options."""
     batch, _ = group.reset(seed=7)
     yield batch.values()[0]
     for step in range(8):
@@ -158,25 +158,25 @@ def trajectory(group: Any, kind: type[_Sampling]) -> Iterator[Any]:
     yield batch.values()[0]
 
 
-def told(ret: Any) -> dict[str, Any]:
+def described(ret: Any) -> dict[str, Any]:
     fields = ("observation", "last_reward", "last_terminated", "last_truncated")
-    # Tuples arrive as lists, whichever way.
+    # Tuples arrive as lists in both cases.
     return {name: getattr(ret, name) for name in fields} | {"info": ret.info, "extra": ret._extra}
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_client_tells_what_a_local_env_tells(kind: type[_Sampling]) -> None:
+def test_a_client_gives_the_results_of_a_local_env(kind: type[_Sampling]) -> None:
     """Observations, rewards, flags, infos, extras and episodes; the responses reach the env."""
     name = f"sampling-{kind.__name__}"
     ENVS.register(name)(kind)
     local = {"name": "here", "backend": name, "task": "any", "placement": "inline"}
     with sync.build_env_group(local) as group:
-        expected = [told(ret) for ret in trajectory(group, kind)]
+        expected = [described(ret) for ret in trajectory(group, kind)]
         stats = group.get_env_stats()["here-0"]
     with sync.build_env_group({"name": "there", "backend": "env_server"}) as group:
         env = kind(EnvConfig(name="there", backend=name, task="any"))
         thread = ClientThread(group["there-0"].address, "client", env)
-        found = [told(ret) for ret in trajectory(group, kind)]
+        found = [described(ret) for ret in trajectory(group, kind)]
         stats_of_client = group.get_env_stats()["there-0/client"]
         group.close()
         thread.join()

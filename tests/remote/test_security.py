@@ -1,8 +1,9 @@
-"""Who may come in, and what strangers can do: nothing."""
+"""Only clients with keys are admitted, and other peers do no harm."""
 
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import pickle
 import shutil
@@ -16,13 +17,14 @@ import zmq
 from patience import HANG
 from remote.counting import ClientThread, CountingEnv
 from remote.random_spaces import mutation
+from zmq.utils.monitor import recv_monitor_message
 
 from rlightning_aio import ConfigError, sync
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.errors import StartFailed
-from rlightning_aio.hosts.listener import server_settings
-from rlightning_aio.protocol.net.wire import Hello, Writer
-from rlightning_aio.remote import RemoteEnvClient, make_keys
+from rlightning_aio.hosts.server_settings import server_settings
+from rlightning_aio.protocol.net.wire import ClientHello, Writer
+from rlightning_aio.remote import RemoteEnvClient, client, make_keys
 from rlightning_aio.remote.keys import read_client_keys, read_server_keys
 
 if TYPE_CHECKING:
@@ -38,7 +40,7 @@ def entry(**env_kwargs: Any) -> dict[str, Any]:
 
 
 def test_keygen_lays_out_a_directory_for_each_machine(tmp_path: Path) -> None:
-    """Secrets are the owner's alone, and each side gets the other's public key."""
+    """Only the owner can read secrets, and each side gets the other's public key."""
     arm, leg = make_keys(tmp_path, ["arm", "leg"])
     server = tmp_path / "server"
     assert (arm, leg) == (tmp_path / "arm", tmp_path / "leg")
@@ -51,7 +53,7 @@ def test_keygen_lays_out_a_directory_for_each_machine(tmp_path: Path) -> None:
 
 
 def test_keys_can_be_added_later_and_are_never_overwritten(tmp_path: Path) -> None:
-    """The server keeps its own key, so that clients which have it go on working."""
+    """The server keeps its own key, so earlier clients still work."""
     (arm,) = make_keys(tmp_path, ["arm"])
     (leg,) = make_keys(tmp_path, ["leg"])
     assert read_client_keys(arm).server == read_client_keys(leg).server
@@ -104,8 +106,8 @@ def test_a_server_whose_keys_are_missing_is_not_built(tmp_path: Path) -> None:
         sync.build_env_group(entry(keys=str(tmp_path)))
 
 
-def stranger_keys(kind: str, tmp_path: Path) -> Path | None:
-    """Keys that must not open the door, each wrong in its own way."""
+def refused_keys(kind: str, tmp_path: Path) -> Path | None:
+    """Return keys that must be refused, each wrong in its own way."""
     if kind == "no key":
         return None
     (other,) = make_keys(tmp_path / "elsewhere", ["mallory"])
@@ -115,7 +117,7 @@ def stranger_keys(kind: str, tmp_path: Path) -> Path | None:
     shutil.copy(tmp_path / "keys" / "arm" / "server.key", other / "server.key")
     if kind == "a key off the list":
         return other
-    # Shows somebody else's public key without having the secret.
+    # Presents another client's public key without its secret.
     own = (other / "client.key_secret").read_text().splitlines()
     stolen = (tmp_path / "keys" / "arm" / "client.key").read_text().splitlines()
     own[2] = stolen[2]
@@ -126,18 +128,16 @@ def stranger_keys(kind: str, tmp_path: Path) -> Path | None:
 @pytest.mark.parametrize(
     "kind", ["no key", "the key of another server", "a key off the list", "a stolen public key"]
 )
-def test_who_has_not_the_right_key_gets_nowhere(kind: str, tmp_path: Path) -> None:
-    """And who has is served meanwhile."""
+def test_a_client_without_the_right_key_is_not_admitted(kind: str, tmp_path: Path) -> None:
+    """A client with the right key is served meanwhile."""
     (arm,) = make_keys(tmp_path / "keys", ["arm"])
-    wrong = stranger_keys(kind, tmp_path)
+    wrong = refused_keys(kind, tmp_path)
     errors: list[BaseException] = []
 
     def try_to_get_in() -> None:
-        with RemoteEnvClient(
-            CountingEnv(), "127.0.0.1", port, keys=wrong, name="mallory"
-        ) as stranger:
+        with RemoteEnvClient(CountingEnv(), "127.0.0.1", port, keys=wrong, name="mallory") as peer:
             try:
-                stranger.connect(timeout=1.5)
+                peer.connect(timeout=0.5)
             except TimeoutError as error:
                 errors.append(error)
 
@@ -155,12 +155,12 @@ def test_who_has_not_the_right_key_gets_nowhere(kind: str, tmp_path: Path) -> No
         group.close()
         friend.join()
     (error,) = errors
-    assert "did not let 'mallory' in within 1.5 s" in str(error)
+    assert "did not let 'mallory' in within 0.5 s" in str(error)
     assert friend.env.steps > 10
 
 
-def test_a_client_is_told_when_its_key_is_not_on_the_list(tmp_path: Path) -> None:
-    """Its own message says what to look at; adding the key lets it in, without a restart."""
+def test_a_client_learns_that_its_key_is_not_allowed(tmp_path: Path) -> None:
+    """Its message says what to check; adding the key admits it without a restart."""
     (arm,) = make_keys(tmp_path, ["arm"])
     listed = tmp_path / "server" / "clients" / "arm.key"
     hidden = tmp_path / "arm.key"
@@ -169,7 +169,7 @@ def test_a_client_is_told_when_its_key_is_not_on_the_list(tmp_path: Path) -> Non
         friend = ClientThread(group["robots-0"].address, "arm", keys=arm)
         while "the server does not know this client's key" not in friend.client.state:
             with pytest.raises(TimeoutError):
-                # Nobody comes; the group only has to listen meanwhile.
+                # No client joins; the group only listens.
                 group.collect_async(deadline=0.1)
         hidden.rename(listed)
         batch, _ = group.reset()
@@ -179,30 +179,65 @@ def test_a_client_is_told_when_its_key_is_not_on_the_list(tmp_path: Path) -> Non
 
 
 def refused(address: str, keys: Path) -> str:
-    """What a client is told that dials in with `keys` and isn't let in."""
+    """Return the error of a client that dials in with `keys` and is refused."""
     host, _, port = address.removeprefix("tcp://").rpartition(":")
     with RemoteEnvClient(CountingEnv(), host, int(port), keys=keys, name="again") as client:
-        while client.state in {"not connected", "asking to be let in"}:  # No trouble so far.
+        while client.state in {"not connected", "asking to be let in"}:  # No failure so far.
             with pytest.raises(TimeoutError):
                 client.connect(timeout=0.5)
         return client.state
 
 
-def test_a_key_that_is_overwritten_in_place_gets_in_no_more(
+@pytest.mark.parametrize("kind", ["no keys", "keys of another server", "keys where none are"])
+def test_a_client_with_other_keys_is_logged_once_on_both_sides(
+    kind: str, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its handshakes fail before it has proved anything, one after the other."""
+    events: list[int] = []
+
+    def note(monitor: Any, flags: int) -> Any:
+        event = recv_monitor_message(monitor, flags)
+        events.append(event["event"])
+        return event
+
+    monkeypatch.setattr(client, "_REDIAL_SECONDS", (0.05, 0.8))
+    monkeypatch.setattr(client, "recv_monitor_message", note)
+    make_keys(tmp_path / "ours", ["arm"])
+    make_keys(tmp_path / "theirs", ["arm"])
+    server = {} if kind == "keys where none are" else {"keys": str(tmp_path / "ours" / "server")}
+    client_keys = None if kind == "no keys" else tmp_path / "theirs" / "arm"
+    caplog.set_level(logging.INFO, "rlightning_aio.remote")
+    with sync.build_env_group(entry(**server)) as group:
+        port = int(group["robots-0"].address.rpartition(":")[2])
+        with RemoteEnvClient(
+            CountingEnv(), "127.0.0.1", port, keys=client_keys, name="arm"
+        ) as remote:
+            while events.count(zmq.EVENT_CONNECTED) < 5 or "robots-0: " not in caplog.text:
+                for wait in (remote.connect, lambda t: group.collect_async(deadline=t)):
+                    with pytest.raises(TimeoutError):
+                        wait(0.05)
+    lines = [record.getMessage() for record in caplog.records]
+    assert len(lines) == len(set(lines)) <= 3
+    (line,) = [line for line in lines if line.startswith("robots-0: ")]
+    assert "the other end has other keys than these, or none" in line
+    assert any(line.startswith("arm: not connected (") for line in lines)
+
+
+def test_a_key_that_is_overwritten_in_place_is_no_longer_admitted(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Nor does a file whose name is no text keep anybody else out."""
+    """A file whose name is not text keeps no other client out."""
     arm, leg = make_keys(tmp_path, ["arm", "leg"])
     listed = tmp_path / "server" / "clients"
     Path(os.fsdecode(os.fsencode(listed) + b"/\xff\x1b.key")).write_text("x")
-    told: list[str] = []
+    errors: list[str] = []
     with sync.build_env_group(entry(keys=str(tmp_path / "server"))) as group:
         address = group["robots-0"].address
         friend = ClientThread(address, "arm", keys=arm)
         batch, _ = group.reset()
         with (listed / "arm.key").open("r+") as file:
             file.write((listed / "leg.key").read_text())
-        thread = threading.Thread(target=lambda: told.append(refused(address, arm)))
+        thread = threading.Thread(target=lambda: errors.append(refused(address, arm)))
         thread.start()
         while thread.is_alive():
             group.step_async(batch.respond(action=np.zeros((1, 2), np.float32)))
@@ -215,8 +250,8 @@ def test_a_key_that_is_overwritten_in_place_gets_in_no_more(
         group.close()
         friend.join()
         another.join()
-    assert "the server does not know this client's key" in told[0]
-    warnings = [r.getMessage() for r in caplog.records if "can't be a client's" in r.getMessage()]
+    assert "the server does not know this client's key" in errors[0]
+    warnings = [r.getMessage() for r in caplog.records if "can't name a client" in r.getMessage()]
     assert len(warnings) == 1
     assert "\\udcff\\x1b.key" in warnings[0]
 
@@ -225,7 +260,7 @@ def test_a_key_that_is_overwritten_in_place_gets_in_no_more(
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "*", "192.168.1.5", "::", "eth0"])
-def test_a_public_address_needs_keys_or_an_explicit_word(host: str, tmp_path: Path) -> None:
+def test_a_public_address_needs_keys_or_insecure(host: str, tmp_path: Path) -> None:
     """Without either, the group isn't built."""
 
     def settings(**env_kwargs: Any) -> Any:
@@ -241,7 +276,7 @@ def test_a_public_address_needs_keys_or_an_explicit_word(host: str, tmp_path: Pa
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "127.9.9.9", "::1"])
 def test_loopback_needs_neither(host: str) -> None:
-    """It is this machine's own."""
+    """Only this machine can reach it."""
     config = EnvConfig(name="r", backend="env_server", env_kwargs={"host": host})
     assert server_settings(config).host == host
 
@@ -257,13 +292,13 @@ def test_loopback_needs_neither(host: str) -> None:
     ],
 )
 def test_a_wrong_setting_is_named_with_its_entry(env_kwargs: dict[str, Any], says: str) -> None:
-    """As every other field of a configuration is."""
+    """Like every other field of a configuration."""
     with pytest.raises(ConfigError, match=f"'robots'.*{says}"):
         sync.build_env_group(entry(**env_kwargs))
 
 
-def test_zmq_port_is_understood() -> None:
-    """It is what RLightning calls the port."""
+def test_zmq_port_is_accepted() -> None:
+    """It is the name of the port in RLightning."""
     config = EnvConfig(name="r", backend="env_server", env_kwargs={"zmq_port": 5})
     assert server_settings(config).port == 5
 
@@ -276,7 +311,7 @@ def test_a_port_that_is_taken_fails_the_start() -> None:
             sync.build_env_group(entry(port=port)).init()
 
 
-# Strangers with a socket of their own
+# Unauthenticated peers with raw sockets
 
 
 class Bomb:
@@ -287,37 +322,37 @@ class Bomb:
         return (os.mkdir, (self.path,))
 
 
-def say(stranger: zmq.Socket[bytes], parts: list[bytes]) -> None:
-    """Unless it is cut off and has said too much meanwhile."""
+def say(peer: zmq.Socket[bytes], parts: list[bytes]) -> None:
+    """Send a message, unless the connection was cut off and its queue is full."""
     with contextlib.suppress(zmq.Again):
-        stranger.send_multipart(parts, zmq.NOBLOCK)
+        peer.send_multipart(parts, zmq.NOBLOCK)
 
 
-def test_nonsense_and_pickles_from_strangers_leave_the_service_unharmed(tmp_path: Path) -> None:
-    """Raw messages, whole and spoilt, beside a client that is served."""
+def test_nonsense_and_pickles_of_unauthenticated_peers_do_no_harm(tmp_path: Path) -> None:
+    """Raw messages, whole and corrupted, while a client is served."""
     rng = np.random.default_rng(0)
     bomb = pickle.dumps(Bomb(str(tmp_path / "exploded")))
     hello = Writer().write(
-        Hello(version=1, name="x", nonce=1, observation_space={}, action_space={})
+        ClientHello(version=1, name="x", nonce=1, observation_space={}, action_space={})
     )
     with sync.build_env_group(entry()) as group:
         address = group["robots-0"].address
         remote = group["robots-0"]._server[0]._listener
         friend = ClientThread(address, "arm")
         batch, _ = group.reset()
-        with zmq.Context() as context, context.socket(zmq.DEALER) as stranger:
-            stranger.linger = 0
-            stranger.connect(address)
+        with zmq.Context() as context, context.socket(zmq.DEALER) as peer:
+            peer.linger = 0
+            peer.connect(address)
             for k in range(300):
                 for parts in ([bomb], [b"", bomb], [hello[0], bomb], mutation(rng)(hello)):
                     if parts:
-                        say(stranger, parts)
+                        say(peer, parts)
                 if k % 10 == 0:
                     group.step_async(batch.respond(action=np.zeros((1, 2), np.float32)))
                     batch, _ = group.collect_async(deadline=HANG)
-            # It is cut off again and again, and dials anew.
-            while remote.malformed < 3 or remote.door.num_cut < 3:
-                say(stranger, [bomb])
+            # It is cut off and dials again, repeatedly.
+            while remote._sessions.num_malformed < 3 or remote.connections.num_cut < 3:
+                say(peer, [bomb])
                 group.step_async(batch.respond(action=np.zeros((1, 2), np.float32)))
                 batch, _ = group.collect_async(deadline=HANG)
         assert group["robots-0"].clients == ["robots-0/arm"]
@@ -328,29 +363,29 @@ def test_nonsense_and_pickles_from_strangers_leave_the_service_unharmed(tmp_path
     assert (tmp_path / "exploded").exists(), "the bomb must be a real one"
 
 
-def test_a_frame_beyond_the_limit_is_not_taken_in() -> None:
+def test_a_frame_beyond_the_limit_is_not_read() -> None:
     """Its sender is cut off before memory is spent on it."""
     with sync.build_env_group(entry()) as group:
         address = group["robots-0"].address
         friend = ClientThread(address, "arm")
         batch, _ = group.reset()
-        with zmq.Context() as context, context.socket(zmq.DEALER) as stranger:
-            stranger.linger = 0
-            monitor = stranger.get_monitor_socket(zmq.EVENT_DISCONNECTED)
-            stranger.connect(address)
-            stranger.send(bytes((64 << 20) + 1))
+        with zmq.Context() as context, context.socket(zmq.DEALER) as peer:
+            peer.linger = 0
+            monitor = peer.get_monitor_socket(zmq.EVENT_DISCONNECTED)
+            peer.connect(address)
+            peer.send(bytes((64 << 20) + 1))
             while not monitor.poll(0):
                 group.step_async(batch.respond(action=np.zeros((1, 2), np.float32)))
                 batch, _ = group.collect_async(deadline=HANG)
-            stranger.disable_monitor()
+            peer.disable_monitor()
             monitor.close()
-        assert group["robots-0"]._server[0]._listener.malformed == 0
+        assert group["robots-0"]._server[0]._listener._sessions.num_malformed == 0
         group.close()
         friend.join()
 
 
-def test_a_client_survives_a_server_that_talks_nonsense() -> None:
-    """It counts what is no message, and goes on asking to be let in."""
+def test_a_client_survives_a_server_that_sends_nonsense() -> None:
+    """It counts malformed messages and keeps asking to be let in."""
     rng = np.random.default_rng(1)
     done = threading.Event()
 
@@ -368,7 +403,7 @@ def test_a_client_survives_a_server_that_talks_nonsense() -> None:
         thread.start()
         env = CountingEnv()
         with RemoteEnvClient(env, "127.0.0.1", port, name="arm") as client:
-            while client._session.malformed <= 20:
+            while client._session.num_malformed <= 20:
                 with pytest.raises(TimeoutError):
                     client.connect(timeout=0.5)
             assert "asking to be let in" in client.state
@@ -383,7 +418,7 @@ def test_a_client_without_a_server_says_so() -> None:
     with (
         RemoteEnvClient(CountingEnv(), "127.0.0.1", 1, name="arm") as client,
         pytest.raises(
-            TimeoutError, match=r"tcp://127.0.0.1:1 did not let 'arm' in.*nobody answers"
+            TimeoutError, match=r"tcp://127.0.0.1:1 did not let 'arm' in.*no server answers"
         ),
     ):
         client.connect(timeout=2.0)

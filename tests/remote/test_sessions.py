@@ -12,11 +12,11 @@ import pytest
 from remote.unreliable import HEARTBEAT, OBSERVATION, Client, World
 
 from rlightning_aio.errors import BadAction, EnvBusy, EnvRaised, UnknownEnv
-from rlightning_aio.protocol.net import server_session
+from rlightning_aio.protocol.net import client_registry
 from rlightning_aio.protocol.net.client_session import ClientSession, Ended, Phase, Refused
 from rlightning_aio.protocol.net.payload import Outcome
 from rlightning_aio.protocol.net.server_session import ServerSessions
-from rlightning_aio.protocol.net.wire import MAX_NESTING, Hello, Welcome, Writer
+from rlightning_aio.protocol.net.wire import MAX_NESTING, ClientHello, Welcome, Writer
 from rlightning_aio.types import EnvMeta, EnvRet
 
 
@@ -32,8 +32,8 @@ def only(results: list[Any]) -> Any:
     return result
 
 
-def test_a_client_that_joins_brings_its_first_result_unasked(world: World) -> None:
-    """Joining is a reset, and its result belongs to no request."""
+def test_a_client_that_joins_sends_its_first_result_without_a_request(world: World) -> None:
+    """Joining is a reset, and its result answers no request."""
     first = {result.client: result for result in world.take()}
     assert set(first) == set(world.server.clients) == {"a", "b"}
     assert first["a"].number is None
@@ -53,10 +53,10 @@ def test_a_step_and_a_reset_come_back_under_their_numbers(world: World) -> None:
     assert (result.number, result.observation[2]) == (5, 0)
 
 
-def test_a_client_that_owes_a_result_is_busy(world: World) -> None:
+def test_a_client_with_a_pending_request_is_busy(world: World) -> None:
     """A second request is refused before anything is sent."""
     world.submit("a", 1)
-    with pytest.raises(EnvBusy, match="srv/a still owes the result of a step"):
+    with pytest.raises(EnvBusy, match="srv/a has not answered its last step"):
         world.submit("a", 2)
 
 
@@ -69,7 +69,7 @@ def test_a_client_that_never_joined_is_unknown(world: World) -> None:
 def test_an_action_that_does_not_fit_is_not_sent(world: World) -> None:
     """The client stays free for a better one."""
     with pytest.raises(BadAction, match=r"srv/a.*expected shape \(2,\)"):
-        world.server.submit("a", 1, np.zeros(3, np.float32), {}, 0.0)
+        world.server.requests.step("a", 1, np.zeros(3, np.float32), {}, 0.0)
     assert world.submit("a", 2)
 
 
@@ -129,7 +129,7 @@ def test_a_repeated_request_gets_the_same_reply_and_an_older_one_is_refused(worl
     world.replay(client, 0, to_server=False)
     world.replay(client, 1, to_server=False)
     again, refused = client.outbox
-    assert again == world.said["a", True][-1]
+    assert again == world.delivered["a", True][-1]
     assert b"StaleRequest" in refused[0]
     assert client.steps == 2
     world.settle()
@@ -150,8 +150,8 @@ def test_a_client_that_dies_in_a_step_leaves_one_marked_result(world: World) -> 
     assert "connection broke" in result.info["client_lost"]
 
 
-def test_who_is_gone_and_known_to_be_is_asked_in_vain(world: World) -> None:
-    """No stream of marked results: what comes next is the client's return."""
+def test_a_request_to_a_client_that_is_known_to_be_absent_is_not_answered(world: World) -> None:
+    """There is no series of marked results: the next result is the client's first one."""
     world.submit("a", 1)
     world.clients["a"].kill()
     world.pass_time(HEARTBEAT)
@@ -166,7 +166,7 @@ def test_who_is_gone_and_known_to_be_is_asked_in_vain(world: World) -> None:
     assert result.observation.tolist() == [1, 2, 0]
 
 
-def test_a_loss_nobody_waited_for_is_told_by_the_next_step(world: World) -> None:
+def test_a_loss_without_a_pending_request_is_reported_by_the_next_step(world: World) -> None:
     """The trainer learns that the episode ended before it sees the next one."""
     world.take()
     world.clients["a"].kill()
@@ -175,7 +175,7 @@ def test_a_loss_nobody_waited_for_is_told_by_the_next_step(world: World) -> None
     world.pass_time(HEARTBEAT)
     world.pass_time(HEARTBEAT)
     world.settle()
-    assert not world.take(), "the first result waits until the loss is told"
+    assert not world.take(), "the first result waits until the loss is reported"
     assert world.submit("a", 1)
     assert "client_lost" in only(world.take()).info
     assert world.submit("a", 2)
@@ -183,8 +183,8 @@ def test_a_loss_nobody_waited_for_is_told_by_the_next_step(world: World) -> None
     assert (result.number, result.observation.tolist()) == (2, [1, 2, 0])
 
 
-def test_a_reset_takes_the_place_of_a_loss_and_of_a_first_result(world: World) -> None:
-    """Who resets doesn't care how the last episode ended."""
+def test_a_reset_replaces_a_loss_and_a_first_result(world: World) -> None:
+    """After a reset, the end of the last episode does not matter."""
     assert world.submit_reset("a", 1)
     world.settle()
     results = world.take()
@@ -201,7 +201,7 @@ def test_a_reset_takes_the_place_of_a_loss_and_of_a_first_result(world: World) -
 
 
 def test_a_broken_connection_is_resumed_within_a_quarter_of_the_heartbeat(world: World) -> None:
-    """The session goes on, and the request under way is executed once."""
+    """The session continues, and the pending request is executed once."""
     world.take()
     client = world.clients["a"]
     world.submit("a", 1)
@@ -216,7 +216,7 @@ def test_a_broken_connection_is_resumed_within_a_quarter_of_the_heartbeat(world:
 
 
 def test_a_client_gives_its_server_up_after_a_quarter_of_the_heartbeat(world: World) -> None:
-    """Then the env is to be made safe, and the next session starts afresh."""
+    """Then the env must be made safe, and another session begins."""
     client = world.clients["a"]
     client.cut()
     world.clock.now += HEARTBEAT / 4
@@ -229,7 +229,7 @@ def test_a_client_gives_its_server_up_after_a_quarter_of_the_heartbeat(world: Wo
 
 
 def test_an_idle_client_that_falls_silent_is_given_up_within_the_heartbeat(world: World) -> None:
-    """Even if its connection seems to live."""
+    """Even if its connection seems intact."""
     world.take()
     while "a" in world.server.clients:
         world.pass_time(HEARTBEAT / 8)
@@ -240,8 +240,8 @@ def test_an_idle_client_that_falls_silent_is_given_up_within_the_heartbeat(world
     assert "b" in world.server.clients
 
 
-def test_a_busy_client_may_be_silent_as_long_as_it_likes(world: World) -> None:
-    """A step may take hours; its connection tells whether the client lives."""
+def test_a_busy_client_may_be_silent_without_limit(world: World) -> None:
+    """A step may take hours; the connection shows that the client lives."""
     world.take()
     client = world.clients["a"]
     world.submit("a", 1)
@@ -270,7 +270,7 @@ def test_a_step_past_its_timeout_loses_the_client() -> None:
     assert any("within 3.0 s" in cause for cause in client.ended)
 
 
-def test_a_client_that_leaves_says_so(world: World) -> None:
+def test_a_client_that_leaves_sends_a_reason(world: World) -> None:
     """Its reason is in the marked result."""
     world.take()
     world.submit("a", 1)
@@ -282,15 +282,15 @@ def test_a_client_that_leaves_says_so(world: World) -> None:
 
 
 def leave(world: World, client: Client) -> None:
-    """The client says goodbye, and is gone."""
+    """Let the client send a goodbye and disconnect."""
     client.session.leave("enough")
     client.flush()
     world.to_server(client)
     client.kill()
 
 
-def test_who_leaves_before_anybody_has_seen_it_may_come_back() -> None:
-    """There is no loss to be told of: nobody would ever ask for it."""
+def test_a_client_that_leaves_before_the_trainer_saw_it_may_come_back() -> None:
+    """There is no loss to report, because no request would report it."""
     world = World("a")
     client = world.clients["a"]
     client.connect()
@@ -299,7 +299,7 @@ def test_who_leaves_before_anybody_has_seen_it_may_come_back() -> None:
     client.execute()
     client.session.leave("enough")
     client.flush()
-    for parts in client.outbox:  # Both are there when the trainer looks.
+    for parts in client.outbox:  # Both have arrived when the trainer reads.
         world.server.receive(client.route or b"", None, parts, 0.0)
     client.outbox.clear()
     world.flush()
@@ -310,8 +310,8 @@ def test_who_leaves_before_anybody_has_seen_it_may_come_back() -> None:
     assert only(world.take()).observation.tolist() == [1, 2, 0]
 
 
-def test_who_was_sent_away_for_want_of_room_may_come_back(world: World) -> None:
-    """Its first result is told as if it had never been there."""
+def test_a_client_that_was_dismissed_for_lack_of_room_may_come_back(world: World) -> None:
+    """Its first result is reported as if it had never been there."""
     world.take()
     world.server.dismiss("a", "no place")
     world.flush()
@@ -322,9 +322,9 @@ def test_who_was_sent_away_for_want_of_room_may_come_back(world: World) -> None:
     assert only(world.take()).number is None
 
 
-def test_who_left_first_is_forgotten_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where others need the seats, it counts who has been away the longest, not who came first."""
-    monkeypatch.setattr(server_session, "_MAX_SEATS", 2)
+def test_the_client_that_left_first_is_forgotten_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """If others need records, the order in which clients left decides, not that of joining."""
+    monkeypatch.setattr(client_registry, "_MAX_RECORDS", 2)
     world = World("abc")
     early, late, other = world.clients.values()
     for client in (early, late):
@@ -340,19 +340,19 @@ def test_who_left_first_is_forgotten_first(monkeypatch: pytest.MonkeyPatch) -> N
     assert world.submit("a", 2)
 
 
-def test_a_loss_that_nobody_has_been_told_of_is_forgotten_last(
+def test_an_unreported_loss_is_forgotten_last(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """One that is known makes room before it, however recent it is."""
-    monkeypatch.setattr(server_session, "_MAX_SEATS", 2)
+    """A reported one makes room before it, however recent it is."""
+    monkeypatch.setattr(client_registry, "_MAX_RECORDS", 2)
     world = World("abc")
-    untold, told, other = world.clients.values()
-    for client in (untold, told):
+    unreported, reported, other = world.clients.values()
+    for client in (unreported, reported):
         client.connect()
         world.settle()
-    leave(world, untold)
+    leave(world, unreported)
     world.submit("b", 1)
-    leave(world, told)
+    leave(world, reported)
     world.take()
     other.connect()
     world.settle()
@@ -363,7 +363,7 @@ def test_a_loss_that_nobody_has_been_told_of_is_forgotten_last(
 
 
 def test_a_second_client_of_a_name_waits_until_the_first_is_gone(world: World) -> None:
-    """The one that is here keeps its session."""
+    """The present client keeps its session."""
     second = Client("a", 9, world.clock)
     second.routes = iter(range(50, 60))
     first, world.clients["a"] = world.clients["a"], second
@@ -374,7 +374,7 @@ def test_a_second_client_of_a_name_waits_until_the_first_is_gone(world: World) -
     assert "a client named 'a' is here already" in (second.session.refusal or "")
     assert first.session.phase is Phase.SERVING
     for _ in range(40):
-        # Whatever is sent to the first one finds nobody.
+        # Messages to the first one find no connection.
         world.pass_time(HEARTBEAT / 8)
         world.settle()
     assert second.session.phase is Phase.SERVING
@@ -396,7 +396,7 @@ def test_a_restarted_server_gets_its_clients_back() -> None:
 
 
 def test_a_server_that_closes_says_goodbye(world: World) -> None:
-    """Clients end their sessions at once, and ask again later."""
+    """Clients end their sessions at once and say hello later."""
     world.server.close("done")
     world.flush()
     world.settle()
@@ -418,33 +418,33 @@ def meta(**changes: Any) -> EnvMeta:
     [
         ("c/d", {}, "name"),
         ("c\n", {}, "name"),
-        ("c", {}, "spaces"),  # Another action space than the others'.
+        ("c", {}, "spaces"),  # Differs from the other clients' action space.
         ("c", {"action_space": gym.spaces.Box(-1, 1, (2,)), "num_envs": 2}, "spaces"),
         ("c", {"action_space": gym.spaces.Box(-1, 1, (2,)), "agents": ("x",)}, "spaces"),
     ],
 )
-def test_who_does_not_fit_is_refused_for_good(
+def test_a_client_that_does_not_fit_is_refused_for_good(
     world: World, name: str, changes: dict[str, Any], code: str
 ) -> None:
-    """The client is told why, and gives up."""
-    stranger = ClientSession(meta(**changes), name, heartbeat=HEARTBEAT)
-    stranger.connected(0.0)
-    world.server.receive(b"r", None, stranger.outbox.popleft(), 0.0)
-    event = stranger.receive(world.server.outbox.popleft().parts, 0.0)
+    """The client receives the reason and gives up."""
+    other_client = ClientSession(meta(**changes), name, heartbeat=HEARTBEAT)
+    other_client.connected(0.0)
+    world.server.receive(b"r", None, other_client.outbox.popleft(), 0.0)
+    event = other_client.receive(world.server.outbox.popleft().parts, 0.0)
     assert isinstance(event, Refused)
     assert event.code == code
     assert "c" not in world.server.clients
 
 
-def test_another_version_is_refused_by_name_of_both(world: World) -> None:
-    """Neither side guesses what the other means."""
-    hello = Hello(version=9, name="z", nonce=1, observation_space={}, action_space={})
+def test_another_version_is_refused_with_both_versions(world: World) -> None:
+    """Neither side guesses."""
+    hello = ClientHello(version=9, name="z", nonce=1, observation_space={}, action_space={})
     world.server.receive(b"r", None, Writer().write(hello), 0.0)
     assert b"speaks version 1, not 9" in world.server.outbox.popleft().parts[0]
 
 
-def test_a_session_answers_to_the_key_it_was_opened_with_alone() -> None:
-    """Knowing a session's number is not enough to speak in it."""
+def test_a_session_accepts_only_the_key_that_opened_it() -> None:
+    """A session's number alone is not enough to use it."""
     server = ServerSessions("srv", heartbeat=HEARTBEAT, new_token=lambda: 7)
     session = ClientSession(meta(), "a", heartbeat=HEARTBEAT)
     session.connected(0.0)
@@ -454,13 +454,13 @@ def test_a_session_answers_to_the_key_it_was_opened_with_alone() -> None:
     result = session.outbox.popleft()
     server.receive(b"s", "mallory", result, 0.0)
     assert not server.take()
-    assert server.malformed == 1
+    assert server.num_malformed == 1
     server.receive(b"s", "alice", result, 0.0)
     assert server.take()
 
 
 def answered_once() -> tuple[World, Any, bytes, bytes]:
-    """A client that has executed a step, whose result, header and frame, hasn't been sent yet."""
+    """Return a client that has executed a step, and the parts of its unsent result."""
     world = World("a")
     world.join_all()
     world.take()
@@ -473,7 +473,7 @@ def answered_once() -> tuple[World, Any, bytes, bytes]:
 
 
 def test_results_that_never_fit_end_the_session() -> None:
-    """A client that breaks its word three times for one request is sent away."""
+    """After three wrong answers to one request, the client is dismissed."""
     world, client, header, _ = answered_once()
     for _ in range(3):
         assert not world.results
@@ -484,8 +484,29 @@ def test_results_that_never_fit_end_the_session() -> None:
     assert client.ended
 
 
+def test_answers_that_are_malformed_as_a_whole_end_the_session() -> None:
+    """The request is not repeated forever; without a request nothing is counted."""
+    world = World("a")
+    world.join_all()
+    client = world.clients["a"]
+    assert client.route
+    for _ in range(5):
+        world.server.receive(client.route, None, [b"nonsense"], world.clock.now)
+    assert world.serving("a")
+    world.take()
+    world.submit("a", 7)
+    for _ in range(2):
+        world.server.receive(client.route, None, [b"nonsense"], world.clock.now)
+    assert not world.take()
+    world.server.receive(client.route, None, [b"nonsense"], world.clock.now)
+    world.flush()
+    (lost,) = world.take()
+    assert lost.is_loss
+    assert "its messages don't fit what it announced" in lost.info["client_lost"]
+
+
 def test_results_that_are_nested_too_deep_end_the_session() -> None:
-    """They are none: nothing that takes an info apart may run out of stack."""
+    """They are malformed, because reading such an info could exhaust the stack."""
     world, client, header, frame = answered_once()
     deep: dict[str, Any] = {}
     for _ in range(MAX_NESTING):
@@ -499,26 +520,26 @@ def test_results_that_are_nested_too_deep_end_the_session() -> None:
     assert "nested more than 32 deep" in only(world.take()).info["client_lost"]
 
 
-def test_a_client_counts_and_drops_what_is_no_message(world: World) -> None:
-    """A server's mistakes are no reason to fail."""
+def test_a_client_counts_and_drops_malformed_messages(world: World) -> None:
+    """A server's mistakes do not end a client."""
     client = world.clients["a"]
     client.receive([b"\xc1"])
-    assert client.session.malformed == 1
+    assert client.session.num_malformed == 1
     assert world.submit("a", 1)
 
 
-def test_a_flood_of_nonsense_is_logged_once_in_a_while(
+def test_a_flood_of_nonsense_is_logged_rarely(
     world: World, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The count goes on, the log doesn't fill."""
+    """All messages are counted, and the log does not fill."""
     with caplog.at_level(logging.WARNING):
         for k in range(1000):
             world.server.receive(b"r", None, [b"\xc1"], 30 * k / 1000)
-    assert world.server.malformed == 1000
+    assert world.server.num_malformed == 1000
     assert len(caplog.records) == 3
 
 
-def test_what_of_an_info_cannot_travel_is_named_once(
+def test_info_that_cannot_be_sent_is_named_once(
     world: World, caplog: pytest.LogCaptureFixture
 ) -> None:
     """The result arrives without it, each time."""
@@ -537,14 +558,14 @@ def test_what_of_an_info_cannot_travel_is_named_once(
             world.settle()
     assert [result.info for result in world.take()] == [{"fine": 1}] * 2
     assert [record.message for record in caplog.records] == [
-        "a: of the env's info, camera can't travel and is left out"
+        "a: camera of the env's info can't be sent and is left out"
     ]
 
 
 def test_a_step_whose_info_has_a_number_as_key_is_answered(
     world: World, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Without it. Refused, the result would be asked for, and refused, again and again."""
+    """Without that key. Otherwise the server would refuse the result and request it forever."""
     world.take()
     client = world.clients["a"]
     world.submit("a", 1)
@@ -553,18 +574,18 @@ def test_a_step_whose_info_has_a_number_as_key_is_answered(
     number, client.todo = client.todo.number, None
     info: dict[Any, Any] = {"fine": {1: 2}, 0: "cup"}
     outcome = Outcome(client.observation(), 1.0, False, False)
-    # As a client gives on what a bare step returns.
+    # Like a client that forwards the results of a bare step.
     client.session.answer(number, outcome, info, {}, 0, 0)
     client.flush()
     world.settle()
     assert only(world.take()).info == {"fine": {1: 2}}
     assert [record.message for record in caplog.records] == [
-        "a: of the env's info, 0 can't travel and is left out"
+        "a: 0 of the env's info can't be sent and is left out"
     ]
 
 
-def test_extras_travel_to_a_client_that_reads_them() -> None:
-    """What the policy attaches reaches the env; what can't travel is dropped."""
+def test_extras_are_sent_to_a_client_that_reads_them() -> None:
+    """Columns of the policy reach the env; those that can't be sent are dropped."""
     server = ServerSessions("srv", heartbeat=HEARTBEAT)
     session = ClientSession(meta(), "a", heartbeat=HEARTBEAT, reads_extras=True, free_actions=True)
     session.connected(0.0)
@@ -573,25 +594,25 @@ def test_extras_travel_to_a_client_that_reads_them() -> None:
     session.finish(0, EnvRet(env_id="e", observation=np.zeros(3)))
     server.receive(b"r", None, session.outbox.popleft(), 0.0)
     chunk = {"chunk": np.ones((4, 2)), "mode": "fast"}
-    server.submit("a", 1, chunk, {"log_prob": -0.5, "net": object()}, 0.0)
+    server.requests.step("a", 1, chunk, {"log_prob": -0.5, "net": object()}, 0.0)
     event = session.receive(server.outbox.popleft().parts, 0.0)
     assert np.array_equal(event.action["chunk"], chunk["chunk"])
     assert event.action["mode"] == "fast"
     assert event.extras == {"log_prob": -0.5}
 
 
-def test_a_client_obeys_no_welcome_that_it_did_not_ask_for(world: World) -> None:
-    """Answers to greetings of long ago change nothing."""
+def test_a_client_ignores_a_welcome_that_answers_no_hello(world: World) -> None:
+    """Answers to earlier hellos change nothing."""
     client = world.clients["a"]
     stray = Welcome(nonce=1, session=99, env_id="x", heartbeat=1.0)
     assert client.session.receive(Writer().write(stray), 0.0) is None
     assert world.submit("a", 1)
 
 
-def test_ended_is_what_a_client_hears_when_its_server_forgot_it(world: World) -> None:
+def test_a_client_that_its_server_forgot_gets_ended(world: World) -> None:
     """`Ended` carries the server's reason."""
     client = world.clients["a"]
-    world.server._lose(client_session_of(world, "a"), "test")
+    world.server._registry.lose(client_session_of(world, "a"), "test")
     client.cut()
     client.connect()
     world.to_server(client)
@@ -600,4 +621,4 @@ def test_ended_is_what_a_client_hears_when_its_server_forgot_it(world: World) ->
 
 
 def client_session_of(world: World, name: str) -> Any:
-    return world.server._seats[name].session
+    return world.server._registry.records[name].session

@@ -1,4 +1,4 @@
-"""Whatever the network and the clients do: once executed at most, once answered exactly."""
+"""Any network and any clients: executed at most once, answered exactly once."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PLACES = st.integers(0, 7)
 class UnreliableNetwork(RuleBasedStateMachine):
     """Drops, repeats, delays and reorders; cuts and kills; against a naive model.
 
-    The model: for each number that was promised a result, the client it was for.
+    The model: the client of each request that must be answered.
     """
 
     def __init__(self) -> None:
@@ -70,7 +70,7 @@ class UnreliableNetwork(RuleBasedStateMachine):
             return
         self.next_number += 1
         number = self.next_number
-        # The answer may be there before the call returns.
+        # The answer may arrive before the call returns.
         self.promised[number] = name
         held = self.held.pop(name, None)
         if reset:
@@ -78,8 +78,8 @@ class UnreliableNetwork(RuleBasedStateMachine):
         submit = self.world.submit_reset if reset else self.world.submit
         if not submit(name, number):
             del self.promised[number]
-            told = held is None or "client_lost" in held.info
-            assert told or reset, "nobody told that the client is gone"
+            reported = held is None or "client_lost" in held.info
+            assert reported or reset, "the loss of the client was not reported"
         self.look()
 
     # The network
@@ -115,7 +115,7 @@ class UnreliableNetwork(RuleBasedStateMachine):
 
     @rule(name=NAMES, k=st.integers(0, 40), to_server=st.booleans())
     def replay(self, name: str, k: int, to_server: bool) -> None:
-        """Something that was said long ago arrives again."""
+        """Deliver an old message again."""
         self.world.replay(self.world.clients[name], k, to_server=to_server)
         self.look()
 
@@ -147,11 +147,11 @@ class UnreliableNetwork(RuleBasedStateMachine):
 
     @invariant()
     def nothing_is_malformed(self) -> None:
-        assert self.world.server.malformed == 0
-        assert all(c.session.malformed == 0 for c in self.world.clients.values())
+        assert self.world.server.num_malformed == 0
+        assert all(c.session.num_malformed == 0 for c in self.world.clients.values())
 
     def teardown(self) -> None:
-        """When the network is well again, everything promised comes, and everyone serves."""
+        """When the network works again, all requests are answered and all clients serve."""
         for client in self.world.clients.values():
             client.raises = False
         for _ in range(30):

@@ -1,4 +1,4 @@
-"""What a timeline shows of clients."""
+"""Timelines of clients."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def test_clients_have_tracks_by_their_names(tmp_path: Path) -> None:
-    """With what they were asked; a place that nobody has taken has none."""
+    """With their requests; a free slot has no track."""
     kwargs = {"min_clients": 2, "connect_timeout": HANG, "heartbeat": 5.0}
     entry = {"name": "robots", "backend": "env_server", "env_kwargs": kwargs}
     with sync.build_env_group(entry) as group:

@@ -1,4 +1,4 @@
-"""What goes onto the wire comes off it again, and nothing else does."""
+"""Messages survive encoding and decoding, and malformed ones are refused."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from rlightning_aio.protocol.net import wire
 from rlightning_aio.protocol.net.payload import Outcome, Packed, ResultLayout, SpaceLayout
 from rlightning_aio.protocol.net.space_description import UnsupportedSpace, describe, space_from
 from rlightning_aio.protocol.net.wire import (
+    ClientResult,
     FromClient,
     Reader,
-    Result,
     Untransferable,
     WireError,
     Writer,
@@ -36,14 +36,14 @@ def through_wire(message: Any, frames: list[bytes] | None = None) -> tuple[Any, 
 
 @given(any_space)
 def test_a_space_survives_its_description_even_as_json(space: Any) -> None:
-    """Any language that has JSON can announce and understand a space."""
+    """Any language with JSON can announce and read a space."""
     text = json.dumps(describe(space, "observation"), allow_nan=False)
     assert space_from(json.loads(text)) == space
 
 
 @given(any_space, st.integers(0, 2**16))
 def test_values_survive_in_structure_dtype_shape_and_content(space: Any, seed: int) -> None:
-    """What a space samples arrives as it was."""
+    """Samples of a space arrive unchanged."""
     value = sampled(space, seed)
     packed = Packed([], [])
     SpaceLayout(space, "observation").pack(value, packed)
@@ -52,14 +52,14 @@ def test_values_survive_in_structure_dtype_shape_and_content(space: Any, seed: i
 
 @given(any_info)
 def test_infos_survive_with_their_arrays(info: dict[str, Any]) -> None:
-    """Whatever msgpack can say travels, and arrays travel as frames."""
-    message, _ = through_wire(Result(session=1, number=2, info=info))
+    """Values of msgpack arrive, and arrays travel as frames."""
+    message, _ = through_wire(ClientResult(session=1, number=2, info=info))
     assert same(message.info, info)
 
 
 def test_a_frame_named_in_an_info_is_no_view_of_the_message() -> None:
     """An info's arrays are the reader's own, and writable."""
-    message, _ = through_wire(Result(session=1, number=2, info={"a": np.arange(3)}))
+    message, _ = through_wire(ClientResult(session=1, number=2, info={"a": np.arange(3)}))
     message.info["a"][0] = 7
 
 
@@ -85,7 +85,7 @@ def test_rewards_and_flags_survive_for_agents_and_sub_environments(
     assert same(tuple(layout.unpack(*packed, header[1:])), tuple(outcome))
 
 
-def test_what_cannot_travel_is_left_out_and_named() -> None:
+def test_a_value_that_cannot_be_sent_is_left_out_and_named() -> None:
     """The rest of an info arrives although one value in it is an object."""
     lost: list[str] = []
     info = {"good": 1, "deep": {"bad": object(), "array": np.ones(2)}, "big": 2**70}
@@ -94,42 +94,42 @@ def test_what_cannot_travel_is_left_out_and_named() -> None:
     assert lost == ["deep.bad", "big"]
 
 
-def test_keys_that_are_no_strings_are_left_out_and_named() -> None:
+def test_keys_that_are_not_strings_are_left_out_and_named() -> None:
     """At the top, where a reader would refuse the whole message for them; numbers survive below."""
     info: dict[Any, Any] = {"good": {1: "one", None: "none"}, 0: {"a": 1}, True: 2}
     with pytest.raises(Untransferable, match="info has the key 0; keys must be strings"):
-        Writer().write(Result(session=1, number=2, info=info))
+        Writer().write(ClientResult(session=1, number=2, info=info))
     lost: list[str] = []
     kept = portable(info, lost)
     assert kept == {"good": {1: "one"}}
     assert lost == ["good.None", "0", "True"]
-    message, _ = through_wire(Result(session=1, number=2, info=kept))
+    message, _ = through_wire(ClientResult(session=1, number=2, info=kept))
     assert message.info == kept
 
 
 def nested(depth: int) -> Any:
-    """That many maps and arrays in one another."""
+    """Return a value with `depth` levels of maps and arrays."""
     value: Any = 1
     for level in range(depth):
         value = {"a": value} if level % 2 else [value]
     return value
 
 
-def test_what_is_nested_too_deep_is_left_out_and_named() -> None:
-    """Whoever passes it on would run out of stack; as deep as is allowed, it survives."""
+def test_a_value_that_is_nested_too_deep_is_left_out_and_named() -> None:
+    """Processing it could exhaust the stack; up to the limit, it survives."""
     info = {"deepest": nested(wire.MAX_NESTING - 1), "deeper": nested(wire.MAX_NESTING)}
     with pytest.raises(Untransferable, match="info is nested more than 32 deep"):
-        Writer().write(Result(session=1, number=2, info=info))
+        Writer().write(ClientResult(session=1, number=2, info=info))
     lost: list[str] = []
     kept = portable(info, lost)
     assert kept == {"deepest": info["deepest"], "deeper": {}}
     assert lost == ["deeper.a"]
-    message, _ = through_wire(Result(session=1, number=2, info=kept))
+    message, _ = through_wire(ClientResult(session=1, number=2, info=kept))
     assert message.info == kept
 
 
 def test_an_info_that_contains_itself_is_left_out() -> None:
-    """A cycle is no way to hang or crash a client."""
+    """A cycle neither hangs nor crashes a client."""
     info: dict[str, Any] = {"good": 1}
     info["self"] = info
     lost: list[str] = []
@@ -138,9 +138,9 @@ def test_an_info_that_contains_itself_is_left_out() -> None:
 
 
 def test_numpy_scalars_and_tuples_travel_as_plain_values() -> None:
-    """An info may hold what simulators put there."""
+    """Infos of simulators contain them."""
     info = {"x": np.float64(0.5), "n": np.int32(3), "t": (1, 2), "words": np.array(["a", "b"])}
-    message, _ = through_wire(Result(session=1, number=2, info=info))
+    message, _ = through_wire(ClientResult(session=1, number=2, info=info))
     assert message.info == {"x": 0.5, "n": 3, "t": [1, 2], "words": ["a", "b"]}
 
 
@@ -155,7 +155,7 @@ def test_numpy_scalars_and_tuples_travel_as_plain_values() -> None:
     ],
 )
 def test_a_value_that_does_not_fit_its_space_is_not_sent(space: Any, value: Any, says: str) -> None:
-    """The message names what was expected and what was found."""
+    """The message has the expected and the found shape."""
     with pytest.raises(Misfit, match=says):
         SpaceLayout(space, "observation").pack(value, Packed([], []))
 
@@ -174,7 +174,7 @@ def test_a_value_that_does_not_fit_its_space_is_not_sent(space: Any, value: Any,
 def test_frames_of_the_wrong_size_or_content_are_refused(
     space: Any, frames: list[bytes], texts: list[str]
 ) -> None:
-    """Nothing is made of bytes that aren't what the space says."""
+    """Bytes that do not fit the space are not used."""
     with pytest.raises(WireError):
         SpaceLayout(space, "observation").unpack(frames, texts)
 
@@ -189,7 +189,7 @@ def test_frames_of_the_wrong_size_or_content_are_refused(
     ],
 )
 def test_a_space_that_cannot_be_announced_is_named(space: Any) -> None:
-    """The message says where in the space it stands."""
+    """The message has its position in the space."""
     with pytest.raises(UnsupportedSpace, match="the observation"):
         describe(space, "the observation")
 
@@ -219,8 +219,8 @@ def test_a_space_that_cannot_be_announced_is_named(space: Any) -> None:
         "box",
     ],
 )  # fmt: skip
-def test_a_description_of_no_space_or_of_a_huge_one_is_refused(description: Any) -> None:
-    """Nobody makes the trainer allocate without end, or fail in any other way."""
+def test_an_invalid_or_huge_description_is_refused(description: Any) -> None:
+    """No description makes the trainer allocate without limit, or fail in another way."""
     with pytest.raises(WireError):
         space_from(description)
 
@@ -279,16 +279,16 @@ RESULT_WITH_KEY = b"\x84\xa4type\xa6result\xa7session\x01\xa6number\x01\xa4info\
         [b"\x80"] * (wire.MAX_PARTS + 1),
     ],
 )
-def test_what_is_no_message_is_refused_as_such(parts: list[bytes]) -> None:
-    """Every way of being wrong is one kind of error."""
+def test_every_malformed_message_raises_one_kind_of_error(parts: list[bytes]) -> None:
+    """`WireError`, whatever is wrong."""
     with pytest.raises(WireError):
         Reader[Any](FromClient).read(parts)
 
 
-def test_a_map_as_key_is_refused_whatever_msgspec_makes_of_it(
+def test_a_map_as_key_is_refused_with_every_version_of_msgspec(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Some of its versions let through what Python says of a key that has no hash."""
+    """Some versions let the TypeError of an unhashable key through."""
     reader: Reader[Any] = Reader(FromClient)
     monkeypatch.setattr(reader, "_decode", lambda _: {cast("Any", {}): 1})
     with pytest.raises(WireError, match="unhashable"):
@@ -304,9 +304,9 @@ class Bomb:
 
 @pytest.mark.parametrize("where", ["header", "frame", "info"])
 def test_a_pickle_does_nothing(where: str) -> None:
-    """Bytes that would run code elsewhere are bytes here."""
+    """Bytes that would run code if unpickled are only bytes here."""
     bomb = pickle.dumps(Bomb())
-    good = Writer().write(Result(session=1, number=1, info={"a": bomb}), [])
+    good = Writer().write(ClientResult(session=1, number=1, info={"a": bomb}), [])
     parts = {"header": [bomb], "frame": [good[0], bomb], "info": good}[where]
     try:
         message, _ = Reader[Any](FromClient).read(parts)

@@ -1,4 +1,4 @@
-"""``docs/wire-format.md`` says what the code does."""
+"""``docs/wire-format.md`` describes the code."""
 
 from __future__ import annotations
 
@@ -15,7 +15,15 @@ import pytest
 from rlightning_aio.protocol.net import wire
 from rlightning_aio.protocol.net.payload import Packed, SpaceLayout
 from rlightning_aio.protocol.net.space_description import describe, space_from
-from rlightning_aio.protocol.net.wire import Bye, Hello, Reader, Result, Step, Welcome, Writer
+from rlightning_aio.protocol.net.wire import (
+    Bye,
+    ClientHello,
+    ClientResult,
+    Reader,
+    Step,
+    Welcome,
+    Writer,
+)
 
 PAGE = (Path(__file__).parents[2] / "docs" / "wire-format.md").read_text()
 MESSAGES = sorted(
@@ -34,7 +42,7 @@ def written(message: Any, space: gym.Space[Any] | None = None, value: Any = None
 
 EXAMPLES = [
     written(
-        Hello(
+        ClientHello(
             version=wire.VERSION,
             name="arm",
             nonce=7,
@@ -44,13 +52,13 @@ EXAMPLES = [
     ),
     written(Welcome(nonce=7, session=9, env_id="robots-0/arm", heartbeat=5.0)),
     written(
-        Result(session=9, number=0, reward=0.0, terminated=False, truncated=False),
+        ClientResult(session=9, number=0, reward=0.0, terminated=False, truncated=False),
         OBSERVATIONS,
         np.array([0.5, -1], np.float32),
     ),
     written(Step(session=9, number=1), ACTIONS, 1),
     written(
-        Result(
+        ClientResult(
             session=9,
             number=1,
             busy_ns=1000,
@@ -67,7 +75,7 @@ EXAMPLES = [
 
 
 def examples_of_the_page() -> list[list[bytes]]:
-    """The parts of each message that the page shows byte by byte."""
+    """Return the parts of each message that the page shows byte by byte."""
     messages: list[list[bytes]] = []
     for block in re.findall(r"^```hex\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL):
         parts = re.split(r"^# part \d+, (\d+) bytes\n", block, flags=re.MULTILINE)[1:]
@@ -86,7 +94,7 @@ def test_the_bytes_are_those_that_are_written() -> None:
 
 
 def test_the_bytes_are_read() -> None:
-    """Each message of the example is one to its receiver."""
+    """The receiver can read each message of the example."""
     for parts in examples_of_the_page():
         kind = msgspec.msgpack.decode(parts[0])["type"]
         side = wire.FromServer if kind in ("welcome", "step") else wire.FromClient
@@ -109,7 +117,7 @@ def test_every_field_is_named(kind: Any) -> None:
 
 @pytest.mark.parametrize("dtype", wire.DTYPES)
 def test_every_dtype_is_named(dtype: str) -> None:
-    """Whatever an array may consist of."""
+    """The page lists all dtypes of arrays."""
     assert f"`{dtype}`" in PAGE
 
 

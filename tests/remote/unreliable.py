@@ -1,9 +1,9 @@
-"""Server and clients without sockets, joined by a network that does what it is told."""
+"""A server and clients without sockets, on a simulated network."""
 
 from __future__ import annotations
 
 import itertools
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -15,8 +15,11 @@ from rlightning_aio.protocol.net.client_session import (
     ResetRequest,
     StepRequest,
 )
-from rlightning_aio.protocol.net.server_session import RemoteResult, ServerSessions
+from rlightning_aio.protocol.net.server_session import ServerSessions
 from rlightning_aio.types import EnvMeta, EnvRet
+
+if TYPE_CHECKING:
+    from rlightning_aio.protocol.net.server_records import RemoteResult
 
 HEARTBEAT = 8.0
 OBSERVATION = gym.spaces.Box(-np.inf, np.inf, (3,), np.float64)
@@ -56,12 +59,12 @@ class Client:
         self.begin()
 
     def begin(self) -> None:
-        """The process starts, anew if it ran before."""
+        """Start the process, or restart it."""
         self.lives += 1
         self.steps = 0
         self.todo: StepRequest | ResetRequest | None = None
         meta = EnvMeta(env_id="env", observation_space=OBSERVATION, action_space=ACTION)
-        # Nonces must differ between lives, as they would in fact.
+        # Nonces must differ between lives, as real ones do.
         start = 1000 * self.lives + 100_000 * self.identity
         self.session = ClientSession(
             meta,
@@ -77,7 +80,7 @@ class Client:
             self.flush()
 
     def cut(self) -> None:
-        """The connection breaks; what is on its way is lost."""
+        """Break the connection; messages on the way are lost."""
         if self.route is not None:
             self.route = None
             self.inbox.clear()
@@ -112,7 +115,7 @@ class Client:
         self.flush()
 
     def execute(self) -> None:
-        """Do what was asked, once."""
+        """Execute the pending request once."""
         request = self.todo
         if not isinstance(request, StepRequest | ResetRequest):
             return
@@ -142,14 +145,14 @@ class World:
         self.server = ServerSessions("srv", heartbeat=HEARTBEAT, new_token=counter(), **server)
         self.clients = {name: Client(name, k + 1, self.clock) for k, name in enumerate(names)}
         self.results: list[RemoteResult] = []
-        self.said: dict[tuple[str, bool], list[list[bytes]]] = {}
+        self.delivered: dict[tuple[str, bool], list[list[bytes]]] = {}
 
     def replay(self, client: Client, k: int, *, to_server: bool) -> None:
-        """Deliver again what was delivered before, the latest first."""
-        said = self.said.get((client.name, to_server), [])
-        if client.route is None or not said or (client.todo is not None and not to_server):
+        """Deliver an earlier message again, the latest first."""
+        delivered = self.delivered.get((client.name, to_server), [])
+        if client.route is None or not delivered or (client.todo is not None and not to_server):
             return
-        parts = said[-1 - k % len(said)]
+        parts = delivered[-1 - k % len(delivered)]
         if to_server:
             self.server.receive(client.route, None, parts, self.clock.now)
             self.flush()
@@ -157,26 +160,26 @@ class World:
             client.receive(parts)
 
     def flush(self) -> None:
-        """Put what the server sends onto the network."""
+        """Put the messages of the server onto the network."""
         while self.server.outbox:
             route, parts = self.server.outbox.popleft()
             client = self.clients[route.decode().partition(":")[0]]
             if client.route == route:
                 client.inbox.append(parts)
             else:
-                self.server.unreachable(route, self.clock.now)
+                self.server.on_unreachable(route, self.clock.now)
         self.results += self.server.take()
 
     def to_server(self, client: Client, k: int = 0, *, keep: bool = False) -> None:
         parts = client.outbox[k] if keep else client.outbox.pop(k)
         assert client.route is not None
-        self.said.setdefault((client.name, True), []).append(parts)
+        self.delivered.setdefault((client.name, True), []).append(parts)
         self.server.receive(client.route, None, parts, self.clock.now)
         self.flush()
 
     def to_client(self, client: Client, k: int = 0, *, keep: bool = False) -> None:
         parts = client.inbox[k] if keep else client.inbox.pop(k)
-        self.said.setdefault((client.name, False), []).append(parts)
+        self.delivered.setdefault((client.name, False), []).append(parts)
         client.receive(parts)
 
     def pass_time(self, seconds: float) -> None:
@@ -208,12 +211,12 @@ class World:
         self.settle()
 
     def submit(self, name: str, number: int) -> bool:
-        answered = self.server.submit(name, number, ACTION.sample(), EXTRAS, self.clock.now)
+        answered = self.server.requests.step(name, number, ACTION.sample(), EXTRAS, self.clock.now)
         self.flush()
         return answered
 
     def submit_reset(self, name: str, number: int, **options: Any) -> bool:
-        answered = self.server.submit_reset(
+        answered = self.server.requests.reset(
             name, number, options.get("seed"), options.get("options"), self.clock.now
         )
         self.flush()

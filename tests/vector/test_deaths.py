@@ -1,4 +1,4 @@
-"""A worker that dies with a batch: all that it stepped together say so, nobody else notices."""
+"""Worker deaths behind the vector interfaces look like truncated episodes."""
 
 from __future__ import annotations
 
@@ -9,14 +9,17 @@ import numpy as np
 import pytest
 from faults.driven import kill, stop
 from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers import vector as wrappers
+from vector.toys import Mortal, assert_alike
 
-from rlightning_aio.errors import WorkerDied
+from rlightning_aio.errors import ConfigError, WorkerDied
 from rlightning_aio.vector import VectorEnv, make_vec
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 TASK, ACTIONS = "Hopper-v5", np.full((4, 3), 0.1, np.float32)
+MODES = list(AutoresetMode)
 LOST = [True, True, False, False]
 
 
@@ -27,7 +30,7 @@ def made(**arguments: Any) -> VectorEnv:
 
 
 def killed(group: Any, send: Callable[[], None]) -> None:
-    """Kill the first worker while it has yet to do what is sent."""
+    """Kill the first worker before it executes what `send` sends."""
     pid = group._core.supervisor.hosts[0].pid
     stop(pid)
     send()
@@ -36,18 +39,113 @@ def killed(group: Any, send: Callable[[], None]) -> None:
 
 @pytest.fixture
 def twins() -> Iterator[Any]:
-    """What all would have done."""
+    """An action for each env."""
     envs: Any = gym.make_vec(TASK, 4, "sync")
     envs.reset(seed=7)
     yield envs
     envs.close()
 
 
-@pytest.mark.parametrize("mode", list(AutoresetMode))
-def test_a_death_in_a_step_truncates_what_was_stepped_together(
+def mortals(mode: AutoresetMode, *, dies: bool, **entry: Any) -> Any:
+    """Three envs, each in a worker of its own, or in this process if they don't die."""
+    makers = [lambda k=k: Mortal(k, dies=dies) for k in range(3)]
+    if not dies:
+        return gym.vector.SyncVectorEnv(makers, autoreset_mode=mode)
+    return VectorEnv(makers, autoreset_mode=mode, envs_per_process=1, max_restarts=9, **entry)
+
+
+def plainly(stepped: Any, mode: AutoresetMode) -> Any:
+    """Results without causes of deaths and without times."""
+    infos = stepped[-1]
+    if "worker_restarted" in infos:
+        assert all(infos["worker_restarted"][infos["_worker_restarted"]])
+        if mode == AutoresetMode.SAME_STEP:  # There the info of the reset has it too.
+            for key in ("worker_restarted", "_worker_restarted"):
+                del infos[key]
+        else:
+            infos["worker_restarted"] = infos["_worker_restarted"]
+    if "worker_restarted" in infos.get("final_info", {}):
+        final = infos["final_info"]
+        final["worker_restarted"] = final["_worker_restarted"]
+    if "episode" in infos:
+        del infos["episode"]["t"]
+    return stepped
+
+
+def both_do(ours: Any, theirs: Any, mode: AutoresetMode, actions: Any) -> None:
+    """Step both; reset envs whose episode has ended if the mode doesn't."""
+    assert_alike(ours.reset(), theirs.reset())
+    for step, chosen in enumerate(actions):
+        found, expected = ours.step(chosen), theirs.step(chosen)
+        assert_alike(plainly(found, mode), plainly(expected, mode), f"step {step}: {chosen}")
+        done = expected[2] | expected[3]
+        if mode == AutoresetMode.DISABLED and done.any():
+            found, expected = (env.reset(options={"reset_mask": done}) for env in (ours, theirs))
+            assert_alike(found, expected)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_death_looks_like_an_episode_that_is_cut_short(mode: AutoresetMode) -> None:
+    """Also to Gymnasium's wrappers; single deaths, several in a row, and with ignored actions."""
+    die, terminate, truncate, step = 0, 2, 3, 4
+    actions = np.array(
+        [
+            [step, step, step], [die, step, step], [die, step, terminate], [die, step, die],
+            [step, die, step], [step, step, step], [die, die, die], [step, die, step],
+            [terminate, step, truncate], [die, truncate, step], [step, step, die],
+        ]
+    )  # fmt: skip
+
+    def wrap(envs: Any) -> Any:
+        if mode == AutoresetMode.NEXT_STEP:
+            envs = wrappers.NormalizeObservation(envs)
+        if (
+            mode == AutoresetMode.DISABLED
+        ):  # In this mode `SyncVectorEnv` hides masks from wrappers.
+            return envs
+        return wrappers.NormalizeReward(wrappers.RecordEpisodeStatistics(envs))
+
+    ours, theirs = wrap(mortals(mode, dies=True)), wrap(mortals(mode, dies=False))
+    both_do(ours, theirs, mode, actions)
+    ours.close()
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_hang_looks_like_an_episode_that_is_cut_short(mode: AutoresetMode) -> None:
+    hang, step = 1, 4
+    ours, theirs = mortals(mode, dies=True, step_timeout=2.0), mortals(mode, dies=False)
+    both_do(ours, theirs, mode, [[step] * 3, [step, hang, step], [step] * 3, [step] * 3])
+    ours.close()
+
+
+def test_a_loop_stores_only_steps_that_were_taken() -> None:
+    """With CleanRL's lines."""
+    envs = mortals(AutoresetMode.SAME_STEP, dies=True)
+    rng, stored = np.random.default_rng(3), []
+    obs, _ = envs.reset()
+    for _ in range(12):
+        actions = rng.choice([0, 2, 3, 4, 5, 6], 3, p=[0.1, 0.1, 0.1, 0.3, 0.2, 0.2])
+        next_obs, rewards, terminations, truncations, infos = envs.step(actions)
+        real_next_obs = next_obs.copy()
+        for idx, trunc in enumerate(truncations | terminations):
+            if trunc:
+                real_next_obs[idx] = infos["final_obs"][idx]
+        stored += zip(obs, real_next_obs, actions, rewards, terminations, strict=True)
+        obs = next_obs
+    envs.close()
+    for before, after, action, reward, terminated in stored:
+        env = Mortal(int(before[0]), dies=False)
+        env.count, env.sum = int(before[1]), int(before[2])
+        expected = env.step(action)
+        np.testing.assert_array_equal(after, expected[0])
+        assert (reward, terminated) == (expected[1], expected[2])
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_death_in_a_step_truncates_all_envs_of_its_worker(
     mode: AutoresetMode, twins: Any
 ) -> None:
-    """Their observations begin new episodes, in every mode; the others' step is what it was."""
+    """Their episodes end at the last observation; the step of the others doesn't change."""
     envs = made(autoreset_mode=mode)
     before, _ = envs.reset(seed=7)
     killed(envs.group, lambda: envs.step_async(ACTIONS))
@@ -57,21 +155,105 @@ def test_a_death_in_a_step_truncates_what_was_stepped_together(
     assert not terminated.any()
     assert rewards[:2].tolist() == [0, 0]
     assert all("was killed by SIGKILL" in cause for cause in infos["worker_restarted"][:2])
-    assert "final_obs" not in infos
-    assert not (observations[:2] == before[:2]).all(axis=1).any()
-    for _ in range(3):
-        np.testing.assert_array_equal(observations[2:], expected[0][2:])
-        np.testing.assert_array_equal(rewards[2:], expected[1][2:])
+    last = observations
+    if mode == AutoresetMode.SAME_STEP:
+        assert infos["_final_obs"].tolist() == infos["final_info"]["_worker_restarted"].tolist()
+        last = np.array([*infos["final_obs"][:2], *observations[2:]])
+        assert not (observations[:2] == before[:2]).all(axis=1).any()
+    np.testing.assert_array_equal(last[:2], before[:2])
+    np.testing.assert_array_equal(last[2:], expected[0][2:])
+    np.testing.assert_array_equal(rewards[2:], expected[1][2:])
+    if mode == AutoresetMode.DISABLED:
+        envs.reset(options={"reset_mask": np.array(LOST)})
+    for turn in range(3):
         observations, rewards, _, truncated, infos = envs.step(ACTIONS)
         expected = twins.step(ACTIONS)
+        is_reset = turn == 0 and mode == AutoresetMode.NEXT_STEP
+        assert ((rewards == 0) == (np.array(LOST) & is_reset)).all()
         assert not truncated.any()
-        assert (rewards != 0).all()
         assert "worker_restarted" not in infos
+        np.testing.assert_array_equal(observations[2:], expected[0][2:])
     envs.close()
 
 
-def test_a_death_in_anything_else(twins: Any) -> None:
-    """A reset begins episodes all the same, without its seeds, and says why; a call ends in an
+def step_until_one_has_ended(envs: Any) -> int:
+    """Step until one of the first two has ended; return its position."""
+    envs.action_space.seed(0)
+    for seed in range(99):
+        envs.reset(seed=seed)
+        for _ in range(60):
+            _, _, terminated, truncated, _ = envs.step(envs.action_space.sample())
+            done = (terminated | truncated)[:2]
+            if done.sum() == 1:
+                return int(done.argmax())
+    raise AssertionError("they end together")
+
+
+def test_one_that_was_about_to_be_reset_has_lost_nothing() -> None:
+    """It begins its episode, while the other env of the worker has lost its episode."""
+    envs = made()
+    due = step_until_one_has_ended(envs)
+    shown, lost = envs._observations.copy(), 1 - due
+    killed(envs.group, lambda: envs.step_async(ACTIONS))
+    observations, rewards, terminated, truncated, infos = envs.step_wait()
+    assert infos["_worker_restarted"].tolist() == LOST
+    assert truncated[[due, lost]].tolist() == [False, True]
+    assert not terminated[:2].any()
+    assert rewards[:2].tolist() == [0, 0]
+    np.testing.assert_array_equal(observations[lost], shown[lost])
+    first = observations[due].copy()
+    assert abs(first[1:] - [0, 0, 0, 0, *[0] * 6]).max() < 0.01
+    observations, rewards, terminated, truncated, infos = envs.step(ACTIONS)
+    assert rewards[lost] == 0 != rewards[due]
+    assert not (terminated | truncated)[:2].any()
+    assert abs(observations[lost][1:]).max() < 0.01
+    assert "worker_restarted" not in infos
+    _, rewards, _, _, _ = envs.step(ACTIONS)
+    assert (rewards[:2] != 0).all()
+    envs.close()
+
+
+def test_a_second_death_during_resets() -> None:
+    """The env that was stepped loses its new episode; the other one begins its episode."""
+    envs = made(max_restarts=5)
+    due = step_until_one_has_ended(envs)
+    lost = 1 - due
+    killed(envs.group, lambda: envs.step_async(ACTIONS))
+    envs.step_wait()
+    shown = envs._observations.copy()
+    killed(envs.group, lambda: envs.step_async(ACTIONS))
+    observations, rewards, _, truncated, infos = envs.step_wait()
+    assert infos["_worker_restarted"].tolist() == LOST
+    assert truncated[[due, lost]].tolist() == [True, False]
+    assert rewards[:2].tolist() == [0, 0]
+    np.testing.assert_array_equal(observations[due], shown[due])
+    _, rewards, _, truncated, _ = envs.step(ACTIONS)
+    assert rewards[due] == 0 != rewards[lost]
+    assert not truncated.any()
+    envs.close()
+
+
+def test_envs_that_are_reset_together_lose_their_episodes_together() -> None:
+    """A task's vector environment without masks."""
+    entry = {"max_concurrency": 2, "autoreset_mode": "NextStep"}
+    envs = make_vec("CartPole-v1", 4, "vector_entry_point", entry)
+    step_until_one_has_ended(envs)
+    shown, actions = envs._observations.copy(), np.zeros(4, np.int64)
+    killed(envs.group, lambda: envs.step_async(actions))
+    observations, _, _, truncated, _ = envs.step_wait()
+    assert truncated[:2].tolist() == [True, True]
+    np.testing.assert_array_equal(observations[:2], shown[:2])
+    observations, rewards, terminated, truncated, _ = envs.step(actions)
+    assert rewards[:2].tolist() == [0, 0]
+    assert not (terminated | truncated)[:2].any()
+    assert abs(observations[:2]).max() <= 0.05
+    # The poles of the other worker may have fallen meanwhile.
+    np.testing.assert_array_equal(envs.step(actions)[1], ~(terminated | truncated))
+    envs.close()
+
+
+def test_a_death_in_a_reset_or_a_call(twins: Any) -> None:
+    """A reset still begins episodes, without its seeds, and reports the cause; a call ends in an
     error, and the next step is the one that tells.
     """
     envs = made()
@@ -84,12 +266,17 @@ def test_a_death_in_anything_else(twins: Any) -> None:
     with pytest.raises(WorkerDied, match="env 'env-0'"):
         envs.call_wait()
     assert envs.step(ACTIONS)[3].tolist() == LOST
-    assert not envs.step(ACTIONS)[3].any()
+    mask = np.array([True, False, True, False])
+    envs.reset(options={"reset_mask": mask})
+    _, rewards, _, truncated, _ = envs.step(ACTIONS)
+    assert (rewards == 0).tolist() == [False, True, False, False]
+    assert not truncated.any()
+    assert (envs.step(ACTIONS)[1] != 0).all()
     envs.close()
 
 
-def test_a_death_is_raised_where_that_is_asked_for() -> None:
-    """Again and again: the worker is not replaced."""
+def test_a_death_raises_if_configured() -> None:
+    """Each time, as the worker is not replaced."""
     envs = made(on_worker_death="raise")
     envs.reset(seed=7)
     killed(envs.group, lambda: envs.step_async(ACTIONS))
@@ -100,26 +287,35 @@ def test_a_death_is_raised_where_that_is_asked_for() -> None:
     envs.close()
 
 
-def test_episodes_that_are_kept_go_on(twins: Any) -> None:
-    """What was lost is done once more, with the same outcome."""
-    envs = made(on_worker_death="resume", snapshot_every=1)
-    envs.reset(seed=7)
-    before = envs.step(ACTIONS)[0]
-    twins.step(ACTIONS)
-    killed(envs.group, lambda: envs.step_async(ACTIONS))
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_resumed_episodes_continue_as_new_ones(mode: AutoresetMode) -> None:
+    """Lost steps are repeated with the same results."""
+    makers = [lambda: gym.make(TASK)] * 2
+    entry = {"on_worker_death": "resume", "snapshot_every": 1, "envs_per_process": 1}
+    envs = VectorEnv(makers, autoreset_mode=mode, **entry)
+    actions = ACTIONS[:2]
+    envs.reset(seed=[7, 7])
+    before = envs.step(actions)[0]
+    killed(envs.group, lambda: envs.step_async(actions))
     observations, rewards, _, truncated, infos = envs.step_wait()
-    np.testing.assert_array_equal(observations[:2], before[:2])
-    assert rewards[:2].tolist() == [0, 0]
-    assert truncated.tolist() == LOST
-    assert infos["worker_resumed"][:2].tolist() == [0, 0]
-    expected = twins.step(ACTIONS)
-    np.testing.assert_array_equal(envs.step(ACTIONS)[0][:2], expected[0][:2])
+    assert truncated.tolist() == [True, False]
+    assert rewards[0] == infos["worker_resumed"][0] == 0
+    if mode == AutoresetMode.NEXT_STEP:
+        np.testing.assert_array_equal(observations[0], before[0])
+        again, rewards, _, _, infos = envs.step(actions)
+        assert (rewards == 0).tolist() == [True, False]
+        assert "worker_resumed" not in infos
+        np.testing.assert_array_equal(again[0], before[0])
+    np.testing.assert_array_equal(envs.step(actions)[0][0], observations[1])
     envs.close()
+    if mode == AutoresetMode.NEXT_STEP:
+        with pytest.raises(ConfigError, match=r"resume.*vectorization_mode='async'"):
+            made(on_worker_death="resume", snapshot_every=1)
 
 
 @pytest.mark.simulators
-def test_stable_baselines3_is_told_in_its_own_words() -> None:
-    """They are done, cut short, and show no last observation, as that is lost."""
+def test_stable_baselines3_gets_deaths_in_its_own_form() -> None:
+    """Episodes are done and truncated, with their last observation."""
     pytest.importorskip("stable_baselines3")
     from rlightning_aio.sb3 import make_vec_env
 
@@ -131,7 +327,8 @@ def test_stable_baselines3_is_told_in_its_own_words() -> None:
     observations, rewards, done, infos = envs.step_wait()
     assert done.tolist() == [info["TimeLimit.truncated"] for info in infos] == LOST
     assert ["worker_restarted" in info for info in infos] == LOST
-    assert not any("terminal_observation" in info for info in infos)
+    for info, shown in zip(infos[:2], before, strict=False):
+        np.testing.assert_array_equal(info["terminal_observation"], shown)
     assert rewards[:2].tolist() == [0, 0]
     assert not (observations[:2] == before[:2]).all(axis=1).any()
     _, rewards, done, infos = envs.step(ACTIONS)
@@ -139,3 +336,61 @@ def test_stable_baselines3_is_told_in_its_own_words() -> None:
     assert (rewards != 0).all()
     assert not any("worker_restarted" in info for info in infos)
     envs.close()
+
+
+@pytest.fixture
+def sb3_mortals() -> Iterator[Any]:
+    """Two envs behind Stable-Baselines3's interface; some random actions kill the worker."""
+    pytest.importorskip("stable_baselines3")
+    from rlightning_aio.sb3 import VecEnv
+
+    makers = [lambda k=k: Mortal(k, dies=True) for k in range(2)]
+    envs = VecEnv(makers, envs_per_process=1, max_restarts=9, step_timeout=2.0)
+    yield envs
+    envs.close()
+
+
+def taken(before: Any, action: int) -> Any:
+    """Results of a step from a given observation."""
+    env = Mortal(int(before[0]), dies=False)
+    env.count, env.sum = int(before[1]), int(before[2])
+    return env.step(action)
+
+
+@pytest.mark.simulators
+def test_a_replay_buffer_holds_only_steps_that_were_taken(sb3_mortals: Any) -> None:
+    """In a run with deaths and hangs."""
+    from stable_baselines3 import DQN
+
+    model = DQN("MlpPolicy", sb3_mortals, learning_starts=99, buffer_size=99, seed=1, device="cpu")
+    buffer = model.learn(60).replay_buffer
+    for step, k in np.ndindex(buffer.pos, 2):
+        before, action = buffer.observations[step, k], int(buffer.actions[step, k, 0])
+        observation, reward, terminated, truncated, _ = taken(before, action)
+        np.testing.assert_array_equal(buffer.next_observations[step, k], observation)
+        assert buffer.rewards[step, k] == reward
+        assert buffer.dones[step, k] == (terminated or truncated)
+        assert buffer.timeouts[step, k] == truncated
+    assert {0, 1} < set(buffer.actions[: buffer.pos].flatten().tolist())
+
+
+@pytest.mark.simulators
+def test_a_rollout_buffer_begins_an_episode_after_a_death(sb3_mortals: Any) -> None:
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.vec_env import VecMonitor
+
+    envs = VecMonitor(sb3_mortals)
+    model = PPO("MlpPolicy", envs, n_steps=30, batch_size=60, seed=3, device="cpu", gamma=0.0)
+    buffer = model.learn(60).rollout_buffer
+    # Swapped and flattened for training: all of one env, then all of the next.
+    observations, actions = (a.reshape(2, 30, -1) for a in (buffer.observations, buffer.actions))
+    for k, step in np.ndindex(2, 29):
+        before, action = observations[k, step], int(actions[k, step, 0])
+        observation, _, terminated, truncated, _ = taken(before, action)
+        first = [k, 0, 0]
+        expected = first if terminated or truncated else observation
+        np.testing.assert_array_equal(observations[k, step + 1], expected)
+    assert {0, 1} < set(actions.flatten().tolist())
+    episodes = model.ep_info_buffer
+    ends = sum(int(action) < 4 for action in actions.flatten())
+    assert len(episodes) == ends

@@ -1,4 +1,4 @@
-"""What Gymnasium's users rely on beside the results: waiting, refusing, closing, wrappers."""
+"""Behaviour of the vector interface other than results: waiting, errors, closing, wrappers."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import contextlib
 import multiprocessing
 import os
 import threading
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -15,14 +15,17 @@ from gymnasium import spaces
 from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import vector as wrappers
+from patience import HANG
 from timelines import Seen
 from vector.toys import Toy, assert_alike, press_ctrl_c, toy
 
-from rlightning_aio.errors import EnvRaised
+from rlightning_aio.errors import EnvRaised, StartFailed
 from rlightning_aio.vector import VectorEnv, make_vec, vector_entry_point
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+POLE = "InvertedPendulum-v5"
 
 
 class Plain(Toy):
@@ -35,7 +38,7 @@ class Plain(Toy):
 
 
 class Held(Plain):
-    """Each step and call waits until the file is there."""
+    """Each step and call waits for the file."""
 
     def __init__(self, gate: Path) -> None:
         self.gate = gate
@@ -93,8 +96,118 @@ def test_halves_of_a_call_belong_together(tmp_path: Path) -> None:
         env.reset()
 
 
+@pytest.mark.parametrize(
+    ("seed", "whose"),
+    [
+        ([1.9, 2], " of env 0"),
+        ([1, "2"], " of env 1"),
+        ([True, 2], " of env 0"),
+        ([-1, 2], " of env 0"),
+        ("12", " of env 0"),
+        (1.9, ""),
+    ],
+)
+def test_a_seed_that_is_not_an_int_raises_with_its_env(seed: Any, whose: str) -> None:
+    """Nothing is sent, so the next reset works."""
+    with contextlib.closing(VectorEnv([Plain] * 2, placement="inline")) as env:
+        with pytest.raises(ValueError, match=f"the seed{whose} must be an int from 0 .*, not "):
+            env.reset(seed=seed)
+        env.reset(seed=[1, None])
+
+
+@pytest.mark.parametrize("make", [lambda: VectorEnv([toy] * 2), lambda: make_vec(POLE, 2)])
+def test_its_envs_are_proxies(make: Any) -> None:
+    """Of separate envs, and of envs stepped together: attributes are read, called and set."""
+    with contextlib.closing(make()) as env:
+        env.reset(seed=3)
+        one = env.envs[1]
+        assert len(env.envs) == env.num_envs == 2
+        assert one.np_random_seed == one.unwrapped.np_random_seed == 4
+        assert one.metadata["render_fps"] > 0
+        assert not hasattr(one, "no_such")
+        with pytest.raises(AttributeError, match="no_such"):
+            one.no_such  # noqa: B018  # Read for its error.
+        assert one.has_wrapper_attr("metadata")
+        if make.__code__.co_names[0] == "VectorEnv":
+            assert one.double(2.0, plus=1.0) == 5.0
+            one.speed = 7.0
+            assert env.get_attr("speed") == (1.0, 7.0)
+        with pytest.raises(ValueError, match="itself"):
+            one.step(0)
+        env.step_async(env.action_space.sample())
+        with pytest.raises(AlreadyPendingCallError):
+            one.metadata  # noqa: B018
+        env.step_wait()
+
+
+class Unsaid(Plain):
+    metadata = None  # type: ignore[assignment]
+
+
+def without_mode() -> Any:
+    env: Any = gym.make_vec("CartPole-v1", 2, vectorization_mode="vector_entry_point")
+    env.metadata = {}
+    return env
+
+
+def with_mode() -> Any:
+    env = without_mode()
+    env.metadata = {**env.metadata, "autoreset_mode": AutoresetMode.NEXT_STEP}
+    return env
+
+
+class Old(gym.vector.VectorEnv[Any, Any, Any]):
+    """As SuperSuit's are: its spaces are those of one env."""
+
+    metadata: ClassVar = {}
+    observation_space = spaces.Discrete(2)
+    action_space = spaces.Discrete(2)
+    num_envs = 2
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (Unsaid, "the metadata of Unsaid must be a dict, not None"),
+        (without_mode, r"CartPoleVectorEnv has no autoreset_mode.*env\.metadata = "),
+        (Old, "Old is no vector environment.*single_observation_space.*backend: pettingzoo"),
+    ],
+)
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_incomplete_metadata_raise_with_the_fix(make: Any, message: str, mode: str) -> None:
+    with pytest.raises(StartFailed, match=message):
+        VectorEnv([make], autoreset_mode=mode, placement="inline")
+
+
+def test_a_vector_env_with_a_declared_mode_is_accepted() -> None:
+    with contextlib.closing(VectorEnv([with_mode] * 2, placement="inline")) as env:
+        assert env.num_envs == 4
+        env.reset()
+
+
+class Late(Plain):
+    """Its simulator gives up waiting."""
+
+    def step(self, action: Any) -> Any:
+        raise TimeoutError("the simulator does not answer")
+
+
+def test_an_error_of_an_env_keeps_its_class() -> None:
+    """If it is builtin; and a timeout of the env is not mistaken for the caller's."""
+    with contextlib.closing(VectorEnv([Late] * 2, max_concurrency=1)) as env:
+        for ask in (env.call, env.get_attr):
+            with pytest.raises(AttributeError, match="no_such") as caught:
+                ask("no_such")
+            assert isinstance(caught.value, EnvRaised)
+            assert "get_wrapper_attr" in caught.value.traceback_text
+        env.reset()
+        env.step_async(np.zeros(2, np.int64))
+        with pytest.raises(TimeoutError, match="does not answer"):
+            env.step_wait(timeout=HANG)
+
+
 def test_a_value_that_cannot_be_sent_leaves_nothing_behind() -> None:
-    """Of the values for several envs, one that can't be pickled."""
+    """One of several values can't be pickled."""
     env = VectorEnv([Plain] * 2, max_concurrency=1)
     with pytest.raises(TypeError, match="pickle"):
         env.set_attr("note", [1, threading.Lock()])
@@ -103,8 +216,8 @@ def test_a_value_that_cannot_be_sent_leaves_nothing_behind() -> None:
     env.close()
 
 
-def test_bad_arguments_are_refused_as_gymnasium_refuses_them() -> None:
-    """By the same classes, and nothing is sent."""
+def test_bad_arguments_raise_as_in_gymnasium() -> None:
+    """The same classes, and nothing is sent."""
     env = VectorEnv([toy] * 2, placement="inline")
     env.reset()
     for actions, kind in ((np.zeros(3, np.int64), ValueError), (np.int64(1), TypeError)):
@@ -129,8 +242,8 @@ class Sized(Plain):
         self.action_space = spaces.Discrete(actions)
 
 
-def test_spaces_go_together_or_are_refused() -> None:
-    """As the observation mode says; actions are always of one space."""
+def test_spaces_must_match() -> None:
+    """According to the observation mode; action spaces must always be equal."""
     both = [lambda: Sized(1, 3), lambda: Sized(2, 3)]
     with pytest.raises(RuntimeError, match=r"env 1 is Box.*observation_mode='different'"):
         VectorEnv(both, placement="inline")
@@ -143,7 +256,7 @@ def test_spaces_go_together_or_are_refused() -> None:
         VectorEnv([lambda: Sized(1, 3), lambda: Sized(1, 4)], placement="inline")
 
 
-def test_what_the_whole_tells_of_itself() -> None:
+def test_attributes_of_the_vector_env() -> None:
     """Spaces, metadata with the mode, render mode, seeds; without building an env here."""
     env = VectorEnv([toy] * 2, autoreset_mode="Disabled", placement="inline")
     assert (env.num_envs, env.render_mode) == (2, "rgb_array")
@@ -157,7 +270,7 @@ def test_what_the_whole_tells_of_itself() -> None:
 
 
 def test_a_timeline_is_recorded_through_its_group(tmp_path: Path) -> None:
-    """Under wrappers, too: each step and reset of each env."""
+    """Also under wrappers: each step and reset of each env."""
     env = wrappers.RecordEpisodeStatistics(
         make_vec("CartPole-v1", 2, vector_kwargs={"placement": "inline"})
     )
@@ -171,8 +284,8 @@ def test_a_timeline_is_recorded_through_its_group(tmp_path: Path) -> None:
         assert [one.name for one in seen.of(env_id)] == ["reset", "step", "step", "step"]
 
 
-def test_make_vec_takes_what_gymnasiums_takes() -> None:
-    """Wrappers, arguments of the task and of the vector env; the spec tells of the task."""
+def test_make_vec_takes_the_arguments_of_gymnasiums() -> None:
+    """Wrappers, arguments of the task and of the vector env; the spec has those of the task."""
     kwargs = {"max_episode_steps": 9, "wrappers": [gym.wrappers.RecordEpisodeStatistics]}
     ours = make_vec("Pendulum-v1", 2, vector_kwargs={"placement": "inline"}, g=3.0, **kwargs)
     theirs = gym.make_vec("Pendulum-v1", 2, vectorization_mode="sync", g=3.0, **kwargs)
@@ -204,7 +317,7 @@ class Interrupting(Plain):
 
 
 def test_after_ctrl_c_it_steps_and_resets() -> None:
-    """What the interrupted step has left is dropped."""
+    """Results of the interrupted step are dropped."""
     trainer = os.getpid()
     env = VectorEnv([lambda: Interrupting(trainer)] * 2)
     first, _ = env.reset(seed=0)
@@ -219,7 +332,7 @@ def test_after_ctrl_c_it_steps_and_resets() -> None:
 
 
 def test_a_tuple_of_actions_is_one_for_each_env() -> None:
-    """As a list is; only the actions of Tuple and Dict spaces are trees."""
+    """Like a list; only actions of Tuple and Dict spaces are trees."""
     with contextlib.closing(make_vec("CartPole-v1", 3)) as env:
         env.reset(seed=0)
         listed = env.step([0, 1, 0])
@@ -231,7 +344,7 @@ def test_a_tuple_of_actions_is_one_for_each_env() -> None:
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
 def test_a_step_limit_of_the_entry_ends_episodes(mode: AutoresetMode) -> None:
-    """In the mode that is asked for, again and again."""
+    """In the requested mode, repeatedly."""
     makers = [lambda: gym.make("Pendulum-v1")] * 2
     with contextlib.closing(VectorEnv(makers, autoreset_mode=mode, max_episode_steps=3)) as env:
         env.reset()
@@ -248,7 +361,7 @@ def test_arguments_of_methods_may_have_any_name() -> None:
 
 
 def test_make_vec_takes_gymnasiums_modes() -> None:
-    """By name or by its enum; what is none of ours is refused with the way to it."""
+    """By name or by enum; the error for unsupported modes names the alternative."""
     inline = {"placement": "inline"}
     for mode in (gym.VectorizeMode.ASYNC, "async", None):
         make_vec("Pendulum-v1", 1, mode, inline).close()
@@ -259,7 +372,7 @@ def test_make_vec_takes_gymnasiums_modes() -> None:
 
 
 def test_gymnasium_makes_it_by_a_vector_entry_point() -> None:
-    """As RLlib does, say."""
+    """As RLlib does, for example."""
     gym.register(
         "served/Pendulum-v1",
         entry_point="gymnasium.envs.classic_control:PendulumEnv",
@@ -286,7 +399,7 @@ def test_gymnasium_makes_it_by_a_vector_entry_point() -> None:
         wrappers.FlattenObservation,
     ],
 )
-def test_vector_wrappers_do_what_they_do_to_gymnasiums(wrap: Any) -> None:
+def test_vector_wrappers_have_the_same_effect_as_on_gymnasiums(wrap: Any) -> None:
     """Over the ends of episodes."""
 
     def make() -> Any:

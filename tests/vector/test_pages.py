@@ -1,4 +1,4 @@
-"""The programs of the pages on libraries that `make test` does not install run as they stand."""
+"""The programs of pages on libraries that `make test` does not install run unchanged."""
 
 from __future__ import annotations
 
@@ -19,18 +19,26 @@ DOCS = Path(__file__).parents[2] / "docs"
         ("torchrl", ["torchrl"]),
         ("rllib", ["ray", "tree", "torch"]),
         ("stable_baselines3", ["stable_baselines3"]),
+        ("rl_zoo3", ["rl_zoo3"]),
+        ("skrl", ["skrl"]),
+        ("tianshou", ["tianshou"]),
+        ("lerobot", ["lerobot"]),
     ],
 )
-def test_program_runs(
+def test_programs_run(
     page: str, needed: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """To its end, and prints what it says."""
-    # Ray would join a cluster that happens to be there, of other tests, say.
+    """Each program of the page runs to its end, and the page's programs print something."""
+    # Ray would join an existing cluster, such as that of other tests.
     monkeypatch.setenv("RAY_ADDRESS", "local")
     if missing := [name for name in needed if importlib.util.find_spec(name) is None]:
         pytest.skip(f"{', '.join(missing)} not installed")
     text = (DOCS / f"{page}.md").read_text()
-    (block,) = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
-    program = tmp_path / "program.py"
-    program.write_text(block)
-    assert output_of(program, folder=tmp_path).strip()
+    outputs = []
+    for index, block in enumerate(
+        re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    ):
+        program = tmp_path / f"program_{index}.py"
+        program.write_text(block)
+        outputs.append(output_of(program, folder=tmp_path))
+    assert "".join(outputs).strip()

@@ -1,8 +1,9 @@
-"""Stable-Baselines3's interface beside its own: the same results, and what trains on it."""
+"""Compares the adapter with Stable-Baselines3's own vector env, and trains on it."""
 
 from __future__ import annotations
 
 import os
+import sys
 import threading
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -30,8 +31,8 @@ def pendulum() -> gym.Env[Any, Any]:
     return gym.make("Pendulum-v1", max_episode_steps=30)
 
 
-def test_it_does_what_its_own_does() -> None:
-    """Over the ends of episodes: observations, rewards, ends, infos, and those of resets."""
+def test_it_does_the_same_as_subproc_vec_env() -> None:
+    """Over episode ends: observations, rewards, dones, infos, and infos of resets."""
     from stable_baselines3.common.vec_env import DummyVecEnv
 
     from rlightning_aio.sb3 import VecEnv
@@ -44,9 +45,11 @@ def test_it_does_what_its_own_does() -> None:
         actions = np.random.default_rng(0).uniform(-2, 2, (3, 1)).astype(np.float32)
         found, expected = ours.step(actions), theirs.step(actions)
         assert_alike(found[0], expected[0])
-        np.testing.assert_allclose(found[1], expected[1], rtol=1e-6)  # Theirs are float32.
+        np.testing.assert_allclose(
+            found[1], expected[1], rtol=1e-6
+        )  # Stable-Baselines3's are float32.
         assert_alike(found[2], expected[2])
-        assert_alike(found[3], expected[3])
+        assert_alike(list(found[3]), expected[3])
         assert_alike(ours.reset_infos, theirs.reset_infos)
     assert ours.get_attr("g") == theirs.get_attr("g")
     ours.set_attr("note", 7, indices=[0, -1])
@@ -58,8 +61,33 @@ def test_it_does_what_its_own_does() -> None:
     ours.close()
 
 
+def test_infos_are_made_when_they_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A step that ends no episode decodes none; a program that reads one finds all."""
+    from rlightning_aio.sb3 import VecEnv
+    from rlightning_aio.vector.rows import Singles
+
+    decoded: list[None] = []
+    info_list = Singles.info_list
+
+    def counted(rows: Singles, batch: Any) -> list[dict[str, Any]]:
+        decoded.append(None)
+        return info_list(rows, batch)
+
+    envs = VecEnv([pendulum] * 2)
+    envs.reset()
+    monkeypatch.setattr(Singles, "info_list", counted)
+    actions = np.zeros((2, 1), np.float32)
+    first = envs.step(actions)[3]
+    for _ in range(20):
+        envs.step(actions)
+    assert not decoded
+    assert first == [{"TimeLimit.truncated": False}] * 2
+    assert len(decoded) == 1
+    envs.close()
+
+
 class Choosy(gym.Env[Any, Any]):
-    """Raises when it is told to."""
+    """Raises for some actions and options."""
 
     observation_space = gym.spaces.Discrete(2)
     action_space = gym.spaces.Discrete(2)
@@ -76,7 +104,7 @@ class Choosy(gym.Env[Any, Any]):
 
 
 class Stuck:
-    """Can be copied, and not be sent."""
+    """Can be copied, but not pickled."""
 
     def __deepcopy__(self, memo: Any) -> Stuck:
         return self
@@ -86,7 +114,7 @@ class Stuck:
 
 
 def test_after_an_env_has_raised_all_are_reset() -> None:
-    """In a reset or a step, or where something can't be sent: nothing of it comes up later."""
+    """In a reset or a step, or if a value can't be sent; no late results appear."""
     from rlightning_aio.errors import EnvRaised
     from rlightning_aio.sb3 import VecEnv
 
@@ -107,7 +135,7 @@ def test_after_an_env_has_raised_all_are_reset() -> None:
 
 
 class Interrupting(gym.Env[Any, Any]):
-    """Its first step presses Ctrl-C where the trainer waits for it."""
+    """Its first step presses Ctrl-C while the trainer waits for it."""
 
     observation_space = gym.spaces.Discrete(10)
     action_space = gym.spaces.Discrete(2)
@@ -127,7 +155,7 @@ class Interrupting(gym.Env[Any, Any]):
 
 
 def test_after_ctrl_c_it_steps_and_resets() -> None:
-    """What the interrupted step has left comes up neither in the next step nor in a reset."""
+    """Results of the interrupted step appear neither in the next step nor in a reset."""
     from rlightning_aio.sb3 import VecEnv
 
     trainer = os.getpid()
@@ -163,7 +191,7 @@ def hoppers_in_turn() -> Any:
 
 @pytest.mark.parametrize("make", [hoppers_together, hoppers_in_turn])
 def test_a_method_of_some_envs_leaves_the_others_alone(make: Any) -> None:
-    """Of those that are stepped together, too; what they share can't be set for some."""
+    """Also for envs that are stepped together; shared attributes can't be set for some."""
     from rlightning_aio.errors import EnvRaised
     from rlightning_aio.sb3 import VecEnv
 
@@ -186,7 +214,7 @@ def test_a_method_of_some_envs_leaves_the_others_alone(make: Any) -> None:
 
 
 def test_a_step_limit_of_the_entry_ends_episodes() -> None:
-    """In the step that reaches it, and again as many steps later."""
+    """In the step that reaches it, and again the same number of steps later."""
     from rlightning_aio.sb3 import VecEnv
 
     env = VecEnv([lambda: gym.make("Pendulum-v1")] * 2, max_episode_steps=3)
@@ -202,7 +230,7 @@ def test_a_step_limit_of_the_entry_ends_episodes() -> None:
 
 
 class Locked(Choosy):
-    """Has what can't be sent."""
+    """Has an attribute that can't be pickled."""
 
     metadata: ClassVar = {"render_modes": [], "render_fps": 7}
 
@@ -213,8 +241,8 @@ class Locked(Choosy):
         return [0, 1]
 
 
-def test_what_envs_have_is_told_without_sending_it() -> None:
-    """As a mask's method is looked for; films have the envs' own rate."""
+def test_has_attr_does_not_transfer_the_value() -> None:
+    """As in look-ups of a mask method; films have the frame rate of the envs."""
     from rlightning_aio.sb3 import VecEnv
 
     env = VecEnv([Locked] * 2)
@@ -225,8 +253,8 @@ def test_what_envs_have_is_told_without_sending_it() -> None:
     env.close()
 
 
-def test_sac_learns_the_very_same_on_it() -> None:
-    """Weights and all, for the same seed; through `VecNormalize`."""
+def test_sac_learns_identically_on_it() -> None:
+    """The same weights for the same seed, through `VecNormalize`."""
     from stable_baselines3 import SAC
     from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
@@ -234,7 +262,9 @@ def test_sac_learns_the_very_same_on_it() -> None:
 
     weights: list[Any] = []
     for kind in (VecEnv, DummyVecEnv):
-        env = VecNormalize(kind([pendulum] * 2), norm_reward=False)  # Theirs are float32.
+        env = VecNormalize(
+            kind([pendulum] * 2), norm_reward=False
+        )  # Stable-Baselines3's are float32.
         model = SAC("MlpPolicy", env, learning_starts=40, seed=1, device="cpu").learn(120)
         weights.append(model.policy.state_dict())
         env.close()
@@ -242,8 +272,8 @@ def test_sac_learns_the_very_same_on_it() -> None:
 
 
 @pytest.mark.parametrize("task", ["CartPole-v1", "Hopper-v5"])  # Separate, and stepped together.
-def test_make_vec_env_is_called_as_theirs(task: str) -> None:
-    """A class that it takes the place of changes nothing; another, or a slip, is refused."""
+def test_make_vec_env_takes_the_arguments_of_stable_baselines3s(task: str) -> None:
+    """Classes that it replaces are ignored; other classes and unknown arguments raise."""
     from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
     from rlightning_aio.sb3 import make_vec_env
@@ -274,3 +304,41 @@ def test_ppo_is_evaluated_on_it(tmp_path: Path) -> None:
     played = [one.name for one in Seen(tmp_path / "run.json").of("env-1")]
     assert played[0] == "reset"
     assert len(played) > 2
+
+
+class Counting(Choosy):
+    """Reports the imports of its worker, and the number of requests."""
+
+    asked = 0
+
+    def loaded(self, name: str) -> bool:
+        self.asked += 1
+        return name in sys.modules
+
+
+def test_workers_do_not_import_the_classes_that_are_looked_for() -> None:
+    """A monitor looks for another monitor around each env, and finds an existing one."""
+    from stable_baselines3.common.monitor import Monitor
+    from stable_baselines3.common.vec_env import VecMonitor
+
+    from rlightning_aio.sb3 import VecEnv
+
+    env = VecMonitor(VecEnv([Counting] * 2))
+    assert not any(env.env_method("loaded", "stable_baselines3"))
+    assert not any(env.env_method("loaded", "torch"))
+    env.close()
+    env = VecEnv([lambda: Monitor(Counting())] * 2)
+    assert env.env_is_wrapped(Monitor) == [True, True]
+    assert env.env_is_wrapped(Monitor, indices=[1, 1]) == [True, True]
+    env.close()
+
+
+def test_an_env_with_two_indices_is_called_twice() -> None:
+    from rlightning_aio.sb3 import VecEnv
+
+    env = VecEnv([Counting] * 3)
+    assert env.env_method("loaded", "sys", indices=[1, 1, 0, -2]) == [True] * 4
+    assert env.get_attr("asked") == [1, 3, 0]
+    env.set_attr("asked", 7, indices=[2, 2])
+    assert env.get_attr("asked", indices=[2, 2, 0]) == [7, 7, 1]
+    env.close()

@@ -1,4 +1,4 @@
-"""Envs that are stepped together behind the vector interface: when, and what they refuse."""
+"""Envs that are stepped together behind the vector interface: conditions and errors."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from vector.toys import Toy, assert_alike
 
+from rlightning_aio.envs import mujoco_tasks
 from rlightning_aio.errors import EnvRaised, StartFailed
 from rlightning_aio.vector import VectorEnv, make_vec
+from rlightning_aio.vector.making import steps_together
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -34,10 +36,10 @@ PENDULUM = "InvertedPendulum-v5"
         ("CartPole-v1", 6, {"vectorization_mode": "vector_entry_point"}, 1),
     ],
 )
-def test_envs_are_stepped_together_where_nobody_notices(
+def test_envs_are_stepped_together_if_results_are_the_same(
     task: str, num_envs: int, arguments: dict[str, Any], num_results: int
 ) -> None:
-    """Not those in wrappers, nor those of tasks with other results; those only if asked to."""
+    """Not with wrappers; tasks with other results only on request."""
     env = make_vec(task, num_envs, vector_kwargs=INLINE, **arguments)
     assert len(env.group.env_ids) == num_results
     observations, infos = env.reset(seed=1)
@@ -53,10 +55,8 @@ def test_envs_are_stepped_together_where_nobody_notices(
     ("arguments", "num_results"),
     [({"max_concurrency": 2}, 2), ({"envs_per_process": 4}, 3), (INLINE, 1)],
 )
-def test_arguments_are_about_envs_however_they_are_stepped(
-    arguments: dict[str, Any], num_results: int
-) -> None:
-    """Twelve, over as many workers as are asked for."""
+def test_numbers_in_arguments_count_envs(arguments: dict[str, Any], num_results: int) -> None:
+    """Twelve envs, over the requested number of workers."""
     env = make_vec(PENDULUM, 12, vector_kwargs=arguments)
     found = len(env.group.env_ids), env.num_envs
     env.reset(seed=[*range(0, 24, 2)])
@@ -66,8 +66,42 @@ def test_arguments_are_about_envs_however_they_are_stepped(
     assert seeds == tuple(range(0, 24, 2))
 
 
-def test_no_such_way_is_refused() -> None:
-    """A mode that is none, an entry point that is none, and wrappers that would be lost."""
+def test_envs_that_are_stepped_together_need_no_worker(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are in this process, unless an argument needs workers or MuJoCo has no batches."""
+    for arguments, pids in (({}, [None]), ({"step_timeout": 60.0, "max_concurrency": 1}, [int])):
+        env = make_vec(PENDULUM, 4, vector_kwargs=arguments, num_threads=2)
+        found = [worker["pid"] for worker in env.group.get_workers()]
+        assert [pid if pid is None else type(pid) for pid in found] == pids
+        env.close()
+    assert steps_together(gym.spec(PENDULUM), {})
+    monkeypatch.setattr(mujoco_tasks, "version", lambda _: "3.12.0")
+    assert not steps_together(gym.spec(PENDULUM), {})
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.value)
+def test_batches_here_and_in_a_worker_form_one_vector_env(mode: AutoresetMode) -> None:
+    """Results of this process are passed as objects, those of a worker in shared memory."""
+    kwargs: dict[str, Any] = {"placement": "split", "envs_per_process": 2, "autoreset_mode": mode}
+    ours = make_vec(PENDULUM, 4, vector_kwargs=kwargs, max_episode_steps=5)
+    make = functools.partial(gym.make, PENDULUM, disable_env_checker=True, max_episode_steps=5)
+    theirs = SyncVectorEnv([make] * 4, autoreset_mode=mode)
+    assert [worker["pid"] is None for worker in ours.group.get_workers()] == [False, True]
+    assert_alike(ours.reset(seed=2), theirs.reset(seed=2))
+    ours.action_space.seed(0)
+    for turn in range(12):
+        actions = ours.action_space.sample()
+        found, expected = ours.step(actions), theirs.step(actions)
+        assert_alike(found, expected, f"{turn}")
+        due = expected[2] | expected[3]
+        if mode == AutoresetMode.DISABLED and due.any():
+            options = {"reset_mask": due}
+            assert_alike(ours.reset(options=dict(options)), theirs.reset(options=dict(options)))
+    ours.close()
+    theirs.close()
+
+
+def test_unsupported_modes_raise() -> None:
+    """An unknown mode, a missing entry point, and wrappers that would be lost."""
     with pytest.raises(ValueError, match="'async' or 'vector_entry_point', not 'sync'"):
         make_vec(PENDULUM, 2, "sync")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="has no such entry point"):
@@ -80,8 +114,8 @@ def test_no_such_way_is_refused() -> None:
         make_vec("CartPole-v1", 2, "vector_entry_point", {"autoreset_mode": "SameStep", **INLINE})
 
 
-def test_what_would_make_them_differ_is_refused() -> None:
-    """Attributes of some, and those that are each one's own; the error says how to have them."""
+def test_attributes_that_would_make_them_differ_raise() -> None:
+    """Attributes of some envs, and attributes of each env; the error says what to do."""
     env = make_vec(PENDULUM, 3, vector_kwargs=INLINE)
     env.reset(seed=0)
     for name, values in (("frame_skip", [1, 2, 3]), ("model", 1), ("data", 1)):
@@ -93,8 +127,8 @@ def test_what_would_make_them_differ_is_refused() -> None:
     env.close()
 
 
-def test_a_tasks_own_vector_environment_says_what_it_lacks() -> None:
-    """Methods of each, and resets of some; a mask of all is no mask."""
+def test_missing_features_of_a_tasks_vector_environment_raise() -> None:
+    """Methods of single envs, and resets of some; a mask of all is allowed."""
     env = make_vec("CartPole-v1", 4, "vector_entry_point", {"max_concurrency": 2})
     first, _ = env.reset(seed=3)
     with pytest.raises(EnvRaised, match=r"has no call\(\) for each; make separate envs"):
@@ -126,7 +160,7 @@ def loops(mode: AutoresetMode, num_envs: int) -> Any:
 
 @pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.value)
 def test_callables_may_return_vector_environments(mode: AutoresetMode) -> None:
-    """Two of three envs each are one of six: results, masks, methods, attributes, frames."""
+    """Two with three envs form one of six: results, masks, methods, attributes, frames."""
     ours = VectorEnv([functools.partial(loops, mode, 3)] * 2, autoreset_mode=mode, **INLINE)
     theirs = loops(mode, 6)
     assert (ours.num_envs, ours.observation_space) == (6, theirs.observation_space)
@@ -153,8 +187,8 @@ def test_callables_may_return_vector_environments(mode: AutoresetMode) -> None:
         env.close()
 
 
-def test_vector_environments_must_go_together() -> None:
-    """As many in each, in the mode that is asked for."""
+def test_vector_environments_must_match() -> None:
+    """In their number of envs and in their autoreset mode."""
     makers = [functools.partial(loops, AutoresetMode.NEXT_STEP, count) for count in (2, 3)]
     with pytest.raises(RuntimeError, match="the number must be the same everywhere"):
         VectorEnv(makers, **INLINE)
@@ -175,8 +209,8 @@ class Gated(Short):
         return observation, reward, False, False, info
 
 
-def test_a_timeout_leaves_it_in_step(tmp_path: Path) -> None:
-    """What comes late is dropped, of all that are stepped together."""
+def test_results_after_a_timeout_are_dropped(tmp_path: Path) -> None:
+    """Also for envs that are stepped together."""
     gate = tmp_path / "open"
     batch = functools.partial(SyncVectorEnv, [functools.partial(Gated, gate)] * 2)
     env = VectorEnv([batch] * 2, max_concurrency=2)

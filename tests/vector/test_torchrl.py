@@ -10,7 +10,7 @@ from rlightning_aio.vector import make_vec
 
 pytestmark = [
     pytest.mark.simulators,
-    # It warns of what it does itself.
+    # It warns of its own actions.
     pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning"),
 ]
 
@@ -21,8 +21,8 @@ def torchrl() -> Any:
 
 
 @pytest.mark.parametrize("mode", ["Disabled", "SameStep"])
-def test_its_wrapper_takes_it_and_feeds_a_collector(mode: str) -> None:
-    """The specs hold what steps bring, and a collector's frames run over ends of episodes."""
+def test_its_wrapper_feeds_a_collector(mode: str) -> None:
+    """Steps match the specs, and frames of a collector continue over episode ends."""
     from torchrl.collectors import Collector
     from torchrl.envs import GymWrapper
     from torchrl.envs.utils import check_env_specs
@@ -38,7 +38,7 @@ def test_its_wrapper_takes_it_and_feeds_a_collector(mode: str) -> None:
     assert [batch.batch_size for batch in batches] == [(2, 20)] * 3
     for batch in batches:
         assert batch["next", "done"].any()
-        # An episode's last observation belongs to it; the next one's first comes after.
+        # The last observation belongs to its episode, the next one begins another.
         ended = batch["next", "done"][:, :-1, 0]
         assert (batch["next", "observation"][:, :-1] != batch["observation"][:, 1:])[ended].any()
         going = ~ended

@@ -1,4 +1,4 @@
-"""Episodes through the adapters beside those of their peers and of a plain loop, to the bit."""
+"""Episodes through the adapters are bit-identical to those of their peers and of a plain loop."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ MODES = [
     pytest.param(AutoresetMode.DISABLED, id="Disabled"),
 ]
 
-# Python keeps shared memory of its own for the next, which would count as left behind. TorchRL,
-# once imported, has processes begin with importing everything anew.
+# Python caches shared memory, which would count as left behind. TorchRL,
+# once imported, makes processes import everything again.
 PEER: dict[str, dict[str, Any]] = {
     "async": {"shared_memory": False, "context": "fork"},
     "sync": {},
@@ -36,7 +36,7 @@ PEER: dict[str, dict[str, Any]] = {
 
 @pytest.fixture(scope="module", autouse=True)
 def tracker_of_multiprocessing() -> None:
-    """Peers start it, one for the whole process; it stays until that ends."""
+    """Peers start one for the whole process, which lasts until the process ends."""
     resource_tracker.ensure_running()
 
 
@@ -63,7 +63,7 @@ def actions_for(space: gym.Space[Any], count: int, size: int = SIZE) -> list[Any
 
 
 def stepped(env: Any, actions: list[Any]) -> Iterator[Any]:
-    """What a vector env answers; where nobody else resets, its user does."""
+    """Results of a vector env; if its mode is disabled, the test resets it."""
     yield env.reset(seed=SEED)
     for each in actions:
         result = env.step(each)
@@ -75,7 +75,7 @@ def stepped(env: Any, actions: list[Any]) -> Iterator[Any]:
 
 
 def looped(makers: list[Any], mode: AutoresetMode, actions: list[Any]) -> Iterator[Any]:
-    """The same without infos, by single envs one after the other; and what episodes ended with."""
+    """The same by single envs in a loop, without infos; and the ends of episodes."""
     envs = [make() for make in makers]
     size = len(envs)
     space = envs[0].observation_space
@@ -108,7 +108,7 @@ def looped(makers: list[Any], mode: AutoresetMode, actions: list[Any]) -> Iterat
 
 
 def compare(ours: Any, theirs: Any, task: str, count: int, makers: list[Any] | None = None) -> None:
-    """All three go through the same episodes, of which there are several."""
+    """All three make the same episodes, more than one."""
     makers = makers or makers_of(task)
     actions = actions_for(theirs.single_action_space, count, len(makers))
     mode, ends = theirs.autoreset_mode, 0
@@ -142,7 +142,7 @@ def test_in_workers(mode: AutoresetMode) -> None:
 
 
 def compare_together(task: str, mode: AutoresetMode, count: int, peer: str, limit: int) -> None:
-    """Four simulations in two workers, which step theirs together."""
+    """Four simulations in two workers, each stepping two together."""
     kwargs, arguments = {"max_episode_steps": limit}, {"autoreset_mode": mode}
     ours = make_vec(task, 4, vector_kwargs={**arguments, "max_concurrency": 2}, **kwargs)
     assert len(ours.group.env_ids) == 2
@@ -152,7 +152,7 @@ def compare_together(task: str, mode: AutoresetMode, count: int, peer: str, limi
 
 @pytest.mark.parametrize("mode", MODES)
 def test_together(mode: AutoresetMode) -> None:
-    """Ends of some, and of all at once."""
+    """Ends of some envs, and of all in one step."""
     compare_together("Hopper-v5", mode, 60, "sync", 20)
 
 
@@ -188,21 +188,21 @@ def test_beside_gymnasiums_processes(task: str, mode: AutoresetMode) -> None:
     + [("Hopper-v5", AutoresetMode.SAME_STEP), ("Hopper-v5", AutoresetMode.DISABLED)],
 )
 def test_together_beside_gymnasiums_processes(task: str, mode: AutoresetMode) -> None:
-    """A thousand steps of each task of MuJoCo, and in each mode: modes are the same for all."""
+    """A thousand steps of each MuJoCo task, and of one in each mode."""
     compare_together(task, mode, 1000, "async", 150)
 
 
 @pytest.mark.simulators
 @pytest.mark.parametrize("task", TASKS)
 def test_beside_stable_baselines3s_processes(task: str) -> None:
-    """A thousand steps of each task: observations, rewards, ends, infos, and those of resets."""
+    """A thousand steps of each task: observations, rewards, dones, infos, and infos of resets."""
     vec_env = pytest.importorskip("stable_baselines3.common.vec_env")
     if task.startswith("ALE/"):
         pytest.importorskip("ale_py")
     from rlightning_aio.sb3 import VecEnv
 
     makers = makers_of(task)
-    # Forked, it leaves no fork server behind.
+    # Forking leaves no fork server behind.
     theirs = vec_env.SubprocVecEnv(makers, start_method="fork")
     compare_with_stable_baselines3(VecEnv(makers), theirs, task, makers)
 
@@ -210,13 +210,13 @@ def test_beside_stable_baselines3s_processes(task: str) -> None:
 @pytest.mark.simulators
 @pytest.mark.parametrize("task", TOGETHER)
 def test_together_beside_stable_baselines3s_processes(task: str) -> None:
-    """The same where each of two workers steps two simulations together."""
+    """The same with two workers that step two simulations each."""
     vec_env = pytest.importorskip("stable_baselines3.common.vec_env")
     from rlightning_aio.sb3 import make_vec_env
 
     makers = [functools.partial(gym.make, task, max_episode_steps=150, render_mode="rgb_array")] * 4
     theirs = vec_env.SubprocVecEnv(makers, start_method="fork")
-    # What monitors add to infos is rounded in two ways; the envs themselves are compared.
+    # Monitors round their infos differently, so compare the envs without them.
     ours = make_vec_env(
         task, 4, env_kwargs={"max_episode_steps": 150}, vec_env_kwargs={"envs_per_process": 2}
     ).venv
@@ -225,7 +225,7 @@ def test_together_beside_stable_baselines3s_processes(task: str) -> None:
 
 
 def as_numpys(infos: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Infos whose numbers are NumPy's, as those of simulations that are stepped together."""
+    """Convert numbers of infos to NumPy's, as in infos of simulations that are stepped together."""
     kinds = {int: np.int64, float: np.float64}
     return [{key: kinds.get(type(v), lambda v: v)(v) for key, v in info.items()} for info in infos]
 
@@ -244,7 +244,7 @@ def compare_with_stable_baselines3(ours: Any, theirs: Any, task: str, makers: li
     for turn, (each, of_loop) in enumerate(zip(actions, plain, strict=True)):
         found = ours.step(each)
         *expected, infos = theirs.step(each)
-        expected[1] = expected[1].astype(np.float64)  # Some tasks' rewards are ints there.
+        expected[1] = expected[1].astype(np.float64)  # Rewards of some tasks are ints.
         infos, reset_infos = list(infos), list(theirs.reset_infos)
         if together:
             infos, reset_infos = (as_numpys(told) for told in (infos, reset_infos))

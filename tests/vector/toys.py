@@ -1,4 +1,4 @@
-"""Envs whose every result tells where it comes from."""
+"""Envs with results that identify their origin."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gymnasium import spaces
 
 
 class Toy(gym.Env[Any, Any]):
-    """Ends at random, by its own generator; tells much."""
+    """Ends at random, by its own generator; reports many infos."""
 
     metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": 7}
     action_space = spaces.Discrete(3)
@@ -49,6 +49,38 @@ class Toy(gym.Env[Any, Any]):
         return 2 * value + plus
 
 
+class Mortal(gym.Env[Any, Any]):
+    """Counts steps; some actions end its episode, or the life of its worker.
+
+    Without `dies`, it is what a program is to see of that: an episode that is cut short.
+    """
+
+    DIE, HANG, TERMINATE, TRUNCATE, STEP = range(5)
+    action_space = spaces.Discrete(8)
+    observation_space = spaces.Box(-1, 100, (3,), np.float64)
+
+    def __init__(self, index: int, *, dies: bool) -> None:
+        self.index, self.dies = index, dies
+
+    def _observed(self) -> Any:
+        return np.array([self.index, self.count, self.sum], np.float64)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        self.count = self.sum = 0
+        return self._observed(), {"begun": self.index}
+
+    def step(self, action: Any) -> Any:
+        if action in (self.DIE, self.HANG):
+            if self.dies:
+                while True:  # The signal that requests stacks doesn't end a hang.
+                    os.kill(os.getpid(), signal.SIGKILL) if action == self.DIE else signal.pause()
+            return self._observed(), 0.0, False, True, {"worker_restarted": "lost"}
+        self.count += 1
+        self.sum += int(action)
+        ends = action == self.TERMINATE, action == self.TRUNCATE
+        return self._observed(), 1.5 + self.count, *ends, {"count": self.count}
+
+
 class Wrapped(gym.Wrapper[Any, Any, Any, Any]):
     """A wrapper with an attribute of its own."""
 
@@ -60,7 +92,7 @@ def toy() -> gym.Env[Any, Any]:
 
 
 def assert_alike(found: Any, expected: Any, where: str = "") -> None:
-    """Equal in structure, type, dtype, shape and value; the order of keys is nobody's business."""
+    """Equal in structure, type, dtype, shape and value; the order of keys doesn't matter."""
     assert type(found) is type(expected), where
     if isinstance(expected, dict):
         assert found.keys() == expected.keys(), where
@@ -82,7 +114,7 @@ def assert_alike(found: Any, expected: Any, where: str = "") -> None:
 
 
 def press_ctrl_c(trainer: int) -> None:
-    """As soon as that process sleeps, which it does where it waits for envs."""
+    """Press it once that process sleeps, that is, waits for envs."""
     while Path(f"/proc/{trainer}/stat").read_text().rpartition(")")[2].split()[0] != "S":
         time.sleep(0.001)
     os.kill(trainer, signal.SIGINT)

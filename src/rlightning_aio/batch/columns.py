@@ -1,4 +1,4 @@
-"""`ResultColumns`: the arrays that a batch of results consists of."""
+"""`ResultColumns`: the arrays of a batch of results."""
 
 from __future__ import annotations
 
@@ -24,33 +24,30 @@ if TYPE_CHECKING:
 
 __all__ = ["BY_ROW", "ResultColumns"]
 
-# The monotonic clock's distance to the epoch; workers stamp results with the former.
+# Offset of the monotonic clock, which stamps results, from the epoch.
 _EPOCH_NS = time.time_ns() - time.monotonic_ns()
 
 
 @dataclass(slots=True)
 class ResultColumns:
-    """Results of envs whose rows have one layout; every array has them on its first axis.
+    """Results of envs with the same row layout; the first axis of each array is that of rows.
 
     Attributes:
-        slots: the env of each row, a slot of `names`.
-        positions: the place of each row in the batch; None for 0, 1, 2, …
-        observation: tree of arrays, or None where observations came one by one
-            (`out_of_band`).
+        slots: slot of the env of each row, in `names`.
+        positions: position of each row in the batch; None for 0, 1, 2, …
+        observation: tree of arrays, or None if observations are in `out_of_band`.
         reward: ``[n, *head]``; flags: ``[n, *head, 4]``, see `protocol.slab`.
-        info_marks, info: see `protocol.info`; None where no env has put any into its row.
-        schemas: by slot, its worker's schemas by number.
-        out_of_band: what did not fit a row, by row, pickled or plain.
-        whole_results: some of these are results handed over whole, which are never pickled.
-        episode_return, episode_length: of episodes that have ended, or were cut; None if
-            nowhere.
-        limit_reached: ``[n]``, where the step limit has cut an episode; None if nowhere.
-        restarted: ``[n]``, where the episode before was lost with its worker; likewise.
-        times: ``[n, 2]``: when each result was ready (monotonic), and the time the env took,
-            in ns.
-        sent_ns: ``[n]``, see `protocol.slab`; None where the trainer's clock is the env's.
-        agents: names of a multi-agent env's agents.
-        observation_space: of one env; None if it isn't known.
+        info_marks, info: see `protocol.info`; None if no row has an info.
+        schemas: for each slot, the schemas of its worker by number.
+        out_of_band: values that did not fit a row, by row, pickled or plain.
+        whole_results: True if `out_of_band` has complete results, which are never pickled.
+        episode_return, episode_length: of episodes that have ended or were cut; None without any.
+        limit_reached: ``[n]``, True if the step limit has cut the episode; None if it is nowhere.
+        restarted: ``[n]``, True if the previous episode was lost with its worker; likewise.
+        times: ``[n, 2]``: when each result was ready (monotonic), and how long the env took, in ns.
+        sent_ns: ``[n]``, see `protocol.slab`; None if the envs use the trainer's clock.
+        agents: names of the agents of a multi-agent env.
+        observation_space: of one env; None if unknown.
     """
 
     slots: NDArray[np.intp]
@@ -77,7 +74,7 @@ class ResultColumns:
         return len(self.slots)
 
     def apart(self) -> ResultColumns:
-        """The same results without a group around them: slots 0, 1, 2, … are its own rows."""
+        """Return the same results without a group: their slots are 0, 1, 2, …"""
         slots: list[int] = self.slots.tolist()
         return replace(
             self,
@@ -86,7 +83,7 @@ class ResultColumns:
             schemas=[self.schemas[slot] for slot in slots],
         )
 
-    # -- what each row is -------------------------------------------------------------
+    # -- flags and times of rows ------------------------------------------------------
 
     @property
     def terminated(self) -> NDArray[np.bool_]:
@@ -100,29 +97,35 @@ class ResultColumns:
 
     @property
     def ended(self) -> NDArray[np.bool_]:
-        """Terminated or truncated: ``[n, *head]``."""
+        """``[n, *head]``, terminated or truncated."""
         return self.terminated | self.truncated
 
     @property
     def done(self) -> NDArray[np.bool_]:
-        """Terminated, truncated or cut by the step limit: ``[n, *head]``."""
+        """``[n, *head]``, terminated, truncated or cut by the step limit."""
         ended = self.ended
         return ended if self.limit_reached is None else ended | self._spread(self.limit_reached)
 
     @property
     def is_reset(self) -> NDArray[np.bool_]:
-        """No transition ends here: ``[n]``, ``[n, num_envs]`` with sub-environments."""
+        """``[n]`` or ``[n, num_envs]``, True if no transition ends in the row."""
         resets = self.flags[..., IS_RESET]
         return resets[:, 0] if self.agents else resets
 
     @property
     def over(self) -> NDArray[np.bool_]:
-        """Whether all episodes of an env have ended and none was reset since: ``[n]``."""
+        """``[n]``, True if all episodes of an env have ended and none was reset since."""
         over = self.flags[..., OVER]
         return over if over.ndim == 1 else np.logical_and.reduce(over.reshape(len(over), -1), 1)
 
+    @property
+    def has_ended(self) -> NDArray[np.bool_]:
+        """Mask of episodes that have ended for all agents, and were not reset since."""
+        over = self.flags[..., OVER]
+        return np.logical_and.reduce(over, 1) if self.agents else over
+
     def by_sub_env(self, column: NDArray[Any] | None) -> NDArray[Any]:
-        """A column of envs, ``[n]``, in the shape of `is_reset`; None is all False."""
+        """Broadcast a column of envs, ``[n]``, to the shape of `is_reset`; None is all False."""
         shape = self.is_reset.shape
         if column is None:
             return np.zeros(shape, np.bool_)
@@ -135,7 +138,7 @@ class ResultColumns:
 
     @property
     def index(self) -> NDArray[np.int64]:
-        """Place in the group, sub-environments counted: ``[n]`` or ``[n, num_envs]``."""
+        """``[n]`` or ``[n, num_envs]``, position in the group, counting sub-environments."""
         names, shape = self.names, self.is_reset.shape
         first: NDArray[np.int64] = names.index_offset[self.slots]
         if len(shape) == 1:
@@ -149,25 +152,25 @@ class ResultColumns:
 
     @property
     def ready_ns(self) -> NDArray[np.int64]:
-        """When each result was ready, on the monotonic clock: ``[n]``."""
+        """``[n]``, time on the monotonic clock when each result was ready."""
         return self.times[:, 0]
 
     @property
     def busy_ns(self) -> NDArray[np.int64]:
-        """The time each env took: ``[n]``."""
+        """``[n]``, time that each env took."""
         return self.times[:, 1]
 
     # -- one row ----------------------------------------------------------------------
 
     def out_of_band_of(self, row: int) -> dict[str, Any]:
-        """What came out of band for `row`; empty if nothing did."""
+        """Out-of-band values of `row`."""
         found = self.out_of_band.get(row)
         if isinstance(found, bytes):
             found = self.out_of_band[row] = pickle.loads(found)
         return found or {}
 
     def observation_of(self, row: int) -> Any:
-        """One env's observation."""
+        """Observation of one env."""
         kept = self.out_of_band_of(row) if self.out_of_band else {}
         if "ret" in kept:
             return kept["ret"].observation
@@ -176,20 +179,20 @@ class ResultColumns:
         return kept["observation"]
 
     def info_of(self, row: int) -> dict[str, Any]:
-        """One env's info, with the episode's sums if it has just ended."""
+        """Info of one env, with the sums of its episode if that has just ended."""
         info = self.reported_info_of(row)
         episode = self.episode(row)
         return {"episode": episode, **info} if episode else info
 
     def reported_info_of(self, row: int) -> dict[str, Any]:
-        """One env's info, as the env told it."""
+        """Info of one env, as the env reported it."""
         kept = self.out_of_band_of(row) if self.out_of_band else {}
         if "ret" in kept:
             return kept["ret"].info
         return kept["info"] if "info" in kept else self._info_in_row(row)
 
     def may_hold(self, row: int, keys: Iterable[str]) -> bool:
-        """Whether the info of `row` may hold any of `keys`; tells without decoding it."""
+        """Return False if the info of `row` has none of `keys`, as seen without decoding it."""
         mark = self._mark(row)
         if mark in (NO_INFO, PICKLED):
             return row in self.out_of_band
@@ -205,24 +208,32 @@ class ResultColumns:
         return self.schemas[int(self.slots[row])][mark].decode(memoryview(self.info[row]))
 
     def episode(self, row: int) -> dict[str, Any]:
-        """The sums of the episode that has just ended; empty if none has."""
+        """Sums of the episode that has just ended; empty if none has."""
         if self.episode_return is None or self.episode_length is None:
             return {}
         if self.restarted is not None and self.restarted[row]:
-            return {}  # It has lost the episode, or goes on with it.
-        ended = self.ended[row]
+            return {}  # The env has lost the episode, or continues it.
+        flags = self.flags[row]
+        ended = flags[..., TERMINATED] | flags[..., TRUNCATED]
         if self.limit_reached is not None and self.limit_reached[row]:
             ended = np.ones_like(ended)
-        lengths = np.where(ended, self.episode_length[row], 0)
-        if not np.any(lengths):
+        lengths = self.episode_length[row] * ended
+        if not lengths.any():
             return {}
         returns = self.episode_return[row]
         if ended.ndim == 0:
             return {"r": float(returns), "l": int(lengths)}
         return {"r": returns, "l": lengths, "ended": ended}
 
+    def episode_of_all(self, row: int) -> dict[str, Any]:
+        """`episode`, with the returns of agents added, and the length of the longest."""
+        sums = self.episode(row)
+        if sums and self.agents:
+            return {"r": sums["r"].sum(axis=0), "l": sums["l"].max(axis=0)}
+        return sums
+
     def ret(self, row: int) -> EnvRet | MultiAgentEnvRet:
-        """One env's result as a value of its own."""
+        """Result of one env as a separate value."""
         kept = self.out_of_band_of(row) if self.out_of_band else {}
         if "ret" in kept:
             return self._ret_handed_over(row, kept["ret"])
@@ -241,7 +252,7 @@ class ResultColumns:
         changed: dict[str, Any] = {}
         for name in ("reward", "terminated", "truncated"):
             field = f"last_{name}"
-            if _stands_for_all(getattr(ret, field)) and self.reward.ndim > 1:
+            if _is_default(getattr(ret, field)) and self.reward.ndim > 1:
                 changed[field] = self.head_of(getattr(self, name), row)
         if self.episode(row):
             changed["info"] = self.info_of(row)
@@ -251,13 +262,13 @@ class ResultColumns:
         return ret.model_copy(update=changed) if changed else ret
 
     def sent_ns_of(self, row: int) -> int:
-        """When one env sent its result, in ns since the epoch."""
+        """Time when one env sent its result, in ns since the epoch."""
         if self.sent_ns is None:
             return int(self.times[row, 0]) + _EPOCH_NS
         return int(self.sent_ns[row])
 
     def head_of(self, column: NDArray[Any], row: int) -> Any:
-        """One env's entry of a column of rewards or ends: a number, an array, a dict by agent."""
+        """Reward or flag of one env: a number, an array, or a dict by agent."""
         value = column[row]
         if self.agents:
             return {
@@ -266,10 +277,10 @@ class ResultColumns:
             }
         return value.item() if value.ndim == 0 else value
 
-    # -- parts of it ------------------------------------------------------------------
+    # -- parts ------------------------------------------------------------------------
 
     def subset(self, rows: Sequence[int], positions: Sequence[int]) -> ResultColumns:
-        """Some rows, at other places of another batch."""
+        """Copy some rows, with their positions in another batch."""
 
         def taken(array: Any) -> Any:
             return None if array is None else array[rows]
@@ -286,23 +297,23 @@ class ResultColumns:
         )
 
     def stacked_head(self, column: str) -> Any:
-        """A column of reward or ends, by agent where there are any."""
+        """A column of rewards or flags, as a dict by agent if there are agents."""
         array = cast("NDArray[Any]", getattr(self, column))
         if self.agents:
             return {agent: array[:, k] for k, agent in enumerate(self.agents)}
         return array
 
 
-def _stands_for_all(told: Any) -> bool:
-    """Whether a reward or an end was left out, by all sub-environments or by all agents."""
-    return type(told) in (float, bool) or (isinstance(told, dict) and not told)
+def _is_default(field: Any) -> bool:
+    """Return True if a reward or flag of all sub-environments or agents was left out."""
+    return type(field) in (float, bool) or (isinstance(field, dict) and not field)
 
 
-def _like(told: Any, value: Any) -> Any:
-    """`value` as what was told in its place: a tensor on its device, or an array."""
-    if isinstance(told, dict):
-        return {key: _like(part, value[key]) for key, part in cast("dict[str, Any]", told).items()}
-    return told.new_tensor(value) if hasattr(told, "new_tensor") else value
+def _like(old: Any, value: Any) -> Any:
+    """Convert `value` to the type of `old`: a tensor on the same device, or an array."""
+    if isinstance(old, dict):
+        return {key: _like(part, value[key]) for key, part in cast("dict[str, Any]", old).items()}
+    return old.new_tensor(value) if hasattr(old, "new_tensor") else value
 
 
 BY_ROW: Final = (

@@ -1,31 +1,33 @@
-"""`BatchedData` itself, and what only groups do with one; see the package."""
+"""`BatchedData`, and the functions by which a group makes a batch and takes the answer to it."""
 
-# The functions at the end are the class's own, and none of its users' business.
+# These functions use private attributes of batches.
 # pyright: reportPrivateUsage=false
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
-from rlightning_aio.batch.infos import (
-    info_list_of_rows,
-    infos_of_rows,
-    sub_env_infos_of_rows,
-    vector_infos,
+from rlightning_aio.batch.infos import vector_infos
+from rlightning_aio.batch.parts import (
+    column_of_parts,
+    infos_of_parts,
+    observations_of_parts,
+    rows_in_order,
+    shapes,
+    taken_parts,
 )
 from rlightning_aio.batch.sent import Sent, taken_sources
-from rlightning_aio.batch.stacking import columns_where_possible, differing, stacked_values
+from rlightning_aio.batch.stacking import columns_where_possible, stacked_values
 from rlightning_aio.errors import BadAction
-from rlightning_aio.protocol.columns import index, is_dict, is_tuple, leaves, mapped
+from rlightning_aio.protocol.columns import index, mapped, paired
 from rlightning_aio.types import PolicyResponse
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
-    import gymnasium as gym
     from numpy.typing import NDArray
 
     from rlightning_aio.batch.columns import ResultColumns
@@ -35,42 +37,30 @@ if TYPE_CHECKING:
 __all__ = [
     "BatchedData",
     "Origin",
+    "answer_of",
     "batch_of_results",
-    "columns_of_responses",
-    "names_of",
-    "origin_of",
-    "parts_of",
-    "reported_info_list",
-    "reported_infos",
-    "reported_sub_env_infos",
-    "slots_of",
-    "sources_of",
+    "with_repeats",
 ]
 
 _MISSING: Any = object()
 
 
-def _by_position(parts: Sequence[ResultColumns], size: int) -> list[tuple[ResultColumns, int]]:
-    """For each place in the batch its part and row."""
-    places: list[Any] = [None] * size
-    for part in parts:
-        positions = range(len(part)) if part.positions is None else part.positions.tolist()
-        for row, position in enumerate(positions):
-            places[position] = (part, row)
-    return places
-
-
 @dataclass(slots=True)
 class Origin:
-    """Where a batch came from, so that an answer to it finds its way without a look-up."""
+    """Group and slots of a batch, so that the answer to it needs no look-up.
+
+    Attributes:
+        repeats: True if `slots` may have an env twice; the group then looks the envs up.
+    """
 
     group: object
     slots: NDArray[np.intp]
     names: EnvNames
+    repeats: bool = False
 
 
 class BatchedData:
-    """Ids and values, in order; an id may come more than once.
+    """Ids and values, in order; ids may repeat.
 
     Args:
         ids: one for each value.
@@ -95,39 +85,27 @@ class BatchedData:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> BatchedData:
-        """A batch of the mapping's items, in its order."""
+        """Make a batch of the items of a mapping, in its order."""
         return cls(list(values), list(values.values()))
-
-    def _response(self, columns: dict[str, Any]) -> BatchedData:
-        batch = _blank()
-        batch._ids = self._ids
-        batch._columns = columns
-        batch._origin = self._origin
-        batch._env_ids = None if self._origin is not None else self.env_ids()
-        return batch
 
     # -- copies ---------------------------------------------------------------------
 
-    def __getstate__(self) -> dict[str, Any]:
-        """What copies and pickles hold: all but the group, which then goes by the ids."""
+    def __getstate__(self) -> tuple[None, dict[str, Any]]:
+        """Copies and pickles have everything but the group, which then uses the ids."""
         state = {name: getattr(self, name) for name in self.__slots__}
         origin = self._origin
         if origin is not None:
             names, slots = origin.names.of(origin.slots), np.arange(len(origin.slots))
             state["_origin"] = Origin(None, slots, names)
             state["_parts"] = [part.apart() for part in self._parts]
-        return state
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        for name, value in state.items():
-            setattr(self, name, value)
+        return None, state
 
     # -- ids and values -----------------------------------------------------------
 
     def ids(self) -> list[str]:
-        """The ids, in order. Results of a client carry its env_server's id, each the same.
+        """Ids, in order. All clients of an env_server have its id.
 
-        The list is the batch's own: change a copy.
+        The batch owns the list: don't change it.
         """
         if self._ids is None:
             origin = self._origin
@@ -135,7 +113,7 @@ class BatchedData:
         return self._ids
 
     def env_ids(self) -> list[str]:
-        """The env of each value, in order; a client's is ``<server id>/<client name>``."""
+        """Env id of each value, in order; that of a client is ``<server id>/<client name>``."""
         if self._origin is not None:
             return self._origin.names.ids(self._origin.slots)
         if self._env_ids is not None:
@@ -146,24 +124,18 @@ class BatchedData:
         ]
 
     def values(self) -> list[Any]:
-        """The values, in order; made on the first call, and the same ones afterwards.
+        """Values, in order. The first call makes them; later calls return the same.
 
         Results are `EnvRet` or `MultiAgentEnvRet`, whose arrays may be views of the columns;
         responses are `PolicyResponse`.
         """
         if self._values is None:
             if self._columns is not None:
-                self._values = self._responses(self._columns)
+                self._values = _policy_responses(self._columns, self.env_ids())
             else:
-                places = _by_position(self._parts, len(self))
+                places = rows_in_order(self._parts)
                 self._values = [part.ret(row) for part, row in places]
         return self._values
-
-    def _responses(self, columns: dict[str, Any]) -> list[PolicyResponse]:
-        return [
-            PolicyResponse(env_id, **{name: index(c, k) for name, c in columns.items()})
-            for k, env_id in enumerate(self.env_ids())
-        ]
 
     def items(self) -> list[tuple[str, Any]]:
         """Pairs of id and value, in order."""
@@ -179,7 +151,7 @@ class BatchedData:
         return id_ in self.ids()
 
     def __getitem__(self, id_: str) -> Any:
-        """The value of `id_`; of the first, if the id comes more than once.
+        """The value of `id_`; the first one if the id repeats.
 
         Raises:
             KeyError: the batch has no such id.
@@ -191,156 +163,114 @@ class BatchedData:
         return self.values()[position]
 
     def __repr__(self) -> str:
-        return f"BatchedData({', '.join([self._described(), *self._shapes()])})"
-
-    def _described(self) -> str:
-        kind = "results" if self._parts else "responses" if self._columns is not None else "values"
+        kind = "results" if self._parts else "values" if self._columns is None else "responses"
         ids = self.ids()
-        return f"{len(self)} {kind} of {', '.join(ids[:3])}{', …' if len(ids) > 3 else ''}"
-
-    def _shapes(self) -> Iterator[str]:
-        """What the columns look like, as ``name: dtype[shape]``."""
-        if self._columns is not None:
-            for name, column in self._columns.items():
-                yield f"{name}: {_shape(column)}"
-        for part in self._parts:
-            observation = "…" if part.observation is None else _shape(part.observation)
-            yield f"observation: {observation}, reward: {_shape(part.reward)}"
+        described = f"{len(self)} {kind} of {', '.join(ids[:3])}{', …' if len(ids) > 3 else ''}"
+        return f"BatchedData({', '.join([described, *shapes(self._columns or {}, self._parts)])})"
 
     # -- columns of results -------------------------------------------------------
 
     @property
     def observation(self) -> Any:
-        """Observations stacked: ``[n, *obs]``, or dicts and tuples of such arrays.
+        """Stacked observations: ``[n, *obs]``, or dicts and tuples of such arrays.
 
-        What has no fixed size (Text, Sequence, Graph) comes as a list of n values.
+        Values without fixed size (Text, Sequence, Graph) are a list of n.
 
         Raises:
             ValueError: the envs have different observation spaces; use `by_name`.
         """
-        if len(self._parts) == 1 and not self._parts[0].whole_results:
-            part = self._parts[0]
-            if part.observation is not None:
-                return part.observation
-            values = [part.observation_of(row) for row in range(len(part))]
-            return _columns(part.observation_space, values)
-        if self._parts:
-            places = _by_position(self._parts, len(self))
-            return stacked_values([part.observation_of(row) for part, row in places])
+        parts = self._parts
+        if parts:
+            columns = None if len(parts) > 1 or parts[0].whole_results else parts[0].observation
+            return observations_of_parts(parts) if columns is None else columns
         return stacked_values([value.observation for value in self.values()])
 
     @property
     def reward(self) -> Any:
         """Rewards: ``[n]`` float64, ``[n, num_envs]``, or a dict of such by agent."""
-        return self._head("reward", "last_reward")
+        return _head(self, "reward", "last_reward")
 
     @property
     def terminated(self) -> Any:
-        """Terminations by the env: ``[n]`` bool, ``[n, num_envs]``, or a dict by agent."""
-        return self._head("terminated", "last_terminated")
+        """Terminations: ``[n]`` bool, ``[n, num_envs]``, or a dict of such by agent."""
+        return _head(self, "terminated", "last_terminated")
 
     @property
     def truncated(self) -> Any:
         """Truncations: ``[n]`` bool, ``[n, num_envs]``, or a dict of such by agent.
 
-        By the env; also true where the step limit cut the episode, if `auto_reset` was told to
-        mark that, and where `restarted` is.
+        Set by the env, by the step limit if `auto_reset` marks that, and where `restarted` is True.
         """
-        return self._head("truncated", "last_truncated")
+        return _head(self, "truncated", "last_truncated")
 
-    def _head(self, column: str, attribute: str) -> Any:
-        if len(self._parts) == 1 and not self._parts[0].whole_results:
-            return self._parts[0].stacked_head(column)
-        return stacked_values([getattr(value, attribute) for value in self.values()])
-
-    # -- what each row is ---------------------------------------------------------
+    # -- flags and times of rows --------------------------------------------------
 
     @property
     def done(self) -> Any:
         """Terminated, truncated, or cut by the step limit of `auto_reset`.
 
-        ``[n]`` bool, ``[n, num_envs]`` with sub-environments, a dict of such by agent.
+        ``[n]`` bool, ``[n, num_envs]`` with sub-environments, or a dict of such by agent.
         """
         if len(self._parts) == 1 and not self._parts[0].whole_results:
             return self._parts[0].stacked_head("done")
         if not len(self):
             return self.limit_reached
-        return _either(_either(self.terminated, self.truncated), self.limit_reached)
+        limit_reached = self.limit_reached
+        ended = paired(np.bitwise_or, self.terminated, self.truncated)
+        return mapped(lambda leaf: leaf | limit_reached, ended)
 
     @property
     def is_reset(self) -> NDArray[np.bool_]:
-        """Whether the row is the first observation of an episode, where no transition ends.
+        """True for the first observation of an episode, where no transition ends.
 
-        True after a reset that you asked for, after one that `auto_reset` or the simulator itself
-        put in place of a step, for a client's first result, and for the result that marks a
-        replaced worker or a lost client. ``[n]`` bool, ``[n, num_envs]`` with
-        sub-environments.
+        These are results of a requested reset, of a reset that `auto_reset` or the simulator did
+        in place of a step, of a new client, and of a replaced worker or a lost client.
+        ``[n]`` bool, ``[n, num_envs]`` with sub-environments.
 
         Raises:
             AttributeError: the batch holds plain values, not results of a group.
             ValueError: the envs have different numbers of sub-environments; use `by_name`.
         """
-        return self._by_row(lambda part: part.is_reset)
+        return _by_row(self, lambda part: part.is_reset)
 
     @property
     def limit_reached(self) -> NDArray[np.bool_]:
-        """Whether the step limit of `auto_reset` cut the episode; shaped as `is_reset`.
+        """True if the step limit of `auto_reset` cut the episode; shaped like `is_reset`.
 
         `collect_async` returns the same flags, one for each env.
         """
-        return self._by_row(lambda part: part.by_sub_env(part.limit_reached))
+        return _by_row(self, lambda part: part.by_sub_env(part.limit_reached))
 
     @property
     def restarted(self) -> NDArray[np.bool_]:
-        """Whether the previous episode was lost with its worker or client; shaped as `is_reset`.
+        """True if the previous episode was lost with its worker or client; shaped like `is_reset`.
 
-        A learner that stores transitions cuts the env's chain there.
+        A learner that stores transitions must cut the env's chain there.
         """
-        return self._by_row(lambda part: part.by_sub_env(part.restarted))
+        return _by_row(self, lambda part: part.by_sub_env(part.restarted))
 
     @property
     def index(self) -> NDArray[np.int64]:
-        """Each row's place in the group: ``[n]``, ``[n, num_envs]`` with sub-environments.
+        """Position of each row in the group: ``[n]``, ``[n, num_envs]`` with sub-environments.
 
-        It is the place among `EnvGroup.env_ids`, counting sub-environments where there are any.
-        Clients of an env_server come after the local envs; each keeps its place while the group
-        lives.
+        It counts sub-environments in the order of `EnvGroup.env_ids`. Clients of an env_server
+        come after the local envs; each keeps its position during the life of the group.
         """
-        return self._by_row(lambda part: part.index).astype(np.int64, copy=False)
+        return _by_row(self, lambda part: part.index).astype(np.int64, copy=False)
 
     @property
     def ready_ns(self) -> NDArray[np.int64]:
-        """When each result was ready, by `time.monotonic_ns`; ``[n]``, one for each env."""
-        return self._by_row(lambda part: part.ready_ns)
+        """``[n]``, time when the result of each env was ready, by `time.monotonic_ns`."""
+        return _by_row(self, lambda part: part.ready_ns)
 
     @property
     def busy_ns(self) -> NDArray[np.int64]:
-        """How long each env worked on its step or reset, in ns; ``[n]``, one for each env."""
-        return self._by_row(lambda part: part.busy_ns)
-
-    def _by_row(self, column: Callable[[ResultColumns], Any]) -> NDArray[Any]:
-        """A column that every part has, in the batch's order."""
-        if self._origin is not None and self._columns is None and not len(self):
-            return np.zeros(0, np.bool_)
-        if not self._parts:
-            raise AttributeError("only results of a group have this; this batch holds plain values")
-        found = [(part, column(part)) for part in self._parts]
-        if self._parts[0].positions is None:
-            return found[0][1]
-        if len({array.shape[1:] for _, array in found}) > 1:
-            raise differing()
-        first = found[0][1]
-        whole = np.empty((len(self), *first.shape[1:]), first.dtype)
-        for part, array in found:
-            whole[part.positions] = array
-        return whole
+        """``[n]``, duration of the step or reset of each env, in ns."""
+        return _by_row(self, lambda part: part.busy_ns)
 
     @property
     def sent(self) -> Sent:
-        """What `respond` attached to the requests that these rows answer.
-
-        ``batch.sent.log_prob``, ``batch.sent.action``, …: columns in the batch's order, which
-        have stayed in this process. See `Sent`.
+        """Columns of the responses that these rows answer: ``batch.sent.log_prob``, …; see `Sent`.
 
         Raises:
             AttributeError: the batch holds plain values, not results of a group.
@@ -351,13 +281,17 @@ class BatchedData:
 
     @property
     def infos(self) -> dict[str, Any]:
-        """Infos as columns, in Gymnasium's vector form; made when it is first read.
+        """Infos as columns, in the form of Gymnasium's vector envs; made when first read.
 
-        ``infos[key]`` is a typed array ``[n, ...]`` (of objects, where the values are not
-        numbers), ``infos["_" + key]`` tells which rows have the key; nested dicts likewise.
+        ``infos[key]`` is an array ``[n, ...]``, of objects if the values are not numbers;
+        ``infos["_" + key]`` is the mask of rows with the key; nested dicts likewise.
         """
         if self._infos is None:
-            self._infos = _infos_of(self, episodes=True)
+            self._infos = (
+                infos_of_parts(self._parts, episodes=True)
+                if self._parts
+                else vector_infos(self.info())
+            )
         return self._infos
 
     @overload
@@ -367,21 +301,21 @@ class BatchedData:
     def info(self, key: str, default: Any = ...) -> Any: ...
 
     def info(self, key: str | None = None, default: Any = _MISSING) -> Any:
-        """One value of every info as a column; without a key, the infos themselves.
+        """Column of one key of the infos; without a key, the infos themselves.
 
         Args:
             key: of the infos.
-            default: in rows whose info lacks the key.
+            default: for rows without the key.
 
         Returns:
-            ``[n, ...]``, a list where the values don't stack; or one dict for each result,
-            decoded now.
+            ``[n, ...]``, or a list if the values don't stack; without a key, one dict for each
+            result.
 
         Raises:
-            KeyError: an info lacks the key, and there is no default.
+            KeyError: an info lacks the key, and no default was given.
         """
         if self._parts:
-            infos = [part.info_of(row) for part, row in _by_position(self._parts, len(self))]
+            infos = [part.info_of(row) for part, row in rows_in_order(self._parts)]
         else:
             infos = [value.info for value in self.values()]
         if key is None:
@@ -396,51 +330,35 @@ class BatchedData:
     # -- parts of a batch ---------------------------------------------------------
 
     def by_name(self) -> dict[str, BatchedData]:
-        """One batch for each config entry, in the order in which entries first come.
-
-        Each of them stacks, and keeps the order of its values.
-        """
-        names = self._names()
+        """Split by config entry, in the order of first appearance; values keep their order."""
+        if self._origin is None:
+            names = [id_.rpartition("-")[0] or id_ for id_ in self.ids()]
+        else:
+            names = self._origin.names.names(self._origin.slots)
         positions: dict[str, list[int]] = {}
         for position, name in enumerate(names):
             positions.setdefault(name, []).append(position)
         return {name: self.take(chosen) for name, chosen in positions.items()}
 
-    def _names(self) -> list[str]:
-        if self._origin is not None:
-            return self._origin.names.names(self._origin.slots)
-        return [id_.rpartition("-")[0] or id_ for id_ in self.ids()]
-
     def take(self, rows: Sequence[int]) -> BatchedData:
-        """The results (or values) at the places `rows`, in that order, in fresh columns."""
+        """Copy the results, responses or values at the positions `rows`, in that order."""
         chosen = list(rows)
+        if self._columns is not None:
+            return _taken_responses(self, self._columns, chosen)
         if self._origin is None:
             ids, values = self.ids(), self.values()
             return BatchedData([ids[k] for k in chosen], [values[k] for k in chosen])
-        rows_of: dict[int, list[int]] = {}
-        positions: dict[int, list[int]] = {}
-        places = _by_position(self._parts, len(self))
-        for position, k in enumerate(chosen):
-            part, row = places[k]
-            rows_of.setdefault(id(part), []).append(row)
-            positions.setdefault(id(part), []).append(position)
-        parts = [
-            part.subset(rows_of[id(part)], positions[id(part)])
-            for part in self._parts
-            if id(part) in rows_of
-        ]
-        if len(parts) == 1:
-            parts[0].positions = None
-        origin = Origin(self._origin.group, self._origin.slots[chosen], self._origin.names)
-        sources = self._sources
+        parts = taken_parts(self._parts, chosen)
+        origin, sources = self._origin, self._sources
         if sources is not None:
             sources = taken_sources(sources, chosen)
-        return batch_of_results(parts, origin, sources)
+        slots = origin.slots[chosen]
+        return with_repeats(batch_of_results(parts, origin.group, slots, origin.names, sources))
 
     # -- columns of responses -----------------------------------------------------
 
     def respond(self, action: Any, **extras: Any) -> BatchedData:
-        """The matching batch of responses, from columns, which it holds uncopied.
+        """Make the batch of responses to these results, from columns that are not copied.
 
         Args:
             action: ``[n, *action]`` (a dict or tuple of such arrays for Dict and Tuple
@@ -448,31 +366,22 @@ class BatchedData:
             extras: further columns of n rows (``log_prob``, ``value``, …).
 
         Raises:
-            BadAction: a column's number of rows is not this batch's number of results.
+            BadAction: the number of rows of a column is not the number of results.
         """
         columns = {"action": action, **extras}
+        origin = self._origin
+        count = len(self) if origin is None else len(origin.slots)
         for name, column in columns.items():
-            mapped(lambda leaf, name=name: self._check_rows(name, leaf), column)
-        return self._response(columns)
-
-    def _check_rows(self, name: str, column: Any) -> None:
-        try:
-            rows = len(column)
-        except TypeError:
-            rows = None
-        if rows != len(self):
-            found = f"is {column!r}" if rows is None else f"has {rows} rows"
-            raise BadAction(
-                f"column {name!r} {found} for a batch of {len(self)}; give one row for "
-                "each result, in the batch's order"
-            )
+            if type(column) is not np.ndarray or not column.ndim or len(column) != count:
+                mapped(lambda leaf, name=name: _check_rows(name, leaf, len(self)), column)
+        return _responses(self, columns)
 
     @property
     def action(self) -> Any:
         """Actions of a batch of responses: ``[n, *action]``, or dicts, tuples, lists of such.
 
         Raises:
-            AttributeError: the batch holds results, which have none; see `sent`.
+            AttributeError: the batch holds results; see `sent` for their actions.
         """
         if self._columns is not None:
             return self._columns["action"]
@@ -480,119 +389,108 @@ class BatchedData:
 
 
 def batch_of_results(
-    parts: Sequence[ResultColumns], origin: Origin, sources: Sources | None = None
+    parts: Sequence[ResultColumns],
+    group: object,
+    slots: NDArray[np.intp],
+    names: EnvNames,
+    sources: Sources | None = None,
 ) -> BatchedData:
-    """A batch over columns, one set for each layout.
+    """Make a batch of results from columns.
 
     Args:
-        parts: each with the places of its rows, unless it is the only one.
-        origin: the group that hands it out.
-        sources: what its rows answer, see `Sent`.
+        parts: one for each layout, with the positions of its rows unless it is the only one.
+        group: the group that returns the batch.
+        slots: slot of each row.
+        names: of the envs of the group.
+        sources: see `Sent`.
     """
-    batch = _blank()
+    batch = BatchedData.__new__(BatchedData)
+    batch._ids = batch._values = batch._columns = batch._env_ids = batch._infos = None
     batch._parts = parts
-    batch._origin = origin
+    batch._origin = Origin(group, slots, names)
     batch._sources = sources
     return batch
 
 
-def _blank() -> BatchedData:
-    """A batch whose ids and values are still to be made."""
-    batch = BatchedData.__new__(BatchedData)
-    batch._ids = batch._values = batch._columns = batch._origin = None
-    batch._env_ids = batch._sources = batch._infos = None
-    batch._parts = ()
+def with_repeats(batch: BatchedData) -> BatchedData:
+    """Record in `batch` itself whether it has an env twice, and return it."""
+    origin = batch._origin
+    if origin is not None:
+        origin.repeats = len({*origin.slots.tolist()}) < len(origin.slots)
     return batch
 
 
-def reported_infos(batch: BatchedData) -> dict[str, Any]:
-    """`BatchedData.infos` of a batch of results, without the sums of episodes."""
-    return _infos_of(batch, episodes=False)
-
-
-def reported_sub_env_infos(batch: BatchedData, num_envs: int) -> dict[str, Any]:
-    """`reported_infos` of envs of `num_envs` sub-environments each, as of one row of envs.
-
-    All are of one layout, in the group's order.
-    """
-    (part,) = batch._parts
-    return sub_env_infos_of_rows(part, num_envs)
-
-
-def reported_info_list(batch: BatchedData) -> list[dict[str, Any]]:
-    """`BatchedData.info` of a batch of results, without the sums of episodes."""
-    parts = batch._parts
-    if len(parts) == 1 and parts[0].positions is None:
-        return info_list_of_rows(parts[0])
-    return [part.reported_info_of(row) for part, row in _by_position(parts, len(batch))]
-
-
-def _infos_of(batch: BatchedData, *, episodes: bool) -> dict[str, Any]:
-    parts = batch._parts
-    if len(parts) == 1 and parts[0].positions is None:
-        return infos_of_rows(parts[0], episodes=episodes)
-    return vector_infos(batch.info() if episodes or not parts else reported_info_list(batch))
-
-
-def parts_of(batch: BatchedData) -> Sequence[ResultColumns]:
-    """The columns of a batch of results; empty for any other batch."""
-    return batch._parts
-
-
-def slots_of(batch: BatchedData, group: object) -> NDArray[np.intp] | None:
-    """Slots of the envs, if the batch is of `group`'s own making."""
+def answer_of(batch: BatchedData, group: object) -> tuple[NDArray[np.intp], dict[str, Any]] | None:
+    """Distinct slots, and columns of responses, to results of `group`; None for other batches."""
+    if type(batch) is not BatchedData or batch._columns is None:
+        return None
     origin = batch._origin
-    return origin.slots if origin is not None and origin.group is group else None
+    if origin is None or origin.group is not group or origin.repeats:
+        return None
+    return origin.slots, batch._columns
 
 
-def origin_of(batch: BatchedData) -> Origin | None:
-    """Where the results of `batch` came from; None for plain values."""
-    return batch._origin
+def _head(batch: BatchedData, column: str, attribute: str) -> Any:
+    """A column of rewards or flags, by agent if there are agents."""
+    if len(batch._parts) == 1 and not batch._parts[0].whole_results:
+        part = batch._parts[0]
+        return part.stacked_head(column) if part.agents else getattr(part, column)
+    return stacked_values([getattr(value, attribute) for value in batch.values()])
 
 
-def sources_of(batch: BatchedData) -> Sources | None:
-    """What the results of `batch` answer; None for any other batch."""
-    return batch._sources
+def _by_row(batch: BatchedData, column: Callable[[ResultColumns], Any]) -> NDArray[Any]:
+    """A column of all parts, in the order of the batch."""
+    parts = batch._parts
+    if len(parts) == 1 and parts[0].positions is None and len(parts[0].slots):
+        return column(parts[0])
+    if batch._origin is not None and batch._columns is None and not len(batch):
+        return np.zeros(0, np.bool_)
+    if not parts:
+        raise AttributeError("only results of a group have this; this batch holds plain values")
+    return column_of_parts(parts, column)
 
 
-def names_of(batch: BatchedData) -> EnvNames | None:
-    """The names of its group's envs when it was handed out; None for plain values."""
-    return None if batch._origin is None else batch._origin.names
+def _responses(batch: BatchedData, columns: dict[str, Any]) -> BatchedData:
+    responses = BatchedData.__new__(BatchedData)
+    responses._ids = batch._ids
+    responses._columns = columns
+    responses._origin = batch._origin
+    responses._env_ids = None if batch._origin is not None else batch.env_ids()
+    responses._values = responses._sources = responses._infos = None
+    responses._parts = ()
+    return responses
 
 
-def columns_of_responses(batch: BatchedData) -> Mapping[str, Any] | None:
-    """Columns of a batch made by `BatchedData.respond`; None for any other batch."""
-    return batch._columns
+def _policy_responses(columns: dict[str, Any], env_ids: list[str]) -> list[PolicyResponse]:
+    return [
+        PolicyResponse(env_id, **{name: index(c, k) for name, c in columns.items()})
+        for k, env_id in enumerate(env_ids)
+    ]
 
 
-def _shape(tree: Any) -> str:
-    """Dtype and shape of what a column consists of."""
-    if isinstance(tree, dict):
-        items = cast("dict[str, Any]", tree).items()
-        return f"{{{', '.join(f'{key}: {_shape(part)}' for key, part in items)}}}"
-    if isinstance(tree, tuple):
-        return f"({', '.join(map(_shape, cast('tuple[Any, ...]', tree)))})"
-    if hasattr(tree, "shape"):
-        return f"{str(tree.dtype).removeprefix('torch.')}{list(tree.shape)}"
-    return f"list[{len(tree)}]"
+def _taken_responses(batch: BatchedData, columns: dict[str, Any], chosen: list[int]) -> BatchedData:
+    def taken(leaf: Any) -> Any:
+        return leaf[chosen] if hasattr(leaf, "shape") else [leaf[k] for k in chosen]
+
+    found = _responses(batch, {name: mapped(taken, column) for name, column in columns.items()})
+    origin = batch._origin
+    if origin is None:
+        env_ids = batch.env_ids()
+        found._env_ids = [env_ids[k] for k in chosen]
+    else:
+        found._origin = Origin(origin.group, origin.slots[chosen], origin.names)
+    found._ids = [batch.ids()[k] for k in chosen]
+    return with_repeats(found)
 
 
-def _either(one: Any, other: Any) -> Any:
-    """``one | other``, by agent where there are any."""
-    if isinstance(one, dict):
-        parts = cast("dict[str, Any]", one)
-        theirs = cast("Any", other) if isinstance(other, dict) else dict.fromkeys(parts, other)
-        return {agent: _either(part, theirs[agent]) for agent, part in parts.items()}
-    return one | other
-
-
-def _columns(space: gym.Space[Any] | None, values: list[Any]) -> Any:
-    """`values` of `space` as columns."""
-    if space is not None and is_dict(space):
-        parts = space.spaces.items()
-        return {key: _columns(inner, [value[key] for value in values]) for key, inner in parts}
-    if space is not None and is_tuple(space):
-        return tuple(
-            _columns(inner, [value[k] for value in values]) for k, inner in enumerate(space.spaces)
+def _check_rows(name: str, column: Any, count: int) -> None:
+    try:
+        rows = len(column)
+    except TypeError:
+        rows = None
+    if rows != count:
+        found = f"is {column!r}" if rows is None else f"has {rows} rows"
+        raise BadAction(
+            f"column {name!r} {found} for a batch of {count}; give one row for "
+            "each result, in the batch's order"
         )
-    return values if space is not None and leaves(space) is None else stacked_values(values)

@@ -1,20 +1,19 @@
 """Infos as columns, in the form of Gymnasium's vector environments.
 
-Where envs put theirs into their rows, whole columns are taken out at once; Gymnasium's own code,
-which goes env by env and key by key, says what they mean and does the rest.
+Infos in slab rows are read column by column, others row by row. Unlike Gymnasium's, columns do not
+depend on the order of the rows.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
-from gymnasium.vector import VectorEnv
 
 from rlightning_aio.protocol.info import has_mask, is_mask
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Collection, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -22,94 +21,152 @@ if TYPE_CHECKING:
     from rlightning_aio.protocol.info import InfoSchema
 
 __all__ = [
+    "columns_of_infos",
     "info_list_of_rows",
     "infos_of_rows",
+    "joined_infos",
     "listed",
     "sub_env_infos_of_rows",
     "vector_infos",
 ]
 
 
-class _Columns(VectorEnv[Any, Any, Any]):
-    """Knows how infos become columns, and nothing else of an environment."""
+def vector_infos(infos: Sequence[Mapping[Any, Any]]) -> dict[Any, Any]:
+    """Convert `infos` to columns: a typed array for each key, and a mask ``_key``.
 
-    def __init__(self, num_envs: int) -> None:
-        self.num_envs = num_envs
-
-    def of(self, infos: Iterable[tuple[int, dict[str, Any]]]) -> dict[str, Any]:
-        columns: dict[str, Any] = {}
-        for place, info in infos:
-            columns = self._add_info(columns, info, place)
-        return columns
-
-    def _add_info(
-        self, vector_infos: dict[str, Any], env_info: dict[str, Any], env_num: int
-    ) -> dict[str, Any]:
-        masks = {key: value for key, value in env_info.items() if is_mask(key, env_info)}
-        if not masks:
-            return super()._add_info(vector_infos, env_info, env_num)
-        rest = {key: value for key, value in env_info.items() if key not in masks}
-        columns = super()._add_info(vector_infos, rest, env_num)
-        for key, mask in masks.items():
-            if columns[key].ndim == 1:
-                outer = columns[key][:, None]
-                columns[key] = np.broadcast_to(outer, (self.num_envs, *mask.shape)).copy()
-            columns[key][env_num] = mask
-        return columns
-
-
-def vector_infos(infos: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """One dict of columns for `infos`: a typed array for each key, and a mask ``_key``.
-
-    Those of vector environments have masks already, which become columns of masks.
+    Infos of vector environments already have masks, which become columns of masks.
     """
-    return _Columns(len(infos)).of(enumerate(infos))
+    return columns_of_infos(dict(enumerate(infos)), len(infos))
+
+
+def columns_of_infos(infos: Mapping[int, Mapping[Any, Any]], size: int) -> dict[Any, Any]:
+    """Make columns of `size` rows from the infos of some rows, in any order.
+
+    The dtype of a column holds all of its values, or is object. The mask of a key takes precedence
+    over a key with the name of the mask.
+    """
+    values: dict[Any, dict[int, Any]] = {}
+    masks: dict[str, dict[int, NDArray[np.bool_]]] = {}
+    for row, info in infos.items():
+        for key, value in info.items():
+            found: dict[Any, dict[int, Any]] = masks if is_mask(key, info) else values
+            found.setdefault(key, {})[row] = value
+    names_of_masks = {f"_{key}" for key in values}
+    columns: dict[Any, Any] = {}
+    for key, own in values.items():
+        if key not in names_of_masks:
+            columns[key] = _column(key, own, size)
+        columns.setdefault(f"_{key}", np.zeros(size, np.bool_))[list(own)] = True
+    for key, own_masks in masks.items():
+        shape = next(iter(own_masks.values())).shape
+        columns[key] = np.broadcast_to(columns[key][:, None], (size, *shape)).copy()
+        for row, mask in own_masks.items():
+            columns[key][row] = mask
+    return columns
+
+
+def _column(key: Any, values: Mapping[int, Any], size: int) -> Any:
+    """Column of a key: an array of `size` rows, or columns of dicts."""
+    if key == "final_obs":  # Observations, dicts or not.
+        return _filled(values, size, *_NOT_TYPED)
+    if all(isinstance(value, dict) for value in values.values()):
+        return columns_of_infos(values, size)
+    dtype, shape = _type_of_all(list(values.values()))
+    try:
+        return _filled(values, size, dtype, shape)
+    except OverflowError:  # An int of more than 64 bits.
+        return _filled(values, size, *_NOT_TYPED)
+
+
+def _filled(
+    values: Mapping[int, Any], size: int, dtype: np.dtype[Any] | None, shape: tuple[int, ...]
+) -> NDArray[Any]:
+    column: NDArray[Any]
+    column = np.full(size, None, object) if dtype is None else np.zeros((size, *shape), dtype)
+    for row, value in values.items():
+        column[row] = value
+    return column
+
+
+_NOT_TYPED: Final[tuple[None, tuple[int, ...]]] = None, ()
+"""Dtype and shape of a column of objects."""
+
+
+def _type_of_all(values: Sequence[Any]) -> tuple[np.dtype[Any] | None, tuple[int, ...]]:
+    """Dtype that holds all of `values`, and their shape; None for a column of objects.
+
+    As in Gymnasium, numbers are those of Python and NumPy, without `numpy.bool_`.
+    """
+    is_array = type(values[0]) is np.ndarray
+    shape: tuple[int, ...] = values[0].shape if is_array else ()
+    dtypes: set[np.dtype[Any]] = set()
+    for value in values:
+        kind = cast("Any", type(value))
+        if (kind is np.ndarray) != is_array or getattr(value, "shape", ()) != shape:
+            return _NOT_TYPED
+        if not (is_array or kind in (int, float, bool) or np.number in kind.__mro__):
+            return _NOT_TYPED
+        dtypes.add(np.dtype(value.dtype if is_array else kind))
+    if len(dtypes) > 1 and not all(dtype.kind in "biufc" for dtype in dtypes):
+        return _NOT_TYPED
+    dtype = np.result_type(*dtypes)
+    if len(dtypes) > 1 and dtype.kind in "fc" and any(map(_is_large_int, values)):
+        return _NOT_TYPED
+    return dtype, shape
+
+
+def _is_large_int(value: Any) -> bool:
+    """Return True for ints, or an array of ints, that a float may not represent exactly."""
+    is_int = np.asarray(value).dtype.kind in "iuO"
+    return is_int and bool(np.any((value > 2**53) | (value < -(2**53))))
 
 
 def infos_of_rows(part: ResultColumns, *, episodes: bool) -> dict[str, Any]:
-    """The same for the rows of `part`, in its own order.
+    """Convert the infos of `part` to columns, in its order.
 
     Args:
         part: results.
-        episodes: with ``episode``, the sums of each that has just ended.
+        episodes: add ``episode``, the sums of episodes that have just ended.
     """
+    if part.info_marks is None and not part.out_of_band and not episodes:
+        return {}
     rows = range(len(part))
-    columns = None if part.out_of_band else _taken_at_once(part)
+    columns = None if part.out_of_band else _columns_of_rows(part)
     if columns is None:
-        told = part.info_of if episodes else part.reported_info_of
-        return vector_infos([told(row) for row in rows])
+        info_of = part.info_of if episodes else part.reported_info_of
+        return vector_infos([info_of(row) for row in rows])
     if episodes and part.episode_length is not None:
-        if "episode" in columns:  # What an env reports under that key goes before.
+        if "episode" in columns:  # The env's own value takes precedence.
             return vector_infos([part.info_of(row) for row in rows])
-        sums = [(row, {"episode": sums}) for row in rows if (sums := part.episode(row))]
-        columns = {**_Columns(len(part)).of(sums), **columns}
+        sums = {row: {"episode": sums} for row in rows if (sums := part.episode(row))}
+        columns = {**columns_of_infos(sums, len(part)), **columns}
     return columns
 
 
 def info_list_of_rows(part: ResultColumns) -> list[dict[str, Any]]:
-    """One info for each row of `part`, as the envs told them, in its own order."""
+    """List the reported infos of `part`, in its order."""
     if part.out_of_band:
         return [part.reported_info_of(row) for row in range(len(part))]
     infos: list[dict[str, Any]] = [{} for _ in range(len(part))]
     for schema, chosen in _rows_by_schema(part).items():
-        assert part.info is not None, "there are rows that hold some"
+        assert part.info is not None, "schemas come with infos in rows"
         for row, info in zip(chosen, schema.decode_all(part.info[chosen]), strict=True):
             infos[row] = info
     return infos
 
 
 def sub_env_infos_of_rows(part: ResultColumns, num_envs: int) -> dict[str, Any]:
-    """Infos of rows with sub-environments as those of one row of envs: ``[n * num_envs, ...]``.
+    """Convert infos of rows with sub-environments to columns ``[n * num_envs, ...]``.
 
-    What an env tells of all its sub-environments is each one's.
+    A value of a whole env is repeated for each sub-environment.
     """
     columns = None
     if not part.out_of_band:
         schema = _schema_of_all(part)
-        # Uncopied: to flatten a column of several rows is to copy it.
-        columns = _taken_at_once(part) if schema is None else _fields(part, schema)
+        # Views suffice, because flattening several rows makes a copy.
+        columns = _columns_of_rows(part) if schema is None else _fields(part, schema)
     if columns is None:
-        return _joined([part.reported_info_of(row) for row in range(len(part))], num_envs)
+        return joined_infos([part.reported_info_of(row) for row in range(len(part))], num_envs)
     flat: dict[str, Any] = {}
     for key, column in columns.items():
         if column.shape[1:2] == (num_envs,):
@@ -119,32 +176,54 @@ def sub_env_infos_of_rows(part: ResultColumns, num_envs: int) -> dict[str, Any]:
     return flat
 
 
-def _joined(infos: Sequence[dict[str, Any]], num_envs: int) -> dict[str, Any]:
-    """Infos of vector environments of `num_envs` each, one after the other."""
-    total = len(infos) * num_envs
+def joined_infos(infos: Sequence[dict[str, Any]], num_envs: int) -> dict[str, Any]:
+    """Concatenate the infos of vector environments with `num_envs` envs each."""
+    if len(infos) == 1 and _is_of_each(infos[0], num_envs):
+        return infos[0]
     joined: dict[str, Any] = {}
     for key in dict.fromkeys(key for info in infos for key in info):
-        told = [info.get(key) for info in infos]
-        if any(isinstance(value, dict) for value in told):
-            joined[key] = _joined([value or {} for value in told], num_envs)
-            continue
-        for k, value in enumerate(told):
-            if value is None:
-                continue
-            is_column = getattr(value, "shape", ())[:1] == (num_envs,)
-            values: Any = value if is_column else _repeated(value, num_envs)
-            if key not in joined:
-                joined[key] = np.zeros((total, *values.shape[1:]), values.dtype)
-                if values.dtype == object:
-                    joined[key][:] = None
-            joined[key][k * num_envs : (k + 1) * num_envs] = values
+        given = {k: info[key] for k, info in enumerate(infos) if key in info}
+        if all(isinstance(value, dict) for value in given.values()):
+            joined[key] = joined_infos([given.get(k, {}) for k in range(len(infos))], num_envs)
+        else:
+            arrays = {k: _of_each(value, num_envs) for k, value in given.items()}
+            joined[key] = _joined_column(arrays, len(infos) * num_envs, num_envs)
     for key in [key for key in joined if not has_mask(key, joined)]:
         mask = np.array([key in info for info in infos])
         joined[f"_{key}"] = mask.repeat(num_envs)
     return joined
 
 
-def _repeated(value: Any, num_envs: int) -> Any:
+def _joined_column(arrays: Mapping[int, Any], total: int, num_envs: int) -> NDArray[Any]:
+    """Column of `total` rows from arrays of `num_envs` rows, by number of their env."""
+    dtype, shape = _type_of_all(list(arrays.values()))
+    if dtype is None or dtype.hasobject:
+        rows = {
+            k * num_envs + place: value
+            for k, values in arrays.items()
+            for place, value in enumerate(values)
+        }
+        return _filled(rows, total, *_NOT_TYPED)
+    column = np.zeros((total, *shape[1:]), dtype)
+    for k, values in arrays.items():
+        column[k * num_envs : (k + 1) * num_envs] = values
+    return column
+
+
+def _is_of_each(info: dict[Any, Any], num_envs: int) -> bool:
+    """Return True if all values are arrays with a row for each sub-environment, and have masks."""
+    for key, value in info.items():
+        if type(value) is not np.ndarray or not value.ndim or len(value) != num_envs:
+            return False
+        if type(key) is not str or not (key[:1] == "_" or f"_{key}" in info):
+            return False
+    return True
+
+
+def _of_each(value: Any, num_envs: int) -> NDArray[Any]:
+    """Values of the sub-environments; a single value is repeated for each."""
+    if getattr(value, "shape", ())[:1] == (num_envs,):
+        return value
     if isinstance(value, np.ndarray):
         return np.stack([cast("NDArray[Any]", value)] * num_envs)
     is_number = isinstance(value, int | float | np.generic)
@@ -152,13 +231,13 @@ def _repeated(value: Any, num_envs: int) -> Any:
 
 
 def listed(columns: dict[str, Any], count: int) -> list[dict[str, Any]]:
-    """Columns with masks as one info for each of `count` envs; numbers are NumPy's."""
+    """Split columns with masks into one info for each of `count` envs.
+
+    Numbers are NumPy's, bools are Python's.
+    """
     names = [name for name in columns if not is_mask(name, columns)]
     masks = [columns[f"_{name}"] for name in names]
-    values = [
-        listed(cast("dict[str, Any]", column), count) if isinstance(column, dict) else list(column)
-        for column in (columns[name] for name in names)
-    ]
+    values = [_values_of_each(columns[name], count) for name in names]
     if all(mask.all() for mask in masks):
         if not names:
             return [{} for _ in range(count)]
@@ -170,8 +249,15 @@ def listed(columns: dict[str, Any], count: int) -> list[dict[str, Any]]:
     return infos
 
 
-def _taken_at_once(part: ResultColumns) -> dict[str, Any] | None:
-    """Columns of infos that all lie in the rows; None where they need to be looked at singly."""
+def _values_of_each(column: Any, count: int) -> list[Any]:
+    if isinstance(column, dict):
+        return listed(cast("dict[str, Any]", column), count)
+    # NumPy's bools would become objects in a column.
+    return column.tolist() if column.dtype == np.bool_ and column.ndim == 1 else list(column)
+
+
+def _columns_of_rows(part: ResultColumns) -> dict[str, Any] | None:
+    """Read infos in rows column by column; None if they must be read one by one."""
     schema = _schema_of_all(part)
     if schema is not None:
         return {key: values.copy() for key, values in _fields(part, schema).items()}
@@ -180,7 +266,7 @@ def _taken_at_once(part: ResultColumns) -> dict[str, Any] | None:
 
 
 def _schema_of_all(part: ResultColumns) -> InfoSchema | None:
-    """The one shape that the infos of all rows have, if they become typed columns."""
+    """The schema of all rows, if they share one with typed columns."""
     if part.info is None or part.info_marks is None:
         return None
     found: InfoSchema | None = None
@@ -195,7 +281,7 @@ def _schema_of_all(part: ResultColumns) -> InfoSchema | None:
 
 
 def _fields(part: ResultColumns, schema: InfoSchema) -> dict[str, Any]:
-    """Views of columns that all rows have, each with its mask."""
+    """Views of columns present in all rows, each with its mask."""
     fields = schema.fields(cast("NDArray[np.uint8]", part.info))
     for key in schema.without_mask:
         fields[f"_{key}"] = np.ones(len(part), np.bool_)
@@ -203,11 +289,11 @@ def _fields(part: ResultColumns, schema: InfoSchema) -> dict[str, Any]:
 
 
 def _rows_by_schema(part: ResultColumns) -> dict[InfoSchema, list[int]]:
-    """Which rows hold infos of one shape."""
+    """Rows grouped by the schema of their info."""
     rows: dict[InfoSchema, list[int]] = {}
     if part.info is None or part.info_marks is None:
         return rows
-    # A worker's schema is one object: few need to be compared.
+    # A worker has one object for each schema, so group by identity before comparing.
     rows_of: dict[int, list[int]] = {}
     slots: list[int] = part.slots.tolist()
     marks: list[int] = part.info_marks.tolist()
@@ -222,18 +308,20 @@ def _rows_by_schema(part: ResultColumns) -> dict[InfoSchema, list[int]]:
     return rows
 
 
-def _agree(schemas: Iterable[InfoSchema]) -> bool:
-    """Whether each key has one typed column in all of `schemas`."""
+def _agree(schemas: Collection[InfoSchema]) -> bool:
+    """Return True if each key has one typed column in all of `schemas`."""
     kinds: dict[str, tuple[Any, ...]] = {}
     for schema in schemas:
         for key, kind, array in zip(schema.keys, schema.types, schema.arrays, strict=True):
-            # Some may have a mask of their own, others not.
-            known = kind, array, f"_{key}" in schema.keys
+            # Only some may have a reported mask.
+            known = kind, array, f"_{key}" in schema.masks
             if kinds.setdefault(key, known) != known:
                 return False
         if not schema.is_typed:
             return False
-    return True
+    # A key with the name of another key's mask must be read row by row.
+    masks = {f"_{key}" for key in kinds}
+    return not any(masks & schema.keys_but_masks for schema in schemas)
 
 
 def _of_some(info: Any, rows: dict[InfoSchema, list[int]]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Joins batches of results, for callers that keep some results while they wait for others."""
+"""Joins batches of results, for callers that keep results while they wait for others."""
 
 from __future__ import annotations
 
@@ -8,14 +8,8 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from rlightning_aio.batch.columns import BY_ROW
-from rlightning_aio.batch.data import (
-    BatchedData,
-    Origin,
-    batch_of_results,
-    origin_of,
-    parts_of,
-    sources_of,
-)
+from rlightning_aio.batch.contents import origin_of, parts_of, sources_of
+from rlightning_aio.batch.data import BatchedData, Origin, batch_of_results, with_repeats
 from rlightning_aio.batch.sent import joined_sources
 from rlightning_aio.batch.stacking import concatenated
 
@@ -31,13 +25,12 @@ __all__ = ["joined"]
 
 
 def joined(batches: Sequence[BatchedData]) -> BatchedData:
-    """The results of several batches of one group, one batch's after the other's.
+    """Concatenate the results of several batches of one group.
 
-    Envs of one layout share columns again, which are fresh; `BatchedData.take` puts rows in
-    another order.
+    Envs with the same layout share columns, which are new. `BatchedData.take` reorders rows.
 
     Raises:
-        ValueError: there is no batch, or one doesn't hold results of the same group.
+        ValueError: there is no batch, or a batch doesn't hold results of the same group.
     """
     if not batches:
         raise ValueError("there is no batch to join")
@@ -53,11 +46,11 @@ def joined(batches: Sequence[BatchedData]) -> BatchedData:
     if len(parts) == 1:
         parts = [replace(parts[0], positions=None)]
     sources = joined_sources([(sources_of(batch), len(batch)) for batch in batches])
-    return batch_of_results(parts, Origin(last.group, slots, last.names), sources)
+    return with_repeats(batch_of_results(parts, last.group, slots, last.names, sources))
 
 
 def _placed(batch: BatchedData, before: Sequence[BatchedData]) -> list[ResultColumns]:
-    """Its parts, each with the places of its rows behind all those of `before`."""
+    """Parts of `batch`, with positions that follow those of the batches `before`."""
     offset = sum(map(len, before))
     return [
         replace(
@@ -69,7 +62,7 @@ def _placed(batch: BatchedData, before: Sequence[BatchedData]) -> list[ResultCol
 
 
 def _merged(parts: list[ResultColumns]) -> list[ResultColumns]:
-    """Fewer parts: one for all whose rows lie alike."""
+    """Merge parts with the same row layout."""
     alike: dict[Any, list[ResultColumns]] = {}
     for k, part in enumerate(parts):
         alike.setdefault(_layout(part) or k, []).append(part)
@@ -77,9 +70,9 @@ def _merged(parts: list[ResultColumns]) -> list[ResultColumns]:
 
 
 def _layout(part: ResultColumns) -> Any:
-    """What parts must have in common; None for one that stays alone.
+    """Key that is equal for parts that can be merged; None for a part that can't be.
 
-    What a worker that was replaced has put into its rows only its own schemas can read.
+    The schemas are part of it, because a replaced worker's rows need the schemas of that worker.
     """
     shapes = _shapes(part.observation)
     if shapes is None or part.whole_results:
@@ -94,7 +87,7 @@ def _layout(part: ResultColumns) -> Any:
 
 
 def _shapes(tree: Tree | None) -> Any:
-    """Something hashable that is equal for trees which can be concatenated; None if none can."""
+    """Hashable key that is equal for trees that can be concatenated; None if they can't be."""
     if isinstance(tree, dict):
         inner = [(key, _shapes(part)) for key, part in cast("dict[str, Tree]", tree).items()]
         return None if any(shapes is None for _, shapes in inner) else tuple(inner)
@@ -108,7 +101,7 @@ def _shapes(tree: Tree | None) -> Any:
 
 
 def _one(parts: list[ResultColumns]) -> ResultColumns:
-    """Parts of one layout as a single one, its rows in the order of their places."""
+    """Concatenate parts with the same layout, with rows in the order of their positions."""
     positions = np.concatenate([cast("NDArray[np.intp]", part.positions) for part in parts])
     order = np.argsort(positions)
     count = len(positions)

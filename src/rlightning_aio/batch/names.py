@@ -1,7 +1,7 @@
-"""`EnvNames`: who the envs of a group are, as batches know them.
+"""`EnvNames`: ids and config entries of the envs of a group, for batches.
 
-Rule: it never changes. When a client takes another's place, the group gets a new one, and batches
-that were returned before keep the names that were true of them.
+Rule: it is immutable. When a client replaces another, the group gets a new one, and earlier batches
+keep theirs.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ class EnvNames:
     """Names of envs, by slot.
 
     Attributes:
-        env_ids: of each; empty for a slot that no client has taken.
-        shared_ids: what a batch calls them: a client goes by its env_server's id.
-        entries: number of each one's config entry; entry_names: their names.
-        index_offset: sub-environments of the group before each slot's.
-        turns: whether results of a slot come from some of its sub-environments at a time.
+        env_ids: id of each env; empty for a slot without a client.
+        shared_ids: ids in batches: a client has the id of its env_server.
+        entries: number of the config entry of each slot; entry_names: names of the entries.
+        index_offset: number of the group's sub-environments before each slot.
+        turns: True if each result of a slot comes from some of its sub-environments.
     """
 
     env_ids: Sequence[str]
@@ -43,7 +43,7 @@ class EnvNames:
         return [self.env_ids[slot] for slot in chosen]
 
     def batch_ids(self, slots: NDArray[np.intp]) -> list[str]:
-        """Ids of `slots` as a batch has them."""
+        """Ids of `slots` in batches."""
         chosen: list[int] = slots.tolist()
         return [self.shared_ids[slot] for slot in chosen]
 
@@ -53,7 +53,7 @@ class EnvNames:
         return [self.entry_names[entry] for entry in chosen]
 
     def of(self, slots: NDArray[np.intp]) -> EnvNames:
-        """Those of `slots` alone, which are slots 0, 1, 2, … of it."""
+        """Select `slots`, which become slots 0, 1, 2, …"""
         return replace(
             self,
             env_ids=self.ids(slots),
@@ -64,7 +64,7 @@ class EnvNames:
         )
 
     def renamed(self, slot: int, env_id: str, index_offset: int) -> EnvNames:
-        """The same with another env in `slot`."""
+        """Copy, with another env in `slot`."""
         env_ids, offsets = list(self.env_ids), self.index_offset.copy()
         env_ids[slot], offsets[slot] = env_id, index_offset
         return replace(self, env_ids=env_ids, index_offset=offsets)

@@ -1,12 +1,12 @@
-"""`Sent`: what a policy attached to requests, given back with the results that answer them.
+"""`Sent`: a policy's columns, returned with the results that answer them.
 
-It never leaves the trainer's process. Each env remembers the columns that its request came
-from, and the place there; columns are put together when somebody reads them.
+They never leave the trainer process. For each env the columns of its request are kept, with its
+row there; a column of a batch is assembled when it is read.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
 
 import numpy as np
 
@@ -21,29 +21,29 @@ if TYPE_CHECKING:
     from rlightning_aio.types import PolicyResponse
 
 __all__ = [
+    "UNASKED",
     "Sent",
     "Sources",
     "columns_of_values",
+    "copied",
     "joined_sources",
-    "kept_columns",
     "taken_sources",
 ]
 
-Sources: TypeAlias = "tuple[Any, NDArray[np.intp] | None]"
-"""For each row the columns it came from (a mapping, or None) and the place there.
+UNASKED: Final = -1
+"""The row of a result that answers no response."""
 
-Or one mapping (or None) whose rows these are, and None.
+Sources: TypeAlias = "tuple[Any, NDArray[np.intp] | None]"
+"""For each row of the batch, the columns of its request (a mapping, or None) and its row there.
+
+If that row is `UNASKED`, the columns are those sent last to its entry, as examples. If the batch
+answers one request in its order: the mapping of that request, and None.
 """
 
 
-def kept_columns(columns: Mapping[str, Any]) -> dict[str, Any]:
-    """`columns` as they are now: arrays and tensors are copied, for their maker may go on
-    writing to them.
-    """
-    return {
-        name: column.copy() if type(column) is np.ndarray else mapped(_copy, column)
-        for name, column in columns.items()
-    }
+def copied(column: Any) -> Any:
+    """Copy a column: an array, a tensor, a list, or a tree of them."""
+    return mapped(_copy, column)
 
 
 def _copy(leaf: Any) -> Any:
@@ -53,7 +53,7 @@ def _copy(leaf: Any) -> Any:
 
 
 def taken_sources(sources: Sources, rows: list[int]) -> Sources:
-    """Those of some rows."""
+    """Select the sources of some rows."""
     columns, places = sources
     if places is None:
         return np.full(len(rows), columns, object), np.array(rows, np.intp)
@@ -61,7 +61,7 @@ def taken_sources(sources: Sources, rows: list[int]) -> Sources:
 
 
 def joined_sources(parts: Sequence[tuple[Sources | None, int]]) -> Sources:
-    """Those of several batches, each with its number of rows, one behind the other."""
+    """Concatenate the sources of several batches, each given with its number of rows."""
     columns: list[Any] = []
     places: list[NDArray[np.intp]] = []
     for sources, count in parts:
@@ -74,11 +74,13 @@ def joined_sources(parts: Sequence[tuple[Sources | None, int]]) -> Sources:
 class Sent:
     """Columns by name, as attributes or by ``[]``, in the order of the batch.
 
-    Rows that answer no response (a reset that was asked for, a first result) hold NaN, or 0
-    where there is none; `BatchedData.is_reset` is true of them.
+    Rows that answer no response (a requested reset, a first result) hold NaN, or 0 if the dtype has
+    no NaN, or None in a list; their `BatchedData.is_reset` is True. They have the shapes and dtypes
+    that were sent last to their config entry. In a batch of only such rows, a name that was never
+    sent is a column of NaN.
 
     Raises:
-        AttributeError, KeyError: nothing of that name was sent for any row.
+        AttributeError, KeyError: some rows answer responses, and none of these has that name.
     """
 
     def __init__(self, sources: Sources, count: int) -> None:
@@ -101,7 +103,7 @@ class Sent:
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):
-            raise AttributeError(name)  # As of an object that is still being copied.
+            raise AttributeError(name)  # `copy` asks objects without attributes.
         try:
             return self[name]
         except KeyError as error:
@@ -109,27 +111,34 @@ class Sent:
 
     def __getitem__(self, name: str) -> Any:
         found: list[Any] = []
+        examples: list[Any] = []
         places: list[NDArray[np.intp]] = []
         lacking: list[NDArray[np.intp]] = []
         for columns, where in self._groups():
-            if columns is None or name not in columns:
+            unasked = self._rows[where[0]] == UNASKED
+            if columns is not None and name in columns and unasked:
+                examples.append(columns[name])
+            if columns is None or name not in columns or unasked:
                 lacking.append(where)
                 continue
             found.append(mapped(lambda leaf, w=where: _rows_of(leaf, self._rows[w]), columns[name]))
             places.append(where)
-        if not found:
-            known = ", ".join(self.keys()) or "nothing"
-            raise KeyError(f"no {name!r} was sent for these results; sent were: {known}")
         if lacking:
-            nobody = np.concatenate(lacking)
-            found.append(mapped(lambda leaf: _filler(leaf, len(nobody)), found[0]))
-            places.append(nobody)
+            like = [*found, *examples]
+            if not like and (self._rows == UNASKED).all():
+                like = [np.empty(0)]
+            if not like:
+                known = ", ".join(self.keys()) or "nothing"
+                raise KeyError(f"no {name!r} was sent for these results; sent were: {known}")
+            missing = np.concatenate(lacking)
+            found.append(mapped(lambda leaf: _filler(leaf, len(missing)), like[0]))
+            places.append(missing)
         if len(found) == 1:
             return found[0]
         return concatenated(found, np.argsort(np.concatenate(places)))
 
     def _groups(self) -> Iterator[tuple[Mapping[str, Any] | None, NDArray[np.intp]]]:
-        """The columns that rows came from, each with the places of its rows in the batch."""
+        """Columns of requests, each with the rows of the batch that answer it."""
         by_source: dict[int, list[int]] = {}
         for place, columns in enumerate(self._columns):
             by_source.setdefault(id(columns), []).append(place)
@@ -145,7 +154,7 @@ def _rows_of(leaf: Any, rows: NDArray[np.intp]) -> Any:
 
 
 def _filler(leaf: Any, count: int) -> Any:
-    """As many rows like those of `leaf`, of no meaning."""
+    """Make `count` placeholder rows with the shape and dtype of `leaf`."""
     if isinstance(leaf, list):
         return [None] * count
     if isinstance(leaf, np.ndarray):
@@ -156,11 +165,14 @@ def _filler(leaf: Any, count: int) -> Any:
     return leaf.new_full((count, *leaf.shape[1:]), nothing)
 
 
-def columns_of_values(values: Sequence[PolicyResponse]) -> dict[str, Any]:
-    """Columns of responses that came one by one."""
+def columns_of_values(
+    values: Sequence[PolicyResponse], *, actions_as_list: bool = False
+) -> dict[str, Any]:
+    """Stack single responses to columns; actions without fixed size stay a list."""
     extras = (getattr(value, "extras", {}) for value in values)
     names = dict.fromkeys(("action", *(name for own in extras for name in own)))
+    rows = {name: [getattr(value, name, None) for value in values] for name in names}
     return {
-        name: columns_where_possible([getattr(value, name, None) for value in values])
-        for name in names
+        name: column if actions_as_list and name == "action" else columns_where_possible(column)
+        for name, column in rows.items()
     }

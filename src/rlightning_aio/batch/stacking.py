@@ -14,25 +14,14 @@ __all__ = ["columns_where_possible", "concatenated", "differing", "stacked_value
 
 
 def stacked_values(values: list[Any]) -> Any:
-    """`values` as columns: arrays, torch tensors, and dicts and tuples of them.
+    """Stack `values` to columns: arrays, torch tensors, or dicts and tuples of them.
 
     Raises:
         ValueError: they differ in structure or shape.
     """
     first = values[0] if values else None
-    if isinstance(first, dict):
-        keys = cast("dict[Any, Any]", first).keys()
-        if not all(isinstance(value, dict) and value.keys() == keys for value in values):
-            raise differing()
-        return {key: stacked_values([value[key] for value in values]) for key in keys}
-    if isinstance(first, tuple):
-        if not all(isinstance(value, tuple) for value in values):
-            raise differing()
-        tuples = cast("list[tuple[Any, ...]]", values)
-        length = len(tuples[0])
-        if any(len(value) != length for value in tuples):
-            raise differing()
-        return tuple(stacked_values([value[k] for value in tuples]) for k in range(length))
+    if isinstance(first, dict | tuple):
+        return _stacked_trees(cast("dict[Any, Any] | tuple[Any, ...]", first), values)
     if isinstance(first, str):
         return values
     if type(first).__module__.partition(".")[0] == "torch":
@@ -44,23 +33,40 @@ def stacked_values(values: list[Any]) -> Any:
     return np.stack(arrays) if arrays else np.empty(0)
 
 
+def _stacked_trees(first: dict[Any, Any] | tuple[Any, ...], values: list[Any]) -> Any:
+    kind, keys = (dict if isinstance(first, dict) else tuple), _keys_of(first)
+    if not all(isinstance(value, kind) and _keys_of(value) == keys for value in values):
+        raise differing()
+    stacked = {key: stacked_values([value[key] for value in values]) for key in keys}
+    return stacked if kind is dict else tuple(stacked.values())
+
+
+def _keys_of(tree: Any) -> Any:
+    """Keys of a dict, or positions of a tuple."""
+    return cast("dict[Any, Any]", tree).keys() if isinstance(tree, dict) else range(len(tree))
+
+
 def differing() -> ValueError:
-    """What is raised where values of one batch don't stack."""
+    """The error for values of one batch that don't stack."""
     return ValueError(
         "envs of this batch have different shapes, so their values don't stack; use by_name()"
     )
 
 
 def columns_where_possible(values: list[Any]) -> Any:
-    """`values` as columns, or as they are where they don't stack."""
+    """Stack `values` to columns; return them unchanged if they don't stack."""
     try:
         return stacked_values(values)
-    except (ValueError, TypeError, RuntimeError):  # Of tensors: a mixture, shapes.
+    except (
+        ValueError,
+        TypeError,
+        RuntimeError,
+    ):  # Tensors on several devices, or of several shapes.
         return values
 
 
 def concatenated(trees: list[Any], order: NDArray[np.intp]) -> Any:
-    """Trees of one structure behind one another, their rows in another order."""
+    """Concatenate trees with the same structure, and reorder their rows."""
     first = trees[0]
     if isinstance(first, dict):
         parts = cast("dict[str, Any]", first)

@@ -1,8 +1,8 @@
 """The command line: it parses, calls the library, and prints.
 
-Rule: figures and tables go to stdout, everything said on the way to stderr; exit code 0
-is success, 1 a failed env, 2 a wrong configuration or command line, 130 Ctrl-C.
-Absent on purpose: rules of environments, and anything a program couldn't call itself.
+Rule: results go to stdout, all other messages to stderr. Exit code 0 is success, 1 a failed env,
+2 a wrong configuration or command line, 130 Ctrl-C. Everything that a program could need is in the
+library, not here.
 """
 
 from __future__ import annotations
@@ -12,33 +12,40 @@ import os
 import signal
 import sys
 import warnings
+from typing import TextIO, cast
 
 __all__ = ["main"]
 
 
 def main() -> None:
     """Run the command that `sys.argv` names; the entry point of ``rlightning-aio``."""
-    # Where envs run, a command catches Ctrl-C itself. Anywhere else there is nothing to
-    # clean up, and an exception could get lost in code that expects none.
+    # A command catches Ctrl-C itself while envs run. At other times there is nothing to clean
+    # up, and an exception could get lost in code that expects none.
     signal.signal(signal.SIGINT, _quit)
     warnings.showwarning = _say
     from rlightning_aio.cli.app import app  # noqa: PLC0415
+    from rlightning_aio.cli.terminal import ResultStream  # noqa: PLC0415
+    from rlightning_aio.errors import ConfigError  # noqa: PLC0415
     from rlightning_aio.hosts.standard_streams import stdout_set_aside  # noqa: PLC0415
 
-    sys.stdout = stdout_set_aside()
+    sys.stdout = cast("TextIO", ResultStream(stdout_set_aside()))
     if sys.stderr is None:  # pyright: ignore[reportUnnecessaryComparison]  # Closed by the caller.
         sys.stderr = open(2, "w", closefd=False)  # noqa: SIM115  # To the end of the process.
 
     try:
-        app()
+        try:
+            app()
+        finally:
+            # The command has finished, so Ctrl-C while the interpreter exits is no interruption.
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+            with contextlib.suppress(BrokenPipeError):  # Its reader is gone.
+                sys.stdout.flush()
     except KeyboardInterrupt:
         sys.exit(130)
+    except ConfigError as error:  # Outside any command, as in --help.
+        sys.stderr.write(f"error: {error}\n")
+        sys.exit(2)
     finally:
-        # All is said; what the interpreter still does to end is not worth a traceback, and what is
-        # printed then is no result.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        with contextlib.suppress(OSError):  # Nobody reads it any more.
-            sys.stdout.flush()
         sys.stdout = sys.stderr
 
 
@@ -47,5 +54,5 @@ def _quit(*_: object) -> None:
 
 
 def _say(message: Warning | str, *_: object) -> None:
-    """Show a warning as a user wants it, without the line of code that it came from."""
+    """Show a warning without the line of code that raised it."""
     sys.stderr.write(f"warning: {message}\n")

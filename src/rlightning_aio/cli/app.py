@@ -1,4 +1,4 @@
-"""The Typer application: which commands there are."""
+"""The Typer application with all commands."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from rlightning_aio.cli.check import check
 from rlightning_aio.cli.evaluating import evaluation
 from rlightning_aio.cli.remote import client, keygen
 from rlightning_aio.cli.rollout import rollout
+from rlightning_aio.cli.serving import serve
 from rlightning_aio.cli.tasks import tasks
 from rlightning_aio.cli.terminal import guarded
 from rlightning_aio.cli.tune import tune
@@ -48,22 +49,25 @@ def prepare(
     """Many reinforcement-learning environments in worker processes, used as one.
 
     A config is a YAML file with one entry for each kind of env. `key=value` arguments
-    after it override its fields (envs.0.num_workers=8).
+    after it override its fields; envs.0.num_workers=8 means eight envs. A checkout has some
+    in configs/. A whole config, as cartpole.yaml:
+
+        envs: [{name: pole, backend: gymnasium, task: CartPole-v1, num_workers: 8}]
 
     Start here:
 
         rlightning-aio backends
-        rlightning-aio check configs/cartpole.yaml
-        rlightning-aio rollout configs/cartpole.yaml
+        rlightning-aio check cartpole.yaml
+        rlightning-aio rollout cartpole.yaml
     """
-    del version  # Its callback has done the work.
+    del version  # Typer has called the option's callback.
     # Policies and `imports:` of a project are found where the command is run, as they are
     # by `python -m`; what is installed comes first.
     if (here := str(Path.cwd())) not in sys.path:
         sys.path.append(here)
 
 
-for command in (rollout, bench, tune, check, backends, tasks, client, keygen):
+for command in (rollout, bench, tune, check, backends, tasks, serve, client, keygen):
     app.command()(guarded(command))
 # Named after what Python has a function of that name for.
 app.command("eval")(guarded(evaluation))

@@ -1,4 +1,4 @@
-"""``rlightning-aio backends``: which simulators are here, and how to get the others."""
+"""``rlightning-aio backends``: lists the simulators, and how to install those that are missing."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rich.text import Text
 
 from rlightning_aio.cli.options import AsJson
 from rlightning_aio.cli.terminal import named_columns, out, print_json, print_table
-from rlightning_aio.registry import BACKENDS, ENTRY_POINT_GROUP
+from rlightning_aio.registry import BACKENDS, ENTRY_POINT_GROUP, ROWS_GROUP, Backend
 
 __all__ = ["backends"]
 
@@ -27,23 +27,26 @@ def backends(
 ) -> None:
     """List all backends: whether the simulator is installed here, and how to install it.
 
-    Backends of other packages (entry points of the group rlightning_aio.envs) are listed
-    after the built-in ones. Simulators that exclude each other need separate virtual
-    environments; run this command there, and name that Python in an entry's `interpreter`.
+    Backends of plug-ins (entry points of the groups rlightning_aio.backends and
+    rlightning_aio.envs) are listed after the built-in ones. Simulators that exclude each other
+    need separate virtual environments; run this command there, and name that Python in an
+    entry's `interpreter`.
 
     For example:
 
         rlightning-aio backends
         rlightning-aio backends --json
     """
-    rows = _built_in() + _third_party()
+    described = [*BACKENDS.values(), *_plug_in_rows()]
+    rows = [_row(backend) for backend in described]
+    rows += _plug_in_classes({row.name for row in rows})
     if as_json:
         print_json([asdict(row) for row in rows])
         return
     table = named_columns("Backends", "backend", "version", "install")
     table.columns[1].justify = table.columns[2].justify = "left"
     for row in rows:
-        # As texts: an extra's brackets are no markup.
+        # Texts, because Rich would take an extra's brackets for markup.
         table.add_row(
             row.name,
             Text(row.version or "not installed", "" if row.version else "dim"),
@@ -52,18 +55,22 @@ def backends(
     print_table(out(), table)
 
 
-def _built_in() -> list[_Row]:
-    found = ((backend, backend.installed_version()) for backend in BACKENDS.values())
-    return [
-        _Row(backend.name, version is not None, version, backend.install_command)
-        for backend, version in found
-    ]
+def _row(backend: Backend) -> _Row:
+    version = backend.installed_version()
+    return _Row(backend.name, version is not None, version, backend.install_command)
 
 
-def _third_party() -> list[_Row]:
-    entry_points = importlib.metadata.entry_points(group=ENTRY_POINT_GROUP)
+def _points(group: str) -> list[importlib.metadata.EntryPoint]:
+    return sorted(importlib.metadata.entry_points(group=group), key=lambda point: point.name)
+
+
+def _plug_in_rows() -> list[Backend]:
+    return [point.load() for point in _points(ROWS_GROUP) if point.name not in BACKENDS]
+
+
+def _plug_in_classes(listed: set[str]) -> list[_Row]:
     return [
         _Row(point.name, True, point.dist.version, f"pip install {point.dist.name}")
-        for point in sorted(entry_points, key=lambda point: point.name)
-        if point.dist is not None and point.name not in BACKENDS
+        for point in _points(ENTRY_POINT_GROUP)
+        if point.dist is not None and point.name not in listed
     ]

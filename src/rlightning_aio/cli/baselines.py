@@ -1,6 +1,6 @@
-"""What a config's envs do without this package: in a plain loop, and in Gymnasium's vector envs.
+"""Steps a config's envs without this package: in a plain loop, and in Gymnasium's vector envs.
 
-Rule: the same simulations, as many, with the same random actions, and none of our code in a step.
+Rule: the same simulations with the same random actions, and none of our code in a step.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 __all__ = ["Baseline", "BaselineStand", "baselines_of", "opened_baseline"]
 
 _PLAIN: Final = ("gymnasium", "mujoco")
-"""Backends whose envs `gymnasium.make` makes, with nothing added."""
+"""Backends whose envs are those of `gymnasium.make`, unchanged."""
 _MANY: Final = 128
-"""Gymnasium's AsyncVectorEnv starts a process for each env; so many are no comparison."""
+"""Above this number, AsyncVectorEnv is left out: it starts a process for each env."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class Baseline:
     """A way to step an entry's simulations without a group.
 
     Attributes:
-        words: how tables call it.
+        words: its name in tables.
     """
 
     words: str
@@ -48,11 +48,11 @@ class Baseline:
 
     @property
     def num_sims(self) -> int:
-        """Simulations in all."""
+        """Return the total number of simulations."""
         return self.config.num_workers * self.config.num_envs
 
     def as_json(self) -> dict[str, Any]:
-        """What makes it."""
+        """Return its description for JSON."""
         return {"placement": "baseline", "num_envs": {self.config.name: self.num_sims}}
 
 
@@ -60,7 +60,7 @@ _LOOP, _SYNC, _ASYNC = "bare loop", "SyncVectorEnv", "AsyncVectorEnv"
 
 
 def baselines_of(configs: Sequence[EnvConfig]) -> list[Baseline]:
-    """What a config can be compared with; nothing where its envs are not Gymnasium's alone."""
+    """Return the baselines for a config; none if Gymnasium alone can't make its envs."""
     config = configs[0]
     if len(configs) > 1 or config.backend not in _PLAIN or ENVS.registered(config.backend):
         return []
@@ -72,7 +72,7 @@ def baselines_of(configs: Sequence[EnvConfig]) -> list[Baseline]:
 
 @contextlib.contextmanager
 def opened_baseline(baseline: Baseline, seed: int) -> Generator[BaselineStand]:
-    """Its envs, built and reset.
+    """Build and reset its envs.
 
     Raises what the simulator raises.
     """
@@ -93,7 +93,7 @@ def opened_baseline(baseline: Baseline, seed: int) -> Generator[BaselineStand]:
 
 
 class BaselineStand:
-    """See `measuring.Measurable`."""
+    """A baseline whose envs are built; a `measuring.Measurable`."""
 
     def __init__(self, envs: _Loop | _Vector, costs: Costs, seed: int) -> None:
         self.costs = costs
@@ -101,7 +101,7 @@ class BaselineStand:
         self._sample = sampler_of(envs.action_space, np.random.default_rng(seed))
 
     async def measure(self, rule: Rule, limits: Limits) -> Round:
-        """See `measuring.Measurable.measure`; there is one rule only."""
+        """Measure it; `rule` has no effect."""
         del rule
         self._round(Limits(limits.steps, limits.seconds / 10))
         return self._round(limits)
@@ -118,7 +118,7 @@ class BaselineStand:
 
 
 class _Loop:
-    """Envs in a list, stepped one after the other."""
+    """A list of envs, stepped one after the other."""
 
     def __init__(self, makers: Sequence[Callable[[], Any]]) -> None:
         self._envs = [make() for make in makers]
@@ -132,7 +132,7 @@ class _Loop:
             env.reset(seed=seed + k)
 
     def step(self, actions: Any, latencies: list[float]) -> int:
-        """Step each; how many steps that were."""
+        """Step each env. Return the number of steps."""
         rows: Any = gym.vector.utils.iterate(self._actions, actions)
         for env, action in zip(self._envs, rows, strict=True):
             sent_at = time.monotonic()
@@ -148,7 +148,7 @@ class _Loop:
 
 
 class _Vector:
-    """One of Gymnasium's vector envs; `close` ends it, whatever it is doing."""
+    """One of Gymnasium's vector envs; `close` ends it even during a step."""
 
     def __init__(self, envs: Any, **close: Any) -> None:
         self._envs = envs
@@ -162,7 +162,7 @@ class _Vector:
         self._envs.reset(seed=seed)
 
     def step(self, actions: Any, latencies: list[float]) -> int:
-        """Step all; how many of them were no resets."""
+        """Step all envs. Return the number of steps that were no resets."""
         sent_at = time.monotonic()
         _, _, terminated, truncated, _ = self._envs.step(actions)
         latencies.append(time.monotonic() - sent_at)
@@ -198,8 +198,8 @@ def _made(baseline: Baseline) -> _Loop | _Vector:
 
 @contextlib.contextmanager
 def _deaf() -> Generator[None]:
-    """Processes that are started in here hear no Ctrl-C, and end without a word when they are told
-    to: the command sees to that.
+    """Make processes that start in this context ignore Ctrl-C and end silently on SIGTERM; the
+    command ends them.
     """
     ways = {signal.SIGINT: signal.SIG_IGN, signal.SIGTERM: signal.SIG_DFL}
     before = {number: signal.signal(number, way) for number, way in ways.items()}

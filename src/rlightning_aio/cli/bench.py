@@ -5,21 +5,31 @@ from __future__ import annotations
 import contextlib
 from dataclasses import dataclass, field
 from enum import StrEnum
-from pathlib import Path  # noqa: TC003 (Typer reads annotations)
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Self, TypeAlias
 
 import typer
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
-import rlightning_aio
 from rlightning_aio.cli.baselines import Baseline, baselines_of, opened_baseline
-from rlightning_aio.cli.collecting import check_trace
-from rlightning_aio.cli.comparing import Comparison, check_name, compared, save
+from rlightning_aio.cli.collecting import traced
+from rlightning_aio.cli.comparing import Comparison, check_name, check_save, compared, save
 from rlightning_aio.cli.contender_table import as_csv, as_markdown, print_contenders
 from rlightning_aio.cli.measuring import Contender, Limits, Rule, Stand, opened, take_turns
-from rlightning_aio.cli.options import AsJson, Config, Overrides
+from rlightning_aio.cli.option_files import check_option_file
+from rlightning_aio.cli.options import (
+    AsJson,
+    Config,
+    MeasuringSeconds,
+    Overrides,
+    PlotFile,
+    PolicyName,
+    Rounds,
+    check_seed,
+)
 from rlightning_aio.cli.plots import check_plot, draw_contenders
 from rlightning_aio.cli.policies import Policy, load_policy
+from rlightning_aio.cli.publishing import check_publish, publish
 from rlightning_aio.cli.settings import Setting, possible_settings
 from rlightning_aio.cli.surroundings import surroundings
 from rlightning_aio.cli.terminal import (
@@ -27,10 +37,10 @@ from rlightning_aio.cli.terminal import (
     count,
     counted,
     err,
-    interruptible,
     out,
     print_json,
     print_result,
+    run_interruptible,
 )
 from rlightning_aio.config import load_config
 
@@ -38,15 +48,16 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from rlightning_aio.cli.measuring import Measurable, Place
+    from rlightning_aio.config import EnvConfig
 
 __all__ = ["Watch", "bench"]
 
 REGRESSION = 3
-"""Exit code where something has become slower than what was saved."""
+"""Exit code if a contender has become slower than in the saved figures."""
 
 
 class Format(StrEnum):
-    """How the table is printed."""
+    """The format of the table."""
 
     TABLE = "table"
     CSV = "csv"
@@ -55,7 +66,7 @@ class Format(StrEnum):
 
 @dataclass
 class _Bench:
-    """What is measured, and how."""
+    """The options of a measurement."""
 
     settings: list[Setting]
     baselines: list[Baseline]
@@ -75,51 +86,118 @@ class _Bench:
         self.contenders += [Contender(baseline, Rule("step", None)) for baseline in self.baselines]
 
 
+@dataclass(frozen=True)
+class _Output:
+    """The options for the figures. They are checked before anything is measured."""
+
+    config: Path
+    overrides: Sequence[str]
+    table_format: Format
+    as_json: bool
+    plot: Path | None
+    save_as: str | None
+    compare: str | None
+    publish: Path | None
+
+    def __post_init__(self) -> None:
+        check_plot(self.plot)
+        check_name(self.save_as, must_exist=False)
+        check_name(self.compare, must_exist=True)
+        check_save(self.save_as)
+        check_publish(self.publish)
+
+    def report(
+        self, configs: Sequence[EnvConfig], contenders: Sequence[Contender], *, interrupted: bool
+    ) -> bool:
+        """Print, draw and save the figures. Return True if one is worse than it was saved."""
+        document = {
+            "config": str(self.config),
+            "interrupted": interrupted,
+            **surroundings(configs),
+            "contenders": [contender.as_json() for contender in contenders],
+        }
+        comparison = None if self.compare is None else compared(self.compare, document)
+        self._print(document, contenders, comparison)
+        if self.plot is not None:
+            draw_contenders(str(self.config), contenders, self.plot)
+        if self.publish is not None:
+            publish(self.publish, self.config, self.overrides, document, contenders)
+        if self.save_as is not None and not interrupted:
+            save(self.save_as, document)
+        return comparison is not None and bool(comparison.slower)
+
+    def _print(
+        self,
+        document: dict[str, Any],
+        contenders: Sequence[Contender],
+        comparison: Comparison | None,
+    ) -> None:
+        if self.as_json:
+            compared_figures = {} if comparison is None else {"comparison": comparison.as_json()}
+            print_json(document | compared_figures)
+            return
+        if self.table_format is Format.CSV:
+            print_result(as_csv(contenders))
+        elif self.table_format is Format.MARKDOWN:
+            print_result(as_markdown(contenders))
+        else:
+            title = ("Interrupted: " if document["interrupted"] else "") + document["config"]
+            print_contenders(out(), title, contenders)
+        if comparison is not None:
+            comparison.print(out() if self.table_format is Format.TABLE else err())
+
+
+_Steps: TypeAlias = Annotated[
+    int | None,
+    typer.Option(min=1, help="End a measurement after this many steps.", show_default="no limit"),
+]
+_Seed: TypeAlias = Annotated[
+    int, typer.Option(min=0, help="Seed of the first reset and random actions.")
+]
+_Save: TypeAlias = Annotated[
+    str | None,
+    typer.Option("--save", metavar="NAME", help="Save the figures to compare with later."),
+]
+_Compare: TypeAlias = Annotated[
+    str | None,
+    typer.Option(metavar="NAME", help="Compare with saved figures; exit code 3 if slower."),
+]
+_Trace: TypeAlias = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="Step the fastest group once more and write a timeline of it for "
+        "https://ui.perfetto.dev.",
+    ),
+]
+_Publish: TypeAlias = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE", help="Write a page (Markdown) with the figures, the machine and the config."
+    ),
+]
+_Format: TypeAlias = Annotated[Format, typer.Option("--format", help="Table format.")]
+
+
 def bench(
     config: Config,
     overrides: Overrides = None,
-    rounds: Annotated[int, typer.Option(min=1, help="Number of turns for each contender.")] = 5,
-    seconds: Annotated[
-        float, typer.Option(min=0.001, help="Length of one measurement, in seconds.")
-    ] = 0.5,
-    steps: Annotated[
-        int | None,
-        typer.Option(
-            min=1, help="End a measurement after this many steps.", show_default="no limit"
-        ),
-    ] = None,
-    policy: Annotated[
-        str | None,
-        typer.Option(metavar="MODULE:CALLABLE", help="Takes a batch, returns actions."),
-    ] = None,
-    seed: Annotated[
-        int, typer.Option(min=0, help="Seed of the first reset and random actions.")
-    ] = 0,
-    save_as: Annotated[
-        str | None,
-        typer.Option("--save", metavar="NAME", help="Save the figures to compare with later."),
-    ] = None,
-    compare: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="Compare with saved figures; exit code 3 if slower."),
-    ] = None,
-    plot: Annotated[
-        Path | None, typer.Option(help="Also draw the figures (PNG, SVG or PDF; needs matplotlib).")
-    ] = None,
-    table_format: Annotated[Format, typer.Option("--format", help="Table format.")] = Format.TABLE,
-    trace: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Step the fastest group once more and write a timeline of it for "
-            "https://ui.perfetto.dev.",
-        ),
-    ] = None,
+    rounds: Rounds = 5,
+    seconds: MeasuringSeconds = 0.5,
+    steps: _Steps = None,
+    policy: PolicyName = None,
+    seed: _Seed = 0,
+    save_as: _Save = None,
+    compare: _Compare = None,
+    plot: PlotFile = None,
+    table_format: _Format = Format.TABLE,
+    trace: _Trace = None,
+    publish: _Publish = None,
     as_json: AsJson = False,
 ) -> None:
     """Measure how fast a config's envs run, and how to make them run faster.
 
-    The envs live in this process, in one worker, in several, or in both. Results come from
+    The envs live in this process, in one worker process, in several, or in both. Results come from
     a synchronous step of all envs, or asynchronously as soon as one, half or all of them
     are ready. Simulations that can share an env (num_envs) are also tried that way. A plain
     loop and Gymnasium's vector envs are measured as well, if these can make the envs. All take
@@ -131,18 +209,17 @@ def bench(
         rlightning-aio bench configs/halfcheetah.yaml
         rlightning-aio bench configs/cartpole.yaml envs.0.num_workers=256 --rounds 9
         rlightning-aio bench configs/hopper.yaml --plot hopper.png --json > hopper.json
-        rlightning-aio bench configs/hopper.yaml --save before
+        rlightning-aio bench configs/hopper.yaml --save before --publish hopper.md
         rlightning-aio bench configs/hopper.yaml --compare before
     """
+    check_seed(seed)
     configs = load_config(config, overrides or ())
-    if plot is not None:
-        check_plot(plot)
-    check_trace(trace)
-    for name in (save_as, compare):
-        check_name(name, must_exist=name is compare)
+    files = (plot, save_as, compare, publish)
+    output = _Output(config, overrides or (), table_format, as_json, *files)
+    check_option_file("--trace", trace)
     order = _Bench(
         possible_settings(configs),
-        # A policy takes a group's batches, which these have none of.
+        # A policy takes a group's batches, which baselines don't have.
         [] if policy else baselines_of(configs),
         rounds,
         Limits(steps or 2**62, seconds),
@@ -150,33 +227,17 @@ def bench(
         seed,
         trace,
     )
-    interrupted = False
-    comparison: Comparison | None = None
+    interrupted = slower = False
     try:
-        with (
-            Watch(len(order.settings), rounds * len(order.contenders)) as watch,
-            interruptible(),
-            contextlib.closing(_measure(order, watch)) as measuring,
-        ):
-            rlightning_aio.run(measuring)
+        with Watch(len(order.settings), rounds * len(order.contenders)) as watch:
+            run_interruptible(_measure(order, watch))
     except KeyboardInterrupt:
         interrupted = True
         raise typer.Exit(INTERRUPTED) from None
     finally:
         if any(contender.rounds for contender in order.contenders):
-            document = {
-                "config": str(config),
-                "interrupted": interrupted,
-                **surroundings(configs),
-                "contenders": [contender.as_json() for contender in order.contenders],
-            }
-            comparison = None if compare is None else compared(compare, document)
-            _report(document, order.contenders, comparison, table_format, as_json=as_json)
-            if plot is not None:
-                draw_contenders(str(config), order.contenders, plot)
-            if save_as is not None and not interrupted:
-                save(save_as, document)
-    if comparison is not None and comparison.slower:
+            slower = output.report(configs, order.contenders, interrupted=interrupted)
+    if slower:
         raise typer.Exit(REGRESSION)
 
 
@@ -188,7 +249,7 @@ def _rules(num_envs: int) -> list[Rule]:
 
 async def _measure(order: _Bench, watch: Watch) -> None:
     with contextlib.ExitStack() as stack:
-        # Before the groups: Gymnasium forks this process as it is.
+        # Before the groups start, because Gymnasium forks this process.
         plain: dict[Place, Measurable | str] = {}
         for baseline in order.baselines:
             try:
@@ -214,17 +275,17 @@ async def _trace_fastest(
     for contender in sorted(order.contenders, key=lambda c: c.steps_per_second, reverse=True):
         stand = stands.get(contender.setting)
         if isinstance(stand, Stand):
-            with stand.group.trace(path):
+            async with traced(stand.group, path):
                 await stand.measure(contender.rule, order.limits)
             return
 
 
 class Watch:
-    """The live line on stderr; on anything but a terminal, plain lines.
+    """The live line on stderr, or plain lines if it is no terminal.
 
     Args:
-        groups: that are started first.
-        measurements: that follow.
+        groups: number of groups to start first.
+        measurements: number of measurements that follow.
     """
 
     def __init__(self, groups: int, measurements: int) -> None:
@@ -252,7 +313,7 @@ class Watch:
             self._progress.stop()
 
     def say(self, words: str, *, advance: int = 0) -> None:
-        """What is being done now."""
+        """Show the present activity."""
         if self._console.is_terminal:
             self._progress.update(self._task, description=words, advance=advance)
             self._progress.refresh()
@@ -260,29 +321,6 @@ class Watch:
             self._console.print(words)
 
     def measured(self, contender: Contender) -> None:
-        """One more measurement is done."""
+        """Count a finished measurement."""
         words = f"{contender.setting.words}, {contender.rule.words}"
         self.say(f"{words}: {count(contender.steps_per_second)} steps/s", advance=1)
-
-
-def _report(
-    document: dict[str, Any],
-    contenders: Sequence[Contender],
-    comparison: Comparison | None,
-    table_format: Format,
-    *,
-    as_json: bool,
-) -> None:
-    if as_json:
-        told = {} if comparison is None else {"comparison": comparison.as_json()}
-        print_json(document | told)
-        return
-    if table_format is Format.CSV:
-        print_result(as_csv(contenders))
-    elif table_format is Format.MARKDOWN:
-        print_result(as_markdown(contenders))
-    else:
-        title = ("Interrupted: " if document["interrupted"] else "") + document["config"]
-        print_contenders(out(), title, contenders)
-    if comparison is not None:
-        comparison.print(out() if table_format is Format.TABLE else err())

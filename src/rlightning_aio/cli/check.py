@@ -1,10 +1,11 @@
-"""``rlightning-aio check``: whether a config's envs can be built and stepped, and their spaces."""
+"""``rlightning-aio check`` builds and steps one env of each entry and prints its spaces."""
 
 from __future__ import annotations
 
-import contextlib
+import asyncio
+import json
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
@@ -14,11 +15,12 @@ from rlightning_aio.cli.options import Config, Overrides
 from rlightning_aio.cli.terminal import (
     INTERRUPTED,
     counted,
-    interruptible,
     out,
     print_json,
+    run_interruptible,
 )
 from rlightning_aio.config import check_installed, load_config
+from rlightning_aio.errors import ConfigError
 from rlightning_aio.registry import ENVS
 
 if TYPE_CHECKING:
@@ -33,10 +35,11 @@ _STEPS: Final = 3
 
 @dataclass
 class _Finding:
-    """What was found out of an entry; None where its env was not started.
+    """The findings about an entry; None where its env was not started.
 
     Attributes:
-        skipped: why it was not.
+        skipped: the reason why it was not started.
+        offers: an OpenEnv server's own description and schemas.
     """
 
     name: str
@@ -48,6 +51,7 @@ class _Finding:
     action_space: str | None = None
     max_episode_steps: int | None = None
     skipped: str | None = None
+    offers: dict[str, Any] | None = None
 
 
 def check(
@@ -71,8 +75,7 @@ def check(
     check_installed(configs)
     findings: list[_Finding] = []
     try:
-        with interruptible(), contextlib.closing(_look(configs, findings)) as looking:
-            rlightning_aio.run(looking)
+        run_interruptible(_look(configs, findings))
     except KeyboardInterrupt:
         raise typer.Exit(INTERRUPTED) from None
     if as_json:
@@ -90,6 +93,8 @@ async def _look(configs: Sequence[EnvConfig], findings: list[_Finding]) -> None:
         )
         if config.backend == "env_server":
             found.skipped = "its envs live with its clients"
+        elif config.backend == "openenv":
+            found.offers = await asyncio.to_thread(_offers, config)
         elif ENVS.is_hardware(config.backend):
             found.skipped = "it would move"
         else:
@@ -97,8 +102,19 @@ async def _look(configs: Sequence[EnvConfig], findings: list[_Finding]) -> None:
         findings.append(found)
 
 
+def _offers(config: EnvConfig) -> dict[str, Any]:
+    """Return the description and schemas of an entry's first server."""
+    # Imported here because it needs an extra.
+    from rlightning_aio.envs.openenv_session import get_json  # noqa: PLC0415
+
+    try:
+        return {path: get_json(config.task, f"/{path}") for path in ("metadata", "schema")}
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{config.name!r}: {config.task} can't be read: {error}") from error
+
+
 async def _try(config: EnvConfig, found: _Finding) -> None:
-    """Build one env of the entry, and step it."""
+    """Build one env of the entry and step it."""
     one = [config.model_copy(update={"num_workers": 1, "min_results": None})]
     async with rlightning_aio.build_env_group(one) as group:
         (meta,) = group.metas
@@ -120,6 +136,8 @@ def _lines(found: _Finding) -> list[str]:
     head += f", {found.task})" if found.task else ")"
     if found.skipped is not None:
         return [head, f"  not started: {found.skipped}"]
+    if found.offers is not None:
+        return [head, *json.dumps(found.offers, indent=2).splitlines()]
     limit = found.max_episode_steps
     return [
         head,

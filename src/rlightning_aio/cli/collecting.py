@@ -1,20 +1,19 @@
-"""What every loop of the command line does with a group: answer its results, reset its envs."""
+"""Parts of every command's loop over a group: responses to results, and resets."""
 
 from __future__ import annotations
 
 import contextlib
+import math
 import warnings
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
+from rlightning_aio.cli.option_files import naming_option
 from rlightning_aio.cli.policies import Policy, RandomPolicy, Responder
-from rlightning_aio.errors import ConfigError
 from rlightning_aio.group.aio import ServerHandle
-from rlightning_aio.group.trace import check_writable
 from rlightning_aio.types import EnvMeta
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Sequence
-    from contextlib import AbstractAsyncContextManager
+    from collections.abc import AsyncGenerator, Generator, Sequence
     from pathlib import Path
 
     import gymnasium as gym
@@ -23,17 +22,15 @@ if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.group.aio import EnvGroup
 
-__all__ = ["Roster", "check_trace", "resetting", "respond_to_all", "responder", "traced"]
-
-_NO_LIMIT: Final = 2**62
+__all__ = ["Roster", "default_min_results", "resetting", "respond_to_all", "responder", "traced"]
 
 
 class Roster:
-    """What each env of a group is like; of clients, what they have said on joining.
+    """Metadata of each env of a group, and of each client that has joined.
 
     Args:
-        group: initialised.
-        metas: what its `init` returned.
+        group: an initialised group.
+        metas: the return value of its `init`.
     """
 
     def __init__(self, group: EnvGroup, metas: Sequence[EnvMeta]) -> None:
@@ -42,7 +39,7 @@ class Roster:
         self.servers = [handle for handle in handles if isinstance(handle, ServerHandle)]
 
     def __call__(self, env_id: str) -> EnvMeta:
-        """The env of that id. One that has joined and left unseen is taken for a plain one."""
+        """Return the metadata for an id, with defaults for a client that has left again."""
         if env_id not in self._known:
             for server in self.servers:
                 self._known.update((meta.env_id, meta) for meta in server.metas)
@@ -54,7 +51,7 @@ class Roster:
 def responder(
     group: EnvGroup, roster: Roster, policy: Policy | None, seed: int | None
 ) -> Responder:
-    """Answers the group's results with `policy`, or at random; one call for each kind of space."""
+    """Return a responder with `policy` or random actions, called once for each kind of space."""
     actions = group.get_action_spaces()
     if policy is None:
         chosen = RandomPolicy(lambda env_id: roster(env_id).action_space, seed)
@@ -67,39 +64,46 @@ def _differ(spaces: Sequence[gym.Space[Any] | None]) -> bool:
 
 
 async def respond_to_all(group: EnvGroup, respond: Responder, batch: BatchedData) -> None:
-    """Have every env of `batch` go on."""
+    """Send a step to every env of `batch`."""
     with group.span("policy"):
         responses = await respond(batch)
     for response in responses:
         group.step_async(response)
 
 
-def check_trace(path: Path | None) -> None:
-    """Find out, before anything is started, whether a timeline can be written.
+def default_min_results(configs: Sequence[EnvConfig]) -> int:
+    """Return the number of results to wait for: that of the entries, or half of the envs."""
+    configured = sum(config.min_results or 0 for config in configs)
+    return configured or max(1, sum(config.num_workers for config in configs) // 2)
+
+
+@contextlib.asynccontextmanager
+async def traced(group: EnvGroup, path: Path | None) -> AsyncGenerator[None]:
+    """Record a timeline of `group` into a file, if one is named.
 
     Raises:
-        ConfigError: it can't, and why.
+        ConfigError: the file can't be written; the message names ``--trace``.
     """
-    if path is not None:
-        try:
-            check_writable(path)
-        except OSError as error:
-            raise ConfigError(f"--trace: {error}") from error
-
-
-def traced(group: EnvGroup, path: Path | None) -> AbstractAsyncContextManager[object]:
-    """Records a timeline of `group` into a file, if one is named."""
-    return contextlib.nullcontext() if path is None else group.trace(path)
+    if path is None:
+        yield
+        return
+    trace = group.trace(path)
+    trace.start()
+    try:
+        yield
+    finally:
+        with naming_option("--trace", path):
+            trace.stop()
 
 
 @contextlib.contextmanager
 def resetting(group: EnvGroup, configs: Sequence[EnvConfig]) -> Generator[None]:
-    """Have finished episodes reset, at the configured step limits or at the simulator's own.
+    """Reset finished episodes, at the configured step limits or at the simulators' own.
 
-    `auto_reset` wants a limit of every entry. Where one has none, episodes of all entries
-    end where their simulators end them, which know the limits that are configured.
+    `auto_reset` needs a limit for every entry. If one has none, episodes of all entries end where
+    their simulators end them; the simulators apply the configured limits, too.
     """
-    limit = None if all(config.max_episode_steps for config in configs) else _NO_LIMIT
+    limit = None if all(config.max_episode_steps for config in configs) else math.inf
     with contextlib.ExitStack() as stack:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="auto_reset.*overrides")

@@ -1,7 +1,7 @@
-"""Figures of `bench` that are kept, and compared with later ones.
+"""Saves figures of `bench` and compares later ones with them.
 
-They lie in the folder `.rlightning-aio/bench` below the one where the command is run, one JSON
-document for each name.
+There is one JSON document for each name, in the folder `.rlightning-aio/bench` of the working
+directory.
 """
 
 from __future__ import annotations
@@ -13,26 +13,28 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any, Final
 
+from rlightning_aio.cli.option_files import naming_option
 from rlightning_aio.cli.terminal import count, named_columns, print_table
 from rlightning_aio.errors import ConfigError
+from rlightning_aio.files import check_folder, check_regular, write_file
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = ["Comparison", "check_name", "compared", "save"]
+__all__ = ["Comparison", "check_name", "check_save", "compared", "save"]
 
 _FOLDER: Final = Path(".rlightning-aio", "bench")
 _SLOWER: Final = 0.95
-"""Below this share of the former rate, and of all its rounds, something has become slower."""
+"""A contender below this share of its former rate, and of all former rounds, is slower."""
 
 
 @dataclass(frozen=True)
 class Pair:
-    """One contender, then and now.
+    """Former and present figures of one contender.
 
     Attributes:
-        before, now: steps per second, medians.
-        slower: by more than the rounds differ.
+        before, now: medians of steps per second.
+        slower: it is slower by more than the rounds differ.
     """
 
     place: str
@@ -44,10 +46,10 @@ class Pair:
 
 @dataclass(frozen=True)
 class Comparison:
-    """With what was saved as `name`.
+    """A comparison with the figures saved as `name`.
 
     Attributes:
-        differences: what else has changed, in words.
+        differences: other changes, in words.
     """
 
     name: str
@@ -56,11 +58,11 @@ class Comparison:
 
     @property
     def slower(self) -> list[Pair]:
-        """What has become slower."""
+        """Return the contenders that have become slower."""
         return [pair for pair in self.pairs if pair.slower]
 
     def as_json(self) -> dict[str, Any]:
-        """All of it."""
+        """Return the comparison for JSON."""
         return {
             "name": self.name,
             "pairs": [asdict(pair) for pair in self.pairs],
@@ -69,7 +71,7 @@ class Comparison:
         }
 
     def print(self, console: Console) -> None:
-        """A table, those that have become slower in red."""
+        """Print a table with slower contenders in red."""
         table = named_columns(
             f"Compared with {self.name!r}: {len(self.slower)} of {len(self.pairs)} slower",
             "envs in", "results", "before", "now", "change",
@@ -85,7 +87,7 @@ class Comparison:
 
 
 def check_name(name: str | None, *, must_exist: bool) -> None:
-    """Raises `ConfigError` if nothing can be saved under `name`, or nothing was."""
+    """Raise `ConfigError` if `name` is not valid, or if nothing was saved under it."""
     if name is None:
         return
     if not re.fullmatch(r"[\w-][\w.-]*", name):
@@ -95,7 +97,7 @@ def check_name(name: str | None, *, must_exist: bool) -> None:
     if must_exist and not _path(name).is_file():
         known = ", ".join(sorted(path.stem for path in _FOLDER.glob("*.json"))) or "nothing"
         raise ConfigError(
-            f"--compare {name}: there is no {_path(name)}; --save makes one, and {known} is there"
+            f"--compare {name}: there is no {_path(name)}; saved with --save: {known}"
         )
 
 
@@ -103,24 +105,33 @@ def _path(name: str) -> Path:
     return _FOLDER / f"{name}.json"
 
 
+def check_save(name: str | None) -> None:
+    """Check before the measurement that figures can be saved as `name`.
+
+    Raises:
+        ConfigError: they can't be saved, with the reason.
+    """
+    if name is not None:
+        with naming_option("--save", _path(name)):
+            check_folder(_FOLDER)
+            check_regular(_path(name))
+
+
 def save(name: str, document: dict[str, Any]) -> None:
-    """Keep the document of a `bench`; one of the same name is replaced.
+    """Save the document of a `bench`, replacing any with this name.
 
     Raises:
         ConfigError: it can't be written.
     """
-    try:
-        _FOLDER.mkdir(parents=True, exist_ok=True)
-        _path(name).write_text(json.dumps(document, indent=2))
-    except OSError as error:
-        raise ConfigError(f"--save {name}: {error}") from error
+    with naming_option("--save", _path(name)):
+        write_file(_path(name), json.dumps(document, indent=2).encode())
 
 
 def compared(name: str, document: dict[str, Any]) -> Comparison:
-    """The contenders of a `bench` beside those that were saved as `name`.
+    """Compare the contenders of a `bench` with those saved as `name`.
 
     Raises:
-        ConfigError: what was saved can't be read.
+        ConfigError: the saved figures can't be read.
     """
     try:
         before = json.loads(_path(name).read_text())
@@ -133,7 +144,7 @@ def compared(name: str, document: dict[str, Any]) -> Comparison:
         if c["rounds"] and then.get((c["place"], c["rule"]))
     ]
     differences = [
-        f"{key} was {before.get(key)}, and is {document[key]}"
+        f"{key} was {before.get(key)} and is now {document[key]}"
         for key in ("config", "cores", "cpu", "versions")
         if before.get(key) != document[key]
     ]

@@ -1,4 +1,4 @@
-"""What `bench` and `tune` have measured: as a table on a terminal, as CSV, as Markdown."""
+"""Shows the figures of `bench` and `tune`: a table on a terminal, CSV, Markdown."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _FIGURES: Final = (
 
 
 def print_contenders(console: Console, title: str, contenders: Sequence[Contender]) -> None:
-    """The table of what was measured, the fastest in bold."""
+    """Print a table of the figures, with the fastest in bold."""
     fastest = max(contenders, key=lambda contender: contender.steps_per_second)
     table = named_columns(
         f"{title}: {counted(num_cores(), 'core')}, "
@@ -46,7 +46,7 @@ def print_contenders(console: Console, title: str, contenders: Sequence[Contende
 
 
 def as_csv(contenders: Sequence[Contender]) -> str:
-    """All figures in plain units, one line for each contender below that of their names."""
+    """Return all figures in plain units: a line of names, then one for each contender."""
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(_FIGURES)
@@ -57,7 +57,7 @@ def as_csv(contenders: Sequence[Contender]) -> str:
 
 
 def as_markdown(contenders: Sequence[Contender]) -> str:
-    """The table as GitHub and others show it."""
+    """Return the table in Markdown."""
     lines = [list(_NAMES), ["---", "---", *["---:"] * (len(_NAMES) - 2)]]
     lines += [_row(contender) for contender in contenders]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)

@@ -1,40 +1,54 @@
-"""``rlightning-aio eval``: equally many episodes of each env, and what they say of a policy."""
+"""``rlightning-aio eval`` judges a policy: a number of episodes of each env, or a queue of them."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Self
+from typing import TYPE_CHECKING, Annotated, Any, Final, Self, TypeAlias
 
 import typer
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
 import rlightning_aio
-from rlightning_aio.cli.collecting import Roster, check_trace, resetting, responder, traced
+from rlightning_aio.cli.collecting import Roster, default_min_results, resetting, responder, traced
 from rlightning_aio.cli.evaluation_file import EvaluationFile, subject
+from rlightning_aio.cli.figures import estimates, with_interval
 from rlightning_aio.cli.films import Video, VideoEnvs, VideoEvery, filmed
-from rlightning_aio.cli.options import AsJson, Config, Overrides, TraceFile
+from rlightning_aio.cli.option_files import check_option_file
+from rlightning_aio.cli.options import AsJson, Config, Overrides, PlotFile, TraceFile, check_seed
 from rlightning_aio.cli.plots import check_plot, draw_evaluation
 from rlightning_aio.cli.policies import load_policy
+from rlightning_aio.cli.queue_evaluating import QueueOrder, evaluate_queue
+from rlightning_aio.cli.queue_options import (
+    EpisodesFile,
+    MaxAttempts,
+    QueueOptions,
+    Seeds,
+    Tasks,
+    VideoEpisodes,
+    VideoFailed,
+)
 from rlightning_aio.cli.sb3_policies import SB3Policy, digest_of
 from rlightning_aio.cli.terminal import (
     INTERRUPTED,
     count,
     counted,
     err,
-    interruptible,
     named_columns,
+    notes_on_returns,
     number,
     out,
     print_json,
     print_table,
+    run_interruptible,
 )
 from rlightning_aio.config import load_config
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.evaluation import Episode, Estimate, Evaluation, evaluate
+from rlightning_aio.evaluation import Episode, Evaluation, evaluate
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -50,9 +64,13 @@ _REFRESH_SECONDS: Final = 0.2
 _RANDOM: Final = "random"
 
 
+_ByEntry: TypeAlias = "Sequence[tuple[EnvConfig, Evaluation]]"
+"""The entries of a config, each with the episodes of its envs."""
+
+
 @dataclass(frozen=True)
 class _Order:
-    """What to evaluate, and how."""
+    """The options of an evaluation."""
 
     configs: Sequence[EnvConfig]
     episodes: int
@@ -62,40 +80,114 @@ class _Order:
     trace: Path | None
 
 
+_PolicyOrModel: TypeAlias = Annotated[
+    str,
+    typer.Option(
+        metavar="MODULE:CALLABLE|FILE.zip|random",
+        help="Takes a batch, returns actions; or a model saved by Stable-Baselines3.",
+    ),
+]
+_Algo: TypeAlias = Annotated[
+    str | None,
+    typer.Option(
+        help="Algorithm of the model in FILE.zip, such as PPO.", show_default="from the file"
+    ),
+]
+_Episodes: TypeAlias = Annotated[
+    int | None, typer.Option(min=1, help="Episodes for each env.", show_default="10")
+]
+_Seed: TypeAlias = Annotated[
+    int | None, typer.Option(min=0, help="Base seed; each episode has its own seed.")
+]
+_Resume: TypeAlias = Annotated[
+    Path | None,
+    typer.Option(help="Save finished episodes to this file, and skip those already in it."),
+]
+
+
+@dataclass(frozen=True)
+class _Output:
+    """The facts that a report repeats, and the options for it."""
+
+    config: Path
+    policy: str
+    seed: int | None
+    episodes: int
+    plot: Path | None
+    as_json: bool
+
+    def __post_init__(self) -> None:
+        check_plot(self.plot)
+
+    def report(self, configs: Sequence[EnvConfig], found: Evaluation, *, interrupted: bool) -> None:
+        """Print and draw the results."""
+        by_entry = _by_entry(configs, found)
+        notes = notes_on_returns(
+            episode.env_id for episode in found.episodes if not math.isfinite(episode.total_reward)
+        )
+        if found.lost:
+            lost = counted(found.lost, "episode")
+            notes.insert(0, f"{lost} lost with a worker and started again")
+        if self.as_json:
+            self._print_json(by_entry, found, notes, interrupted=interrupted)
+        else:
+            title = f"{self.policy}: {counted(self.episodes, 'episode')} of each env"
+            if interrupted:
+                title = f"Interrupted, so short episodes are favoured: {title}"
+            _print_table(title, by_entry)
+            for note in notes:
+                out().print(note, markup=False)
+        if self.plot is not None and found.episodes:
+            figures = [(config.name, own, own.returns) for config, own in by_entry]
+            draw_evaluation(str(self.config), figures, self.plot)
+
+    def _print_json(
+        self, by_entry: _ByEntry, found: Evaluation, notes: list[str], *, interrupted: bool
+    ) -> None:
+        print_json(
+            {
+                "config": str(self.config),
+                "policy": self.policy,
+                "seed": self.seed,
+                "episodes_each": self.episodes,
+                "interrupted": interrupted,
+                "lost": found.lost,
+                "notes": notes,
+                "entries": [
+                    {"name": config.name, "episodes": len(own.episodes), **estimates(own)}
+                    for config, own in by_entry
+                ],
+                "episodes": [asdict(episode) for episode in found.episodes],
+            }
+        )
+
+
 def evaluation(
     config: Config,
     overrides: Overrides = None,
-    policy: Annotated[
-        str,
-        typer.Option(
-            metavar="MODULE:CALLABLE|FILE.zip|random",
-            help="Takes a batch, returns actions; or a model saved by Stable-Baselines3.",
-        ),
-    ] = _RANDOM,
-    algo: Annotated[
-        str | None,
-        typer.Option(
-            help="Algorithm of the model in FILE.zip, such as PPO.", show_default="from the file"
-        ),
-    ] = None,
-    episodes: Annotated[int, typer.Option(min=1, help="Episodes for each env.")] = 10,
-    seed: Annotated[
-        int | None, typer.Option(min=0, help="Base seed; each episode has its own seed.")
-    ] = None,
-    resume: Annotated[
-        Path | None,
-        typer.Option(help="Save finished episodes to this file, and skip those already in it."),
-    ] = None,
-    plot: Annotated[
-        Path | None, typer.Option(help="Also draw the results (PNG, SVG or PDF; needs matplotlib).")
-    ] = None,
+    policy: _PolicyOrModel = _RANDOM,
+    algo: _Algo = None,
+    episodes: _Episodes = None,
+    seed: _Seed = None,
+    episodes_file: EpisodesFile = None,
+    tasks: Tasks = None,
+    seeds: Seeds = None,
+    max_attempts: MaxAttempts = 3,
+    resume: _Resume = None,
+    plot: PlotFile = None,
     video: Video = None,
     video_env: VideoEnvs = None,
     video_every: VideoEvery = None,
+    video_failed: VideoFailed = False,
+    video_episode: VideoEpisodes = None,
     trace: TraceFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Evaluate a policy: play a fixed number of episodes for each env and print statistics.
+    """Evaluate a policy: play a fixed set of episodes and print statistics.
+
+    Either each env plays a number of episodes (--episodes), or the envs share a queue: each task of
+    --tasks with each of --seeds, or the episodes of --episodes-file, each once, on any free env.
+    An episode of a queue that is lost with its worker is played again.
 
     Means and success rates have 95 % intervals. The episodes that end first would not be a fair
     sample, because envs with short episodes would have more of them. Success is the value of
@@ -105,27 +197,49 @@ def evaluation(
     For example:
 
         rlightning-aio eval configs/cartpole.yaml --episodes 5 --seed 0
-        rlightning-aio eval configs/hopper.yaml --policy my_policies:greedy --resume hopper.jsonl
+        rlightning-aio eval configs/hopper.yaml --policy my_policies:greedy --seeds 0:50
         rlightning-aio eval configs/halfcheetah.yaml --policy model.zip --video films --plot it.png
     """
+    check_seed(seed)
     configs = load_config(config, overrides or ())
     _check_envs(config, configs)
-    if plot is not None:
-        check_plot(plot)
-    check_trace(trace)
+    check_option_file("--trace", trace)
+    films = (video, video_every, video_failed, video_episode)
+    queue = QueueOptions(episodes_file, tasks, seeds, max_attempts, *films)
     chosen, named = _policy(policy, algo)
+    if queue.wanted:
+        _refuse({"--episodes": episodes, "--seed": seed, "--video-env": video_env})
+        facts = {"config": str(config), "policy": policy}
+        evaluate_queue(
+            configs, queue, QueueOrder(chosen, named, resume, plot, trace, as_json, facts)
+        )
+        return
+    output = _Output(config, policy, seed, episodes or 10, plot, as_json)
     about = subject(configs, named, seed)
     configs = filmed(configs, video, video_env, video_every)
     with contextlib.ExitStack() as stack:
         kept = None if resume is None else stack.enter_context(EvaluationFile(resume, about))
-        group = rlightning_aio.build_env_group(configs, mixed_actions=True)
-        played = _within([] if kept is None else kept.played, episodes)
-        order = _Order(configs, episodes, seed, chosen, played, trace)
-        watch = stack.enter_context(_Watch(group, order, kept))
-        interrupted = stopped = False
+        played = _within([] if kept is None else kept.played, output.episodes)
+        _play(_Order(configs, output.episodes, seed, chosen, played, trace), kept, output)
+
+
+def _refuse(given: dict[str, Any]) -> None:
+    """Raise `ConfigError` if an option is given that a queue has no use for."""
+    for option, value in given.items():
+        if value is not None:
+            raise ConfigError(
+                f"{option} is for a number of episodes of each env; leave it out with --seeds or "
+                "--episodes-file"
+            )
+
+
+def _play(order: _Order, kept: EvaluationFile | None, output: _Output) -> None:
+    """Play a number of episodes of each env, and report them."""
+    group = rlightning_aio.build_env_group(order.configs, mixed_actions=True)
+    interrupted = stopped = False
+    with _Watch(group, order, kept) as watch:
         try:
-            with interruptible(), contextlib.closing(_evaluate(group, order, watch)) as playing:
-                rlightning_aio.run(playing)
+            run_interruptible(_evaluate(group, order, watch))
         except KeyboardInterrupt:
             interrupted = stopped = True
             raise typer.Exit(INTERRUPTED) from None
@@ -133,17 +247,10 @@ def evaluation(
             interrupted = True
             raise
         finally:
-            # Also after an error: what was played until then is worth knowing.
+            # After an error, too: the episodes until then may be useful.
             watch.stop()
-            facts = {
-                "config": str(config),
-                "policy": policy,
-                "seed": seed,
-                "episodes_each": episodes,
-                "interrupted": interrupted,
-            }
             if stopped or watch.found.episodes:
-                _report(facts, configs, watch.found, plot, as_json=as_json)
+                output.report(order.configs, watch.found, interrupted=interrupted)
 
 
 def _check_envs(path: Path, configs: Sequence[EnvConfig]) -> None:
@@ -157,7 +264,7 @@ def _check_envs(path: Path, configs: Sequence[EnvConfig]) -> None:
 
 
 def _policy(name: str, algorithm: str | None) -> tuple[Policy | None, str]:
-    """The policy, None for random actions, and what tells it from others."""
+    """Return the policy, or None for random actions, and a text that identifies it."""
     if name.endswith(".zip"):
         policy = SB3Policy(Path(name), algorithm)
         return policy, f"{name}, SHA-256 {digest_of(Path(name))}"
@@ -167,7 +274,7 @@ def _policy(name: str, algorithm: str | None) -> tuple[Policy | None, str]:
 
 
 def _within(played: Sequence[Episode], episodes: int) -> list[Episode]:
-    """Those of more episodes that were asked for before."""
+    """Leave out saved episodes beyond the present number."""
     return [episode for episode in played if episode.number < episodes]
 
 
@@ -176,7 +283,7 @@ async def _evaluate(group: EnvGroup, order: _Order, watch: _Watch) -> None:
         metas = await group.init()
         if isinstance(order.policy, SB3Policy):
             order.policy.check(metas)
-        # What was drawn for the episodes before is not drawn again.
+        # The random actions of the saved episodes must not be drawn again.
         seed = None if order.seed is None else order.seed + len(order.played)
         respond = responder(group, Roster(group, metas), order.policy, seed)
         watch.ready(sum(meta.num_envs for meta in metas) * order.episodes)
@@ -186,14 +293,14 @@ async def _evaluate(group: EnvGroup, order: _Order, watch: _Watch) -> None:
                 watch.seeing(group, respond),
                 order.episodes,
                 seed=order.seed,
-                min_batch=max(1, len(group) // 2),
+                min_results=default_min_results(order.configs),
                 played=order.played,
                 on_episode=watch.note,
             )
 
 
 class _Watch:
-    """What has been played so far, and the live line on stderr."""
+    """The figures so far, and the live line on stderr."""
 
     def __init__(self, group: EnvGroup, order: _Order, kept: EvaluationFile | None) -> None:
         self.found = Evaluation(list(order.played))
@@ -229,12 +336,12 @@ class _Watch:
         self.stop()
 
     def stop(self) -> None:
-        """No more is shown."""
+        """End the live line."""
         if self._console.is_terminal:
             self._progress.stop()
 
     def ready(self, total: int) -> None:
-        """All envs have started; so many episodes are to be had."""
+        """Show that all envs have started, with the number of episodes."""
         done = len(self.found.episodes)
         if self._console.is_terminal:
             self._progress.update(self._task, description="", total=total)
@@ -243,19 +350,19 @@ class _Watch:
             self._console.print(f"playing {counted(total, 'episode')}{before}")
 
     def note(self, episode: Episode) -> None:
-        """An episode has ended."""
+        """Count a finished episode."""
         self.found.episodes.append(episode)
         if self._kept is not None:
             self._kept.add(episode)
 
     def seeing(self, group: EnvGroup, respond: Responder) -> Callable[[BatchedData], Any]:
-        """`respond`, with the live line drawn now and then."""
+        """Return `respond`, extended to draw the live line from time to time."""
 
         async def answer(batch: BatchedData) -> list[BatchedData]:
             if time.monotonic() >= self._next_at:
                 self._next_at = time.monotonic() + _REFRESH_SECONDS
                 self._show()
-                # Where results never keep us waiting, nothing else would let Ctrl-C in.
+                # If results are always ready, nothing else would let Ctrl-C take effect.
                 await asyncio.sleep(0)
             with group.span("policy"):
                 return await respond(batch)
@@ -271,51 +378,17 @@ class _Watch:
             self._progress.refresh()
 
 
-# -- what is printed --------------------------------------------------------------------
+# -- output ------------------------------------------------------------------------------
 
 
-def _by_entry(
-    configs: Sequence[EnvConfig], found: Evaluation
-) -> list[tuple[EnvConfig, Evaluation]]:
+def _by_entry(configs: Sequence[EnvConfig], found: Evaluation) -> _ByEntry:
     return [
         (config, found.of_envs(f"{config.name}-{k}" for k in range(config.num_workers)))
         for config in configs
     ]
 
 
-def _report(
-    facts: dict[str, Any],
-    configs: Sequence[EnvConfig],
-    found: Evaluation,
-    plot: Path | None,
-    *,
-    as_json: bool,
-) -> None:
-    by_entry = _by_entry(configs, found)
-    if as_json:
-        entries = [{"name": config.name, **_figures(own)} for config, own in by_entry]
-        episodes = [asdict(episode) for episode in found.episodes]
-        print_json({**facts, "lost": found.lost, "entries": entries, "episodes": episodes})
-    else:
-        _print_table(facts, by_entry, found.lost)
-    if plot is not None and found.episodes:
-        draw_evaluation(facts["config"], [(c.name, own) for c, own in by_entry], plot)
-
-
-def _figures(found: Evaluation) -> dict[str, Any]:
-    estimates = {
-        "total_reward": found.total_reward, "length": found.length, "success": found.success,
-    }  # fmt: skip
-    told = {name: None if one is None else asdict(one) for name, one in estimates.items()}
-    return {"episodes": len(found.episodes), **told}
-
-
-def _print_table(
-    facts: dict[str, Any], by_entry: Sequence[tuple[EnvConfig, Evaluation]], lost: int
-) -> None:
-    title = f"{facts['policy']}: {counted(facts['episodes_each'], 'episode')} of each env"
-    if facts["interrupted"]:
-        title = f"Interrupted, so short episodes are favoured: {title}"
+def _print_table(title: str, by_entry: _ByEntry) -> None:
     table = named_columns(
         title,
         "entry", "envs", "episodes", "mean\nreturn", "\n95 %", "mean\nlength", "\n95 % ",
@@ -327,19 +400,8 @@ def _print_table(
             config.name,
             count(config.num_workers * config.num_envs),
             count(len(found.episodes)),
-            *_with_interval(found.total_reward, number),
-            *_with_interval(found.length, number),
-            *_with_interval(success, lambda share: f"{share:.1%}"),
+            *with_interval(found.total_reward, number),
+            *with_interval(found.length, number),
+            *with_interval(success, lambda share: f"{share:.1%}"),
         )
-    console = out()
-    print_table(console, table, ("\n95 % ", "envs"))
-    if lost:
-        console.print(f"{counted(lost, 'episode')} lost with a worker, and started again")
-
-
-def _with_interval(one: Estimate | None, words: Callable[[float], str]) -> tuple[str, str]:
-    if one is None:
-        return "-", "-"
-    if one.low is None or one.high is None:
-        return words(one.mean), "-"
-    return words(one.mean), f"{words(one.low)} to {words(one.high)}"
+    print_table(out(), table, ("\n95 % ", "envs"))

@@ -1,17 +1,15 @@
-"""The file that ``eval --resume`` keeps: what is evaluated, and each episode as it ends.
-
-Rule: a line of JSON is written whole before the next one, so whatever ends the command, what the
-file holds was played to its end; a last line without its end was not.
-"""
+"""The file of ``eval --resume``: the subject of the evaluation, and each finished episode."""
 
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final
 
-from rlightning_aio.errors import ConfigError
-from rlightning_aio.evaluation import Episode
+from rlightning_aio.cli.terminal import finite
+from rlightning_aio.evaluation.episodes import Episode, check_numbers
+from rlightning_aio.evaluation.results_file import EpisodeFile
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -19,85 +17,50 @@ if TYPE_CHECKING:
 
     from rlightning_aio.config import EnvConfig
 
-__all__ = ["EvaluationFile", "subject"]
+__all__ = ["EvaluationFile", "queue_subject", "subject"]
 
-_TOLD: Final = (
+_FIELDS: Final = (
     "name", "backend", "task", "num_workers", "num_envs", "max_episode_steps", "env_kwargs",
 )  # fmt: skip
-"""Fields of an entry that say what is evaluated; others say where and how."""
+"""Fields of an entry that affect the results; others only affect where and how it runs."""
 
 
 def subject(configs: Sequence[EnvConfig], policy: str, seed: int | None) -> dict[str, Any]:
-    """What is evaluated, as it is written down."""
-    entries = [{name: getattr(config, name) for name in _TOLD} for config in configs]
-    # What JSON has no word for is compared as it prints.
-    return json.loads(json.dumps({"policy": policy, "seed": seed, "envs": entries}, default=repr))
+    """Return the subject of the evaluation as it is saved."""
+    return _written({"policy": policy, "seed": seed, "envs": _entries(configs, _FIELDS)})
 
 
-class EvaluationFile:
-    """Opens the file, or makes it.
+def queue_subject(configs: Sequence[EnvConfig], policy: str) -> dict[str, Any]:
+    """Return the subject of an evaluation of a queue, which any number of envs may play."""
+    fields = [name for name in _FIELDS if name != "num_workers"]
+    return _written({"policy": policy, "envs": _entries(configs, fields)})
 
-    Args:
-        path: of the file.
-        about: what is evaluated, see `subject`.
 
-    Attributes:
-        played: the episodes that it holds.
+def _entries(configs: Sequence[EnvConfig], fields: Sequence[str]) -> list[dict[str, Any]]:
+    return [{name: getattr(config, name) for name in fields} for config in configs]
 
-    Raises:
-        ConfigError: it can't be read and written, or is of another evaluation.
-    """
+
+def _written(subject: dict[str, Any]) -> dict[str, Any]:
+    # Values that JSON can't hold are compared by their `repr`.
+    return finite(json.loads(json.dumps(subject, default=repr)))
+
+
+class EvaluationFile(EpisodeFile[Episode]):
+    """The episodes of an evaluation with a number for each env; see `EpisodeFile`."""
 
     def __init__(self, path: Path, about: dict[str, Any]) -> None:
-        self._path, self.played = path, list[Episode]()
-        try:
-            self._file = path.open("a+", encoding="utf-8")
-        except OSError as error:
-            raise ConfigError(f"--resume {path}: can't be written: {error.strerror}") from None
-        try:
-            self._read(about)
-        except BaseException:
-            self._file.close()
-            raise
+        super().__init__(path, about, label="--resume")
 
-    def _read(self, about: dict[str, Any]) -> None:
-        self._file.seek(0)
-        foreign = ConfigError(f"--resume {self._path}: is not a file that eval has written")
-        try:
-            text = self._file.read()
-            whole = text[: text.rfind("\n") + 1]
-            values: list[Any] = [json.loads(line) for line in whole.splitlines()]
-            before: dict[str, Any] = {**values[0]} if values else {}
-            self.played = [Episode(**value) for value in values[1:]]
-        except (ValueError, TypeError):
-            raise foreign from None
-        if not text:
-            self._write(about)
-        elif before.keys() != about.keys():
-            raise foreign
-        elif before != about:
-            told = "; ".join(
-                f"its {key} is {before[key]}, not {about[key]}"
-                for key in about
-                if before[key] != about[key]
-            )
-            raise ConfigError(
-                f"--resume {self._path}: is of another evaluation ({told}); name another file, or "
-                "use the same settings as before"
-            )
-        else:
-            self._file.truncate(len(whole.encode()))
+    def _encode(self, episode: Episode) -> dict[str, Any]:
+        return finite(asdict(episode))
 
-    def add(self, episode: Episode) -> None:
-        """Keep an episode that has ended."""
-        self._write(asdict(episode))
+    def _decode(self, value: dict[str, Any]) -> Episode:
+        return _episode(**value)
 
-    def _write(self, value: dict[str, Any]) -> None:
-        self._file.write(json.dumps(value) + "\n")
-        self._file.flush()
+    def _check(self, played: list[Episode]) -> None:
+        check_numbers(played)
 
-    def __enter__(self) -> Self:
-        return self
 
-    def __exit__(self, *exception: object) -> None:
-        self._file.close()
+def _episode(*, total_reward: float | None, **fields: Any) -> Episode:
+    """Return an episode from its saved form; null stands for a return that is not finite."""
+    return Episode(total_reward=math.nan if total_reward is None else total_reward, **fields)

@@ -1,8 +1,7 @@
-"""The options of commands that film: ``--video`` and its kin."""
+"""The options of commands that film: ``--video`` and those that go with it."""
 
 from __future__ import annotations
 
-import difflib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
@@ -10,11 +9,12 @@ import typer
 
 from rlightning_aio.config import MADE_BY_GYMNASIUM, EnvConfig
 from rlightning_aio.errors import ConfigError
+from rlightning_aio.registry import did_you_mean
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-__all__ = ["Video", "VideoEnvs", "VideoEvery", "filmed"]
+__all__ = ["Video", "VideoEnvs", "VideoEvery", "filmed", "rendering"]
 
 Video: TypeAlias = Annotated[
     Path | None,
@@ -45,7 +45,7 @@ def filmed(
     env_ids: Sequence[str] | None,
     every: int | None,
 ) -> list[EnvConfig]:
-    """`configs` with what the options ask for.
+    """Return `configs` with the video that the options ask for.
 
     Raises:
         ConfigError: an option lacks --video, or an env can't be filmed.
@@ -59,12 +59,12 @@ def filmed(
         ]
     for name, given in (("--video-env", env_ids), ("--video-every", every)):
         if given:
-            raise ConfigError(f"{name} says what to film, but not where to: add --video FOLDER")
+            raise ConfigError(f"{name} chooses what to film; add --video FOLDER for the files")
     return list(configs)
 
 
 def _chosen(configs: Sequence[EnvConfig], env_ids: Sequence[str] | None) -> list[list[int]]:
-    """Which envs of each entry."""
+    """Return the numbers of the chosen envs of each entry."""
     if env_ids is None:
         return [[] if config.backend == "env_server" else [0] for config in configs]
     places = {
@@ -75,18 +75,25 @@ def _chosen(configs: Sequence[EnvConfig], env_ids: Sequence[str] | None) -> list
     chosen: list[list[int]] = [[] for _ in configs]
     for env_id in dict.fromkeys(env_ids):
         if env_id not in places:
-            near = difflib.get_close_matches(env_id, places, n=1)
-            hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(places)}"
+            hint = did_you_mean(env_id, places) or f"known: {', '.join(places)}"
             raise ConfigError(f"no env {env_id!r} to film; {hint}")
         entry, index = places[env_id]
         chosen[entry].append(index)
     return chosen
 
 
+def rendering(config: EnvConfig) -> EnvConfig:
+    """Return `config` with simulators that can render frames."""
+    if config.backend not in MADE_BY_GYMNASIUM:
+        return config
+    kwargs = {"render_mode": "rgb_array", **config.env_kwargs}
+    return config.model_copy(update={"env_kwargs": kwargs})
+
+
 def _filmed(config: EnvConfig, video: dict[str, Any]) -> EnvConfig:
     fields = {name: getattr(config, name) for name in config.model_fields_set}
     if config.backend in MADE_BY_GYMNASIUM:
-        fields["env_kwargs"] = {"render_mode": "rgb_array", **config.env_kwargs}
+        fields["env_kwargs"] = rendering(config).env_kwargs
     try:
         return EnvConfig.model_validate({**fields, "video": video})
     except ValueError as error:

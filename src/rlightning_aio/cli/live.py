@@ -1,7 +1,8 @@
-"""What `rollout` shows on a terminal while it runs: how far it is, how fast, and whom it waits for.
+"""The live display of `rollout`: progress, speed, and the envs it is waiting for.
 
-Rule: a rate is of the last moments, and where nothing comes there is none: then it says who is
-waited for, and since when. On anything but a terminal there are plain lines at the start alone.
+Rule: a rate is that of the last seconds. If no result arrives, the display names the envs it waits
+for, and since when. If stderr is no terminal, there are plain lines at the start, and when clients
+join or leave.
 """
 
 from __future__ import annotations
@@ -20,7 +21,16 @@ from rich.table import Table
 from rich.text import Text
 
 from rlightning_aio.cli.processes import memory_bytes
-from rlightning_aio.cli.terminal import count, counted, duration, err, fitted, named_columns, number
+from rlightning_aio.cli.terminal import (
+    connections_logged,
+    count,
+    counted,
+    duration,
+    err,
+    fitted,
+    named_columns,
+    number,
+)
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Sequence
@@ -34,7 +44,7 @@ __all__ = ["Display"]
 
 _REFRESH_SECONDS: Final = 0.2
 _PATIENCE_SECONDS: Final = 1.0
-"""So long nothing may come before it is said that it is waited for."""
+"""Seconds without a result after which the display says that it is waiting."""
 _RATE_SECONDS: Final = 3.0
 _BAR: Final = 16
 _NAMED: Final = 3
@@ -43,12 +53,12 @@ _EXPENDABLE: Final = ("entry", "envs", "memory", "step", "restarts")
 
 
 class Display:
-    """The live line on stderr, and below it, where `workers` are wanted, one for each of them.
+    """The live line on stderr, with a line for each worker below it if `workers` is True.
 
     Args:
-        group: not yet initialised.
-        statistics: of what is collected.
-        steps, seconds: after which it ends; None where it doesn't.
+        group: a group before its `init`.
+        statistics: the statistics of the rollout.
+        steps, seconds: the end of the rollout; None where there is none.
     """
 
     def __init__(
@@ -67,6 +77,7 @@ class Display:
         self._console = err()
         self._workers = _WorkerTable(group, statistics) if workers else None
         self._spinner = Spinner("dots")
+        self._lines = contextlib.ExitStack()
         self._live = Live(console=self._console, auto_refresh=False, transient=True)
         self._doing = f"starting {counted(len(group), 'env')}"
         self._since = time.monotonic()
@@ -78,15 +89,17 @@ class Display:
             self._live.start()
         else:
             self._console.print(self._doing)
+            self._lines.enter_context(connections_logged())
         return self
 
     def __exit__(self, *exception: object) -> None:
+        self._lines.close()
         if self._console.is_terminal:
             self._live.stop()
 
     @contextlib.asynccontextmanager
     async def ticking(self) -> AsyncGenerator[None]:
-        """Meanwhile, it is drawn anew whatever is waited for."""
+        """Keep drawing in the background while this context is open."""
         if not self._console.is_terminal:
             yield
             return
@@ -104,11 +117,11 @@ class Display:
             await asyncio.sleep(_REFRESH_SECONDS)
 
     def resetting(self) -> None:
-        """All envs are there, and begin their first episodes."""
+        """Show that all envs have started and are being reset."""
         self._doing, self._since = "first reset", time.monotonic()
 
     def ready(self) -> None:
-        """All envs have had their first reset."""
+        """Show that the first reset is complete."""
         self._doing = ""
         if not self._console.is_terminal:
             words = [] if self._steps is None else [counted(self._steps, "step")]
@@ -116,15 +129,15 @@ class Display:
             self._console.print(f"collecting {' '.join(words)}")
 
     def say(self, words: str) -> None:
-        """Add a line that stays."""
+        """Print a line that stays."""
         self._console.print(words, soft_wrap=True)
 
     def due(self) -> bool:
-        """Whether it is time to show something new."""
+        """Return True if the display is old enough to be drawn again."""
         return time.monotonic() >= self._next_at
 
     def show(self) -> None:
-        """Draw everything as it is now."""
+        """Draw everything."""
         now = time.monotonic()
         self._next_at = now + _REFRESH_SECONDS
         if not self._console.is_terminal:
@@ -159,7 +172,7 @@ class Display:
         return min(1.0, max(shares))
 
     def _parts(self, now: float) -> list[str]:
-        """What there is to say, the most important first."""
+        """Return the parts of the line, the most important first."""
         if self._doing:
             waited = now - self._since
             return [self._doing, *self._awaited(waited)]
@@ -175,8 +188,8 @@ class Display:
             f"{count(rate)} steps/s",
             *self._time_left(now, rate),
             steps,
-            f"return {number(total / episodes if episodes else None)}",
-            f"{count(episodes)} episodes",
+            f"{count(episodes)} episodes ended",
+            f"return of these {number(total / episodes if episodes else None)}",
         ]
 
     def _rate(self) -> float:
@@ -197,7 +210,7 @@ class Display:
                 f"{minutes}:{seconds % 60:02} left"]  # fmt: skip
 
     def _awaited(self, waited: float) -> list[str]:
-        """For whom it waits, and since when."""
+        """Return a text on the envs that it waits for, and since when; empty if there are none."""
         if waited <= _PATIENCE_SECONDS:
             return []
         workers = self._group.get_workers()
@@ -212,7 +225,7 @@ class Display:
 
 
 class _WorkerTable:
-    """A line for each worker: who it is, what it does, how fast."""
+    """A line for each worker with its envs, state and speed."""
 
     def __init__(self, group: EnvGroup, statistics: RolloutStatistics) -> None:
         self._group = group
@@ -221,7 +234,7 @@ class _WorkerTable:
         self._rates: dict[int, float] = {}
 
     def drawn(self, now: float, rows: int) -> Table:
-        """As it is now, of so many workers."""
+        """Return the table of these workers."""
         table = named_columns(
             "", "worker", "entry", "envs", "steps/s", "step", "memory", "restarts", "state"
         )
@@ -271,13 +284,13 @@ def _state(worker: dict[str, Any]) -> str:
 
 
 def _listed(names: Sequence[str]) -> str:
-    shown = [name for name in names if name][:_NAMED]
-    more = len(names) - len(shown)
-    return ", ".join(shown) + (f" and {more} more" if more > 0 and shown else "")
+    named = [name for name in names if name][:_NAMED]
+    more = len(names) - len(named)
+    return ", ".join(named) + (f" and {more} more" if more > 0 and named else "")
 
 
 def _fitting(parts: Sequence[str], room: int) -> str:
-    """As many of `parts` as have room, from the first."""
+    """Return the first of `parts`, as many as fit."""
     text = parts[0]
     for part in parts[1:]:
         if len(text) + 2 + len(part) > room:

@@ -1,7 +1,7 @@
-"""Action masks: which discrete actions a result allows.
+"""Action masks: the discrete actions that a result allows.
 
-As PettingZoo and Gymnasium have them: under ``action_mask`` in the info, or in an observation
-that is a dict; an agent's in its own. 1 stands for an action that is allowed.
+As in PettingZoo and Gymnasium, a mask is ``action_mask`` in the info or in a dict observation (of
+the agent, if there are several). 1 stands for an allowed action.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ __all__ = ["allowed_action", "can_be_masked", "has_masks"]
 
 
 def can_be_masked(space: gym.Space[Any]) -> bool:
-    """Whether actions of `space`, or of an agent in it, are discrete."""
+    """Return True if actions of `space`, or of an agent in it, are discrete."""
     parts = space.spaces.values() if is_dict(space) else (space,)
     return any(map(_is_discrete, parts))
 
 
 def has_masks(result: Any) -> bool:
-    """Whether a result has a mask, of any of its agents."""
+    """Return True if a result has a mask for any agent."""
     return any(mask is not None for _, mask in _masks(result))
 
 
 def allowed_action(
     space: gym.Space[Any], action: Any, result: Any, rng: np.random.Generator
 ) -> Any:
-    """`action`, one of `space`, with what the masks of `result` forbid drawn anew.
+    """Return `action`, with a random allowed action wherever a mask of `result` forbids it.
 
-    An agent without a mask, or whose mask allows nothing, keeps its own.
+    Agents without a mask, and those whose mask allows nothing, keep their action.
     """
     for agent, mask in _masks(result):
         if agent is None:
@@ -48,7 +48,7 @@ def allowed_action(
 
 
 def _masks(result: Any) -> Iterator[tuple[str | None, Any]]:
-    """Each agent's mask, or None; one for the agent None where there are no agents."""
+    """Return each agent's mask or None; the key is None for an env without agents."""
     if isinstance(result, MultiAgentEnvRet):
         for agent, observation in result.observation.items():
             yield agent, _mask(observation, result.info.get(agent))
@@ -64,7 +64,7 @@ def _mask(observation: Any, info: Any) -> Any:
 
 
 def _is_discrete(space: gym.Space[Any]) -> bool:
-    # Gymnasium's spaces are generic over dtypes that nobody states.
+    # Gymnasium's spaces are generic over a dtype that is usually left out.
     spaces: Any = gym.spaces
     return isinstance(space, (spaces.Discrete, spaces.MultiDiscrete))
 
@@ -73,7 +73,7 @@ def _allowed(space: gym.Space[Any], action: Any, mask: Any, rng: np.random.Gener
     known = cast("Any", space)
     if mask is None or not _is_discrete(space):
         return action
-    # A vectorised env has a row for each sub-environment, and as many actions.
+    # A vectorised env has one action for each sub-environment.
     weights = np.asarray(mask, np.bool_)
     drawn = (weights * (1.0 - rng.random(weights.shape))).argmax(axis=-1)
     any_allowed = weights.any(axis=-1)

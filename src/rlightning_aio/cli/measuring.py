@@ -1,8 +1,8 @@
 """Speed and latency of one config under several settings, in alternating rounds.
 
-Rule: what is compared is measured in turns (A B C A B C …) with all groups open, and told
-as medians over the rounds, so that a machine that is busy for a while slows all of them.
-A group that waits for its turn sleeps. Finished episodes are reset.
+Rule: contenders take turns (A B C A B C …) with all groups open, and figures are medians over the
+rounds, so other load on the machine slows all of them alike. A group that waits for its turn
+sleeps. Finished episodes are reset.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 
 import rlightning_aio
 from rlightning_aio.batch import BatchedData
-from rlightning_aio.batch.data import parts_of
+from rlightning_aio.batch.contents import parts_of
 from rlightning_aio.cli.collecting import Roster, resetting, respond_to_all, responder
 from rlightning_aio.cli.processes import cpu_seconds, memory_bytes
 from rlightning_aio.cli.rollout_statistics import RolloutStatistics
@@ -51,11 +51,11 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Rule:
-    """When results are taken.
+    """A rule for when results are collected.
 
     Attributes:
-        words: how tables call it.
-        min_results: of `collect_async`; None for a synchronous `step` of all envs.
+        words: its name in tables.
+        min_results: the argument of `collect_async`; None for a synchronous `step` of all envs.
     """
 
     words: str
@@ -64,13 +64,13 @@ class Rule:
 
 @dataclass(frozen=True)
 class Limits:
-    """A measurement ends at the first of these, but not before the first step."""
+    """Limits of a measurement, which ends at the first of them, but after one step at least."""
 
     steps: int
     seconds: float
 
     def not_reached(self, steps: int, seconds: float) -> bool:
-        """Whether to go on, after so many steps in so many seconds."""
+        """Return True if a measurement with these steps and seconds has to continue."""
         return steps == 0 or (steps < self.steps and seconds < self.seconds)
 
 
@@ -79,8 +79,8 @@ class Round:
     """One measurement.
 
     Attributes:
-        latency_us: from an action's sending to its result in hand, p50 and p99.
-        cores: that were kept busy, by this process and the workers.
+        latency_us: time from sending an action to receiving its result, p50 and p99.
+        cores: number of cores kept busy by this process and the workers.
     """
 
     steps_per_second: float
@@ -90,11 +90,12 @@ class Round:
 
 @dataclass(frozen=True)
 class Costs:
-    """What envs cost beside their steps.
+    """Costs of envs other than those of steps.
 
     Attributes:
-        start_seconds: until all of them were built; reset_seconds: their first reset.
-        memory_bytes: of their processes; in this process, by how much it has grown.
+        start_seconds: time until all envs were built.
+        reset_seconds: time of the first reset.
+        memory_bytes: memory of their processes, or growth of this process.
     """
 
     start_seconds: float
@@ -103,31 +104,31 @@ class Costs:
 
 
 class Place(Protocol):
-    """Where envs can live, and be stepped."""
+    """A way to place and step envs."""
 
     @property
     def words(self) -> str:
-        """How tables call it."""
+        """Return its name in tables."""
         ...
 
     def as_json(self) -> dict[str, Any]:
-        """What makes it."""
+        """Return its description for JSON."""
         ...
 
 
 class Measurable(Protocol):
-    """Envs that wait to be measured."""
+    """Envs that can be measured."""
 
     costs: Costs
 
     async def measure(self, rule: Rule, limits: Limits) -> Round:
-        """One measurement, of full length after a few steps that warm the caches."""
+        """Measure once, after a few steps that warm the caches."""
         ...
 
 
 @dataclass
 class Contender:
-    """A place under a rule, and what was measured of it."""
+    """A place with a rule, and its measurements."""
 
     setting: Place
     rule: Rule
@@ -137,18 +138,18 @@ class Contender:
 
     @property
     def steps_per_second(self) -> float:
-        """Median over the rounds; 0 if there was none."""
+        """Return the median over the rounds, or 0 without any."""
         return median(r.steps_per_second for r in self.rounds) if self.rounds else 0.0
 
     @property
     def spread(self) -> float:
-        """Half of what lies between the slowest and the fastest round, as a share of the median."""
+        """Return half the range of the rounds, as a share of the median."""
         rates = [r.steps_per_second for r in self.rounds]
         return (max(rates) - min(rates)) / 2 / self.steps_per_second
 
     @property
     def latency_us(self) -> tuple[float, float]:
-        """Medians of the rounds' p50 and p99."""
+        """Return the medians of the rounds' p50 and p99."""
         return (
             median(r.latency_us[0] for r in self.rounds),
             median(r.latency_us[1] for r in self.rounds),
@@ -156,11 +157,11 @@ class Contender:
 
     @property
     def cores(self) -> float:
-        """Median over the rounds of the cores that were busy."""
+        """Return the median over the rounds of the cores that were busy."""
         return median(r.cores for r in self.rounds)
 
     def as_json(self) -> dict[str, Any]:
-        """All that is known of it."""
+        """Return all figures for JSON."""
         document: dict[str, Any] = {
             "place": self.setting.words,
             **self.setting.as_json(),
@@ -181,13 +182,13 @@ class Contender:
 
 
 class Stand:
-    """An open group that waits to be measured: all its envs are idle between measurements.
+    """An open group to be measured; all its envs are idle between measurements.
 
     Args:
-        group: initialised, inside `resetting`.
-        everyone: a batch of all its envs, to which actions respond again and again.
-        costs: of the group.
-        policy: where actions come from; None for random ones, of that seed.
+        group: an initialised group inside `resetting`.
+        everyone: a batch of all its envs, to which every action responds.
+        costs: the group's costs.
+        policy: the source of actions; None draws random ones from the seed.
     """
 
     def __init__(
@@ -210,7 +211,7 @@ class Stand:
         self.statistics.begin(roster)
 
     async def measure(self, rule: Rule, limits: Limits) -> Round:
-        """One measurement, of full length after a few steps that warm the caches."""
+        """Measure once, after a few steps that warm the caches."""
         one_round = self._step if rule.min_results is None else self._collect
         await one_round(rule.min_results or 0, Limits(limits.steps, limits.seconds / 10))
         return await one_round(rule.min_results or 0, limits)
@@ -261,7 +262,7 @@ class Stand:
 
 
 def _processes(group: EnvGroup) -> list[int]:
-    """Of the trainer, and of the group's workers."""
+    """Return the process ids of the trainer and of the group's workers."""
     pids = [worker["pid"] for worker in group.get_workers()]
     return [os.getpid(), *(pid for pid in pids if pid is not None)]
 
@@ -269,13 +270,13 @@ def _processes(group: EnvGroup) -> list[int]:
 def as_round(
     steps: int, seconds: float, cpu_seconds: float, latencies: NDArray[np.float64]
 ) -> Round:
-    """What so many steps in so many seconds come to; latencies are in seconds."""
+    """Return the figures of a measurement; latencies are given in seconds."""
     p50, p99 = np.percentile(latencies, [50, 99]) * 1e6
     return Round(steps / seconds, (float(p50), float(p99)), cpu_seconds / seconds)
 
 
 def _joined(responses: list[BatchedData]) -> BatchedData:
-    """One batch of all responses, as `step` wants it."""
+    """Return one batch of all responses, for `step`."""
     if len(responses) == 1:
         return responses[0]
     values = [value for batch in responses for value in batch.values()]
@@ -304,10 +305,10 @@ async def _open(
 async def opened(
     settings: Sequence[Setting], policy: Policy | None = None, seed: int = 0
 ) -> AsyncGenerator[dict[Place, Measurable | str]]:
-    """Groups for all settings, open at once; a message for each that could not start.
+    """Open groups for all settings. Yield them, and a message for each that could not start.
 
     Raises:
-        RLightningError: none could.
+        RLightningError: no group could start.
     """
     async with contextlib.AsyncExitStack() as stack:
         stands: dict[Place, Measurable | str] = {}
@@ -328,9 +329,9 @@ async def take_turns(
     contenders: Sequence[Contender],
     rounds: int,
     limits: Limits,
-    tell: Callable[[Contender], None],
+    report: Callable[[Contender], None],
 ) -> None:
-    """Measure all contenders in turn, `rounds` times; `tell` is called after each."""
+    """Measure all contenders in turn, `rounds` times; `report` is called after each."""
     for _ in range(rounds):
         for contender in contenders:
             stand = stands[contender.setting]
@@ -339,5 +340,5 @@ async def take_turns(
             else:
                 contender.costs = stand.costs
                 contender.rounds.append(await stand.measure(contender.rule, limits))
-            tell(contender)
-            await asyncio.sleep(0)  # Ctrl-C gets its turn.
+            report(contender)
+            await asyncio.sleep(0)  # Let Ctrl-C take effect.

@@ -3,16 +3,41 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import Annotated, Final, TypeAlias
 
 import typer
 
-__all__ = ["AsJson", "Config", "Overrides", "TraceFile"]
+from rlightning_aio.errors import ConfigError
+
+__all__ = [
+    "AsJson",
+    "Config",
+    "MeasuringSeconds",
+    "Overrides",
+    "PlotFile",
+    "PolicyName",
+    "Rounds",
+    "TraceFile",
+    "check_seed",
+]
+
+_LAST_SEED: Final = 2**61
+"""Further seeds count up from a given one, and all must be below 2**62."""
 
 Config: TypeAlias = Annotated[Path, typer.Argument(help="YAML file with envs:", show_default=False)]
 Overrides: TypeAlias = Annotated[
     list[str] | None,
-    typer.Argument(help="Dotted overrides, such as envs.0.num_workers=8", show_default=False),
+    typer.Argument(help="Dotted overrides: envs.0.num_workers=8 (envs)", show_default=False),
+]
+Rounds: TypeAlias = Annotated[int, typer.Option(min=1, help="Number of turns for each contender.")]
+MeasuringSeconds: TypeAlias = Annotated[
+    float, typer.Option(min=0.001, help="Length of one measurement, in seconds.")
+]
+PolicyName: TypeAlias = Annotated[
+    str | None, typer.Option(metavar="MODULE:CALLABLE", help="Takes a batch, returns actions.")
+]
+PlotFile: TypeAlias = Annotated[
+    Path | None, typer.Option(help="Also draw the figures (PNG, SVG or PDF; needs matplotlib).")
 ]
 TraceFile: TypeAlias = Annotated[
     Path | None,
@@ -21,3 +46,9 @@ TraceFile: TypeAlias = Annotated[
 AsJson: TypeAlias = Annotated[
     bool, typer.Option("--json", help="Print one JSON document instead of the table.")
 ]
+
+
+def check_seed(seed: int | None) -> None:
+    """Raise `ConfigError` if `seed` leaves no room to count further seeds."""
+    if seed is not None and seed > _LAST_SEED:
+        raise ConfigError(f"--seed {seed}: should be from 0 to 2**61")

@@ -1,13 +1,16 @@
-"""Pictures of what commands have measured; matplotlib is an extra that only they need."""
+"""Plots of measurements; only they need matplotlib."""
 
 from __future__ import annotations
 
 import importlib
 import importlib.util
+import io
 from typing import TYPE_CHECKING, Any, Final
 
+from rlightning_aio.cli.option_files import check_option_file, naming_option
 from rlightning_aio.cli.terminal import counted
 from rlightning_aio.errors import ConfigError
+from rlightning_aio.files import write_file
 from rlightning_aio.sharing import num_cores
 
 if TYPE_CHECKING:
@@ -16,28 +19,25 @@ if TYPE_CHECKING:
 
     from rlightning_aio.cli.measuring import Contender
     from rlightning_aio.cli.rollout_statistics import Course
-    from rlightning_aio.evaluation import Estimate, Evaluation
+    from rlightning_aio.evaluation import Estimate
+    from rlightning_aio.evaluation.episodes import Figures
 
 __all__ = ["check_plot", "draw_contenders", "draw_evaluation", "draw_rollout"]
 
 _KINDS: Final = (".png", ".svg", ".pdf")
 
 
-def check_plot(path: Path) -> None:
-    """Find out, before anything is measured, whether a picture can be written.
+def check_plot(path: Path | None) -> None:
+    """Check before the measurement that a plot can be drawn and written to `path`, if there is one.
 
     Raises:
-        ConfigError: it can't, and why.
+        ConfigError: it can't, with the reason.
     """
+    if path is None:
+        return
     if path.suffix.lower() not in _KINDS:
         raise ConfigError(f"--plot {path}: should end in {', '.join(_KINDS[:-1])} or {_KINDS[-1]}")
-    is_new = not path.exists()
-    try:
-        path.open("ab").close()
-    except OSError as error:
-        raise ConfigError(f"--plot {path}: can't be written: {error.strerror}") from error
-    if is_new:
-        path.unlink()
+    check_option_file("--plot", path)
     if importlib.util.find_spec("matplotlib") is None:
         raise ConfigError("--plot needs matplotlib: pip install matplotlib")
 
@@ -48,19 +48,20 @@ def _pyplot() -> Any:
 
 
 def _save(plt: Any, figure: Any, path: Path) -> None:
+    picture = io.BytesIO()
     try:
-        figure.savefig(path, dpi=150)
-    except OSError as error:
-        raise ConfigError(f"--plot {path}: can't be written: {error}") from error
+        figure.savefig(picture, dpi=150, format=path.suffix[1:].lower())
     finally:
         plt.close(figure)
+    with naming_option("--plot", path):
+        write_file(path, picture.getvalue())
 
 
 def draw_contenders(config: str, contenders: Sequence[Contender], path: Path) -> None:
-    """Bars of steps per second, one group of bars for each place, with the rounds' spread.
+    """Draw bars of steps per second with the rounds' spread, grouped by place.
 
     Raises:
-        ConfigError: the picture can't be written.
+        ConfigError: the plot can't be written.
     """
     plt = _pyplot()
     measured = [contender for contender in contenders if contender.rounds]
@@ -91,10 +92,10 @@ def _axes_of(points: Iterable[tuple[float, float]]) -> tuple[list[float], list[f
 
 
 def draw_rollout(config: str, courses: Sequence[Course], path: Path) -> None:
-    """Steps per second over time, and returns of episodes over steps, by entry.
+    """Draw steps per second over time, and returns of episodes over steps, by entry.
 
     Raises:
-        ConfigError: the picture can't be written.
+        ConfigError: the plot can't be written.
     """
     plt = _pyplot()
     figure, (rates, returns) = plt.subplots(2, figsize=(8, 6), layout="constrained")
@@ -109,21 +110,27 @@ def draw_rollout(config: str, courses: Sequence[Course], path: Path) -> None:
     _save(plt, figure, path)
 
 
-def draw_evaluation(config: str, by_entry: Sequence[tuple[str, Evaluation]], path: Path) -> None:
-    """Each episode's return, the means and, where episodes are judged, the success rates with their
-    95 % intervals, by entry.
+def draw_evaluation(
+    config: str, groups: Sequence[tuple[str, Figures, Sequence[float]]], path: Path
+) -> None:
+    """Draw each episode's return and the means, and success rates where there are any, with their
+    95 % intervals.
+
+    Args:
+        config: title of the plot.
+        groups: name, figures and returns of each entry or task.
+        path: the file.
 
     Raises:
-        ConfigError: the picture can't be written.
+        ConfigError: the plot can't be written.
     """
     plt = _pyplot()
-    judged = any(found.success is not None for _, found in by_entry)
+    judged = any(found.success is not None for _, found, _ in groups)
     figure, axes = plt.subplots(
-        1, 1 + judged, squeeze=False, figsize=(9, 1.6 + 0.6 * len(by_entry)), layout="constrained"
+        1, 1 + judged, squeeze=False, figsize=(9, 1.8 + 0.35 * len(groups)), layout="constrained"
     )
     returns, *rates = axes[0]
-    for place, (_, found) in enumerate(by_entry):
-        values = [episode.total_reward for episode in found.episodes]
+    for place, (_, found, values) in enumerate(groups):
         returns.plot(values, [place] * len(values), "|", alpha=0.4, ms=12)
         _draw_estimate(returns, found.total_reward, place)
         for axis in rates:
@@ -132,8 +139,8 @@ def draw_evaluation(config: str, by_entry: Sequence[tuple[str, Evaluation]], pat
     for axis in rates:
         axis.set(xlabel="success rate, 95 %", xlim=(-0.02, 1.02))
     for axis in axes[0]:
-        axis.set_yticks(range(len(by_entry)), [name for name, _ in by_entry])
-        axis.set_ylim(len(by_entry) - 0.5, -0.5)
+        axis.set_yticks(range(len(groups)), [name for name, _, _ in groups])
+        axis.set_ylim(len(groups) - 0.5, -0.5)
     _save(plt, figure, path)
 
 

@@ -1,8 +1,8 @@
-"""Where a rollout's actions come from: at random, or from a callable that the user names.
+"""Sources of a rollout's actions: random sampling, or a callable that the user names.
 
-A policy is a callable, or a coroutine function, that takes a `BatchedData` of results and returns
-actions (``[n, *action]``, one row for each result, in order), or a batch of responses made with
-`BatchedData.respond`. Sampling works on whole columns: it costs a batch, not an env.
+A policy is a callable or coroutine function that takes a `BatchedData` of results and returns
+actions (``[n, *action]``, in the order of the results), or a batch of responses made with
+`BatchedData.respond`. Sampling works on whole columns, so its cost hardly grows with the batch.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ Policy: TypeAlias = Callable[[BatchedData], Any]
 Sampler: TypeAlias = Callable[[int], Any]
 
 _UNBOUNDED_SCALE = 0.1
-"""Standard deviation where a space has no bounds: simulators take such actions in units of
-a joint's range, and larger ones throw a robot about."""
+"""Standard deviation for unbounded spaces. Their actions are usually in units of a joint's range,
+and larger ones would throw a robot about."""
 _PACKAGE: Final = str(Path(__file__).parents[1])
 
 
 class PolicyRaised(RLightningError):
-    """The user's policy raised; the message has the way through its own code."""
+    """The user's policy raised an exception; the message has the traceback of its own code."""
 
 
 def load_policy(name: str) -> Policy:
-    """The callable that ``module:callable`` names; the working folder is on the path.
+    """Return the callable that ``module:callable`` names; the working directory is on the path.
 
     Raises:
         ConfigError: it can't be imported, or is not callable.
@@ -66,11 +66,11 @@ def load_policy(name: str) -> Policy:
 
 
 class Responder:
-    """Makes the responses to a batch, with one call of the policy if its results stack.
+    """Makes the responses to a batch, with one call of the policy if results can be stacked.
 
     Args:
-        policy: see the module's text.
-        separate: call it once for each config entry, as their spaces differ.
+        policy: as the module's docstring describes.
+        separate: call it once for each config entry, because their spaces differ.
     """
 
     def __init__(self, policy: Policy, *, separate: bool) -> None:
@@ -78,10 +78,10 @@ class Responder:
         self._separate = separate
 
     async def __call__(self, batch: BatchedData) -> list[BatchedData]:
-        """Batches of responses, which together answer `batch`.
+        """Return batches of responses that together answer `batch`.
 
         Raises:
-            PolicyRaised: by the policy.
+            PolicyRaised: the policy raised an exception.
         """
         parts = list(batch.by_name().values()) if self._separate else [batch]
         return [await self._respond(part) for part in parts]
@@ -92,14 +92,14 @@ class Responder:
             if inspect.isawaitable(answer):
                 answer = await answer
         except ConfigError:
-            raise  # Random actions can't be had.
+            raise  # Random actions can't be drawn.
         except Exception as error:
-            raise PolicyRaised(_told(error)) from error
+            raise PolicyRaised(_raised(error)) from error
         return answer if isinstance(answer, BatchedData) else batch.respond(action=answer)
 
 
-def _told(error: Exception) -> str:
-    """What a policy raised, and where: from the first line that is not of this package."""
+def _raised(error: Exception) -> str:
+    """Return the error for an exception of a policy, with the traceback from its own code on."""
     trace: TracebackType | None = error.__traceback__
     while trace is not None and trace.tb_frame.f_code.co_filename.startswith(_PACKAGE):
         trace = trace.tb_next
@@ -110,14 +110,14 @@ def _told(error: Exception) -> str:
 class RandomPolicy:
     """Samples actions from the envs' spaces.
 
-    Bounded numbers are uniform. Where a space has no bounds they are normal, with a small
-    spread. Envs whose first result has an ``action_mask``, in an observation that is a dict or
-    in the info (an agent's in its own), get discrete actions that it allows; who may do nothing
-    gets any. One generator serves all envs in the order in which results arrive.
+    Bounded numbers are uniform, unbounded ones normal with a small spread. Envs whose first
+    result has an ``action_mask`` (see `masks`) get discrete actions that it allows, or any if it
+    allows none. One generator serves all envs in the order of their results.
 
     Args:
-        space_of: an env's action space, by id; asked when its first result comes.
-        seed: of the generator; None draws one.
+        space_of: a function that returns the action space for an env id; called at the env's
+            first result.
+        seed: the seed of the generator; None draws one.
     """
 
     def __init__(self, space_of: Callable[[str], gym.Space[Any] | None], seed: int | None) -> None:
@@ -126,10 +126,10 @@ class RandomPolicy:
         self._kinds: list[tuple[gym.Space[Any], Sampler]] = []
         self._samplers: dict[str, Sampler] = {}
         self._masked: dict[str, gym.Space[Any]] = {}
-        """The action spaces of envs whose results say what is allowed."""
+        """Action spaces of envs whose results have masks."""
 
     def __call__(self, batch: BatchedData) -> Any:
-        """Actions for a batch: columns if its envs share one action space, else a list."""
+        """Return actions for a batch: columns if its envs share one action space, else a list."""
         env_ids = batch.env_ids()
         samplers = [
             self._samplers.get(id_) or self._meet(id_, batch, row)
@@ -143,7 +143,7 @@ class RandomPolicy:
         return self._allowed(env_ids, actions, batch) if self._masked else actions
 
     def _allowed(self, env_ids: list[str], actions: Any, batch: BatchedData) -> Any:
-        """`actions`, in the same form, with what the results forbid drawn anew."""
+        """Return `actions` in the same form, with allowed ones in place of forbidden ones."""
         listed = isinstance(actions, list)
         chosen = [actions[k] if listed else index(actions, k) for k in range(len(env_ids))]
         for row, (env_id, result) in enumerate(zip(env_ids, batch.values(), strict=True)):
@@ -160,14 +160,14 @@ class RandomPolicy:
             sampler = sampler_of(space, self._rng)
             self._kinds.append((space, sampler))
         self._samplers[env_id] = sampler
-        # Others' infos are left alone: they may hold what can't be unpickled here.
+        # Other infos are not read: they may hold objects that can't be unpickled here.
         if can_be_masked(space) and has_masks(batch.values()[row]):
             self._masked[env_id] = space
         return sampler
 
 
 def sampler_of(space: gym.Space[Any], rng: np.random.Generator) -> Sampler:
-    """A function that makes n actions of `space`, as columns."""
+    """Return a function that makes n actions of `space`, as columns."""
     columns = _columns(space, rng)
     if columns is not None:
         return columns
@@ -176,8 +176,8 @@ def sampler_of(space: gym.Space[Any], rng: np.random.Generator) -> Sampler:
 
 
 def _columns(space: gym.Space[Any], rng: np.random.Generator) -> Sampler | None:
-    """A function that makes whole columns; None for spaces whose values don't stack."""
-    # Gymnasium's spaces are generic over dtypes that nobody states.
+    """Return a function that makes columns, or None for spaces whose values can't be stacked."""
+    # Gymnasium's spaces are generic over a dtype that is usually left out.
     spaces: Any = gym.spaces
     known = cast("Any", space)
     if isinstance(space, spaces.Box):
@@ -204,7 +204,7 @@ def _mapping(samplers: dict[Any, Sampler | None]) -> Sampler | None:
 
 
 def _integers(low: Any, high: Any, space: gym.Space[Any], rng: np.random.Generator) -> Sampler:
-    """Whole numbers from `low` to `high`, both included."""
+    """Return a function that draws integers from `low` to `high`, both included."""
     shape, dtype = space.shape or (), space.dtype
     return lambda n: rng.integers(low, high, (n, *shape), dtype=dtype, endpoint=True)
 
@@ -228,7 +228,7 @@ def _partly_bounded(
     rng: np.random.Generator,
     shape: tuple[int, ...],
 ) -> NDArray[np.float64]:
-    """Uniform where there are two bounds, normal around 0 or away from the only one."""
+    """Draw uniformly between two bounds, and normally around 0 or away from a single bound."""
     both = np.isfinite(span)
     uniform = np.where(both, low, 0.0) + np.where(both, span, 0.0) * rng.random(shape)
     normal = rng.normal(0.0, _UNBOUNDED_SCALE, shape)

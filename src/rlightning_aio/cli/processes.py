@@ -1,4 +1,4 @@
-"""What processes of this machine use, as the kernel counts it."""
+"""Resource use of this machine's processes, as the kernel counts it."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ __all__ = ["cpu_model", "cpu_seconds", "memory_bytes"]
 
 _TICKS: Final = os.sysconf("SC_CLK_TCK")
 _USER_TICKS: Final = 11
-"""Where the time in user mode stands behind a process's name; that in the kernel follows."""
+"""Position of user time behind a process's name; kernel time follows it."""
 
 
 def cpu_seconds(pids: Sequence[int]) -> float:
-    """Time that the processes have spent on cores until now; 0 of one that is gone."""
+    """Return the CPU time of the processes so far; one that has ended counts as 0."""
     return sum(map(_cpu_seconds, pids))
 
 
@@ -30,7 +30,7 @@ def _cpu_seconds(pid: int) -> float:
 
 
 def memory_bytes(pids: Sequence[int]) -> int:
-    """Memory of the processes; of what several share, each has its part. 0 of one that is gone."""
+    """Return the memory of the processes, with shared memory divided among its users."""
     return sum(map(_memory_bytes, pids))
 
 
@@ -42,7 +42,7 @@ def _memory_bytes(pid: int) -> int:
 
 
 def cpu_model() -> str:
-    """What this machine's processor calls itself; empty where it doesn't."""
+    """Return the name of this machine's processor, or an empty string."""
     for line in _read("/proc/cpuinfo").splitlines():
         if line.startswith("model name"):
             return line.partition(":")[2].strip()

@@ -1,8 +1,7 @@
-"""``rlightning-aio client`` and ``keygen``: the far end of an env_server, and its keys.
+"""``rlightning-aio client`` and ``keygen``: the client of an env_server, and its keys.
 
-Rule: the env lives in this very process and is closed however the command ends, so that
-a robot's safe stop is reached by Ctrl-C too.
-Absent on purpose: choosing among entries; a config for a client has one.
+Rule: the env lives in this process and is closed however the command ends, so Ctrl-C also brings a
+robot to its safe stop. A config for a client has exactly one entry.
 """
 
 from __future__ import annotations
@@ -19,6 +18,7 @@ from rich.text import Text
 
 from rlightning_aio.cli.terminal import (
     INTERRUPTED,
+    connections_logged,
     count,
     counted,
     err,
@@ -96,7 +96,7 @@ def client(
 
 
 def _split(address: str) -> tuple[str, int]:
-    """Host and port of ``tcp://host:port``; an IPv6 host stands in brackets there."""
+    """Return host and port of ``tcp://host:port``; an IPv6 host is in brackets."""
     match = re.fullmatch(r"tcp://(?:\[([0-9A-Fa-f:.]+)\]|([\w.-]+)):([0-9]{1,5})", address)
     if match is None or not 0 < int(match[3]) <= _MAX_PORT:
         raise ConfigError(f"--connect {address!r}: should look like tcp://127.0.0.1:5555")
@@ -104,19 +104,20 @@ def _split(address: str) -> tuple[str, int]:
 
 
 def _the_entry(path: Path, configs: Sequence[EnvConfig]) -> EnvConfig:
-    """The one entry, if this process can run it.
+    """Return the only entry.
 
     Raises:
-        ConfigError: it can't, or there are several; naming file, entry and field.
+        ConfigError: this process can't run it, or there are several; the message names file,
+            entry and field.
     """
     if len(configs) > 1:
         names = ", ".join(config.name for config in configs)
-        raise ConfigError(f"{path}: envs: a client has one env, but there are entries {names}")
+        raise ConfigError(f"{path}: envs: a client has one env, so keep one of the entries {names}")
     entry = configs[0]
     place = f"{path}: envs.0 ({entry.name!r})"
     if entry.backend == "env_server":
         raise ConfigError(
-            f"{place}, backend: an env_server is what clients dial; name the env's own backend"
+            f"{place}, backend: clients connect to an env_server; name the env's own backend"
         )
     for field in ("interpreter", "env_vars"):
         if getattr(entry, field):
@@ -142,14 +143,14 @@ def _client_of(
 
 @contextlib.contextmanager
 def _faults_of(entry: EnvConfig) -> Generator[None]:
-    """What the env raises becomes one message that names it."""
+    """Turn an exception of the env into one message that names the env."""
     try:
         yield
     except RLightningError:
         raise
     except Exception as error:  # noqa: BLE001  # It is the env author's code.
         words, env_id = ErrorText.of(error), f"{entry.name}-0"
-        fault = EnvRaised(
+        fault = EnvRaised.of(
             f"{env_id} (backend {entry.backend!r}, task {entry.task!r}) raised "
             f"{words.summary}; the remote traceback is above",
             env_id=env_id,
@@ -162,16 +163,17 @@ def _faults_of(entry: EnvConfig) -> Generator[None]:
 
 @contextlib.contextmanager
 def _status(served: RemoteEnvClient, address: str) -> Generator[None]:
-    """A live line on stderr; on anything but a terminal, one plain line at the start."""
+    """Show a live line on stderr, or a plain line for each change if it is no terminal."""
     console = err()
     if not console.is_terminal:
-        console.print(f"{served.name} dials {address}", soft_wrap=True, markup=False)
-        yield
+        console.print(f"{served.name} connects to {address}", soft_wrap=True, markup=False)
+        with connections_logged():
+            yield
         return
     spinner = Spinner("dots")
 
     def line() -> Spinner:
-        # As a text: brackets of a name or an address are no markup.
+        # Text, because Rich would take brackets in a name or address for markup.
         spinner.update(text=Text(f"{served.name}: {served.state}  {_figures(served)}"))
         return spinner
 

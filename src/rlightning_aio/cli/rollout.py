@@ -1,20 +1,20 @@
-"""``rlightning-aio rollout``: collect steps asynchronously, and say how it went."""
+"""``rlightning-aio rollout`` collects steps asynchronously and prints statistics."""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
+import math
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path  # noqa: TC003 (Typer reads annotations)
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
 
 import typer
 
 import rlightning_aio
 from rlightning_aio.cli.collecting import (
     Roster,
-    check_trace,
+    default_min_results,
     resetting,
     respond_to_all,
     responder,
@@ -22,7 +22,16 @@ from rlightning_aio.cli.collecting import (
 )
 from rlightning_aio.cli.films import Video, VideoEnvs, VideoEvery, filmed
 from rlightning_aio.cli.live import Display
-from rlightning_aio.cli.options import AsJson, Config, Overrides, TraceFile
+from rlightning_aio.cli.option_files import check_option_file
+from rlightning_aio.cli.options import (
+    AsJson,
+    Config,
+    Overrides,
+    PlotFile,
+    PolicyName,
+    TraceFile,
+    check_seed,
+)
 from rlightning_aio.cli.plots import check_plot, draw_rollout
 from rlightning_aio.cli.policies import Policy, load_policy
 from rlightning_aio.cli.rollout_statistics import EntryFigures, RolloutStatistics
@@ -30,14 +39,16 @@ from rlightning_aio.cli.terminal import (
     INTERRUPTED,
     count,
     duration,
-    interruptible,
     named_columns,
+    notes_on_returns,
     number,
     out,
     print_json,
     print_table,
+    run_interruptible,
 )
 from rlightning_aio.config import EnvConfig, load_config
+from rlightning_aio.errors import EnvFault
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -48,12 +59,12 @@ __all__ = ["rollout"]
 
 _ENDLESS = 2**62
 _STEPS = 10_000
-"""Collected where nothing else is said."""
+"""Default number of steps."""
 
 
 @dataclass(frozen=True)
 class _Order:
-    """What to collect, and how."""
+    """The options of a rollout."""
 
     steps: int | None
     seconds: float | None
@@ -63,7 +74,7 @@ class _Order:
     trace: Path | None
 
     def left(self, statistics: RolloutStatistics) -> tuple[int, float | None] | None:
-        """Steps and seconds that are left to collect; None at the end."""
+        """Return the steps and seconds that are left, or None at the end."""
         steps = _ENDLESS if self.steps is None else self.steps - statistics.steps
         seconds = self.seconds
         if seconds is not None:
@@ -71,39 +82,40 @@ class _Order:
         return None if steps <= 0 or (seconds is not None and seconds <= 0) else (steps, seconds)
 
 
+_Steps: TypeAlias = Annotated[
+    int | None,
+    typer.Option(min=1, help="Env steps to collect.", show_default="10000, or for --seconds"),
+]
+_Seconds: TypeAlias = Annotated[
+    float | None,
+    typer.Option(min=0.001, help="Seconds to collect for.", show_default="no limit"),
+]
+_Seed: TypeAlias = Annotated[
+    int | None, typer.Option(min=0, help="Seed of the first reset and random actions.")
+]
+_MinResults: TypeAlias = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        help="Results to wait for in each collect.",
+        show_default="the config's, or half of the envs",
+    ),
+]
+_Live: TypeAlias = Annotated[
+    bool, typer.Option("--live", help="On a terminal, show each worker process while it runs.")
+]
+
+
 def rollout(
     config: Config,
     overrides: Overrides = None,
-    steps: Annotated[
-        int | None,
-        typer.Option(min=1, help="Env steps to collect.", show_default="10000, or for --seconds"),
-    ] = None,
-    seconds: Annotated[
-        float | None,
-        typer.Option(min=0.001, help="Seconds to collect for.", show_default="no limit"),
-    ] = None,
-    policy: Annotated[
-        str | None,
-        typer.Option(metavar="MODULE:CALLABLE", help="Takes a batch, returns actions."),
-    ] = None,
-    seed: Annotated[
-        int | None, typer.Option(min=0, help="Seed of the first reset and random actions.")
-    ] = None,
-    min_results: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            help="Results to wait for in each collect.",
-            show_default="the config's, or half of the envs",
-        ),
-    ] = None,
-    live: Annotated[
-        bool, typer.Option("--live", help="On a terminal, show each worker while it runs.")
-    ] = False,
-    plot: Annotated[
-        Path | None,
-        typer.Option(help="Draw rates and returns (PNG, SVG or PDF; needs matplotlib)."),
-    ] = None,
+    steps: _Steps = None,
+    seconds: _Seconds = None,
+    policy: PolicyName = None,
+    seed: _Seed = None,
+    min_results: _MinResults = None,
+    live: _Live = False,
+    plot: PlotFile = None,
     video: Video = None,
     video_env: VideoEnvs = None,
     video_every: VideoEvery = None,
@@ -127,39 +139,32 @@ def rollout(
         rlightning-aio rollout configs/halfcheetah.yaml --trace run.json
         rlightning-aio rollout configs/cartpole.yaml --video films --video-every 10
     """
+    check_seed(seed)
     configs = filmed(load_config(config, overrides or ()), video, video_env, video_every)
-    if plot is not None:
-        check_plot(plot)
-    num_envs = sum(entry.num_workers for entry in configs)
-    configured = sum(entry.min_results or 0 for entry in configs)
+    check_plot(plot)
     order = _Order(
-        steps=_STEPS if steps is None and seconds is None else steps,
-        seconds=seconds,
-        min_results=min_results or configured or max(1, num_envs // 2),
-        seed=seed,
-        policy=load_policy(policy) if policy else None,
-        trace=trace,
+        _STEPS if steps is None and seconds is None else steps,
+        seconds,
+        min_results or default_min_results(configs),
+        seed,
+        load_policy(policy) if policy else None,
+        trace,
     )
-    check_trace(trace)
+    check_option_file("--trace", trace)
     statistics = RolloutStatistics(configs, keep_course=plot is not None)
     group = rlightning_aio.build_env_group(configs, mixed_actions=True)
-    interrupted = False
+    interrupted = completed = False
     try:
-        with (
-            Display(group, statistics, order.steps, seconds, workers=live) as display,
-            interruptible(),
-            contextlib.closing(_collect(group, configs, order, statistics, display)) as collecting,
-        ):
-            rlightning_aio.run(collecting)
+        with Display(group, statistics, order.steps, seconds, workers=live) as display:
+            run_interruptible(_collect(group, configs, order, statistics, display))
+        completed = True
     except KeyboardInterrupt:
         interrupted = True
         raise typer.Exit(INTERRUPTED) from None
     finally:
-        # Also after an error: what was collected until then is worth knowing.
-        if interrupted or statistics.steps:
-            _report(config, group, statistics, interrupted=interrupted, as_json=as_json)
-            if plot is not None:
-                draw_rollout(str(config), statistics.courses(), plot)
+        # After an error, too: the statistics until then may be useful.
+        if completed or interrupted or statistics.steps:
+            _report(config, group, statistics, plot, interrupted=interrupted, as_json=as_json)
 
 
 async def _collect(
@@ -189,14 +194,16 @@ async def _collect(
                         max_results=most,
                         deadline=seconds,
                     )
+                except EnvFault:
+                    raise  # Among them those of envs that raised `TimeoutError`.
                 except TimeoutError:
-                    statistics.end(time.monotonic())  # The time is over; it was waited till then.
+                    statistics.end(time.monotonic())  # The time limit has passed while waiting.
                     break
                 statistics.add(batch)
                 await respond_to_all(group, respond, batch)
                 if display.due():
                     display.show()
-                    # Where results never keep us waiting, nothing else would let Ctrl-C in.
+                    # If results are always ready, nothing else would let Ctrl-C take effect.
                     await asyncio.sleep(0)
 
 
@@ -204,11 +211,20 @@ def _report(
     config: Path,
     group: EnvGroup,
     statistics: RolloutStatistics,
+    plot: Path | None,
     *,
     interrupted: bool,
     as_json: bool,
 ) -> None:
-    entries = statistics.by_entry(group.get_env_stats())
+    env_stats = group.get_env_stats()
+    entries = statistics.by_entry(env_stats)
+    notes = notes_on_returns(
+        env_id
+        for env_id, own in env_stats.items()
+        if own["episodes"] and not math.isfinite(own["mean_return"])
+    )
+    if any(entry.episodes for entry in entries):
+        notes.append(_BIAS)
     stats = group.get_stats()
     if as_json:
         print_json(
@@ -218,19 +234,28 @@ def _report(
                 "seconds": statistics.seconds,
                 "steps": statistics.steps,
                 "steps_per_second": statistics.steps_per_second,
+                "notes": notes,
                 "entries": [asdict(entry) for entry in entries],
                 "batch_size": stats["batch_size"],
                 "latency_us": stats["latency_us"],
             }
         )
-        return
-    title = (
-        f"{'Interrupted after ' if interrupted else ''}{count(statistics.steps)} steps in "
-        f"{statistics.seconds:.1f} s: {count(statistics.steps_per_second)} steps/s"
-    )
-    _print_table(title, entries, stats["latency_us"])
+    else:
+        title = (
+            f"{'Interrupted after ' if interrupted else ''}{count(statistics.steps)} steps in "
+            f"{statistics.seconds:.1f} s: {count(statistics.steps_per_second)} steps/s"
+        )
+        _print_table(title, entries, stats["latency_us"])
+        for note in notes:
+            out().print(note, markup=False)
+    if plot is not None:
+        draw_rollout(str(config), statistics.courses(), plot)
 
 
+_BIAS: Final = (
+    "Mean return and length are those of the episodes that ended first, which favours short ones; "
+    "to measure a policy, use rlightning-aio eval."
+)
 _EXPENDABLE = ("\np99", "envs", "mean\nlength", "steps", "episodes", "step\np50")
 
 
@@ -260,7 +285,7 @@ def _print_table(
     if latency:
         shares = (("step", "in the env"), ("wait", "before it"), ("transfer", "after it"))
         console.print(
-            "a step's way, median and p99: "
+            "parts of a step, median and p99: "
             + ", ".join(
                 f"{duration(latency[kind]['p50'])} ({duration(latency[kind]['p99'])}) {words}"
                 for kind, words in shares

@@ -1,7 +1,7 @@
-"""What a rollout has collected, counted by config entry.
+"""Statistics of a rollout, by config entry.
 
-Rule: a step is an action that an env has executed; resets, which arrive as results too,
-are told apart and left out. A vectorised env's step counts once for each sub-environment.
+Rule: a step is an action that an env has executed. Resets, which arrive as results, too, are left
+out. A vectorised env's step counts once for each sub-environment.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from rlightning_aio.batch.data import parts_of
+from rlightning_aio.batch.contents import parts_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -32,17 +32,17 @@ _NOTHING: Final = np.empty(0, np.int64)
 _RECENT_BATCHES: Final = 64
 _COURSE_SECONDS: Final = 0.25
 _COURSE_EPISODES: Final = 50_000
-"""As many as a picture has room for; of more, the last."""
+"""Number of episodes in a plot; of more, the last are kept."""
 _LATENCY_BATCHES: Final = 4096
-"""Batches whose step times are kept for the percentiles."""
+"""Number of batches whose step times are kept for percentiles."""
 
 
 @dataclass(frozen=True, slots=True)
 class EntryFigures:
-    """One line of the closing table; a figure is None where nothing was seen.
+    """A line of the final table; a figure without observations is None.
 
     Attributes:
-        step_us: time in the env's own step, p50 and p99, in microseconds.
+        step_us: time in the env's own step in microseconds, p50 and p99.
     """
 
     name: str
@@ -59,8 +59,8 @@ class RolloutStatistics:
     """Counts results as they are collected.
 
     Args:
-        configs: of the group, in order.
-        keep_course: keep what `courses` tells.
+        configs: the group's entries, in order.
+        keep_course: record `courses`.
     """
 
     def __init__(self, configs: Sequence[EnvConfig], *, keep_course: bool = False) -> None:
@@ -81,37 +81,37 @@ class RolloutStatistics:
 
     @property
     def began(self) -> bool:
-        """Whether there is anything to tell."""
+        """Return True if the rollout has begun."""
         return self._began > 0
 
     @property
     def seconds(self) -> float:
-        """From the first step sent to the last result counted."""
+        """Return the seconds from the first step sent to the last result counted."""
         return self._ended - self._began
 
     @property
     def steps_per_second(self) -> float:
-        """Over the whole time."""
+        """Return the mean rate over the whole time."""
         return self.steps / self.seconds if self.seconds else 0.0
 
     def end(self, now: float) -> None:
-        """Nothing has come until now, nor will."""
+        """Record that no further result will come."""
         self._ended = now
 
     def elapsed(self, now: float) -> float:
-        """Seconds since the first step was sent; 0 before."""
+        """Return the seconds since the first step was sent, or 0 before it."""
         return now - self._began if self._began else 0.0
 
     def idle(self, now: float) -> float:
-        """Seconds since the last result came, or since the first step was sent."""
+        """Return the seconds since the last result, or since the first step was sent."""
         return now - self._ended if self._began else 0.0
 
     def steps_of(self, env_ids: Sequence[str]) -> int:
-        """Steps of these envs."""
+        """Return the number of steps of these envs."""
         return sum(self._counts[env_id] for env_id in env_ids)
 
     def recent_step_us(self) -> dict[str, float]:
-        """Time in an env's own step, mean over the last batches, by env."""
+        """Return the mean time of each env's own step over the last batches."""
         sums, numbers = Counter[str](), Counter[str]()
         for times in list(self._step_times)[-_RECENT_BATCHES:]:
             env_ids = times.names.ids(times.slots)
@@ -121,22 +121,23 @@ class RolloutStatistics:
         return {env_id: total / numbers[env_id] / 1e3 for env_id, total in sums.items()}
 
     def courses(self) -> list[Course]:
-        """How each entry went, if that was kept."""
+        """Return the course of each entry; empty unless it was recorded."""
         for course in self._courses.values():
             course.end(self.seconds)
         return list(self._courses.values())
 
     def begin(self, meta_of: Callable[[str], EnvMeta]) -> None:
-        """The first steps are about to be sent.
+        """Record that the first steps are about to be sent.
 
         Args:
-            meta_of: what the env of an id is like; asked when its first result comes.
+            meta_of: a function that returns the metadata for an env id; called at the env's
+                first result.
         """
         self._meta_of = meta_of
         self._began = self._ended = time.monotonic()
 
     def add(self, batch: BatchedData) -> None:
-        """Count what `collect_async` or `step` returned."""
+        """Count the results of a `collect_async` or `step`."""
         self._ended = time.monotonic()
         for part in parts_of(batch):
             stepped = ~part.is_reset.reshape(len(part), -1)
@@ -151,7 +152,7 @@ class RolloutStatistics:
                 self._note_course(part, stepped)
 
     def _note_course(self, part: ResultColumns, stepped: NDArray[np.bool_]) -> None:
-        """What `courses` tells of results of envs of one kind."""
+        """Add results of one entry to its course."""
         rows = len(part)
         names = np.array(part.names.names(part.slots))
         ended = np.zeros((rows, 1), np.bool_)
@@ -166,18 +167,18 @@ class RolloutStatistics:
                 course.returns += [(course.steps, value) for value in returns.tolist()]
 
     def _meet(self, env_id: str) -> None:
-        """Take note of an env that is met for the first time."""
+        """Register an env at its first result."""
         assert self._meta_of is not None
         self._sub_envs[env_id] = self._meta_of(env_id).num_envs
 
     def _entry(self, env_id: str) -> str:
-        """Its config entry; a client's is its server's, ``<server id>/<client name>``."""
+        """Return the env's config entry; for a client (``<server id>/<name>``), its server's."""
         if env_id in self._entries:
             return self._entries[env_id]
         return next(name for id_, name in self._entries.items() if env_id.startswith(f"{id_}/"))
 
     def by_entry(self, env_stats: Mapping[str, Mapping[str, Any]]) -> list[EntryFigures]:
-        """One line for each entry, with the episodes of `EnvGroup.get_env_stats`."""
+        """Return a line for each entry, with the episodes of `EnvGroup.get_env_stats`."""
         steps, episodes = Counter[str](), dict[str, list[Mapping[str, Any]]]()
         for env_id, count in self._counts.items():
             steps[self._entry(env_id)] += count
@@ -204,7 +205,7 @@ class RolloutStatistics:
         )
 
     def _num_envs(self, config: EnvConfig) -> int:
-        """Sub-environments of all envs of an entry; of a server, those of clients met."""
+        """Return the number of sub-environments of an entry; for a server, of its known clients."""
         if config.backend != "env_server":
             return config.num_workers * config.num_envs
         return sum(n for id_, n in self._sub_envs.items() if self._entry(id_) == config.name)
@@ -217,7 +218,7 @@ class RolloutStatistics:
         return {"p50": float(p50), "p99": float(p99)}
 
     def mean_step_us(self) -> float | None:
-        """Time in an env's own step, mean over all entries, in microseconds."""
+        """Return the mean time of an env's own step over all entries, in microseconds."""
         if not self._step_times:
             return None
         return float(np.concatenate([times.busy_ns for times in self._step_times]).mean()) / 1e3
@@ -225,20 +226,20 @@ class RolloutStatistics:
 
 @dataclass(frozen=True, slots=True)
 class _StepTimes:
-    """How long the envs of one batch took."""
+    """Step times of one batch."""
 
     names: EnvNames
     slots: NDArray[np.intp]
     busy_ns: NDArray[np.int64]
 
     def of(self, entry: str) -> NDArray[np.int64]:
-        """Those of an entry's envs."""
+        """Return the step times of an entry's envs."""
         mine = [name == entry for name in self.names.names(self.slots)]
         return self.busy_ns[mine]
 
 
 def _mean(stats: Sequence[Mapping[str, Any]], key: str, episodes: int) -> float | None:
-    """Mean over all episodes of all envs."""
+    """Return the mean over all episodes of all envs."""
     if not episodes:
         return None
     return float(sum(s[key] * s["episodes"] for s in stats if s["episodes"]) / episodes)
@@ -246,12 +247,12 @@ def _mean(stats: Sequence[Mapping[str, Any]], key: str, episodes: int) -> float 
 
 @dataclass
 class Course:
-    """How a rollout of one entry went.
+    """The course of a rollout of one entry.
 
     Attributes:
-        steps: until now.
-        rates: seconds since the start, and steps per second of the moment before.
-        returns: of episodes, each with the entry's steps at its end.
+        steps: number of steps so far.
+        rates: pairs of the seconds since the start and the steps per second of the last interval.
+        returns: pairs of the entry's steps at the end of an episode and its return.
     """
 
     name: str
@@ -263,13 +264,13 @@ class Course:
     _since: tuple[float, int] = (0.0, 0)
 
     def add(self, steps: int, seconds: float) -> None:
-        """So many steps have come, so long after the start."""
+        """Add steps that arrived at a time since the start."""
         self.steps += steps
         if seconds - self._since[0] >= _COURSE_SECONDS:
             self.end(seconds)
 
     def end(self, seconds: float) -> None:
-        """Close the present moment."""
+        """Close the present interval."""
         then, before = self._since
         if seconds > then:
             self.rates.append((seconds, (self.steps - before) / (seconds - then)))

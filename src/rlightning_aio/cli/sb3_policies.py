@@ -1,6 +1,6 @@
-"""Policies from files that Stable-Baselines3 has saved; it is imported when one is asked for.
+"""Policies from files saved by Stable-Baselines3, which is imported on first use.
 
-Such a file holds pickles, which can have this process execute anything: it is trusted as code is.
+Such a file holds pickles that can execute any code in this process, so it must be trusted as code.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ if TYPE_CHECKING:
 __all__ = ["SB3Policy", "digest_of"]
 
 _BY_MODULE: Final = {"dqn": "DQN", "sac": "SAC", "td3": "TD3"}
-"""The algorithm whose policies a module has; DDPG's are TD3's, and act alike."""
+"""Algorithms by the module of their policies; DDPG uses TD3's."""
 
 
 class SB3Policy:
-    """What a model's `predict` says, its likeliest actions.
+    """A policy that returns the deterministic actions of a model's `predict`.
 
     Args:
-        path: of the file.
-        algorithm: such as ``PPO``; None reads it from the file.
+        path: the file of the model.
+        algorithm: such as ``PPO``; None finds it in the file.
 
     Raises:
-        ConfigError: the file isn't there, or is no model of that algorithm.
+        ConfigError: the file is missing, or is no model of the algorithm.
     """
 
     def __init__(self, path: Path, algorithm: str | None) -> None:
@@ -57,15 +57,15 @@ class SB3Policy:
             raise ConfigError(f"--algo {name}: Stable-Baselines3 has no such algorithm")
         try:
             self._model: Any = kind.load(path, device="cpu")
-        except Exception as error:  # Whatever pickles raise.
+        except Exception as error:  # Unpickling may raise anything.
             words = f"{type(error).__name__}: {error}"
             raise ConfigError(f"--policy {path}: can't be loaded as {name}: {words}") from error
 
     def check(self, metas: Sequence[EnvMeta]) -> None:
-        """See that the model was trained on such envs.
+        """Check that the model was trained on envs with these spaces.
 
         Raises:
-            ConfigError: it wasn't; naming the env.
+            ConfigError: it was not; the message names the env.
         """
         for meta in metas:
             for what in ("observation", "action"):
@@ -87,16 +87,16 @@ class SB3Policy:
 
 
 def _size(space: Any, num_envs: int) -> Any:
-    """What two spaces that suit each other have in common; images may be transposed."""
+    """Return a value that is equal for compatible spaces; images may be transposed."""
     if space is None or space.shape is None:
         return type(space).__name__
     return sorted(space.shape[1:] if num_envs > 1 else space.shape)
 
 
 def _algorithm_in(path: Path) -> str:
-    """The algorithm that has saved a model, as far as its file tells."""
+    """Return the algorithm of a saved model, as found in its file."""
     unknown = ConfigError(
-        f"--policy {path}: doesn't say which algorithm of Stable-Baselines3 saved it; name it "
+        f"--policy {path}: the algorithm of Stable-Baselines3 can't be found in it; name it "
         "with --algo"
     )
     try:
@@ -115,6 +115,6 @@ def _algorithm_in(path: Path) -> str:
 
 
 def digest_of(path: Path) -> str:
-    """Tells one model from another that was saved under the same name."""
+    """Return the SHA-256 of a file, which identifies a model."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,7 +1,7 @@
-"""Where a config's envs could live: what `bench` and `tune` try.
+"""The settings that `bench` and `tune` try for a config.
 
-Rule: every setting steps as many simulations as the config has, in envs of one or of several of
-them, in this process, in workers, or in both.
+Rule: every setting steps the same number of simulations as the config, with one or several in each
+env, in this process, in workers, or in both.
 """
 
 from __future__ import annotations
@@ -12,27 +12,27 @@ from typing import TYPE_CHECKING, Any, Final
 from rlightning_aio.cli.terminal import counted
 from rlightning_aio.config import moved
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.registry import BACKENDS, ENVS
+from rlightning_aio.registry import ENVS
 from rlightning_aio.sharing import num_batches, num_cores
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from rlightning_aio.config import EnvConfig
 
 __all__ = ["Setting", "possible_settings"]
 
 _MANY_WORKERS: Final = 32
-"""More are not tried: starting them takes longer than it teaches."""
+"""Largest number of workers to try; starting more takes too long."""
 
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """Where the envs live. One is itself alone: fields of a config need not be hashable.
+    """A placement of a config's envs. Compared by identity, as configs may not be hashable.
 
     Attributes:
         configs: the entries with their placement, envs_per_process, num_workers and num_envs.
-        words: how tables call it.
+        words: its name in tables.
     """
 
     configs: tuple[EnvConfig, ...]
@@ -40,23 +40,23 @@ class Setting:
 
     @property
     def num_envs(self) -> int:
-        """Envs in all, and so results of one step of all."""
+        """Return the total number of envs, and so of results of one step of all."""
         return sum(config.num_workers for config in self.configs)
 
     @property
     def placement(self) -> str:
-        """Where they live, for all entries alike."""
+        """Return the placement, which all entries share."""
         return self.configs[0].placement
 
     @property
     def workers(self) -> int:
-        """Worker processes in all."""
+        """Return the total number of worker processes."""
         if self.placement == "inline":
             return 0
         return sum(_num_shares(c) - (c.placement == "split") for c in self.configs)
 
     def as_json(self) -> dict[str, Any]:
-        """The fields that make it."""
+        """Return the fields that define it, for JSON."""
         return {
             "placement": self.placement,
             "workers": self.workers,
@@ -76,39 +76,44 @@ def _num_shares(config: EnvConfig) -> int:
 
 
 def possible_settings(configs: Sequence[EnvConfig]) -> list[Setting]:
-    """The settings worth trying.
+    """Return the settings worth trying.
 
-    The envs as they are configured: in several numbers of workers, in this process, in both. Then,
-    of simulators that step several simulations in one env (``num_envs``), the same simulations
-    in one env for each core, in workers or in both, and all in one env in this process.
+    The envs as configured: in several numbers of workers, in this process, in both. Then, for
+    simulators that step several simulations in one env (``num_envs``), the same simulations in one
+    env for each core, in workers or in both, and all in one env in this process.
 
     Raises:
-        ConfigError: an entry's envs don't live where the command could choose.
+        ConfigError: an entry's placement can't be chosen.
     """
     for config in configs:
         if config.backend == "env_server" or config.placement == "ray":
             raise ConfigError(
                 f"entry {config.name!r}: its envs live elsewhere, so there is nothing to choose; "
-                "use rollout to measure it as it is"
+                "use rollout to measure it"
             )
-    cores = num_cores()
+    settings: dict[tuple[object, ...], Setting] = {}
+    for setting in _candidates(configs, num_cores()):
+        sizes = tuple(config.num_workers for config in setting.configs)
+        settings.setdefault((setting.placement, setting.workers, sizes), setting)
+    return list(settings.values())
+
+
+def _candidates(configs: Sequence[EnvConfig], cores: int) -> Iterator[Setting]:
     here = not any(config.interpreter or config.env_vars for config in configs)
-    found = [_in_workers(configs, count) for count in _worker_counts(configs, cores)]
+    for count in _worker_counts(configs, cores):
+        yield _in_workers(configs, count)
     if here:
-        found += [_inline(configs), _split(configs, cores)]
+        yield _inline(configs)
+        yield from _split(configs, cores)
     for num_shares in (1, cores):
         batched = [_batched(config, num_shares) for config in configs]
         if batched == list(configs):
             continue
-        found += [_in_workers(batched, num_shares)]
-        if here:
-            found += [_inline(batched) if num_shares == 1 else _split(batched, cores)]
-    settings: dict[tuple[object, ...], Setting] = {}
-    for setting in found:
-        if setting is not None:
-            sizes = tuple(config.num_workers for config in setting.configs)
-            settings.setdefault((setting.placement, setting.workers, sizes), setting)
-    return list(settings.values())
+        yield _in_workers(batched, num_shares)
+        if here and num_shares == 1:
+            yield _inline(batched)
+        elif here:
+            yield from _split(batched, cores)
 
 
 def _worker_counts(configs: Sequence[EnvConfig], cores: int) -> list[int]:
@@ -119,7 +124,8 @@ def _worker_counts(configs: Sequence[EnvConfig], cores: int) -> list[int]:
 
 def _in_workers(configs: Sequence[EnvConfig], count: int) -> Setting:
     placed = tuple(_shared_out(config, count, "process") for config in configs)
-    return Setting(placed, counted(sum(map(_num_shares, placed)), "worker") + _sizes(placed))
+    workers = counted(sum(map(_num_shares, placed)), "worker process")
+    return Setting(placed, workers + _sizes(placed))
 
 
 def _inline(configs: Sequence[EnvConfig]) -> Setting:
@@ -127,13 +133,13 @@ def _inline(configs: Sequence[EnvConfig]) -> Setting:
     return Setting(placed, "inline" + _sizes(placed))
 
 
-def _split(configs: Sequence[EnvConfig], cores: int) -> Setting | None:
-    """As many shares as there are cores, one of them in this process; None where one can't be."""
+def _split(configs: Sequence[EnvConfig], cores: int) -> Iterator[Setting]:
+    """Yield the setting with one share for each core, one of them here, if it is possible."""
     if cores == 1 or any(c.num_workers == 1 or not ENVS.is_cpu_bound(c.backend) for c in configs):
-        return None
+        return
     placed = tuple(_shared_out(moved(config, "split"), cores, "split") for config in configs)
     workers = sum(_num_shares(config) - 1 for config in placed)
-    return Setting(placed, f"split, {counted(workers, 'worker')}{_sizes(placed)}")
+    yield Setting(placed, f"split, {counted(workers, 'worker process')}{_sizes(placed)}")
 
 
 def _sizes(configs: Sequence[EnvConfig]) -> str:
@@ -143,23 +149,23 @@ def _sizes(configs: Sequence[EnvConfig]) -> str:
 
 
 def _shared_out(config: EnvConfig, count: int, placement: str) -> EnvConfig:
-    backend = BACKENDS.get(config.backend)
+    backend = ENVS.described(config.backend)
     if backend is not None and not backend.cpu_bound:
-        # A simulator with a device or threads of its own shares no process.
+        # A simulator that uses a device or its own threads needs a process for each env.
         count = config.num_workers
     per_process = -(-config.num_workers // count) if count < config.num_workers else 1
     return config.model_copy(update={"placement": placement, "envs_per_process": per_process})
 
 
 def _batched(config: EnvConfig, num_shares: int) -> EnvConfig:
-    """The entry with its simulations in so many envs, or about, where its simulator can do that."""
-    backend = BACKENDS.get(config.backend)
+    """Return the entry with its simulations in about `num_shares` envs, if it supports that."""
+    backend = ENVS.described(config.backend)
     vectorized = backend is not None and backend.vectorized and backend.cpu_bound
     if not vectorized or config.backend == "callable" or ENVS.registered(config.backend):
         return config
     total = config.num_workers * config.num_envs
     count = num_batches(total, num_shares)
-    # A number of results that was set was for other envs.
+    # A configured `min_results` was meant for another number of envs.
     return config.model_copy(
         update={"num_workers": count, "num_envs": total // count, "min_results": None}
     )

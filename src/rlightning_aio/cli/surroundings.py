@@ -1,4 +1,4 @@
-"""What figures depend on beside the config: versions, the processor, its cores."""
+"""Facts that figures depend on, besides the config: versions, the processor, its cores."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import rlightning_aio
 from rlightning_aio.cli.processes import cpu_model
-from rlightning_aio.registry import BACKENDS
+from rlightning_aio.registry import ENVS
 from rlightning_aio.sharing import num_cores
 
 if TYPE_CHECKING:
@@ -20,12 +20,12 @@ __all__ = ["surroundings"]
 
 
 def surroundings(configs: Iterable[EnvConfig]) -> dict[str, Any]:
-    """The cores, the processor, and the versions of Python and of what the entries need."""
+    """Return the cores, the processor, and the versions of Python and of the simulators."""
     versions = {"rlightning_aio": rlightning_aio.__version__, "python": platform.python_version()}
     for name in ("numpy", "gymnasium"):
         versions[name] = importlib.metadata.version(name)
     for config in configs:
-        backend = BACKENDS.get(config.backend)
+        backend = ENVS.described(config.backend)
         version = None if backend is None else backend.installed_version()
         if backend is not None and version is not None:
             versions[backend.distribution] = version

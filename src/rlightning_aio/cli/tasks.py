@@ -1,4 +1,4 @@
-"""``rlightning-aio tasks``: what a config entry's ``task`` may say, by backend."""
+"""``rlightning-aio tasks`` lists the tasks of a backend."""
 
 from __future__ import annotations
 
@@ -48,6 +48,10 @@ def _of_maniskill() -> Iterable[str]:
     return importlib.import_module("mani_skill.utils.registration").REGISTERED_ENVS
 
 
+def _of_metaworld() -> Iterable[str]:
+    return importlib.import_module("metaworld.env_dict").ALL_V3_ENVIRONMENTS
+
+
 _LISTS: Final[dict[str, Callable[[], Iterable[str]]]] = {
     "gymnasium": _of_gymnasium,
     "mujoco": _of_mujoco,
@@ -55,11 +59,12 @@ _LISTS: Final[dict[str, Callable[[], Iterable[str]]]] = {
     "pettingzoo": _of_pettingzoo,
     "envpool": _of_envpool,
     "maniskill": _of_maniskill,
+    "metaworld": _of_metaworld,
 }
 
 
 def _backends() -> list[str]:
-    """For the shell's completion."""
+    """Return the completions for the shell."""
     return list(_LISTS)
 
 
@@ -88,8 +93,8 @@ def tasks(
         if not ENVS.knows(backend):
             raise ConfigError(ENVS.unknown(backend))
         raise ConfigError(
-            f"backend {backend!r} has no list of tasks: docs/backends.md says what its `task` is; "
-            f"there are lists of {known}"
+            f"backend {backend!r} has no list of tasks; docs/backends.md describes its `task`, and "
+            f"there are lists for {known}"
         )
     known_backend = BACKENDS[backend]
     if known_backend.installed_version() is None:

@@ -1,7 +1,7 @@
-"""What every command shares: the two output streams, how errors end it, how figures look.
+"""Output of every command: the two streams, messages of errors, formats of figures.
 
-Rule: stdout has results and nothing else, whoever prints. An error is one message on stderr and
-an exit code, never a traceback; one in the user's own code (a policy) says where it happened there.
+Rule: stdout gets results and nothing else, even if other code prints. An error is one message on
+stderr and an exit code, never a traceback; for the user's own code (a policy) it has the place.
 """
 
 from __future__ import annotations
@@ -9,58 +9,88 @@ from __future__ import annotations
 import contextlib
 import functools
 import json
+import logging
+import math
 import re
 import signal
 import sys
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO, cast
 
 import typer
 from rich.console import Console
 from rich.measure import Measurement
 from rich.table import Column, Table
 
+import rlightning_aio
 from rlightning_aio.errors import ConfigError, EnvFault, RemoteTraceback, RLightningError
+from rlightning_aio.protocol.net.limited_log import LOG
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Sequence
+    from collections.abc import Callable, Coroutine, Generator, Iterable, Sequence
 
 __all__ = [
     "INTERRUPTED",
+    "ResultStream",
+    "connections_logged",
     "count",
     "counted",
     "duration",
     "err",
+    "finite",
     "fitted",
     "guarded",
     "interruptible",
     "named_columns",
+    "notes_on_returns",
     "number",
     "out",
     "print_json",
     "print_result",
     "print_table",
+    "run_interruptible",
 ]
 
 INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
+"""Exit code after Ctrl-C, as in shells."""
+
+
+@contextlib.contextmanager
+def connections_logged() -> Generator[None]:
+    """Write one line on stderr for each change of a client's connection, on either side."""
+    handler = logging.StreamHandler(err().file)
+    level = LOG.level
+    LOG.addHandler(handler)
+    LOG.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        LOG.removeHandler(handler)
+        LOG.setLevel(level)
+
 
 _NATURAL = 10_000
-"""Columns in which any table has room."""
+"""Width in which every table fits."""
 _WIDE = 160
-"""Columns of a table that goes to a file: what reads it wraps lines itself."""
+"""Width of a table in a file, whose readers wrap lines themselves."""
+
+
+_NAMED = 8
+"""Number of envs that a message names; further ones are counted."""
+_LONG = 1e12
+"""Smallest number that is written with a power of ten."""
 
 
 _results: list[TextIO] = []
-"""Where results go while a command runs; stdout itself leads to stderr then."""
+"""The stream for results while a command runs; stdout itself leads to stderr then."""
 
 
 def out() -> Console:
-    """The console for results."""
+    """Return the console for results."""
     return _console(_results[-1] if _results else sys.stdout)
 
 
 def err() -> Console:
-    """The console for what is said on the way."""
+    """Return the console for all other messages."""
     return _console(sys.stderr)
 
 
@@ -69,18 +99,67 @@ def _console(file: TextIO) -> Console:
 
 
 def print_result(text: str) -> None:
-    """Print `text` on stdout as it is."""
+    """Print `text` on stdout, unchanged."""
     typer.echo(text, file=_results[-1] if _results else None)
 
 
 def print_json(value: Any) -> None:
     """Print `value` as the one JSON document on stdout."""
-    print_result(json.dumps(value, indent=2, allow_nan=False))
+    print_result(json.dumps(finite(value), indent=2, allow_nan=False))
+
+
+def finite(value: Any) -> Any:
+    """Return `value` with None in place of NaN and infinity, which JSON lacks."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {key: finite(held) for key, held in cast("dict[Any, Any]", value).items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(held) for held in cast("list[Any]", value)]
+    return value
+
+
+def notes_on_returns(env_ids: Iterable[str]) -> list[str]:
+    """Return a note on envs whose returns are not finite, or an empty list."""
+    named = sorted(set(env_ids))
+    if not named:
+        return []
+    more = f" and {count(len(named) - _NAMED)} more" if len(named) > _NAMED else ""
+    note = f"returns of {', '.join(named[:_NAMED])}{more} are NaN, infinite or too large to add up"
+    return [f"{note}; figures with them are left out"]
+
+
+class ResultStream:
+    """Stdout that turns a full disk into one `ConfigError`. Click handles a closed pipe."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self._is_lost = False
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        return self._try(self._stream.write, text) or 0
+
+    def flush(self) -> None:
+        self._try(self._stream.flush)
+
+    def _try(self, method: Callable[..., Any], *args: Any) -> Any:
+        if self._is_lost:
+            return None
+        try:
+            return method(*args)
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            self._is_lost = True
+            raise ConfigError(f"stdout: results can't be written: {error.strerror}") from error
 
 
 @contextlib.contextmanager
 def _prints_on_stderr() -> Generator[None]:
-    """What anybody prints in here goes to stderr; stdout has results and nothing else."""
+    """Redirect all printing inside this context to stderr."""
     _results.append(sys.stdout)
     try:
         with contextlib.redirect_stdout(sys.stderr):
@@ -90,7 +169,7 @@ def _prints_on_stderr() -> Generator[None]:
 
 
 def guarded(command: Callable[..., None]) -> Callable[..., None]:
-    """`command`, with errors of the library turned into messages and exit codes."""
+    """Return `command` with the library's errors turned into messages and exit codes."""
 
     @functools.wraps(command)
     def run(*args: Any, **kwargs: Any) -> None:
@@ -100,7 +179,7 @@ def guarded(command: Callable[..., None]) -> Callable[..., None]:
         except RLightningError as error:
             typer.echo(f"error: {_in_words(error)}", err=True)
             raise typer.Exit(2 if isinstance(error, ConfigError) else 1) from None
-        except TimeoutError as error:  # Of a group: clients that didn't come.
+        except TimeoutError as error:  # A group's clients have not connected in time.
             typer.echo(f"error: {error}", err=True)
             raise typer.Exit(1) from None
         except KeyboardInterrupt:
@@ -111,12 +190,11 @@ def guarded(command: Callable[..., None]) -> Callable[..., None]:
 
 @contextlib.contextmanager
 def interruptible() -> Generator[None]:
-    """Ctrl-C raises KeyboardInterrupt in here, where there is something to clean up.
+    """Make Ctrl-C raise KeyboardInterrupt inside this context, so that envs are closed.
 
-    So does every other signal that ends a command: SIGTERM, with which a service manager stops
-    a robot's client, SIGHUP, which comes when a terminal or an SSH session closes (unless it is
-    ignored, as under nohup), and SIGQUIT. Anywhere else they end the command on the spot (see
-    `cli.main`).
+    The other signals that end a command do the same: SIGTERM, with which a service manager stops
+    a robot's client; SIGHUP, sent when a terminal or SSH session closes (unless it is ignored, as
+    under nohup); and SIGQUIT. Outside this context they end the command at once (see `cli.main`).
     """
     numbers = [signal.SIGINT, signal.SIGTERM, signal.SIGQUIT]
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
@@ -129,12 +207,18 @@ def interruptible() -> Generator[None]:
             signal.signal(number, handler)
 
 
+def run_interruptible(command: Coroutine[Any, Any, None]) -> None:
+    """Run `command` on an event loop inside `interruptible`; its envs are closed at the end."""
+    with interruptible(), contextlib.closing(command):
+        rlightning_aio.run(command)
+
+
 def _in_words(error: RLightningError) -> str:
-    """The message, with the place in the env's code in place of a traceback."""
+    """Return the message, with the place in the env's code instead of a traceback."""
     text = str(error)
     if isinstance(error.__cause__, RemoteTraceback):
         places = re.findall(r'^  File (".*", line \d+, in .*)$', error.__cause__.text, re.MULTILINE)
-        where = f"it happened in {places[-1]}" if places else "its traceback is lost"
+        where = f"it happened in {places[-1]}" if places else "its traceback was lost"
         text = text.replace("the remote traceback is above", where)
     if isinstance(error, EnvFault) and error.others:
         text += f"\n(and {len(error.others)} more envs of the same call)"
@@ -142,7 +226,7 @@ def _in_words(error: RLightningError) -> str:
 
 
 def named_columns(title: str, *names: str) -> Table:
-    """An empty table: the first column is text, all others are figures."""
+    """Return an empty table: the first column is text, all others are figures."""
     table = _empty(title)
     for position, name in enumerate(names):
         table.add_column(
@@ -158,12 +242,12 @@ def _empty(title: Any, *columns: Column) -> Table:
 
 
 def fitted(console: Console, table: Table, expendable: Sequence[str]) -> tuple[Table, list[str]]:
-    """`table` without as many columns as it takes to fit the console, and what they are called.
+    """Return `table` without the columns that don't fit the console, and their names.
 
     Args:
-        console: where it goes.
-        table: of `named_columns`.
-        expendable: names of columns, those first that are missed least.
+        console: the console to print on.
+        table: a table of `named_columns`.
+        expendable: names of columns that may be left out, the least important first.
     """
     wide = console.options.update(max_width=_NATURAL, width=_NATURAL)
     left_out: list[str] = []
@@ -178,7 +262,7 @@ def fitted(console: Console, table: Table, expendable: Sequence[str]) -> tuple[T
 
 
 def print_table(console: Console, table: Table, expendable: Sequence[str] = ()) -> None:
-    """Print `table`, without some of its `expendable` columns where it is too wide."""
+    """Print `table`, without some of its `expendable` columns if it is too wide."""
     table, left_out = fitted(console, table, expendable)
     console.print(table)
     if left_out:
@@ -187,22 +271,25 @@ def print_table(console: Console, table: Table, expendable: Sequence[str] = ()) 
 
 
 def count(value: float) -> str:
-    """A count, or a rate of counts."""
+    """Return the text of a count, or of a rate of counts."""
     return f"{value:,.0f}"
 
 
 def counted(how_many: int, what: str) -> str:
-    """Such as "1 env", "16 envs" and "0 envs"."""
-    return f"{count(how_many)} {what}{'' if how_many == 1 else 's'}"
+    """Return a text such as "1 env", "16 envs" or "0 worker processes"."""
+    plural = "es" if what.endswith("s") else "s"
+    return f"{count(how_many)} {what}{'' if how_many == 1 else plural}"
 
 
 def number(value: float | None) -> str:
-    """Any other figure; a dash where there is none."""
-    return "-" if value is None else f"{value:,.2f}"
+    """Return the text of any other figure, or a dash if it is missing or not finite."""
+    if value is None or not math.isfinite(value):
+        return "-"
+    return f"{value:,.2f}" if abs(value) < _LONG else f"{value:.4g}"
 
 
 def duration(microseconds: float | None) -> str:
-    """A time in the unit that suits its size."""
+    """Return the text of a time, in a unit that suits its size."""
     if microseconds is None:
         return "-"
     if microseconds < 1e3:

@@ -1,8 +1,7 @@
-"""``rlightning-aio tune``: find the setting under which a config's envs go fastest."""
+"""``rlightning-aio tune`` finds the fastest setting for a config's envs."""
 
 from __future__ import annotations
 
-import contextlib
 from dataclasses import dataclass, field
 from pathlib import Path  # noqa: TC003 (Typer reads annotations)
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -10,11 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 import yaml
 
-import rlightning_aio
 from rlightning_aio.cli.bench import Watch
 from rlightning_aio.cli.contender_table import print_contenders
 from rlightning_aio.cli.measuring import Contender, Limits, Rule, Stand, opened, take_turns
-from rlightning_aio.cli.options import Config, Overrides
+from rlightning_aio.cli.options import Config, MeasuringSeconds, Overrides, Rounds
 from rlightning_aio.cli.settings import Setting, possible_settings
 from rlightning_aio.cli.terminal import (
     INTERRUPTED,
@@ -22,9 +20,9 @@ from rlightning_aio.cli.terminal import (
     counted,
     duration,
     err,
-    interruptible,
     print_json,
     print_result,
+    run_interruptible,
 )
 from rlightning_aio.config import load_config
 from rlightning_aio.sharing import num_cores
@@ -41,17 +39,18 @@ _NOISE: Final = 0.03
 """Settings within this share of the fastest count as equally fast."""
 
 _FINALISTS: Final = 2
-"""Settings whose min_results are tried."""
+"""Number of settings for which several values of min_results are tried."""
 
 
 @dataclass
 class _Search:
-    """What is tried, and what was found out on the way.
+    """The contenders and the results so far.
 
     Attributes:
         places: all settings, under one rule.
         finals: the fastest settings, under several rules.
-        step_us: time in an env's own step, mean, with one worker at work alone.
+        step_us: mean time in an env's own step, with one worker alone.
+        core_us: time for which this step keeps cores busy, including the trainer's part.
     """
 
     configs: Sequence[EnvConfig]
@@ -60,6 +59,7 @@ class _Search:
     places: list[Contender] = field(default_factory=list[Contender])
     finals: list[Contender] = field(default_factory=list[Contender])
     step_us: float | None = None
+    core_us: float | None = None
 
     @property
     def num_envs(self) -> int:
@@ -67,19 +67,27 @@ class _Search:
 
     @property
     def sub_envs(self) -> int:
-        """Environment steps in one round of all envs."""
+        """Return the number of env steps in one step of all envs."""
         return sum(config.num_workers * config.num_envs for config in self.configs)
 
     @property
+    def waits(self) -> bool:
+        """Return True if an env spends most of its step waiting, without using the core."""
+        return bool(self.step_us) and self.core_us is not None and self.core_us < self.step_us / 2
+
+    @property
     def limit(self) -> float | None:
-        """Steps per second of all cores, if they did nothing but step."""
-        if not self.step_us:
+        """Return the steps per second of all cores if they only stepped. None if this is no limit:
+        envs wait, or several simulations in one env take less time each.
+        """
+        if not self.step_us or self.waits:
             return None
-        return num_cores() * 1e6 / self.step_us * self.sub_envs / self.num_envs
+        limit = num_cores() * 1e6 / self.step_us * self.sub_envs / self.num_envs
+        return limit if limit >= self.best.steps_per_second else None
 
     @property
     def best(self) -> Contender:
-        """The fastest; of those that are as fast, the one with the lowest latency."""
+        """Return the fastest contender; of equally fast ones, that with the lowest latency."""
         finals = [contender for contender in self.finals if contender.rounds]
         measured = finals or [contender for contender in self.places if contender.rounds]
         fastest = max(contender.steps_per_second for contender in measured)
@@ -90,10 +98,8 @@ class _Search:
 def tune(
     config: Config,
     overrides: Overrides = None,
-    rounds: Annotated[int, typer.Option(min=1, help="Number of turns for each setting.")] = 5,
-    seconds: Annotated[
-        float, typer.Option(min=0.001, help="Length of one measurement, in seconds.")
-    ] = 0.5,
+    rounds: Rounds = 5,
+    seconds: MeasuringSeconds = 0.5,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print one JSON document instead of the YAML.")
     ] = False,
@@ -101,10 +107,10 @@ def tune(
     """Find where a config's envs should live, and how many results to wait for.
 
     It first measures a step of the envs alone. Then it tries this process, several numbers of
-    workers and both together, with one simulation in each env or several (num_envs), and then
-    several `min_results` with the two fastest of these, all in alternating rounds. It prints the
-    config with the best setting as YAML on stdout, and the table of all settings on stderr.
-    Among equally fast settings, the one with the lowest latency is best. Actions
+    worker processes and both together, with one simulation in each env or several (num_envs),
+    and then several `min_results` with the two fastest of these, all in alternating rounds. It
+    prints the config with the best setting as YAML on stdout, and the table of all settings on
+    stderr. Among equally fast settings, the one with the lowest latency is best. Actions
     are random: a slow policy shifts the balance towards a smaller min_results.
 
     For example:
@@ -118,12 +124,8 @@ def tune(
     measurements = rounds * (len(settings) + _FINALISTS * len(_least(search.num_envs)))
     interrupted = False
     try:
-        with (
-            Watch(len(settings), measurements) as watch,
-            interruptible(),
-            contextlib.closing(_search(search, settings, watch)) as searching,
-        ):
-            rlightning_aio.run(searching)
+        with Watch(len(settings), measurements) as watch:
+            run_interruptible(_search(search, settings, watch))
     except KeyboardInterrupt:
         interrupted = True
         raise typer.Exit(INTERRUPTED) from None
@@ -156,12 +158,14 @@ async def _search(search: _Search, settings: Sequence[Setting], watch: Watch) ->
 async def _measure_env(
     search: _Search, settings: Sequence[Setting], stands: dict[Place, Measurable | str]
 ) -> None:
-    """Step with one worker alone, where nothing disturbs it."""
+    """Measure a step with one worker alone."""
     for setting in settings:
         stand = stands[setting]
         if isinstance(stand, Stand):
-            await stand.measure(Rule("step", None), search.limits)
+            alone = await stand.measure(Rule("step", None), search.limits)
+            steps_per_second = alone.steps_per_second * search.num_envs / search.sub_envs
             search.step_us = stand.statistics.mean_step_us()
+            search.core_us = alone.cores / steps_per_second * 1e6
             return
 
 
@@ -175,7 +179,7 @@ def _waiting_for(least: int) -> Rule:
 
 
 def _least(num_envs: int) -> list[int]:
-    """The values of min_results worth trying."""
+    """Return the values of min_results worth trying."""
     eighths = (num_envs * share // 8 for share in (1, 2, 4, 6, 8))
     return sorted({1, *eighths} - {0})
 
@@ -199,7 +203,12 @@ def _report(config: Path, search: _Search, *, interrupted: bool, as_json: bool) 
     print_contenders(console, "Where the envs live", search.places)
     if any(contender.rounds for contender in search.finals):
         print_contenders(console, "How many results to wait for", search.finals)
-    if search.limit is not None:
+    if search.waits:
+        console.print(
+            f"A step takes {duration(search.step_us)} in the env, most of it waiting: "
+            "the number of cores is no limit, so try more worker processes."
+        )
+    elif search.limit is not None:
         console.print(
             f"A step takes {duration(search.step_us)} in the env: {counted(num_cores(), 'core')} "
             f"that only step make {count(search.limit)} steps/s."
@@ -212,7 +221,7 @@ def _as_yaml(config: Path, best: Contender, *, interrupted: bool = False) -> str
     wanted = _dealt_out(best.rule.min_results or 1, [c.num_workers for c in setting.configs])
     entries: list[dict[str, Any]] = [
         {
-            # What was given; a default may be a robot's, or mean nothing where the envs live.
+            # Only the given fields: a default may be that of hardware, or have no meaning here.
             **entry.model_dump(
                 mode="json", exclude_defaults=True, include=set(entry.model_fields_set)
             ),
@@ -236,7 +245,7 @@ def _as_yaml(config: Path, best: Contender, *, interrupted: bool = False) -> str
 
 
 def _dealt_out(wanted: int, sizes: Sequence[int]) -> list[int]:
-    """`wanted` results over entries of so many envs, by their shares; the sum is `wanted`."""
+    """Return `wanted` results divided among entries in proportion to their envs."""
     total, parts, before = sum(sizes), list[int](), 0
     for size in sizes:
         parts.append(wanted * (before + size) // total - wanted * before // total)

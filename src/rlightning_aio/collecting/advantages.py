@@ -1,9 +1,9 @@
 """Advantages over chains: generalised advantage estimation, and V-trace.
 
 Both are one recursion that runs backwards from the ends of *segments* (transitions without an
-end in between), over all segments at once: a step of the loop is one step of time in all those
-that are still that long. Arithmetic keeps the dtype of the values, and the order of operations
-of the formulas as they are printed.
+end in between). Each iteration of the loop handles one time step of all segments that are long
+enough. The arithmetic keeps the dtype of the values and the order of operations of the published
+formulas.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ __all__ = ["Segments", "VTrace", "gae", "vtrace"]
 
 
 class VTrace(NamedTuple):
-    """What V-trace gives for each transition.
+    """V-trace's result for each transition.
 
     Attributes:
         targets: of the value function (``vs`` of the paper).
@@ -31,14 +31,14 @@ class VTrace(NamedTuple):
 
 
 class Segments:
-    """Which of ``[n]`` transitions follow one another.
+    """The division of ``[n]`` transitions into segments of consecutive ones.
 
     Args:
-        ends: ``[k]``, positions of the last transition of each segment, in any order. Every
+        ends: ``[k]``, positions of the last transition of each segment, in any order. Each
             transition belongs to one segment.
-        count: of transitions.
-        stride: how far the transition after one is: 1 where chains lie one behind the other,
-            the number of envs in a ``[T, N]`` block.
+        count: the number of transitions, n.
+        stride: distance between successive transitions of an env: 1 for concatenated chains, the
+            number of envs in a ``[T, N]`` block.
     """
 
     def __init__(self, ends: NDArray[np.intp], count: int, stride: int = 1) -> None:
@@ -46,12 +46,12 @@ class Segments:
         self.count = count
         self.stride = stride
         steps = count // stride
-        # As if each env's transitions lay one behind the other.
+        # Positions as if the transitions of each env were contiguous.
         places = ends % stride * steps + ends // stride
         order = np.argsort(places)
         lengths = np.empty(len(ends), np.intp)
         lengths[order] = np.diff(places[order], prepend=-1)
-        # Longest first: those that are longer than d are the first `longer[d]`.
+        # Longest first, so that the first `longer[d]` are those longer than d.
         longest_first = np.argsort(-lengths, kind="stable")
         self._ends = ends[longest_first]
         ascending = np.sort(lengths)
@@ -59,14 +59,22 @@ class Segments:
         self._longer = len(ends) - np.searchsorted(ascending, np.arange(1, most), side="right")
 
     def successors(self, values: NDArray[Any], next_values: NDArray[Any]) -> NDArray[Any]:
-        """The value after each transition: of the next one, or ``next_values[k]`` at end k."""
+        """Value after each transition: that of the next one, or ``next_values[k]`` at end k."""
         after = np.empty_like(values)
         after[: -self.stride] = values[self.stride :]
         after[self.ends] = next_values
         return after
 
-    def backwards(self, terms: NDArray[Any], decays: NDArray[Any] | float) -> NDArray[Any]:
-        """``x[t] = terms[t] + decays[t] * x[t + 1]``, with 0 after the end of each segment."""
+    def backwards(
+        self,
+        terms: NDArray[Any],
+        decays: NDArray[Any] | float,
+        stops: NDArray[np.bool_] | None = None,
+    ) -> NDArray[Any]:
+        """Compute ``x[t] = terms[t] + decays[t] * x[t + 1]``, with 0 after each segment.
+
+        `stops` marks further transitions with 0 after them.
+        """
         found = np.empty_like(terms)
         positions = self._ends
         latest = terms[positions]
@@ -74,8 +82,10 @@ class Segments:
         each = isinstance(decays, np.ndarray)
         for longer in self._longer.tolist():
             positions = positions[:longer] - self.stride
-            decay = decays[positions] if each else decays
-            latest = terms[positions] + decay * latest[:longer]
+            latest = latest[:longer]
+            if stops is not None:
+                latest = np.where(stops[positions], 0, latest)
+            latest = terms[positions] + (decays[positions] if each else decays) * latest
             found[positions] = latest
         return found
 
@@ -92,15 +102,18 @@ def gae(
 ) -> NDArray[Any]:
     """Generalised advantage estimation (Schulman et al., 2016, arXiv:1506.02438, eq. 16).
 
-    Of ``[n]`` `rewards`, `terminated` and `values`, and ``[k]`` `next_values` after the segments'
-    ends, which are without effect where it has terminated; `gamma` is the discount, `lam` is λ.
-    `stops` are further ends, whose successors are there: of an agent that ends before others.
+    `rewards`, `terminated` and `values` are ``[n]``; `next_values` after the ends of segments are
+    ``[k]``, ignored after a termination. `gamma` is the discount, `lam` is λ. `stops` marks
+    further ends, inside segments: those of an agent that ends before others.
     """
-    going_on = (~terminated).astype(values.dtype)
-    after = segments.successors(values, next_values)
-    errors = rewards + gamma * after * going_on - values
-    decays = gamma * lam if stops is None else gamma * lam * (~stops).astype(values.dtype)
-    return segments.backwards(errors.astype(values.dtype, copy=False), decays)
+    after = _until(terminated, segments.successors(values, next_values))
+    errors = rewards + gamma * after - values
+    return segments.backwards(errors.astype(values.dtype, copy=False), gamma * lam, stops)
+
+
+def _until(terminated: NDArray[np.bool_], after: NDArray[Any]) -> NDArray[Any]:
+    """Set values after a termination to 0, without a product: 0 times infinity is NaN."""
+    return np.where(terminated, 0, after)
 
 
 def vtrace(
@@ -118,24 +131,21 @@ def vtrace(
 ) -> VTrace:
     """V-trace (Espeholt et al., 2018, arXiv:1802.01561, eq. 1 and section 4.2).
 
-    Of the same as `gae`, and ``[n]`` `log_ratios`: log-probability of the action by the policy
-    that is learned, less that by the policy that acted. Ratios are clipped at `clip_rho` where they
-    weight errors and advantages, at `clip_c` where they carry corrections back (the paper's traces
-    c), which `lam` scales (remark 2).
+    Takes the arguments of `gae`, and ``[n]`` `log_ratios`: log-probability of the action under the
+    learned policy minus that under the acting policy. Ratios that weight errors and advantages are
+    clipped at `clip_rho`; those that carry corrections back (the paper's traces c, scaled by
+    `lam`, remark 2) at `clip_c`.
     """
     dtype = values.dtype
     ratios = np.exp(log_ratios).astype(dtype, copy=False)
     rhos = np.minimum(ratios, dtype.type(clip_rho))
     traces = lam * np.minimum(ratios, dtype.type(clip_c))
-    if stops is not None:
-        traces = traces * (~stops).astype(dtype)
-    going_on = (~terminated).astype(dtype)
     after = segments.successors(values, next_values)
-    errors = rhos * (rewards + gamma * after * going_on - values)
-    corrections = segments.backwards(errors.astype(dtype, copy=False), gamma * traces)
+    errors = rhos * (rewards + gamma * _until(terminated, after) - values)
+    corrections = segments.backwards(errors.astype(dtype, copy=False), gamma * traces, stops)
     targets = values + corrections
     following = segments.successors(targets, next_values)
-    # What follows a stop is no part of its chain: its value stands for it there, too.
+    # A stop's successor is not part of its chain, so its value is used instead of its target.
     after = following if stops is None else np.where(stops, after, following)
-    advantages = rhos * (rewards + gamma * after * going_on - values)
+    advantages = rhos * (rewards + gamma * _until(terminated, after) - values)
     return VTrace(targets, advantages.astype(dtype, copy=False))

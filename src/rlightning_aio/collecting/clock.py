@@ -1,4 +1,4 @@
-"""`Clock`: where the time of a rollout goes; see `rollout.Seconds`."""
+"""`Clock`: measures the times of a rollout (`rollout.Seconds`)."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ __all__ = ["Clock"]
 
 
 class Clock:
-    """Adds up what is asked for, in nanoseconds of the monotonic clock."""
+    """Sums times in nanoseconds of the monotonic clock."""
 
     def __init__(self) -> None:
         self._began = 0
-        # When `collect` was last left, and entered again after that.
+        # When `collect` last returned, and when it was called after that.
         self._left = 0
         self._entered = 0
-        # Whether results may have been ready before that.
+        # True if results may have been ready before that call.
         self._awaited = False
         self._start()
 
@@ -32,38 +32,38 @@ class Clock:
         self._for_learner = self._for_policy = 0
 
     def enter(self) -> None:
-        """`collect` is called."""
+        """Record that `collect` was called."""
         self._entered = time.monotonic_ns()
         self._awaited = True
         if not self._began:
             self._began = self._left = self._entered
 
     def leave(self) -> None:
-        """`collect` ends, with a rollout or without."""
+        """Record that `collect` returns or raises."""
         self._left = time.monotonic_ns()
         self._collecting += self._left - self._entered
 
-    def note_policy(self, seconds_ns: int) -> None:
-        """A call of the policy took that long."""
-        self._policy += seconds_ns
+    def note_policy(self, duration_ns: int) -> None:
+        """Record the duration of a call of the policy."""
+        self._policy += duration_ns
 
     def note_answered(self, batch: BatchedData) -> None:
-        """The envs of `batch` were asked to go on just now."""
+        """Record that the envs of `batch` have just been sent their next request."""
         now = time.monotonic_ns()
         ready = batch.ready_ns
-        waited = now * len(ready) - int(ready.sum())
+        waited = now * len(ready) - int(np.add.reduce(ready))
         learner = 0
         if self._awaited:
-            # Since a result was ready, `collect` was left once at most.
+            # `collect` returned at most once since a result was ready.
             outside = self._entered - np.maximum(ready, self._left)
-            learner = int(outside[outside > 0].sum())
+            learner = int(np.add.reduce(outside[outside > 0]))
             self._awaited = learner > 0
         self._for_learner += learner
         self._for_policy += waited - learner
-        self._busy += int(batch.busy_ns.sum())
+        self._busy += int(np.add.reduce(batch.busy_ns))
 
     def seconds(self) -> Seconds:
-        """What was added up since the last call; `collect` is about to be left."""
+        """Return the sums since the last call. Call this right before `collect` returns."""
         now = time.monotonic_ns()
         found = Seconds(
             elapsed=(now - self._began) / 1e9,
@@ -75,6 +75,6 @@ class Clock:
         )
         self._began = now
         self._start()
-        # What `leave` adds for the time before `now`.
+        # Compensates for the time before `now`, which `leave` will add.
         self._collecting = -(now - self._entered)
         return found

@@ -1,18 +1,19 @@
-"""`Collector`: steps a group with a policy, and gives out rollouts.
+"""`Collector`: steps a group with a policy, and returns rollouts.
 
-It stands on the public `EnvGroup` alone. If something interrupts it between a result and the next
-request (a policy raises, a task is cancelled, a rollout is full), it keeps the results that are
-still to be answered, and the next `collect` continues there.
+It uses only the public `EnvGroup`. If it is interrupted between a result and the next request (a
+policy raises, a task is cancelled, a rollout is full), it keeps the unanswered results, and the
+next `collect` continues there.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast, overload
 
 from rlightning_aio.collecting.clock import Clock
-from rlightning_aio.collecting.kind import Kind, Part
+from rlightning_aio.collecting.kind import OWN_NAMES, EnvKind, Part
 from rlightning_aio.collecting.procedure import Procedure, run
 from rlightning_aio.collecting.record import RecordedGroup, ReplayedGroup
 from rlightning_aio.collecting.rollout import Rollout
@@ -21,7 +22,7 @@ from rlightning_aio.group.aio import EnvGroup as AsyncEnvGroup
 from rlightning_aio.group.sync import EnvGroup as SyncEnvGroup
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine
+    from collections.abc import Callable, Coroutine, Sequence
 
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.types import EnvMeta
@@ -37,23 +38,22 @@ class Collector(Generic[G, R]):
     """Steps the envs of a group with a policy, and collects their transitions.
 
     Without `wait_all` envs are stepped first come, first served: the policy is called as soon as
-    `min_batch` results are there, and a rollout has a fixed total of transitions, of which a fast
-    env makes more than a slow one. ``min_batch=len(group)`` waits for all envs each time, which
+    `min_results` results have arrived, and a rollout has a fixed total of transitions, more of a
+    fast env than of a slow one. ``min_results=len(group)`` waits for all envs each time, which
     makes a run reproducible. With `wait_all` each env makes the same number of transitions, and a
     rollout is a block ``[T, N]``; envs whose episode is over are reset before the policy is
-    called, which therefore always has a batch of all envs, in the group's order.
+    called, so its batch always has all envs, in the order of the group.
 
-    Nothing is lost or duplicated between rollouts: requests in flight when a rollout is full
+    No transition is lost or duplicated between rollouts: requests in flight when a rollout is full
     begin the next one, and the next `collect` answers the results that have filled it, with the
-    policy that is newest then. Rows that are resets, transitions that were lost with a worker,
-    and steps of a sub-environment that waits for others to end are in no rollout.
+    policy at that time. Resets, transitions that were lost with a worker, and steps of a
+    sub-environment that waits for others to end are in no rollout.
 
-    While the collector is in use, nothing else may step the group; use another group for that.
-    Use it inside ``with group.auto_reset():``.
+    Use the collector inside ``with group.auto_reset():``, and don't step its group otherwise.
 
         async with rl.build_env_group(config) as group:
             with group.auto_reset():
-                collector = Collector(group, policy, num_transitions=2048, min_batch=4, seed=0)
+                collector = Collector(group, policy, num_transitions=2048, min_results=4, seed=0)
                 for _ in range(updates):
                     rollout = await collector.collect()
                     learn(rollout)
@@ -62,25 +62,30 @@ class Collector(Generic[G, R]):
     With a group of `rlightning_aio.sync`, call ``collector.collect()`` without ``await``.
 
     Args:
-        group: initialised; or a `RecordedGroup` or `ReplayedGroup` in front of one.
-        policy: called with a batch of results (`BatchedData`); returns columns by name,
-            ``action`` among them, with one row for each result, ``[n, …]``, or for each
-            sub-environment of each, ``[n, num_envs, …]``: arrays, or CPU tensors without
-            gradient. It may be a coroutine function, if the group is asynchronous. Envs of
-            different kinds need one for each config entry, as a mapping by its name; `collect`
-            then returns a dict of rollouts, whose transitions together are `num_transitions`.
-        num_transitions: of each rollout, sub-environments counted; T * N with `wait_all`.
-        min_batch: results (each of all sub-environments of an env) to wait for before the policy
-            is called, or as many as are pending.
-        wait_all: collect blocks.
-        seed: of the first reset, as of `EnvGroup.reset`.
+        group: an initialised group, or a `RecordedGroup` or `ReplayedGroup` around one.
+        policy: called with a batch of results (`BatchedData`); returns columns by name, including
+            ``action``, with one row for each result, ``[n, …]``, or for each sub-environment,
+            ``[n, num_envs, …]``: arrays, or CPU tensors without gradient. It may be a coroutine
+            function if the group is asynchronous. Envs of different kinds need one policy for each
+            config entry, as a mapping by its name; `collect` then returns a dict of rollouts with
+            `num_transitions` transitions in total.
+        num_transitions: transitions of each rollout, counting sub-environments; T * N with
+            `wait_all`.
+        min_results: number of results to wait for before the policy is called, or all pending
+            ones if they are fewer; an env with sub-environments returns one result. None is the
+            sum of ``min_results`` of the config entries, or 1.
+        wait_all: collect blocks ``[T, N]``.
+        infos: names of numbers in infos, such as ``("success",)``. Each becomes a float64 column
+            of the rollout, NaN where the info of a transition has no such number.
+        seed: of the first reset; see `EnvGroup.reset`.
 
     Attributes:
-        policy_version: set it to the number of the policy that acts. Each transition has the
-            version that chose its action.
+        policy_version: set it to the version of the policy. Each transition records the version
+            that chose its action.
 
     Raises:
-        ValueError: a number isn't above 0, or `min_batch` comes with `wait_all`.
+        ValueError: a number is below 1, both `min_results` and `wait_all` are given, or a name of
+            `infos` is that of a column of every rollout.
     """
 
     @overload
@@ -90,8 +95,9 @@ class Collector(Generic[G, R]):
         policy: Callable[[BatchedData], Any],
         *,
         num_transitions: int,
-        min_batch: int | None = None,
+        min_results: int | None = None,
         wait_all: bool = False,
+        infos: Sequence[str] = (),
         seed: Any = None,
     ) -> None: ...
 
@@ -102,8 +108,9 @@ class Collector(Generic[G, R]):
         policy: Mapping[str, Callable[[BatchedData], Any]],
         *,
         num_transitions: int,
-        min_batch: int | None = None,
+        min_results: int | None = None,
         wait_all: bool = False,
+        infos: Sequence[str] = (),
         seed: Any = None,
     ) -> None: ...
 
@@ -113,33 +120,39 @@ class Collector(Generic[G, R]):
         policy: Any,
         *,
         num_transitions: int,
-        min_batch: int | None = None,
+        min_results: int | None = None,
         wait_all: bool = False,
+        infos: Sequence[str] = (),
         seed: Any = None,
     ) -> None:
-        for name, number in (("num_transitions", num_transitions), ("min_batch", min_batch)):
+        for name, number in (("num_transitions", num_transitions), ("min_results", min_results)):
             if number is not None and number < 1:
                 raise ValueError(f"{name} must be at least 1, not {number!r}")
-        if wait_all and min_batch is not None:
-            raise ValueError("wait_all waits for all envs: give it no min_batch")
+        if wait_all and min_results is not None:
+            raise ValueError("wait_all waits for all envs: give it no min_results")
+        if isinstance(infos, str):
+            raise ValueError(f"infos is a sequence of names: give ({infos!r},)")
+        for name in (OWN_NAMES | {"action"}).intersection(infos):
+            raise ValueError(f"infos: a rollout already has {name!r}; rename the env's info")
         self.policy_version = 0
         self._group = group
+        self._infos = infos
         self._policy: Any = policy
         self._policies: Mapping[str, Callable[[BatchedData], Any]] | None = (
             policy if isinstance(policy, Mapping) else None
         )
         self._quota = num_transitions
-        self._min_batch = min_batch or 1
+        self._min_results = min_results
         self._block = wait_all
         self._num_steps = 0
         self._seed = seed
         self._clock = Clock()
-        self._kinds: dict[str, Kind] = {}
+        self._kinds: dict[str, EnvKind] = {}
         self._started = self._start_cut_off = False
         self._collecting = False
         self._metas: dict[str, EnvMeta] = {}
-        # What has come and was not looked at; of the rest, what is to be stored, and what is to
-        # be answered; whether more is to be waited for before anything else.
+        # Results in order of progress: received, not yet stored, not yet answered.
+        # `_expecting`: wait for results next.
         self._received: BatchedData | None = None
         self._unstored: list[Part] = []
         self._unanswered: list[Part] = []
@@ -152,31 +165,30 @@ class Collector(Generic[G, R]):
     def collect(self: Collector[AsyncEnvGroup, R]) -> Coroutine[Any, Any, R]: ...
 
     def collect(self) -> Any:
-        """Step the envs until a rollout is full, and return it: to be awaited, if the group is.
+        """Step the envs until a rollout is full, and return it; await it if the group is async.
 
-        The rollout's arrays are its own until this is called for the second time after it.
-        Cancelled, or ended by an error, it loses nothing: the next call goes on.
+        The rollout owns its arrays until the second call after it. Cancellation and errors lose
+        nothing: the next call continues.
 
         Raises:
-            RuntimeError: the group has no `auto_reset` context open, or this is being called
-                already.
+            RuntimeError: the group has no open `auto_reset` context, or a call is in progress.
             ValueError, TypeError: the policy's answer doesn't fit; envs differ, and need a policy
-                for each entry; or a block can't be collected of these envs.
-            EnvRaised, WorkerDied, EnvHung: as of `EnvGroup.collect_async`: the answer to one
+                for each entry; or these envs can't fill a block.
+            EnvRaised, WorkerDied, EnvHung: as for `EnvGroup.collect_async`, the answer to one
                 request. An env that raised takes part again after
                 ``group.reset_async(env_ids=[error.env_id])``.
             BadAction: the policy's actions don't fit the action space; nothing was sent.
-            NothingPending: no env is left that could answer.
+            NothingPending: no env has a request to answer.
         """
         group = self._group
-        behind: Any = group
+        wrapped: Any = group
         if isinstance(group, RecordedGroup | ReplayedGroup):
-            behind = cast("RecordedGroup[Any] | ReplayedGroup[Any]", group).group
-        return run(self._timed(), behind)
+            wrapped = cast("RecordedGroup[Any] | ReplayedGroup[Any]", group).group
+        return run(self._collect(), wrapped)
 
     # -- the loop -----------------------------------------------------------------
 
-    def _timed(self) -> Procedure[R]:
+    def _collect(self) -> Procedure[R]:
         if self._collecting:
             raise RuntimeError(
                 "this collector is already collecting; only one collect can run at a time"
@@ -189,34 +201,31 @@ class Collector(Generic[G, R]):
         self._collecting = True
         self._clock.enter()
         try:
-            return (yield from self._collect())
+            if not self._started:
+                yield from self._start()
+            while True:
+                if self._expecting:
+                    self._received, _ = yield self._receive
+                    self._expecting = False
+                if self._received is not None:
+                    self._split_received(self._received)
+                    self._received = None
+                if not self._store():
+                    return self._full()
+                if self._block and not self._unanswered:
+                    self._plan()
+                while self._unanswered:
+                    yield from self._answer(self._unanswered[0])
+                    del self._unanswered[0]
+                self._expecting = True
         finally:
             self._clock.leave()
             self._collecting = False
 
-    def _collect(self) -> Procedure[R]:
-        if not self._started:
-            yield from self._start()
-        while True:
-            if self._expecting:
-                yield from self._receive()
-            if self._received is not None:
-                self._take_in(self._received)
-                self._received = None
-            self._store()
-            if self._complete() == self._quota:
-                return self._full()
-            if self._block and not self._unanswered:
-                self._plan()
-            while self._unanswered:
-                yield from self._answer(self._unanswered[0])
-                del self._unanswered[0]
-            self._expecting = True
-
     def _start(self) -> Procedure[None]:
-        """Reset all envs. A reset that was cancelled when it had been sent is to be collected."""
+        """Reset all envs; or expect the results of a reset that was sent and then cancelled."""
         try:
-            batch, _ = yield lambda: self._group.reset(seed=self._seed)
+            batch, _ = yield partial(self._group.reset, seed=self._seed)
         except EnvBusy:
             if not self._start_cut_off:
                 raise
@@ -228,17 +237,15 @@ class Collector(Generic[G, R]):
             self._started = True
             self._received = batch
 
-    def _receive(self) -> Procedure[None]:
+    def _receive(self) -> Any:
         if self._block:
-            batch, _ = yield lambda: self._group.collect_async(wait_all=True, ordered=True)
-        else:
-            wanted = self._min_batch
-            batch, _ = yield lambda: self._group.collect_async(min_results=wanted, ordered=True)
-        self._expecting = False
-        self._received = batch
+            return self._group.collect_async(wait_all=True, ordered=True)
+        return self._group.collect_async(min_results=self._min_results, ordered=True)
 
-    def _take_in(self, batch: BatchedData) -> None:
-        self._unstored = [kind.part(part) for kind, part in self._split(batch)]
+    def _split_received(self, batch: BatchedData) -> None:
+        self._unstored = []
+        for kind, part in self._split(batch):
+            self._unstored.append(kind.part(part))
         if not self._block:
             self._unanswered = list(self._unstored)
             return
@@ -247,8 +254,8 @@ class Collector(Generic[G, R]):
         if not self._num_steps:
             self._lay_out()
 
-    def _split(self, batch: BatchedData) -> list[tuple[Kind, BatchedData]]:
-        """What each policy is to answer."""
+    def _split(self, batch: BatchedData) -> list[tuple[EnvKind, BatchedData]]:
+        """Split a batch by policy."""
         policies = self._policies
         if policies is None:
             return [(self._kind("", self._policy), batch)]
@@ -260,9 +267,9 @@ class Collector(Generic[G, R]):
             )
         return [(self._kind(name, policies[name]), part) for name, part in parts.items()]
 
-    def _kind(self, name: str, policy: Callable[[BatchedData], Any]) -> Kind:
+    def _kind(self, name: str, policy: Callable[[BatchedData], Any]) -> EnvKind:
         if name not in self._kinds:
-            self._kinds[name] = Kind(policy, self._quota, self._meta_of)
+            self._kinds[name] = EnvKind(policy, self._quota, self._meta_of, self._infos)
         return self._kinds[name]
 
     def _meta_of(self, env_id: str) -> EnvMeta | None:
@@ -277,7 +284,7 @@ class Collector(Generic[G, R]):
     # -- blocks -------------------------------------------------------------------
 
     def _lay_out(self) -> None:
-        """Settle how many steps a block has, once all envs have been reset."""
+        """Compute the number of steps of a block, once all envs have been reset."""
         for meta in self._group.metas:
             if _is_server(meta) or (meta.num_envs > 1 and meta.autoreset != "same_step"):
                 why = (
@@ -287,7 +294,7 @@ class Collector(Generic[G, R]):
                 )
                 raise ValueError(
                     f"no [T, N] block can be made with env {meta.env_id!r}, which {why}; collect "
-                    "chains of any length, with min_batch instead of wait_all"
+                    "chains of any length, with min_results instead of wait_all"
                 )
         kinds = self._kinds.values()
         counts = [len(kind.held.results.index) for kind in kinds if kind.held is not None]
@@ -303,7 +310,7 @@ class Collector(Generic[G, R]):
             kind.quota = num_steps * count
 
     def _plan(self) -> None:
-        """Say who is to be asked next: resets first, then envs that are a step behind others."""
+        """Choose what happens next: resets first, then steps of envs that are behind others."""
         parts = [kind.held for kind in self._kinds.values() if kind.held is not None]
         over = [env_id for part in parts for env_id in part.waiting_for_reset()]
         if over:
@@ -315,24 +322,31 @@ class Collector(Generic[G, R]):
 
     # -- one turn -----------------------------------------------------------------
 
-    def _complete(self) -> int:
-        return sum(kind.staging.complete for kind in self._kinds.values())
-
-    def _store(self) -> None:
+    def _store(self) -> int:
+        """Store the transitions that fit the rollout; return how many are still missing."""
+        room = self._quota
+        for kind in self._kinds.values():
+            room -= kind.staging.complete
+        remaining: list[Part] = []
         for part in self._unstored:
-            part.store(self._quota - self._complete())
-        self._unstored = [part for part in self._unstored if len(part.unstored)]
+            room -= part.store(room)
+            if len(part.unstored):
+                remaining.append(part)
+        self._unstored = remaining
+        return room
 
     def _answer(self, part: Part) -> Procedure[None]:
-        """Call the policy for `part`, and send what it says."""
+        """Call the policy for `part`, and send its actions."""
         version = self.policy_version
         began = time.monotonic_ns()
         with self._group.span("policy"):
-            answer = yield lambda: part.kind.policy(part.batch)
+            answer = yield partial(part.kind.policy, part.batch)
         self._clock.note_policy(time.monotonic_ns() - began)
         responses, columns = part.kind.columns_of(part, answer)
-        self._group.step_async(responses)
+        # Copy before sending: the columns may be views of rows that envs will overwrite.
         part.kind.staging.begin(part.results.index, columns, version)
+        self._group.step_async(responses)
+        part.kind.staging.note_sent()
         self._clock.note_answered(part.batch)
 
     def _full(self) -> R:

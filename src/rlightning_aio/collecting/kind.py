@@ -1,21 +1,21 @@
-"""`Kind`: envs whose transitions share columns, with the policy that acts in them."""
+"""`EnvKind`: envs whose transitions share columns, and their policy."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
 from rlightning_aio.batch import joined
-from rlightning_aio.collecting.results import Results, results_of
-from rlightning_aio.collecting.rollout import Lag, Rollout, Seconds
+from rlightning_aio.collecting.results import ResultRows, result_rows
+from rlightning_aio.collecting.rollout import Ends, Lag, Rollout, Seconds
 from rlightning_aio.collecting.staging import Staging
 from rlightning_aio.collecting.trees import allocated, rows_of
-from rlightning_aio.protocol.columns import gather, mapped
+from rlightning_aio.protocol.columns import gather, is_array, mapped, paired
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
@@ -23,28 +23,31 @@ if TYPE_CHECKING:
     from rlightning_aio.protocol.columns import Tree
     from rlightning_aio.types import EnvMeta
 
-__all__ = ["Kind", "Part"]
+__all__ = ["OWN_NAMES", "EnvKind", "Part"]
 
 
 @dataclass(slots=True)
 class Part:
-    """Results of one kind that are there together.
+    """ResultRows of one kind from one batch.
 
     Attributes:
-        unstored: rows of `results` whose transitions are in no rollout yet.
+        unstored: rows of `results` whose transitions are not stored yet.
     """
 
-    kind: Kind
+    kind: EnvKind
     batch: BatchedData
-    results: Results
+    results: ResultRows
     unstored: NDArray[np.intp]
 
-    def store(self, room: int) -> None:
-        """Complete the transitions that end here, `room` at most."""
-        self.unstored = self.kind.staging.store(self.results, self.unstored, room)
+    def store(self, room: int) -> int:
+        """Complete at most `room` of the transitions that end here; return their number."""
+        staging = self.kind.staging
+        before = staging.complete
+        self.unstored = staging.store(self.results, self.unstored, room)
+        return staging.complete - before
 
     def waiting_for_reset(self) -> list[str]:
-        """The envs whose episode is over."""
+        """Ids of envs whose episode is over."""
         over = self.kind.staging.over(self.results.index)
         if not np.count_nonzero(over):
             return []
@@ -52,11 +55,11 @@ class Part:
         return [env_ids[row] for row in np.flatnonzero(over).tolist()]
 
     def steps(self) -> NDArray[np.int64]:
-        """How many transitions of the rollout each env has made."""
+        """Number of transitions that each env has made for the rollout."""
         return self.kind.staging.made[self.results.index]
 
     def behind(self, steps: int) -> Part | None:
-        """The envs that have made fewer than `steps`; None if there are none."""
+        """The part whose envs have made fewer than `steps` transitions; None without any."""
         envs = len(self.batch)
         fewer = (self.steps() < steps).reshape(envs, -1).any(axis=1)
         if not np.count_nonzero(fewer):
@@ -66,17 +69,18 @@ class Part:
         )
 
 
-class Kind:
-    """One set of columns.
+class EnvKind:
+    """Envs that share a policy and a set of columns.
 
     Args:
-        policy: what answers these envs.
-        quota: transitions of a rollout, at most.
-        meta_of: what the env of an id is like; None of one that has left unseen.
+        policy: acts in these envs.
+        quota: maximum number of transitions of a rollout.
+        meta_of: returns the meta of an env, or None of one that has already left.
+        infos: names of numbers in infos that become columns.
 
     Attributes:
-        num_steps: transitions of each env in a block; 0 where chains have any length.
-        held: the newest results of all envs; in blocks only.
+        num_steps: transitions of each env in a block; 0 for chains of any length.
+        held: for blocks, the newest results of all envs.
     """
 
     def __init__(
@@ -84,35 +88,42 @@ class Kind:
         policy: Callable[[BatchedData], Any],
         quota: int,
         meta_of: Callable[[str], EnvMeta | None],
+        infos: Sequence[str] = (),
     ) -> None:
         self.policy = policy
         self._meta_of = meta_of
         self.quota = quota
         self.num_steps = 0
         self.held: Part | None = None
-        self.staging = Staging(quota, 0)
+        self._acts_in_arrays = False
+        self.staging = Staging(quota, 0, infos)
+        self._taken = OWN_NAMES.union(infos)
         # Two sets, so that one rollout can be read while the next one is collected.
         self._sets: list[dict[str, Tree]] = [{}, {}]
 
     def part(self, batch: BatchedData) -> Part:
-        """Take in a batch."""
-        results = results_of(batch)
+        """Convert a batch to rows, and make room for envs that are new."""
+        results = result_rows(batch)
         new = self.staging.newcomers(results.index)
         if len(new):
             self._meet(batch, results, new)
         return Part(self, batch, results, np.arange(len(results.index)))
 
-    def _meet(self, batch: BatchedData, results: Results, rows: NDArray[np.intp]) -> None:
-        """Learn what those envs are like which are in `rows` for the first time."""
+    def _meet(self, batch: BatchedData, results: ResultRows, rows: NDArray[np.intp]) -> None:
+        """Record the autoreset mode of envs that are in `rows` for the first time."""
         env_ids = batch.env_ids()
         newcomers: list[int] = rows.tolist()
         for row in newcomers:
             meta = self._meta_of(env_ids[row // results.num_sub_envs])
-            if meta is not None and meta.autoreset == "same_step":
+            if meta is None:
+                continue
+            space = meta.action_space
+            self._acts_in_arrays = space is not None and is_array(space)
+            if meta.autoreset == "same_step":
                 self.staging.note_same_step(results.index[row])
 
     def hold(self, part: Part) -> None:
-        """Keep results as the newest of their envs."""
+        """Keep `part` as the newest results of its envs."""
         if self.held is None or len(part.batch) == len(self.held.batch):
             self.held = part
             return
@@ -124,10 +135,10 @@ class Kind:
         self.held = self.part(joined([self.held.batch, part.batch]).take(rows.tolist()))
 
     def columns_of(self, part: Part, answer: Any) -> tuple[BatchedData, dict[str, Tree]]:
-        """What the policy answered for `part`, as a batch of responses, and as columns.
+        """Convert the policy's answer for `part` to a batch of responses, and to columns.
 
         Raises:
-            ValueError, TypeError: it doesn't fit.
+            ValueError, TypeError: the answer doesn't fit.
         """
         try:
             given = dict(answer)
@@ -139,18 +150,23 @@ class Kind:
         if "action" not in given:
             names = ", ".join(map(repr, given)) or "nothing"
             raise ValueError(f"a policy returns columns by name, including 'action', not {names}")
-        for name in _OWN & given.keys():
-            raise ValueError(f"a rollout has a column {name!r} of its own; rename the policy's")
+        for name in self._taken & given.keys():
+            raise ValueError(
+                f"a rollout already has {name!r}; give the policy's column another name"
+            )
         head = part.results.head
-        columns = {name: rows_of(name, column, head) for name, column in given.items()}
+        stored: dict[str, Any] = {**given}
+        if self._acts_in_arrays and isinstance(given["action"], list):
+            stored["action"] = np.asarray(cast("list[Any]", given["action"]))
+        columns = rows_of(stored, head)
         columns["observation"] = part.results.observation
         self.staging.check(columns)
         return part.batch.respond(**given), columns
 
-    def rollout(self, held: Results | None, version: int, seconds: Seconds) -> Rollout:
-        """What has been completed, as columns.
+    def rollout(self, held: ResultRows | None, version: int, seconds: Seconds) -> Rollout:
+        """Return the completed transitions as columns.
 
-        `held` are results that are still to be answered, `version` is the newest policy's.
+        `held` has the results without an answer; `version` is that of the newest policy.
         """
         staging = self.staging
         full = staging.full(held)
@@ -161,12 +177,15 @@ class Kind:
             ends = ends % steps * envs + ends // steps
             shape = (steps, envs)
         columns = self._columns(order, shape)
-        end_observation = mapped(lambda leaf: leaf[:0], columns["observation"])
         if len(ends):
             end_observation = gather(staging.end_observation, full.end_rows)
+        else:
+            end_observation = mapped(lambda leaf: leaf[:0], columns["observation"])
         lag = _lag(version - columns["policy_version"])
+        episodes = staging.episodes
         staging.carry_over()
-        return Rollout(columns, shape, ends, end_observation, full.num_chains, lag, seconds)
+        found = Ends(ends, end_observation)
+        return Rollout(columns, shape, found, full.num_chains, episodes, lag, seconds)
 
     def _columns(self, order: NDArray[np.intp], shape: tuple[int, ...]) -> dict[str, Tree]:
         outs = self._sets.pop(0)
@@ -177,33 +196,25 @@ class Kind:
         def shaped(leaf: NDArray[Any]) -> NDArray[Any]:
             return leaf[:count].reshape(*shape, *leaf.shape[1:])
 
-        columns: dict[str, Tree] = {}
-        for name, column in staging.columns.items():
-            if name not in outs:
-                outs[name] = allocated(column, self.quota)
-            staging.read(name, order, outs[name])
-            columns[name] = mapped(shaped, outs[name])
-        columns["done"] = _either(columns["terminated"], columns["truncated"])
+        if not outs:
+            outs |= allocated(staging.columns, self.quota)
+        staging.read(order, outs)
+        columns = mapped(shaped, outs)
+        columns["done"] = paired(np.bitwise_or, columns["terminated"], columns["truncated"])
         for name, column in staging.of_places(order).items():
             columns[name] = column.reshape(shape)
         return columns
 
 
-_OWN = frozenset(
-    {"done", "end_observation", "ends", "first", "index", "lag", "num_chains", "observation"}
-    | {"policy_version", "reward", "seconds", "segments", "shape", "terminated", "truncated"}
-    | {"advantages", "at_ends", "keys", "next_observation", "vtrace"}
+OWN_NAMES: Final = frozenset(
+    {"done", "end_observation", "ends", "episodes", "first", "index", "lag", "num_chains"}
+    | {"observation", "policy_version", "reward", "seconds", "segments", "shape", "terminated"}
+    | {"truncated", "advantages", "at_ends", "keys", "next_observation", "vtrace"}
 )
+"""Names that neither a policy nor an info may give to a column of a rollout."""
 
 
 def _lag(ages: NDArray[np.int64]) -> Lag:
     if not ages.size:
         return Lag(0, 0.0, 0)
     return Lag(int(ages.min()), float(ages.mean()), int(ages.max()))
-
-
-def _either(one: Any, other: Any) -> Any:
-    if isinstance(one, dict):
-        ends = cast("dict[str, Any]", one)
-        return {agent: end | other[agent] for agent, end in ends.items()}
-    return one | other

@@ -1,7 +1,7 @@
-"""How a collector waits: with ``await`` over an asynchronous group, without over the other.
+"""One code for both kinds of groups: procedures, run with or without ``await``.
 
-A procedure is a generator that yields what is to be called, and is sent what came of it. So each
-rule exists once; two functions here are all that differs.
+A procedure is a generator that yields functions to call, and is sent their results. Only the two
+functions that run it differ between asynchronous and synchronous groups.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 Procedure: TypeAlias = Generator[Callable[[], Any], Any, T]
-"""Yields calls, is sent their values (of coroutines: what they return), returns its result."""
+"""Yields functions to call, is sent their results (awaited if awaitable), returns its result."""
 
 
 def run(procedure: Procedure[Any], group: AsyncEnvGroup | SyncEnvGroup) -> Any:
-    """Run `procedure` to its end: now, or as a coroutine if `group` is asynchronous."""
+    """Run `procedure` to its end: synchronously, or as a coroutine if `group` is asynchronous."""
     return _awaited(procedure) if isinstance(group, AsyncEnvGroup) else _called(procedure)
 
 
 def _called(procedure: Procedure[T]) -> T:
-    """Run `procedure` to its end.
+    """Run `procedure` to its end, synchronously.
 
     Raises:
         TypeError: a call must be awaited.
@@ -39,7 +39,7 @@ def _called(procedure: Procedure[T]) -> T:
         while True:
             try:
                 value = call()
-                if inspect.isawaitable(value):
+                if hasattr(value, "__await__"):
                     _discard(value)
                     raise TypeError(
                         "a policy that is a coroutine function needs an asynchronous group: "
@@ -59,13 +59,13 @@ def _discard(value: Any) -> None:
 
 
 async def _awaited(procedure: Procedure[T]) -> T:
-    """Run `procedure` to its end; what a call returns is awaited where it can be."""
+    """Run `procedure` to its end, and await awaitable results of calls."""
     try:
         call = next(procedure)
         while True:
             try:
                 value = call()
-                if inspect.isawaitable(value):
+                if hasattr(value, "__await__"):
                     value = await value
             except BaseException as error:
                 call = procedure.throw(error)

@@ -1,4 +1,4 @@
-"""Records the order in which a group returns its results, and replays it.
+"""Records the order of a group's results, and replays it.
 
 With the same seeds and the same policy, everything else follows from that order, so an asynchronous
 run can be repeated bit for bit. Both groups here wrap an `EnvGroup` and have all of its methods.
@@ -15,8 +15,10 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 from rlightning_aio.batch import joined
 from rlightning_aio.collecting.procedure import Procedure, run
 from rlightning_aio.errors import EnvFault, NothingPending, ReplayDiverged
+from rlightning_aio.files import write_file
 from rlightning_aio.group.aio import EnvGroup as AsyncEnvGroup
 from rlightning_aio.group.sync import EnvGroup as SyncEnvGroup
+from rlightning_aio.sealing import seal, unseal
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -27,26 +29,27 @@ __all__ = ["Record", "RecordedGroup", "ReplayedGroup"]
 
 G = TypeVar("G", AsyncEnvGroup, SyncEnvGroup)
 
-_MAGIC: Final = b"rlightning_aio order 1\n"
+_BEGINNING: Final = b"rlightning-aio record 2\n"
+_HEAD: Final = struct.Struct("<QQ")
 _STEP, _RESET, _RESTARTED, _FAULT = range(4)
-_SAID: Final = ("a step", "a reset", "the first result of a replaced worker", "an error")
+_NAMES: Final = ("a step", "a reset", "the first result of a replaced worker", "an error")
 
 
 class Record:
-    """Which envs' results were handed out, call by call: four bytes for each, and for each call.
+    """The order of results, call by call: four bytes for each result, and for each call.
 
-    It can be stored and read again with `save` and `load`, and pickled.
+    It can be saved, loaded and pickled.
     """
 
     def __init__(self) -> None:
-        # Calls one behind the other: a count, and for each result 4 * number of its env + kind.
+        # For each call a count, and for each of its results 4 * the env's number + kind.
         self._entries = array("I")
         self._env_ids: list[str] = []
         self._numbers: dict[str, int] = {}
         self.num_calls = 0
 
     def note(self, results: Iterable[tuple[str, int]]) -> None:
-        """Add what one call has handed out: env ids, and what kind of result each had."""
+        """Add one call: the env id and the kind of each result."""
         entries = [4 * self._number(env_id) + kind for env_id, kind in results]
         self._entries.append(len(entries))
         self._entries.extend(entries)
@@ -60,46 +63,50 @@ class Record:
         return number
 
     def call_at(self, place: int) -> tuple[list[tuple[str, int]], int]:
-        """What the call at `place` has handed out, and the place of the next one."""
+        """Return the results of the call at `place`, and the place of the next call."""
         first = place + 1
         end = first + self._entries[place]
         entries = self._entries[first:end]
         return [(self._env_ids[entry >> 2], entry & 3) for entry in entries], end
 
     def __len__(self) -> int:
-        """Entries: of each call one, and one for each of its results."""
+        """Number of entries: one for each call, and one for each result."""
         return len(self._entries)
 
     def save(self, path: str | Path) -> None:
-        """Write it to a file."""
+        """Write the record to a file, atomically.
+
+        Raises:
+            OSError: the file can't be written.
+        """
         names = "\n".join(self._env_ids).encode()
-        head = struct.pack("<QQ", self.num_calls, len(names))
+        head = _HEAD.pack(self.num_calls, len(names))
         entries = struct.pack(f"<{len(self._entries)}I", *self._entries)
-        Path(path).write_bytes(_MAGIC + head + names + entries)
+        write_file(path, seal(_BEGINNING, head + names + entries))
 
     @classmethod
     def load(cls, path: str | Path) -> Record:
-        """Read what `save` has written.
+        """Read a record that was written by `save`.
 
         Raises:
-            ValueError: the file holds something else.
+            ValueError: the file holds something else, or was changed or truncated.
+            OSError: the file can't be read.
         """
-        data = Path(path).read_bytes()
-        if not data.startswith(_MAGIC):
-            raise ValueError(f"{path} is not a record of the order of results")
-        start = len(_MAGIC) + 16
-        num_calls, length = struct.unpack("<QQ", data[len(_MAGIC) : start])
+        try:
+            content = unseal(_BEGINNING, Path(path).read_bytes())
+        except ValueError as error:
+            raise ValueError(f"the record in {path} can't be replayed: it {error}") from None
         record = cls()
-        record.num_calls = num_calls
-        for env_id in data[start : start + length].decode().split("\n"):
+        record.num_calls, length = _HEAD.unpack_from(content)
+        names, entries = content[_HEAD.size :][:length], content[_HEAD.size + length :]
+        for env_id in filter(None, names.decode().split("\n")):
             record._number(env_id)
-        entries = data[start + length :]
         record._entries.extend(struct.unpack(f"<{len(entries) // 4}I", entries))
         return record
 
 
-class _InFront(Generic[G]):
-    """Has every method of the group behind it."""
+class _WrappedGroup(Generic[G]):
+    """Forwards every method to the group that it wraps."""
 
     def __init__(self, group: G) -> None:
         self.group = group
@@ -116,14 +123,14 @@ class _InFront(Generic[G]):
         return len(self.group)
 
 
-class RecordedGroup(_InFront[G]):
-    """A group whose `collect_async` keeps account of what it hands out.
+class RecordedGroup(_WrappedGroup[G]):
+    """A group whose `collect_async` records the order of its results.
 
     Args:
-        group: initialised, asynchronous or not.
+        group: an initialised group, asynchronous or synchronous.
 
     Attributes:
-        record: what was handed out so far.
+        record: the results returned so far.
     """
 
     def __init__(self, group: G) -> None:
@@ -131,7 +138,7 @@ class RecordedGroup(_InFront[G]):
         self.record = Record()
 
     def collect_async(self, **options: Any) -> Any:
-        """As the group's own, to be awaited if that is."""
+        """Collect like the wrapped group, awaitable if that is asynchronous."""
         return run(self._collect(options), self.group)
 
     def _collect(self, options: dict[str, Any]) -> Procedure[tuple[BatchedData, list[bool]]]:
@@ -144,15 +151,15 @@ class RecordedGroup(_InFront[G]):
         return batch, flags
 
 
-class ReplayedGroup(_InFront[G]):
-    """A group whose `collect_async` hands results out as a record says, whatever comes when.
+class ReplayedGroup(_WrappedGroup[G]):
+    """A group whose `collect_async` returns results in the order of a record.
 
-    What is there before its turn is kept. The record decides how many results a call returns, so
-    of the arguments of `collect_async` only `deadline` matters.
+    A result that arrives early is kept until its turn. The record determines how many results a
+    call returns, so `collect_async` ignores its arguments other than `deadline`.
 
     Args:
-        group: initialised, with the envs of the group that was recorded.
-        record: what it handed out.
+        group: an initialised group with the envs of the recorded one.
+        record: of that group.
     """
 
     def __init__(self, group: G, record: Record) -> None:
@@ -163,18 +170,18 @@ class ReplayedGroup(_InFront[G]):
         self._faults: dict[str, EnvFault] = {}
 
     def collect_async(self, **options: Any) -> Any:
-        """As the group's own, to be awaited if that is.
+        """Collect the next recorded results, awaitable if the wrapped group is asynchronous.
 
         Raises:
-            ReplayDiverged: the record is at its end; or an env can't answer as it did then, as
-                it was asked for nothing, or for something else, or its worker was replaced.
+            ReplayDiverged: the record has ended; or an env can't answer as recorded, because it has
+                no request or another one, or because its worker was replaced.
         """
         return run(self._collect(options.get("deadline")), self.group)
 
     def _collect(self, deadline: float | None) -> Procedure[tuple[BatchedData, list[bool]]]:
         if self._place == len(self._record):
             raise ReplayDiverged(
-                f"the record ends here, after {self._calls} calls of collect_async; what was not "
+                f"the record ends after {self._calls} calls of collect_async; what was not "
                 "recorded can't be replayed"
             )
         turn, after = self._record.call_at(self._place)
@@ -186,7 +193,7 @@ class ReplayedGroup(_InFront[G]):
         return joined([row for row, _ in kept]), [flag for _, flag in kept]
 
     def _wait_for(self, turn: list[tuple[str, int]], deadline: float | None) -> Procedure[None]:
-        """Until all envs of a turn have answered as they did then."""
+        """Wait until all envs of a turn have answered as recorded."""
         while True:
             missing = [env_id for env_id, kind in turn if not self._has(env_id, kind)]
             if not missing:
@@ -195,7 +202,7 @@ class ReplayedGroup(_InFront[G]):
             try:
                 batch, flags = yield partial(self.group.collect_async, ordered=True, **options)
             except NothingPending:
-                raise self._diverged(missing[0], "it was asked for nothing") from None
+                raise self._diverged(missing[0], "it has no request to answer") from None
             except EnvFault as fault:
                 self._faults[fault.env_id] = fault
                 continue
@@ -203,28 +210,33 @@ class ReplayedGroup(_InFront[G]):
                 self._kept[env_id] = batch.take([k]), flags[k]
 
     def _has(self, env_id: str, kind: int) -> bool:
-        """Whether an env has answered, with a result of `kind`."""
+        """Return True if an env has answered with a result of `kind`.
+
+        Raises:
+            ReplayDiverged: it has answered with another kind.
+        """
         if kind == _FAULT and env_id in self._faults:
             return True
         if env_id in self._faults:
-            raise self._diverged(env_id, f"its answer was {_SAID[kind]}") from self._faults[env_id]
+            raise self._diverged(env_id, f"its answer was {_NAMES[kind]}") from self._faults[env_id]
         if env_id not in self._kept:
             return False
         ((_, found),) = _kinds(self._kept[env_id][0])
         if found != kind:
-            raise self._diverged(env_id, f"its answer was {_SAID[kind]}, and is {_SAID[found]} now")
+            now = f"its answer was {_NAMES[kind]}, and is {_NAMES[found]} now"
+            raise self._diverged(env_id, now)
         return True
 
     def _diverged(self, env_id: str, why: str) -> ReplayDiverged:
         return ReplayDiverged(
-            f"the replay left its record in call {self._calls + 1} of collect_async (of "
+            f"the replay differs from its record in call {self._calls + 1} of collect_async (of "
             f"{self._record.num_calls}): env {env_id!r} is next there, but {why}; replay the same "
             "program with the same seeds and settings"
         )
 
 
 def _kinds(batch: BatchedData) -> list[tuple[str, int]]:
-    """Each result's env, and whether it is a step, a reset or a replaced worker's."""
+    """Return the env id and the kind of each result."""
     count = len(batch)
     resets = batch.is_reset.reshape(count, -1).all(axis=1).astype(int)
     kinds = resets + batch.restarted.reshape(count, -1).all(axis=1)

@@ -1,4 +1,4 @@
-"""`Results`: what a batch tells of transitions, with one row for each sub-environment."""
+"""`ResultRows`: a batch of results as columns with one row for each sub-environment."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from rlightning_aio.batch.contents import ended_episodes, plain_columns
+from rlightning_aio.batch.infos import joined_infos, listed
+from rlightning_aio.collecting.rollout import EndedEpisode
 from rlightning_aio.collecting.trees import rows_of
 from rlightning_aio.protocol.columns import Tree, mapped
 
@@ -15,44 +18,42 @@ if TYPE_CHECKING:
 
     from rlightning_aio.batch import BatchedData
 
-__all__ = ["Results", "results_of"]
+__all__ = ["ResultRows", "all_agents", "result_rows"]
 
 
 @dataclass(slots=True)
-class Results:
+class ResultRows:
     """Rows of a batch of results.
 
     Attributes:
-        head: the batch's shape: ``(n,)``, or ``(m, num_envs)``.
-        index: ``[n]``, which env of the group each is; see `BatchedData.index`.
+        head: the shape of the batch: ``(n,)``, or ``(m, num_envs)``.
+        index: ``[n]``, index of each env in the group; see `BatchedData.index`.
         observation: tree of ``[n, *obs]``.
-        reward, terminated, truncated: ``[n]``, or dicts of such by agent; truncated where the
-            step limit has cut the episode, too.
-        done: ``[n]``, whether the episode is over: for all of its agents.
+        outcome: reward, terminated and truncated by name: ``[n]``, or dicts of such by agent;
+            ``truncated`` includes truncation by the group's step limit.
+        done: ``[n]``, True if the episode is over for all of its agents.
         is_reset: ``[n]``.
-        batch: whose rows they are.
+        batch: the batch itself.
     """
 
     head: tuple[int, ...]
     index: NDArray[np.int64]
     observation: Tree
-    reward: Any
-    terminated: Any
-    truncated: Any
+    outcome: dict[str, Any]
     done: NDArray[np.bool_]
     is_reset: NDArray[np.bool_]
     batch: BatchedData
 
     @property
     def num_sub_envs(self) -> int:
-        """Rows of each result."""
+        """Number of rows of each result."""
         return self.head[1] if len(self.head) > 1 else 1
 
     def final_observation(self, rows: NDArray[np.intp], otherwise: Tree) -> Tree:
-        """Final observations of rows whose env has begun its next episode in the same step.
+        """Return the final observations of `rows` whose env resets itself in the same step.
 
-        The env tells them in ``info["final_obs"]``, as Gymnasium's vector envs do. Of one that
-        doesn't, they are what is given, which is written to.
+        They are in ``info["final_obs"]``, as with Gymnasium's vector envs. Where an env doesn't
+        report any, the row of `otherwise` remains; the others are overwritten in place.
         """
         infos: list[dict[str, Any]] = self.batch.info()
         chosen: list[int] = rows.tolist()
@@ -65,9 +66,77 @@ class Results:
                 _write_row(otherwise, k, found)
         return otherwise
 
+    def info(self, name: str) -> NDArray[np.float64]:
+        """``[n]``, the number `name` of the info of each row, NaN where the info has none.
+
+        If the env has reset itself in the same step, it is that of the ended episode.
+
+        Raises:
+            ValueError: a value isn't one number.
+        """
+        columns = self.batch.infos
+        found = _numbers(name, columns, self.head)
+        final = columns.get("final_info")
+        if isinstance(final, dict):
+            over = _spread(columns["_final_info"], self.head)
+            found[over] = _numbers(name, cast("dict[str, Any]", final), self.head)[over]
+        return found.reshape(-1)
+
+    def episodes(self, rows: NDArray[np.intp]) -> list[EndedEpisode]:
+        """Episodes that ended in `rows`."""
+        count = self.num_sub_envs
+        chosen: list[int] = rows.tolist()
+        several = len(self.head) > 1
+        found: list[EndedEpisode] = []
+        reported = ended_episodes(self.batch, [row // count for row in chosen])
+        for row, (sums, info) in zip(chosen, reported, strict=True):
+            if not sums:
+                continue
+            total, length, own = sums["r"], sums["l"], info
+            if several:
+                sub_env = row % count
+                total, length = total[sub_env], length[sub_env]
+                own = listed(joined_infos([info], count), count)[sub_env]
+            own = own.get("final_info", own)
+            found.append(EndedEpisode(int(self.index[row]), float(total), int(length), own))
+        return found
+
+
+def _numbers(name: str, columns: dict[str, Any], head: tuple[int, ...]) -> NDArray[np.float64]:
+    found = np.full(head, np.nan)
+    if name in columns:
+        try:
+            has_it = _spread(columns[f"_{name}"], head)
+            found[has_it] = _spread(columns[name], head)[has_it].astype(np.float64)
+        except (TypeError, ValueError):
+            raise ValueError(
+                f"info {name!r} can't be a column of a rollout: a column needs one number for each "
+                f"transition; an info was {_example(columns[name])!r}"
+            ) from None
+    return found
+
+
+def _example(column: Any) -> Any:
+    """An example from a column of infos, for a message."""
+    if isinstance(column, dict):
+        return cast("dict[str, Any]", column)
+    return next((value for value in column if value is not None), None)
+
+
+def _spread(column: Any, head: tuple[int, ...]) -> NDArray[Any]:
+    """Broadcast a column of infos to `head`; a vector env may report one value for all.
+
+    Raises:
+        ValueError: the values are arrays.
+    """
+    array = np.asarray(column)
+    if array.shape == head[:1]:
+        array = array.reshape(-1, *(1 for _ in head[1:]))
+    return np.broadcast_to(array, head)
+
 
 def _one_of(observations: Any, sub_env: int) -> Any:
-    """Of sub-environments, whose observations are one tree, or an array of objects or None."""
+    """Take one sub-environment's observation from a tree, or from an array of objects or None."""
     if isinstance(observations, np.ndarray):
         return cast("NDArray[Any]", observations)[sub_env]
     return mapped(lambda leaf: leaf[sub_env], observations)
@@ -81,31 +150,30 @@ def _write_row(tree: Tree, row: int, value: Any) -> None:
         _write_row(tree[key], row, value[key])
 
 
-def results_of(batch: BatchedData) -> Results:
-    """The rows of `batch`, whose columns they are where these need no other shape."""
-    is_reset = batch.is_reset
+def result_rows(batch: BatchedData) -> ResultRows:
+    """Return the rows of `batch`, as views of its columns where possible."""
+    source = plain_columns(batch)
+    if source is None:
+        source = batch
+    is_reset = source.is_reset
     head = is_reset.shape
-    done = terminated = truncated = batch.done
-    if isinstance(done, dict) or np.count_nonzero(done):  # Else none of them is true anywhere.
-        terminated, truncated = batch.terminated, batch.truncated
+    done = terminated = truncated = source.done
+    if isinstance(done, dict) or len(done.nonzero()[0]):  # Otherwise all flags are False.
+        terminated, truncated = source.terminated, source.truncated
         limit = batch.limit_reached
-        if np.count_nonzero(limit):
+        if len(limit.nonzero()[0]):
             truncated = mapped(lambda leaf: leaf | limit, truncated)
-    return Results(
-        head,
-        batch.index.reshape(-1),
-        rows_of("observation", batch.observation, head),
-        rows_of("reward", batch.reward, head),
-        rows_of("terminated", terminated, head),
-        rows_of("truncated", truncated, head),
-        _of_all(done).reshape(-1),
-        is_reset.reshape(-1),
-        batch,
+    columns = {"reward": source.reward, "terminated": terminated, "truncated": truncated}
+    outcome = rows_of({"observation": source.observation, **columns}, head)
+    observation = outcome.pop("observation")
+    index, done, is_reset = source.index, all_agents(done), is_reset.reshape(-1)
+    return ResultRows(
+        head, index.reshape(-1), observation, outcome, done.reshape(-1), is_reset, batch
     )
 
 
-def _of_all(done: Any) -> NDArray[np.bool_]:
-    """Whether an episode is over for all of its agents."""
+def all_agents(done: Any) -> NDArray[np.bool_]:
+    """Return True for episodes that are over for all of their agents."""
     if isinstance(done, dict):
         return np.logical_and.reduce(list(cast("dict[str, Any]", done).values()))
     return done

@@ -1,4 +1,4 @@
-"""`Rollout`: transitions of many envs as columns, and what a learner computes from them."""
+"""`Rollout`: transitions of many envs as columns, and advantages over them."""
 
 from __future__ import annotations
 
@@ -8,38 +8,54 @@ from typing import TYPE_CHECKING, Any, NamedTuple, cast
 import numpy as np
 
 from rlightning_aio.collecting.advantages import Segments, VTrace, gae, vtrace
-from rlightning_aio.protocol.columns import Tree, gather, mapped
+from rlightning_aio.collecting.trees import with_lists
+from rlightning_aio.protocol.columns import Tree, gather, mapped, paired
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from numpy.typing import NDArray
 
-__all__ = ["Lag", "Rollout", "Seconds"]
+__all__ = ["EndedEpisode", "Ends", "Lag", "Rollout", "Seconds"]
 
 
 class Lag(NamedTuple):
-    """How many policy versions behind the newest one the transitions' own was."""
+    """Age of the policies that made the transitions, in versions behind the newest."""
 
     min: int
     mean: float
     max: int
 
 
+class EndedEpisode(NamedTuple):
+    """An episode whose last transition is in a rollout.
+
+    Attributes:
+        index: of the env in the group; see `BatchedData.index`.
+        total_reward: the undiscounted return since the reset, summed over agents.
+        length: steps since the reset.
+        info: of the last step, without that of the next episode.
+    """
+
+    index: int  # pyright: ignore[reportIncompatibleMethodOverride] -- the word for this everywhere
+    total_reward: float
+    length: int
+    info: dict[str, Any]
+
+
 @dataclass(frozen=True, slots=True)
 class Seconds:
-    """Where the time of a rollout went, in seconds.
+    """Times of a rollout, in seconds.
 
     Attributes:
         elapsed: since the previous rollout was complete, or since the first call of `collect`.
-        collecting: inside `Collector.collect`: how long a learner has waited that doesn't work at
-            the same time.
+        collecting: inside `Collector.collect`; a learner that runs in between waits that long.
         policy: in calls of the policy.
         env_busy: in steps and resets, summed over envs.
-        waited_for_policy: between an env's result and its next request, summed over envs, less
-            the next figure: the env waited for the policy, or for results of others to fill its
-            batch.
-        waited_for_learner: the part of that in which nobody was in `collect`.
+        waited_for_policy: between the result of an env and its next request, summed over envs,
+            minus `waited_for_learner`: envs wait for the policy, or for results of other envs to
+            fill a batch.
+        waited_for_learner: likewise, while no call of `collect` was in progress.
     """
 
     elapsed: float
@@ -50,37 +66,44 @@ class Seconds:
     waited_for_learner: float
 
 
+class Ends(NamedTuple):
+    """Where transitions have no successor; see `Rollout.ends` and `Rollout.end_observation`."""
+
+    positions: NDArray[np.intp]
+    observation: Tree
+
+
 class Rollout:
     """Transitions, one row each, as columns of contiguous, writable NumPy arrays.
 
-    Rows are ``[n]``, with each env's transitions side by side and in order (a *chain*), or
-    ``[T, N]`` if the collector waits for all: row ``[t, i]`` is the t-th transition of the i-th
-    env. The *ends* are those transitions that are not followed by the next one of their env in
-    this rollout: the last of each chain, those that end an episode, and those whose episode was
-    lost with its worker. Only after these is an observation needed to bootstrap from; it is in
-    `end_observation`.
+    Rows are ``[n]``, with the transitions of each env contiguous and in order (a *chain*), or
+    ``[T, N]`` with `wait_all`: row ``[t, i]`` is the t-th transition of the i-th env. The *ends*
+    are transitions without a successor in this rollout: the last of each chain, those that end an
+    episode, and those whose episode was lost with its worker. Only ends need an observation to
+    bootstrap from; it is in `end_observation`.
 
-    What the policy attached is an attribute or an item: ``rollout.log_prob``,
-    ``rollout["log_prob"]``. Columns of envs with Dict or Tuple spaces are dicts or tuples of
-    arrays; reward, terminated, truncated and done of multi-agent envs are dicts by agent.
+    The policy's columns are attributes and items: ``rollout.log_prob``, ``rollout["log_prob"]``.
+    Columns of envs with Dict or Tuple spaces are dicts or tuples of arrays; columns of plain Python
+    values are lists (of lists, for ``[T, N]``). Reward, terminated, truncated and done of
+    multi-agent envs are dicts by agent.
 
-    The arrays belong to the collector, which has two sets: they are the rollout's until `collect`
-    is called for the second time after it. Until then they may be written to, and read from
-    another thread. ``torch.from_numpy`` shares them.
+    The collector owns the arrays, in two sets: they are valid until the second call of `collect`
+    after it. Until then they may be written to, and used by other threads. ``torch.from_numpy``
+    shares them.
 
     Attributes:
-        observation: what the policy saw; action: what it answered.
-        reward: float32; terminated: the episode ended by itself; truncated: it was cut, by the
-            env or by the step limit of `auto_reset`; done: either.
+        observation: the observation before the action; action: the policy's answer.
+        reward: float32; terminated: the env ended the episode; truncated: the env or the step
+            limit of `auto_reset` cut it; done: either.
         policy_version: int64, `Collector.policy_version` when the action was chosen.
-        index: int64, which env of the group: see `BatchedData.index`.
-        first: whether an episode begins with it, or continues after a loss.
+        index: int64, index of the env in the group: see `BatchedData.index`.
+        first: True if an episode begins with the transition, or continues after a loss.
         ends: ``[k]``, positions of the ends (for ``[T, N]``, in the flattened block). The last
-            transition of each chain comes first, in the order of chains.
-        end_observation: tree of ``[k, *obs]``, the observation after each end: the episode's
-            final one where it is over.
-        num_chains: number of envs with transitions here.
-        lag: how old the transitions' policies are; seconds: where the time went.
+            transitions of chains come first, in the order of chains.
+        episodes: those that ended in this rollout, in the order of arrival: terminated, truncated,
+            or cut by the step limit, but not lost with a worker. They may have begun earlier.
+        num_chains: number of envs with transitions in this rollout.
+        lag: age of the policies of the transitions; seconds: times of the rollout.
     """
 
     observation: Tree
@@ -97,22 +120,29 @@ class Rollout:
         self,
         columns: dict[str, Tree],
         shape: tuple[int, ...],
-        ends: NDArray[np.intp],
-        end_observation: Tree,
+        ends: Ends,
         num_chains: int,
+        episodes: list[EndedEpisode],
         lag: Lag,
         seconds: Seconds,
     ) -> None:
         self._columns = columns
         self.shape = shape
-        self.ends = ends
-        self.end_observation = end_observation
+        self.ends, self._end_observation = ends
         self.num_chains = num_chains
+        self.episodes = episodes
         self.lag = lag
         self.seconds = seconds
         self._segments: Segments | None = None
 
     # -- columns ------------------------------------------------------------------
+
+    @property
+    def end_observation(self) -> Tree:
+        """Tree of ``[k, *obs]``, the observation after each end: the final one of the episode
+        where that is over.
+        """
+        return with_lists(self._end_observation)
 
     def keys(self) -> list[str]:
         """Names of all columns."""
@@ -126,21 +156,21 @@ class Rollout:
 
     def __getitem__(self, name: str) -> Tree:
         try:
-            return self._columns[name]
+            return with_lists(self._columns[name])
         except KeyError:
             known = ", ".join(self._columns)
             raise KeyError(f"this rollout has no column {name!r}; it has {known}") from None
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):
-            raise AttributeError(name)  # As of an object that is still being copied.
+            raise AttributeError(name)  # `copy` asks objects without attributes.
         try:
             return self[name]
         except KeyError as error:
             raise AttributeError(error.args[0]) from None
 
     def __len__(self) -> int:
-        """How many transitions."""
+        """Number of transitions."""
         return int(np.prod(self.shape))
 
     def __repr__(self) -> str:
@@ -152,7 +182,7 @@ class Rollout:
 
     @property
     def segments(self) -> Segments:
-        """Which transitions follow one another."""
+        """The segments of consecutive transitions."""
         if self._segments is None:
             stride = self.shape[1] if len(self.shape) > 1 else 1
             self._segments = Segments(self.ends, len(self), stride)
@@ -160,17 +190,18 @@ class Rollout:
 
     @property
     def next_observation(self) -> Tree:
-        """The observation after each transition, in fresh arrays; the final one where it ends."""
+        """Observation after each transition, in new arrays; the final one if the episode ends."""
 
         def after(leaf: NDArray[Any], ends: NDArray[Any]) -> NDArray[Any]:
             flat = self._flat(leaf)
             return self.segments.successors(flat, ends).reshape(leaf.shape)
 
-        return _paired(after, self.observation, self.end_observation)
+        return with_lists(paired(after, self._columns["observation"], self._end_observation))
 
     def at_ends(self, name: str) -> Tree:
-        """A column's rows at the ends, ``[k, *shape]``, in fresh arrays."""
-        return mapped(lambda leaf: gather(self._flat(leaf), self.ends), self[name])
+        """Rows of a column at the ends, ``[k, *shape]``, in new arrays."""
+        column = self._columns[name] if name in self else self[name]
+        return with_lists(mapped(lambda leaf: gather(self._flat(leaf), self.ends), column))
 
     def _flat(self, leaf: NDArray[Any]) -> NDArray[Any]:
         return leaf.reshape(len(self), *leaf.shape[len(self.shape) :])
@@ -178,23 +209,22 @@ class Rollout:
     # -- advantages ---------------------------------------------------------------
 
     def advantages(self, values: Any, next_values: Any, gamma: float, lam: float) -> Any:
-        """Generalised advantage estimation over chains.
+        """Compute generalised advantage estimates over chains.
 
-        After a termination the value is zero. Wherever else a chain breaks off (it was truncated,
-        lost with its worker, or is in flight when the rollout is full), `next_values` stand for
-        the rest of the episode.
+        After a termination the value is zero. At any other end (truncated, lost with its worker,
+        or continued in the next rollout), `next_values` estimate the rest of the episode.
 
         Args:
-            values: of `observation`: an array or CPU tensor in the rollout's shape; a dict of
+            values: of `observation`: an array or CPU tensor in the shape of the rollout; a dict of
                 such by agent for multi-agent envs.
-            next_values: of `end_observation`, ``[k]``; without effect where the end is
-                terminated. Zeros where it is truncated treat truncation like termination.
+            next_values: of `end_observation`, ``[k]``; ignored at terminated ends. Zeros at
+                truncated ends treat truncation like termination.
             gamma: discount.
             lam: λ of the exponentially weighted average.
 
         Returns:
-            A fresh array of the rollout's shape and the dtype of `values`, or a dict of such.
-            Added to `values` it is what a value function learns.
+            A new array with the shape of the rollout and the dtype of `values`, or a dict of such.
+            Its sum with `values` is the target of a value function.
 
         Raises:
             ValueError: an argument has another shape.
@@ -226,22 +256,22 @@ class Rollout:
         clip_rho: float = 1.0,
         clip_c: float = 1.0,
     ) -> VTrace | dict[str, VTrace]:
-        """V-trace over chains: for transitions of a policy that lags behind.
+        """Compute V-trace over chains, for transitions of an older policy.
 
         Args:
-            values: as of `advantages`.
-            next_values: likewise.
-            log_ratios: log-probability of each action by the policy that is learned, less that
-                by the policy that chose it (``rollout.log_prob``, if it was attached by that
-                name), in the rollout's shape; a dict of such by agent.
+            values: as for `advantages`.
+            next_values: as for `advantages`.
+            log_ratios: log-probability of each action under the learned policy minus that under
+                the policy that chose it (``rollout.log_prob`` if the policy returned it by that
+                name), in the shape of the rollout; a dict of such by agent.
             gamma: discount.
             lam: scales the traces.
             clip_rho: upper limit of the ratios that weight errors and advantages.
             clip_c: upper limit of the ratios that carry corrections back.
 
         Returns:
-            Fresh arrays in the rollout's shape, or such by agent: targets of the value function
-            and advantages of the policy gradient.
+            New arrays in the shape of the rollout, or a dict of such by agent: targets of the
+            value function and advantages of the policy gradient.
 
         Raises:
             ValueError: an argument has another shape.
@@ -267,7 +297,7 @@ class Rollout:
         clip_c: float,
     ) -> VTrace:
         now, after = self._checked(values, next_values)
-        ratios = self._rows("log_ratios", log_ratios, len(self))
+        ratios = self._rows("log_ratios", log_ratios)
         reward, terminated = self._of(agent, "reward"), self._of(agent, "terminated")
         found = vtrace(
             self.segments,
@@ -289,31 +319,23 @@ class Rollout:
         return self._flat(column if agent is None else column[agent])
 
     def _checked(self, values: Any, next_values: Any) -> tuple[NDArray[Any], NDArray[Any]]:
-        now = self._rows("values", values, len(self))
+        now = self._rows("values", values)
         if now.dtype.kind != "f":
             now = now.astype(np.float32)
-        return now, self._rows("next_values", next_values, len(self.ends)).astype(now.dtype)
-
-    def _rows(self, name: str, given: Any, count: int) -> NDArray[Any]:
-        array = np.asarray(given)
-        if array.size != count:
+        after = np.asarray(next_values)
+        if after.shape != self.ends.shape:
             raise ValueError(
-                f"{name} has shape {list(array.shape)}, which is not one number for each of "
-                f"{count} {'ends' if name == 'next_values' else 'transitions'}; give "
-                + (
-                    "the values of rollout.end_observation"
-                    if name == "next_values"
-                    else f"it in the shape {list(self.shape)}"
-                )
+                f"next_values has shape {list(after.shape)}, and this rollout has "
+                f"{len(self.ends)} ends; give the values of rollout.end_observation, one number "
+                f"for each: {list(self.ends.shape)}"
+            )
+        return now, after.astype(now.dtype)
+
+    def _rows(self, name: str, given: Any) -> NDArray[Any]:
+        array = np.asarray(given)
+        if array.shape != self.shape:
+            raise ValueError(
+                f"{name} has shape {list(array.shape)}; give one number for each transition, in "
+                f"the rollout's shape {list(self.shape)}"
             )
         return array.reshape(-1)
-
-
-def _paired(function: Any, one: Tree, other: Tree) -> Tree:
-    if isinstance(one, dict):
-        parts = cast("dict[str, Tree]", one)
-        return {key: _paired(function, part, other[key]) for key, part in parts.items()}
-    if isinstance(one, tuple):
-        several = cast("tuple[Tree, ...]", one)
-        return tuple(_paired(function, part, other[k]) for k, part in enumerate(several))
-    return function(one, other)

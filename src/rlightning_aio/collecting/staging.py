@@ -1,9 +1,9 @@
-"""`Staging`: where transitions come together, in the order in which they were begun.
+"""`Staging`: assembles transitions, in the order of their beginnings.
 
-An env that is asked to step takes a *place*, which holds what the policy saw and said; the
-result completes it. A result that ends no transition (a reset, an episode lost with its worker)
-leaves the place to the env's next step. So each transition is here once, whatever comes when;
-places that are not complete when a rollout is full are carried over to the next one.
+A step request takes a *place*, a row of the columns that holds the observation and the policy's
+answer; the result completes it. If the result ends no transition (a reset, an episode lost with
+its worker), the env's next step uses the place. So each transition is stored once, in any order of
+results. Incomplete places of a full rollout are carried over to the next one.
 """
 
 from __future__ import annotations
@@ -12,32 +12,33 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from rlightning_aio.batch.contents import has_ended
 from rlightning_aio.collecting.trees import allocated, check_alike, gathered, grown, scattered
 from rlightning_aio.protocol.columns import gather, mapped
 
 if TYPE_CHECKING:
-    from collections.abc import KeysView, Mapping
+    from collections.abc import KeysView, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from rlightning_aio.collecting.results import Results
+    from rlightning_aio.collecting.results import ResultRows
+    from rlightning_aio.collecting.rollout import EndedEpisode
     from rlightning_aio.protocol.columns import Rows, Tree
 
 __all__ = ["Full", "Staging"]
 
-_NOWHERE: Final = -1
-_NOBODY: Final = np.zeros(0, np.intp)
-_OF_RESULTS: Final = ("reward", "terminated", "truncated")
+_NO_PLACE: Final = -1
+_NO_ROWS: Final = np.zeros(0, np.intp)
 
 
 class Full:
-    """A rollout's transitions, still in their places.
+    """The order of the transitions of a rollout.
 
     Attributes:
-        order: ``[n]``, their places, each env's side by side and in order.
-        ends: ``[k]``, positions in `order` after which nothing follows, those of chains first.
+        order: ``[n]``, their places, those of each env contiguous and in order.
+        ends: ``[k]``, positions in `order` of transitions without successor, ends of chains first.
         end_rows: ``[k]``, rows of `Staging.end_observation`.
-        num_chains: envs that have any.
+        num_chains: number of envs with transitions.
     """
 
     __slots__ = ("end_rows", "ends", "num_chains", "order")
@@ -56,26 +57,31 @@ class Full:
 
 
 class Staging:
-    """Places for the transitions of one rollout, and for what is in flight.
+    """Places for the transitions of one rollout, and for steps in flight.
 
     Args:
-        quota: transitions of a rollout, at most.
-        num_envs: envs, sub-environments counted; there may come to be more.
+        quota: maximum number of transitions of a rollout.
+        num_envs: expected number of envs, counting sub-environments; it may grow.
+        infos: names of numbers in infos that become columns.
 
     Attributes:
-        columns: by name trees of ``[places, …]``; allocated when the first rows come.
-        complete: how many transitions are.
-        made: by env, how many of them are its own.
+        columns: trees of ``[places, …]`` by name; allocated with the first rows.
+        complete: number of complete transitions.
+        made: number of complete transitions by env.
+        episodes: those that ended with these transitions.
     """
 
-    def __init__(self, quota: int, num_envs: int) -> None:
+    def __init__(self, quota: int, num_envs: int, infos: Sequence[str] = ()) -> None:
         self._quota = quota
+        self._infos = infos
+        self.episodes: list[EndedEpisode] = []
         self.columns: dict[str, Tree] = {}
         self.complete = 0
         self.end_observation: Tree = None
-        # Names of the columns that come with a request.
+        # Names of the columns that come with a request, fixed once any were sent.
         self._given: KeysView[str] = {}.keys()
-        # Whether a transition has ever been completed: resets may tell less than steps.
+        self._is_settled = False
+        # True once a transition was completed; the columns of resets may be incomplete.
         self._knows_results = False
         # By place.
         size = quota + num_envs
@@ -84,29 +90,29 @@ class Staging:
         self._version = np.zeros(size, np.int64)
         self._is_complete = np.zeros(size, np.bool_)
         self._used = 0
-        # By env: the place of the step it owes, and of its last transition; whether the next one
-        # begins a chain; whether its episode is over and waits for a reset.
+        # By env: the place of its step in flight, and of its last transition; True if the next one
+        # begins a chain; True if its episode is over and waits for a reset.
         self.made = np.zeros(num_envs, np.int64)
-        self._place = np.full(num_envs, _NOWHERE, np.intp)
-        self._last = np.full(num_envs, _NOWHERE, np.intp)
+        self._place = np.full(num_envs, _NO_PLACE, np.intp)
+        self._last = np.full(num_envs, _NO_PLACE, np.intp)
         self._fresh = np.ones(num_envs, np.bool_)
         self._over = np.zeros(num_envs, np.bool_)
         self._known = np.zeros(num_envs, np.bool_)
-        self._resets_itself_at_once = np.zeros(num_envs, np.bool_)
-        # Of each end its place; its observation has the same row of `end_observation`.
+        self._resets_in_same_step = np.zeros(num_envs, np.bool_)
+        # The place of each end; the observation after it is in the same row of `end_observation`.
         self._end_place = np.zeros(size, np.intp)
         self._num_ends = self._end_room = 0
 
     # -- envs -------------------------------------------------------------------------
 
     def newcomers(self, index: NDArray[np.int64]) -> NDArray[np.intp]:
-        """Places in `index` of envs that were not here before; there is room for them then."""
+        """Return positions in `index` of envs that are new, and make room for them."""
         try:
-            if self._known[index].all():
-                return _NOBODY
+            if False not in self._known[index].tolist():
+                return _NO_ROWS
         except IndexError:
             self._make_room(index)
-        new = np.flatnonzero(~self._known[index])
+        new = (~self._known[index]).nonzero()[0]
         self._known[index[new]] = True
         return new
 
@@ -122,34 +128,34 @@ class Staging:
         self.columns = {name: grown(column, size) for name, column in self.columns.items()}
         self.made = grown(self.made, count)
         for name, value in (
-            ("_place", _NOWHERE),
-            ("_last", _NOWHERE),
+            ("_place", _NO_PLACE),
+            ("_last", _NO_PLACE),
             ("_fresh", True),
             ("_over", False),
             ("_known", False),
-            ("_resets_itself_at_once", False),
+            ("_resets_in_same_step", False),
         ):
             column = grown(getattr(self, name), count)
             column[known:] = value
             setattr(self, name, column)
 
     def note_same_step(self, envs: Any) -> None:
-        """Envs that begin their next episode in the step that ends one."""
-        self._resets_itself_at_once[envs] = True
+        """Record that these envs begin their next episode in the step that ends one."""
+        self._resets_in_same_step[envs] = True
 
     def over(self, index: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which of these envs wait for a reset."""
+        """Mask of the envs that wait for a reset."""
         return self._over[index]
 
     # -- steps ------------------------------------------------------------------------
 
     def check(self, given: Mapping[str, Tree]) -> None:
-        """Whether there is a column for what comes with a request.
+        """Check that the columns of a request match those of earlier requests.
 
         Raises:
-            ValueError: other columns came before, or others in shape.
+            ValueError: names or shapes differ.
         """
-        if not self._given:
+        if not self._is_settled:
             return
         if given.keys() != self._given:
             now, before = sorted(given), sorted(self._given)
@@ -157,39 +163,45 @@ class Staging:
                 f"the policy's answer makes the columns {', '.join(now)}, and before there were "
                 f"{', '.join(before)}; a policy must give the same ones each time"
             )
-        for name, values in given.items():
-            check_alike(name, self.columns[name], values)
+        check_alike(self.columns, given)
 
     def begin(self, index: NDArray[np.int64], given: Mapping[str, Tree], version: int) -> None:
-        """Note what the envs of `index` (``[n]``) are asked: columns of ``[n, …]`` that were
-        checked, the observation among them. `version` is the policy's.
+        """Store a request to the envs of `index` (``[n]``): checked columns ``[n, …]``.
+
+        The observation is one of them; `version` is that of the policy. If the request can't be
+        sent, the next one to these envs overwrites it.
         """
-        if not self._given:
+        if not self._is_settled:
+            for name in self._given:
+                del self.columns[name]
             self._given = dict.fromkeys(given).keys()
             for name, values in given.items():
                 self.columns[name] = allocated(values, len(self._env))
         places = self._place[index]
         new = places < 0
-        count = int(np.count_nonzero(new))
+        count = len(new.nonzero()[0])
         rows: Any = slice(self._used, self._used + count)
         if count == len(index):
             places = np.arange(self._used, self._used + count)
         else:
             places[new] = np.arange(self._used, self._used + count)
             rows = places
-        for name, values in given.items():
-            scattered(self.columns[name], rows, values)
+        scattered(self.columns, rows, given)
         self._used += count
         self._place[index] = places
         self._env[rows] = index
         self._first[rows] = self._fresh[index]
         self._version[rows] = version
 
-    def store(self, results: Results, rows: NDArray[np.intp], room: int) -> NDArray[np.intp]:
-        """Complete the transitions that end in `rows` of results, `room` at most.
+    def note_sent(self) -> None:
+        """Require all further requests to have the columns of the last one."""
+        self._is_settled = True
+
+    def store(self, results: ResultRows, rows: NDArray[np.intp], room: int) -> NDArray[np.intp]:
+        """Complete at most `room` of the transitions that end in `rows` of results.
 
         Returns:
-            The rows that are left: transitions of the next rollout.
+            The remaining rows: transitions of the next rollout.
         """
         if not self._knows_results:
             self._adopt_results(results)
@@ -197,75 +209,83 @@ class Staging:
         index = results.index if all_rows else results.index[rows]
         resets = results.is_reset if all_rows else results.is_reset[rows]
         ending = self._place[index] >= 0
-        if np.count_nonzero(resets):
+        if len(resets.nonzero()[0]):
             self._begin_chains(index[resets], ending[resets])
+            if len(results.batch.restarted.nonzero()[0]):
+                # A resumed sub-environment may already have ended, and wait for others.
+                over = has_ended(results.batch).reshape(-1)[rows] & resets
+                self._over[index] |= over & ~self._resets_in_same_step[index]
             ending &= ~resets
         ending &= ~self._over[index]
-        count = int(np.count_nonzero(ending))
-        if count == len(results.index) <= room:
+        chosen = ending.nonzero()[0]
+        if len(chosen) == len(results.index) <= room:
             self._complete(results, index, slice(None))
             return rows[:0]
-        chosen = np.flatnonzero(ending)
-        if count:
+        if len(chosen):
             self._complete(results, index[chosen[:room]], rows[chosen[:room]])
         return rows[chosen[room:]]
 
-    def _begin_chains(self, index: NDArray[np.int64], owing: NDArray[np.bool_]) -> None:
-        """Envs begin an episode; the one before may have been lost in the middle."""
-        lost = index[owing & ~self._fresh[index] & (self._last[index] >= 0)]
+    def _begin_chains(self, index: NDArray[np.int64], in_flight: NDArray[np.bool_]) -> None:
+        """Record that envs begin an episode; a step in flight means that the last one was lost."""
+        lost = index[in_flight & ~self._fresh[index] & (self._last[index] >= 0)]
         if len(lost):
             before = gather(self.columns["observation"], self._place[lost])
             self._note_ends(self._last[lost], before)
         self._fresh[index] = True
         self._over[index] = False
 
-    def _complete(self, results: Results, index: NDArray[np.int64], rows: Rows) -> None:
+    def _complete(self, results: ResultRows, index: NDArray[np.int64], rows: Rows) -> None:
         self._knows_results = True
         places = self._place[index]
-        for name in _OF_RESULTS:
-            values = getattr(results, name)
-            if not isinstance(rows, slice):
-                values = mapped(lambda leaf: leaf[rows], values)
-            scattered(self.columns[name], places, values)
+        for name, values in results.outcome.items():
+            if type(values) is np.ndarray:
+                self.columns[name][places] = values[rows]
+            else:
+                scattered(self.columns[name], places, mapped(lambda leaf: leaf[rows], values))
+        for name in self._infos:
+            scattered(self.columns[name], places, results.info(name)[rows])
         self._is_complete[places] = True
         self._last[index] = places
-        self._place[index] = _NOWHERE
+        self._place[index] = _NO_PLACE
         self.made[index] += 1
         self.complete += len(index)
         done = results.done[rows]
         self._fresh[index] = done
-        if np.count_nonzero(done):
-            ended = index[done]
-            self._over[ended] = ~self._resets_itself_at_once[ended]
-            ended_rows = np.flatnonzero(done) if isinstance(rows, slice) else rows[done]
-            self._note_ends(places[done], self._final(results, ended_rows, ended, places[done]))
+        where = done.nonzero()[0]
+        if len(where):
+            ended = index[where]
+            self._over[ended] = ~self._resets_in_same_step[ended]
+            ended_rows = where if isinstance(rows, slice) else rows[where]
+            self.episodes += results.episodes(ended_rows)
+            places = places[where]
+            self._note_ends(places, self._final(results, ended_rows, ended, places))
 
     def _final(
         self,
-        results: Results,
+        results: ResultRows,
         rows: NDArray[np.intp],
         index: NDArray[np.int64],
         places: NDArray[np.intp],
     ) -> Tree:
-        """The final observations of episodes that end in `rows`."""
+        """Final observations of episodes that end in `rows`."""
         final = gather(results.observation, rows)
-        at_once = np.flatnonzero(self._resets_itself_at_once[index])
-        if len(at_once):
-            # Where the group's limit alone has cut the episode, nothing has begun anew.
+        same_step = self._resets_in_same_step[index].nonzero()[0]
+        if len(same_step):
+            # Where only the group's limit has cut the episode, the env has not reset itself.
             limit = results.batch.limit_reached.reshape(-1)[rows]
-            otherwise = gather(self.columns["observation"], places[at_once])
-            cut = np.flatnonzero(limit[at_once])
-            scattered(otherwise, cut, gather(final, at_once[cut]))
-            told = results.final_observation(rows[at_once], otherwise)
-            scattered(final, at_once, told)
+            otherwise = gather(self.columns["observation"], places[same_step])
+            cut = np.flatnonzero(limit[same_step])
+            scattered(otherwise, cut, gather(final, same_step[cut]))
+            scattered(final, same_step, results.final_observation(rows[same_step], otherwise))
         return final
 
-    def _adopt_results(self, results: Results) -> None:
+    def _adopt_results(self, results: ResultRows) -> None:
         size = len(self._env)
-        single = mapped(lambda leaf: leaf.astype(np.float32), results.reward)
-        self.columns["reward"] = allocated(single, size)
-        self.columns["terminated"] = allocated(results.terminated, size)
-        self.columns["truncated"] = allocated(results.truncated, size)
+        self.columns |= allocated(results.outcome, size)
+        single = mapped(lambda leaf: leaf.astype(np.float32), self.columns["reward"])
+        self.columns["reward"] = single
+        for name in self._infos:
+            self.columns[name] = np.zeros(size)
 
     def _note_ends(self, places: NDArray[np.intp], observation: Tree) -> None:
         first, after = self._num_ends, self._num_ends + len(places)
@@ -281,46 +301,45 @@ class Staging:
 
     # -- a rollout --------------------------------------------------------------------
 
-    def full(self, held: Results | None) -> Full:
-        """Arrange the transitions that are complete; to be followed by `carry_over`.
+    def full(self, held: ResultRows | None) -> Full:
+        """Order the complete transitions; call `carry_over` afterwards.
 
         Args:
-            held: rows of envs that are to be asked next, which are in no place.
+            held: rows of envs that have no step in flight.
         """
         self._end_chains(held)
-        places = np.flatnonzero(self._is_complete[: self._used])
-        order = places[np.argsort(self._env[places], kind="stable")]
+        places = self._is_complete[: self._used].nonzero()[0]
+        order = places[self._env[places].argsort(kind="stable")]
         envs = self._env[order]
         position = np.empty(self._used, np.intp)
         position[order] = np.arange(len(order))
         ends = position[self._end_place[: self._num_ends]]
-        lasts = np.append(np.flatnonzero(np.diff(envs)), len(envs) - 1)[: len(envs)]
-        inner = np.ones(len(order), np.bool_)
-        inner[lasts] = False
+        inner = np.zeros(len(order), np.bool_)
+        inner[:-1] = envs[1:] == envs[:-1]
         end_rows = np.lexsort((ends, inner[ends]))
-        return Full(order, ends[end_rows], end_rows, len(lasts))
+        return Full(order, ends[end_rows], end_rows, len(order) - len(inner.nonzero()[0]))
 
-    def _end_chains(self, held: Results | None) -> None:
-        """Note what comes after each chain that goes on in the next rollout."""
-        going_on = np.flatnonzero((self._last >= 0) & ~self._fresh)
-        places = self._place[going_on]
-        in_flight = going_on[places >= 0]
+    def _end_chains(self, held: ResultRows | None) -> None:
+        """Record the observation after each chain that continues in the next rollout."""
+        continuing = ((self._last >= 0) & ~self._fresh).nonzero()[0]
+        places = self._place[continuing]
+        in_flight = continuing[places >= 0]
         if len(in_flight):
             before = gather(self.columns["observation"], self._place[in_flight])
             self._note_ends(self._last[in_flight], before)
-        resting = going_on[places < 0]
-        if len(resting):
+        idle = continuing[places < 0]
+        if len(idle):
             assert held is not None
             row = np.zeros(len(self._place), np.intp)
             row[held.index] = np.arange(len(held.index))
-            self._note_ends(self._last[resting], gather(held.observation, row[resting]))
+            self._note_ends(self._last[idle], gather(held.observation, row[idle]))
 
-    def read(self, name: str, order: NDArray[np.intp], out: Tree) -> None:
-        """Copy a column, in `order`, to `out`."""
-        gathered(self.columns[name], order, out)
+    def read(self, order: NDArray[np.intp], outs: dict[str, Tree]) -> None:
+        """Copy all columns, in `order`, to those of `outs`."""
+        gathered(self.columns, order, outs)
 
     def of_places(self, order: NDArray[np.intp]) -> dict[str, NDArray[Any]]:
-        """What is known of each place beside its columns: fresh arrays."""
+        """Return the properties of places that are in no column, as new arrays."""
         return {
             "policy_version": self._version[order],
             "index": self._env[order],
@@ -328,19 +347,20 @@ class Staging:
         }
 
     def carry_over(self) -> None:
-        """Forget what is complete; what is in flight begins the next rollout."""
-        owing = np.flatnonzero(self._place >= 0)
-        places = self._place[owing]
-        now = slice(0, len(owing))
-        for name, column in self.columns.items():
-            if name not in _OF_RESULTS:
-                scattered(column, now, gather(column, places))
-        self._env[now] = owing
+        """Drop complete transitions, and move steps in flight to the first places."""
+        in_flight = (self._place >= 0).nonzero()[0]
+        places = self._place[in_flight]
+        now = slice(0, len(in_flight))
+        for name in self._given:
+            column = self.columns[name]
+            scattered(column, now, gather(column, places))
+        self._env[now] = in_flight
         self._first[now] = self._first[places]
         self._version[now] = self._version[places]
-        self._place[owing] = np.arange(len(owing))
+        self._place[in_flight] = np.arange(len(in_flight))
         self._is_complete[:] = False
-        self._last[:] = _NOWHERE
+        self._last[:] = _NO_PLACE
         self.made[:] = 0
-        self._used = len(owing)
+        self._used = len(in_flight)
         self._num_ends = self.complete = 0
+        self.episodes = []

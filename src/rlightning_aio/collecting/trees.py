@@ -1,8 +1,8 @@
 """Columns of transitions: arrays, or dicts and tuples of arrays, with rows on their first axis.
 
-What comes from an env or a policy becomes such a tree (`rows_of`), with one row for each
-sub-environment; what is stored is allocated once, and read and written by rows.
-Absent on purpose: torch. A tensor on the CPU is an array that NumPy reads uncopied.
+`rows_of` converts values of envs and policies to such trees, with one row for each
+sub-environment. Storage is allocated once, and read and written by rows.
+Absent on purpose: torch. NumPy reads a CPU tensor without copying it.
 """
 
 from __future__ import annotations
@@ -14,17 +14,26 @@ import numpy as np
 from rlightning_aio.protocol.columns import Tree, mapped
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Mapping
 
     from numpy.typing import NDArray
 
-__all__ = ["allocated", "as_column", "check_alike", "gathered", "grown", "rows_of", "scattered"]
+__all__ = [
+    "allocated",
+    "as_column",
+    "check_alike",
+    "gathered",
+    "grown",
+    "rows_of",
+    "scattered",
+    "with_lists",
+]
 
 
 def as_column(name: str, value: Any) -> NDArray[Any]:
-    """What somebody gave for column `name`, as an array: an array or CPU tensor uncopied.
+    """Convert a value for column `name` to an array; arrays and CPU tensors are not copied.
 
-    Values that don't stack (a list of texts, of dicts) become an array of objects.
+    A list of Python values (strings, dicts, lists of any length) becomes an array of objects.
     """
     if isinstance(value, np.ndarray):
         return cast("NDArray[Any]", value)
@@ -32,7 +41,7 @@ def as_column(name: str, value: Any) -> NDArray[Any]:
         return _listed(cast("list[Any]", value))
     try:
         return np.asarray(value)
-    except (TypeError, RuntimeError) as error:  # Of tensors: a GPU's, or one with a gradient.
+    except (TypeError, RuntimeError) as error:  # A tensor on a GPU, or with a gradient.
         raise TypeError(
             f"column {name!r} can't be read as a NumPy array ({error}); give an array, or a tensor "
             "on the CPU without gradient: tensor.detach().cpu()"
@@ -40,32 +49,41 @@ def as_column(name: str, value: Any) -> NDArray[Any]:
 
 
 def _listed(values: list[Any]) -> NDArray[Any]:
-    try:
-        array = np.asarray(values)
-    except ValueError:
-        array = None
-    if array is not None and array.dtype.kind not in "OSU":
-        return array
+    if not values or not isinstance(values[0], list | dict | tuple | str):
+        try:
+            array = np.asarray(values)
+        except ValueError:
+            array = None
+        if array is not None and array.dtype.kind not in "OSU":
+            return array
     objects = np.empty(len(values), object)
     objects[:] = values
     return objects
 
 
-def rows_of(name: str, tree: Any, head: tuple[int, ...]) -> Tree:
-    """Column `name` with one row for each sub-environment: ``[n, *shape]``.
+def with_lists(tree: Tree) -> Tree:
+    """Replace each array of objects in `tree` by a list."""
+    return mapped(lambda leaf: leaf.tolist() if leaf.dtype == object else leaf, tree)
+
+
+def rows_of(columns: Mapping[str, Any], head: tuple[int, ...]) -> dict[str, Tree]:
+    """Reshape columns to one row for each sub-environment: ``[n, *shape]``.
 
     Args:
-        name: for messages.
-        tree: ``[*head, *shape]``, or dicts and tuples of such.
+        columns: trees of ``[*head, *shape]`` by name.
         head: ``(n,)``, or ``(m, num_envs)``.
 
     Raises:
-        ValueError: it has not one row for each of `head`.
-        TypeError: it is a tensor of a GPU, or one with a gradient.
+        ValueError: the leading axes of a column are not `head`.
+        TypeError: a column is a tensor on a GPU or with a gradient.
     """
-    if isinstance(tree, (dict, tuple)):
-        return mapped(lambda leaf: _leaf_rows(name, leaf, head), cast("Tree", tree))
-    return _leaf_rows(name, tree, head)
+    rows: dict[str, Tree] = {}
+    for name, column in columns.items():
+        if type(column) is np.ndarray and len(head) == 1 and column.shape[:1] == head:
+            rows[name] = column
+        else:
+            rows[name] = mapped(lambda leaf, name=name: _leaf_rows(name, leaf, head), column)
+    return rows
 
 
 def _leaf_rows(name: str, value: Any, head: tuple[int, ...]) -> NDArray[Any]:
@@ -81,12 +99,12 @@ def _leaf_rows(name: str, value: Any, head: tuple[int, ...]) -> NDArray[Any]:
 
 
 def allocated(like: Tree, count: int) -> Tree:
-    """Zeros for `count` rows like those of `like`."""
+    """Return zeros for `count` rows with the shapes and dtypes of `like`."""
     return mapped(lambda leaf: np.zeros((count, *leaf.shape[1:]), leaf.dtype), like)
 
 
 def grown(tree: Tree, count: int) -> Tree:
-    """The same rows, and further ones up to `count`."""
+    """Return `tree` extended by zeros to `count` rows."""
 
     def leaf(array: NDArray[Any]) -> NDArray[Any]:
         larger = np.zeros((count, *array.shape[1:]), array.dtype)
@@ -96,48 +114,65 @@ def grown(tree: Tree, count: int) -> Tree:
     return mapped(leaf, tree)
 
 
-def check_alike(name: str, tree: Tree, values: Tree) -> None:
-    """Whether `values` can be written to rows of `tree`.
+def check_alike(columns: Mapping[str, Tree], values: Mapping[str, Tree]) -> None:
+    """Check that `values` can be written to rows of the `columns` with the same names.
 
     Raises:
-        ValueError: they have another shape, structure or kind of number than those before.
+        ValueError: they differ in shape, structure or kind of dtype.
     """
-    alike = type(values) is type(tree)
-    if alike and isinstance(tree, np.ndarray):
+    for name, rows in values.items():
+        column = columns[name]
+        if type(rows) is type(column) is np.ndarray and rows.dtype == column.dtype:
+            alike = rows.shape[1:] == column.shape[1:]
+        else:
+            alike = _alike(column, rows)
+        if not alike:
+            raise ValueError(
+                f"column {name!r} has rows of another shape or dtype than before; envs that differ "
+                "are collected apart: give one policy for each config entry, as "
+                "{'entry name': policy, …}"
+            )
+
+
+def _alike(tree: Tree, values: Tree) -> bool:
+    if type(values) is not type(tree):
+        return False
+    if isinstance(tree, np.ndarray):
         column, rows = cast("NDArray[Any]", tree), cast("NDArray[Any]", values)
-        alike = rows.shape[1:] == column.shape[1:]
-        if rows.dtype != column.dtype:
-            alike = alike and np.can_cast(rows.dtype, column.dtype, "same_kind")
-    elif alike:
-        alike = _keys(values) == _keys(tree)
-    if not alike:
-        raise ValueError(
-            f"column {name!r} has rows of another shape or dtype than before; envs that differ are "
-            "collected apart: give one policy for each config entry, as {'entry name': policy, …}"
-        )
-    if not isinstance(tree, np.ndarray):
-        for key in _keys(tree):
-            check_alike(name, tree[key], values[key])
+        castable = np.can_cast(rows.dtype, column.dtype, "same_kind")
+        return castable and rows.shape[1:] == column.shape[1:]
+    keys = _keys(tree)
+    return _keys(values) == keys and all(_alike(tree[key], values[key]) for key in keys)
 
 
 def _keys(tree: Tree) -> Collection[Any]:
-    return cast("dict[Any, Tree]", tree).keys() if isinstance(tree, dict) else range(len(tree))
+    return tree.keys() if hasattr(tree, "keys") else range(len(tree))
+
+
+# These two recurse for each dict and tuple, not for each array: calls cost more than small copies.
 
 
 def scattered(tree: Tree, rows: Any, values: Tree) -> None:
-    """Write `values` into `rows` of `tree`, which is like them."""
+    """Write `values` into `rows` of `tree`, which has the same parts and may have others."""
     if isinstance(tree, np.ndarray):
         tree[rows] = values
         return
-    for key in _keys(tree):
-        scattered(tree[key], rows, values[key])
+    for key in _keys(values):
+        part = tree[key]
+        if type(part) is np.ndarray:
+            part[rows] = values[key]
+        else:
+            scattered(part, rows, values[key])
 
 
 def gathered(tree: Tree, rows: NDArray[np.intp], out: Tree) -> None:
-    """Copy `rows` of `tree` to the front of `out`, which has at least as many."""
+    """Copy `rows` of `tree` to the first rows of `out`."""
     if isinstance(tree, np.ndarray):
-        column = cast("NDArray[Any]", tree)
-        np.take(column, rows, axis=0, out=out[: len(rows)], mode="clip")
+        tree.take(rows, axis=0, out=out[: len(rows)], mode="clip")
         return
     for key in _keys(tree):
-        gathered(tree[key], rows, out[key])
+        part = tree[key]
+        if type(part) is np.ndarray:
+            part.take(rows, axis=0, out=out[key][: len(rows)], mode="clip")
+        else:
+            gathered(part, rows, out[key])

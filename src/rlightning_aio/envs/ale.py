@@ -1,9 +1,9 @@
 """`ale`: Atari games of the Arcade Learning Environment, one at a time or vectorised.
 
-Rule: a config means the same game, frames and rewards whether ``num_envs`` is 1 (ALE's
-Gymnasium env) or more (ale-py's own C++ vector environment); only who steps differs.
-Absent on purpose: preprocessing of our own, and ale-py's asynchronous mode, whose place
-several workers take.
+Rule: a config means the same game, frames and rewards whether ``num_envs`` is 1 (ALE's Gymnasium
+env) or more (ale-py's C++ vector environment).
+Absent on purpose: our own preprocessing, and ale-py's asynchronous mode, because several workers
+do the same.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from gymnasium.spaces import Box
 from gymnasium.wrappers import AtariPreprocessing, FrameStackObservation, TimeLimit
 from gymnasium.wrappers.vector import TransformObservation
 
+from rlightning_aio.envs.ale_console import StickyConsole, is_sticky
 from rlightning_aio.envs.gymnasium import GymnasiumEnv
 from rlightning_aio.errors import ConfigError
 
@@ -30,7 +31,7 @@ ale_py: Any = import_module("ale_py")
 # Otherwise each game that starts prints a banner.
 ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)
 
-# What `AtariPreprocessing` does unless told otherwise.
+# Defaults of `AtariPreprocessing`.
 PREPROCESSING_DEFAULTS: dict[str, Any] = {
     "noop_max": 30,
     "frame_skip": 4,
@@ -46,14 +47,13 @@ SINGLE_GAME_ONLY = ("grayscale_newaxis", "scale_obs")
 class ALEEnv(GymnasiumEnv):
     """One Atari game, or ``num_envs`` of them in ale-py's vector environment.
 
-    ``env_kwargs`` may hold ``preprocessing`` (true, or a mapping of options of
-    Gymnasium's `AtariPreprocessing`) and ``frame_stack`` (observations hold so many
-    frames, oldest first); all others go to `gymnasium.make` or `gymnasium.make_vec`.
+    ``env_kwargs`` may have ``preprocessing`` (true, or a mapping of options of Gymnasium's
+    `AtariPreprocessing`) and ``frame_stack`` (number of frames in an observation, oldest first);
+    all others go to `gymnasium.make` or `gymnasium.make_vec`.
 
-    Observations are uint8: raw ``[210, 160, 3]``, preprocessed ``[84, 84]``, with a
-    leading axis of ``frame_stack`` if that is above 1, and of ``num_envs`` before it if
-    that is above 1. A vectorised game that has ended is reset by the step after, which
-    ignores that game's action and returns reward 0.
+    Observations are uint8: raw ``[210, 160, 3]``, preprocessed ``[84, 84]``, with leading axes for
+    ``num_envs`` and ``frame_stack`` if these are above 1. A vectorised game that has ended is reset
+    by the next step, which ignores its action and returns reward 0.
     """
 
     _is_seeded = False
@@ -66,7 +66,7 @@ class ALEEnv(GymnasiumEnv):
         return make(preprocessing, frame_stack, game_kwargs)
 
     def _preprocessing_options(self, given: Any) -> dict[str, Any] | None:
-        """All options of the preprocessing, or None if frames stay raw."""
+        """Options of the preprocessing, completed; None for raw frames."""
         if given is False or given is None:
             return None
         options: dict[str, Any] = {} if given is True else dict(given)
@@ -80,7 +80,7 @@ class ALEEnv(GymnasiumEnv):
             )
         options = PREPROCESSING_DEFAULTS | options
         size: Any = options["screen_size"]
-        # YAML has no tuples, and the wrapper takes nothing else for a pair.
+        # YAML has no tuples, which the wrapper requires.
         options["screen_size"] = (size, size) if isinstance(size, int) else tuple(size)
         return options
 
@@ -88,16 +88,19 @@ class ALEEnv(GymnasiumEnv):
         self, preprocessing: dict[str, Any] | None, frame_stack: int, game_kwargs: dict[str, Any]
     ) -> gym.Env[Any, Any]:
         if preprocessing is not None:
-            # Frames are skipped by the preprocessing, which needs those in between.
+            # The preprocessing skips frames, and needs the skipped ones.
             game_kwargs = {"frameskip": 1, **game_kwargs}
         game_kwargs = {"disable_env_checker": True, **game_kwargs}
         env: gym.Env[Any, Any] = gym.make(self.config.task, **game_kwargs)
+        game: Any = env.unwrapped
+        if is_sticky(game.ale):
+            game.ale = StickyConsole(game.ale)
         if preprocessing is not None:
             env = AtariPreprocessing(env, **preprocessing)
         if frame_stack > 1:
             env = FrameStackObservation(env, frame_stack)
         if self.config.max_episode_steps is not None:
-            # Outermost: inside the preprocessing it would count frames.
+            # Outermost, because inside the preprocessing it would count frames.
             env = TimeLimit(env, self.config.max_episode_steps)
         return env
 
@@ -146,14 +149,14 @@ class ALEEnv(GymnasiumEnv):
         if seed is not None:
             seeds = np.asarray(self.sub_env_seeds(seed))
         elif not self._is_seeded:
-            # ale-py would take the time in seconds, the same for all workers.
+            # ale-py would seed with the time in seconds, the same for all workers.
             seeds = np.random.default_rng().integers(2**31 - 1, size=self.num_envs)
         self._is_seeded = True
         return super().reset(seed=seeds, options=options)
 
 
 def _in_vector_terms(preprocessing: dict[str, Any]) -> dict[str, Any]:
-    """Options of `AtariPreprocessing` as those of ale-py's vector environment."""
+    """Convert options of `AtariPreprocessing` to those of ale-py's vector environment."""
     width, height = preprocessing["screen_size"]
     return {
         "img_height": height,
@@ -167,7 +170,7 @@ def _in_vector_terms(preprocessing: dict[str, Any]) -> dict[str, Any]:
 
 
 def _without_stack_axis(games: Any) -> Any:
-    """The vector environment without the axis of its stack of one frame."""
+    """Remove the axis of a stack of one frame from observations."""
     stacked = games.single_observation_space
     frame = Box(0, 255, stacked.shape[1:], np.uint8)
     return TransformObservation(games, lambda frames: frames[:, 0], single_observation_space=frame)

@@ -1,4 +1,4 @@
-"""`BaseEnv`: what every environment is to the runtime, one of a user's own, too.
+"""`BaseEnv`: the interface of every env, built-in or the user's own.
 
 Rule: an env knows its simulator and its config, never its group, its process or
 its channel. `reset` and `step` speak `EnvRet`; a backend whose step is exactly
@@ -11,7 +11,7 @@ import abc
 import copy
 import gc
 import sys
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from rlightning_aio.envs.state import load_state, save_state
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
 
 __all__ = [
+    "Answer",
     "BareReset",
     "BareResult",
     "BareStep",
@@ -43,6 +44,8 @@ __all__ = [
 
 PreprocessFn = Callable[[PolicyResponse], Any]
 Result = EnvRet | MultiAgentEnvRet | list[EnvRet]
+Answer = Result | Awaitable[Result]
+"""What `reset` and `step` return; those of awaitable envs are coroutine functions."""
 BareReset = Callable[..., tuple[Any, dict[str, Any]]]
 BareResult = tuple[Any, Any, Any, Any, dict[str, Any]]
 BareStep = Callable[[Any], BareResult]
@@ -51,9 +54,9 @@ BareStepWait = Callable[[], BareResult]
 
 
 def result_of(env_id: str, outcome: BareResult) -> EnvRet:
-    """The result that the five values of a Gymnasium step make."""
+    """Make a result of the five values that a Gymnasium step returns."""
     observation, reward, terminated, truncated, info = outcome
-    # Not validated: that would cost more than everything else here.
+    # Validation would cost more than everything else here.
     return EnvRet.model_construct(
         env_id=env_id,
         observation=observation,
@@ -69,7 +72,8 @@ class BaseEnv(abc.ABC):
 
     Subclasses call ``super().__init__`` first, create their simulator, and either set
     ``self.env`` or override the two space getters. A worker builds, resets, steps and
-    closes an env on its main thread, one call at a time.
+    closes an env on its main thread, one call at a time. An env whose `reset` and `step` are
+    `async def` is awaitable: it runs on an event loop, with many others at once.
 
     Args:
         config: the config entry; the env keeps a deep copy.
@@ -78,26 +82,28 @@ class BaseEnv(abc.ABC):
 
     Attributes:
         env_id: ``<entry name>-<worker index>``, the same after a restart.
-        trainer_pid: the trainer's process, if it is another process on this machine; the worker
+        trainer_pid: the trainer's process, if it is another process on this machine. The worker
             sets it once the env is built. A robot stops when that process is stopped.
-        transforms_actions: set it on a subclass whose `step` takes actions that need not
+        transforms_actions: set it on a subclass whose `step` takes actions that don't have to
             fit the action space (chunks, logits, dicts).
         agents: agent names of a multi-agent env, in order; empty otherwise.
         num_envs: sub-environments in each result. If it is below the config's, each result comes
-            from some of them, and ``info["env_id"]`` says from which.
+            from some of them, which ``info["env_id"]`` lists.
         autoreset: what sub-environments do after the end of their episode; see `EnvMeta`.
-        fresh_results: what `bare_step` returns consists of new arrays and dicts, which nobody
-            reads or writes again: with inline placement, observation and info are passed on
-            uncopied.
+        switches_task: `reset` accepts the name of any task of the same spaces as
+            ``options["task"]``, and switches to it until the next such reset.
+        fresh_results: `bare_step` returns new arrays and dicts, and keeps no reference to them.
+            With inline placement, observation and info are then passed on without a copy.
     """
 
     transforms_actions: ClassVar[bool] = False
-    fresh_results: ClassVar[bool] = False
 
     env: Any = None
     trainer_pid: int | None = None
     agents: tuple[str, ...] = ()
     autoreset: Autoreset = "disabled"
+    switches_task: bool = False
+    fresh_results: bool = False
 
     def __init__(
         self,
@@ -117,73 +123,83 @@ class BaseEnv(abc.ABC):
     @abc.abstractmethod
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
-    ) -> Result:
-        """Start a new episode.
+    ) -> Answer:
+        """Start a new episode. An awaitable env defines this and `step` as `async def`.
 
         Args:
             seed: for the simulator; with ``num_envs > 1`` sub-environment k takes ``seed + k``.
             options: simulator-specific.
 
-        Returns one result, of which only id and observation count. With ``num_envs > 1`` it may
-        be a list with one for each sub-environment, in order; so may that of a step.
+        Returns one result; only its id and observation are used. With ``num_envs > 1``, a reset or
+        a step may also return a list with one result for each sub-environment, in order.
         """
 
     @abc.abstractmethod
-    def step(self, policy_resp: PolicyResponse) -> Result:
+    def step(self, policy_resp: PolicyResponse) -> Answer:
         """Advance by one step with the action that ``self._preprocess_fn`` makes.
 
-        A reward of 0.0 and ends of False, which are the defaults, hold for all sub-environments
+        The defaults (reward 0.0, terminated and truncated False) apply to all sub-environments
         and agents.
         """
 
     def step_async(self, policy_resp: PolicyResponse) -> None:
         """Start a step, for an env that answers later, such as one on another machine.
 
-        If an env has this and `collect_async`, they replace `step`, which may raise
-        NotImplementedError then. With inline placement a step starts when it is sent.
+        If an env defines this and `collect_async`, they replace `step`, which may then raise
+        NotImplementedError. With inline placement a step starts when it is sent.
         """
         raise NotImplementedError(f"env {self.env_id!r} has no step_async()")
 
     def collect_async(self) -> Result:
-        """Wait for the end of the step that `step_async` has started, and return its result."""
+        """Wait for the step that `step_async` started, and return its result."""
         raise NotImplementedError(f"env {self.env_id!r} has no collect_async()")
 
     def bare_step(self) -> BareStep | None:
-        """The simulator's own ``action -> (obs, reward, terminated, truncated, info)``.
+        """Return the simulator's own ``action -> (obs, reward, terminated, truncated, info)``.
 
         Return it only if `step` adds nothing to it but a call of ``self._preprocess_fn``, which
-        the runtime makes by itself; None (the default) has the runtime call `step`. The action
-        is its own: nobody writes to it again.
+        the runtime then makes itself. With None (the default) the runtime calls `step`. The
+        function owns the action: the runtime doesn't write to it again.
         """
         return None
 
     def bare_step_async(self) -> tuple[BareStepAsync, BareStepWait] | None:
-        """`bare_step` in two halves: one only starts a step, the other waits for its end.
+        """Return `bare_step` as two functions: one starts a step, the other waits for its end.
 
-        Return them, beside a `bare_step`, if the simulator computes by itself in between: with
-        inline placement a step whose action fits its row starts when it is sent then, not when
-        it is collected. An interrupt (Ctrl-C) of the first half comes with the result.
+        Return them, in addition to `bare_step`, if the simulator computes on its own in between.
+        With inline placement, a step whose action fits its row then starts when it is sent
+        instead of when it is collected. Ctrl-C during the first function is raised with the
+        result.
         """
         return None
 
-    def bare_reset(self) -> BareReset | None:
-        """The simulator's own ``(seed=, options=) -> (obs, info)``, if `reset` adds nothing.
+    def on_stepped(self, notify: Callable[[], None]) -> bool:
+        """Have `notify` called, in any thread, when a step that the first half of `bare_step_async`
+        started has ended, so that the second half doesn't have to wait.
 
-        Used where `bare_step` is.
+        Return False, the default, if the env can't do that: an event loop then waits with it.
+        """
+        del notify
+        return False
+
+    def bare_reset(self) -> BareReset | None:
+        """Return the simulator's own ``(seed=, options=) -> (obs, info)``, if `reset` adds nothing.
+
+        The runtime uses it together with `bare_step`.
         """
         return None
 
     def init(self) -> EnvMeta | None:
-        """Called once after construction, where the env lives; None stands for `get_metadata`."""
+        """Finish construction where the env runs; called once. None stands for `get_metadata`."""
         return self.get_metadata()
 
     def initialised(self) -> EnvMeta:
-        """Call `init`, as whoever runs an env does; what the env is like from then on."""
+        """Call `init` and return the metadata; every runner of an env starts with this."""
         meta = self.init()
         return self.get_metadata() if meta is None else meta
 
     def get_metadata(self) -> EnvMeta:
-        """Id, spaces and counts of this env."""
+        """Return id, spaces and counts of this env."""
         return EnvMeta(
             env_id=self.env_id,
             observation_space=self.get_observation_space(),
@@ -192,18 +208,20 @@ class BaseEnv(abc.ABC):
             agents=self.agents,
             max_episode_steps=self.max_episode_steps,
             autoreset=self.autoreset,
+            task=self.config.task,
+            switches_task=self.switches_task,
         )
 
     def get_observation_space(self) -> gym.Space[Any]:
-        """Space of ``EnvRet.observation``; batched when ``num_envs > 1``."""
+        """Return the space of ``EnvRet.observation``; batched when ``num_envs > 1``."""
         return self.env.observation_space
 
     def get_action_space(self) -> gym.Space[Any]:
-        """Space of the actions that `step` takes; batched when ``num_envs > 1``."""
+        """Return the space of the actions of `step`; batched when ``num_envs > 1``."""
         return self.env.action_space
 
     def sub_env_seeds(self, seed: int | list[int]) -> list[int]:
-        """One seed for each sub-environment: ``seed + k``, or the list that was given.
+        """Return one seed for each sub-environment: ``seed + k``, or the given list.
 
         Raises:
             ValueError: a list of another length than ``num_envs`` of the config.
@@ -216,37 +234,38 @@ class BaseEnv(abc.ABC):
         return [int(one) for one in seed]
 
     def save_state(self) -> Any:
-        """Everything that the env needs to continue from here exactly as it would have, as a
-        value that can be pickled; see `load_state`.
+        """Return the complete state of the env as a value that can be pickled; see `load_state`.
 
-        By default it holds the attributes of this object and of the layers of its simulator; see
-        docs/state.md. Define both methods if these can't be pickled, or aren't the whole state.
+        The default holds the attributes of this object and of the layers of its simulator; see
+        docs/state.md. Define both methods if these can't be pickled or are not the whole state.
 
         Raises:
-            NotImplementedError: the env can't give its state; the message says why.
+            NotImplementedError: the state can't be saved; the message says why.
         """
         return save_state(self)
 
     def load_state(self, state: Any) -> None:
-        """Continue from where `save_state` was called: on this env or on another of the same
-        entry, in this process or another, perhaps before its first reset.
+        """Continue from the point where `save_state` was called.
+
+        The state may come from this env or another one of the same entry, in this process or
+        another, and may be loaded before the first reset.
         """
         load_state(self, state)
 
     def render(self) -> Any:
-        """One frame, as the simulator renders it."""
+        """Return one frame as the simulator renders it."""
         return self.env.render()
 
     def render_one(self, sub_env: int) -> Any:
-        """One frame of a sub-environment; of an env without such, its own.
+        """Return one frame of a sub-environment, or of an env that has no sub-environments.
 
-        By default what `render` has for it, which renders all of them.
+        The default calls `render`, which renders all of them.
         """
         frames = self.render()
         return frames if self.num_envs == 1 else frames[sub_env]
 
     def offload(self) -> None:
-        """Free device memory until `reload`; envs that hold none need not support it."""
+        """Free device memory until `reload`; optional for envs that use none."""
         raise NotImplementedError(f"backend {self.config.backend!r} has no offload()")
 
     def reload(self) -> None:
@@ -254,7 +273,7 @@ class BaseEnv(abc.ABC):
         raise NotImplementedError(f"backend {self.config.backend!r} has no reload()")
 
     def clear_memory(self) -> None:
-        """Release memory that nothing uses any more; for `offload` to call at its end.
+        """Release unused memory; `offload` calls this at its end.
 
         Collects garbage, then empties torch's cache of CUDA memory, if torch was imported.
         """
@@ -264,11 +283,14 @@ class BaseEnv(abc.ABC):
             torch.cuda.empty_cache()
 
     def is_finish(self) -> bool:
-        """Whether `RemoteEnvClient.run` should end; asked after every reset and step."""
+        """Return True to end `RemoteEnvClient.run`; called after every reset and step."""
         return False
 
     def on_disconnect(self) -> None:
-        """The trainer is gone: bring the env to a safe state (a robot stops). Default: nothing."""
+        """Bring the env to a safe state, because the trainer is gone. Default: do nothing."""
 
-    def close(self) -> None:
-        """Release everything; called once, also after a failed step. Default: nothing."""
+    def close(self) -> Awaitable[None] | None:
+        """Release everything; called once, also after a failed step. Default: nothing.
+
+        An awaitable env may define it as `async def`.
+        """

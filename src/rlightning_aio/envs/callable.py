@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import contextlib
 import sys
+from inspect import iscoroutinefunction
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 
-from rlightning_aio.envs.base import BaseEnv, PreprocessFn
+from rlightning_aio.envs.base import BaseEnv, PreprocessFn, result_of
 from rlightning_aio.envs.gymnasium import GymnasiumEnv, outdated_assets_accepted
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.registry import load
 
 if TYPE_CHECKING:
+    from collections.abc import Awaitable
+
     from rlightning_aio.config import EnvConfig
+    from rlightning_aio.types import EnvRet, PolicyResponse
 
 __all__ = ["env_of_callable"]
 
@@ -42,9 +46,12 @@ def env_of_callable(
         return _adopted(made, config, worker_index, preprocess_fn)
     if isinstance(made, gym.Env | gym.vector.VectorEnv):
         return _GivenEnv(made, config, worker_index, preprocess_fn)
+    if iscoroutinefunction(getattr(made, "step", None)):
+        return _AwaitableEnv(made, config, worker_index, preprocess_fn)
     raise TypeError(
         f"the callable of entry {config.name!r} must return a gymnasium.Env, a "
-        f"gymnasium.vector.VectorEnv or a BaseEnv, not {type(made).__name__}"
+        "gymnasium.vector.VectorEnv, a BaseEnv, or an object with their reset and step as "
+        f"`async def`, not {type(made).__name__}"
     )
 
 
@@ -89,3 +96,34 @@ class _GivenEnv(GymnasiumEnv):
                 "it where the envs are made"
             )
         return gym.wrappers.TimeLimit(made, config.max_episode_steps)
+
+
+class _AwaitableEnv(BaseEnv):
+    """An object with Gymnasium's methods; its `reset` and `step` are coroutine functions."""
+
+    def __init__(
+        self,
+        made: Any,
+        config: EnvConfig,
+        worker_index: int,
+        preprocess_fn: PreprocessFn | None,
+    ) -> None:
+        super().__init__(config, worker_index, preprocess_fn)
+        self.env = made
+        self.switches_task = bool(getattr(made, "switches_task", False))
+
+    async def reset(
+        self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
+    ) -> EnvRet:
+        observation, info = await self.env.reset(seed=seed, options=options)
+        return result_of(self.env_id, (observation, 0.0, False, False, info))
+
+    async def step(self, policy_resp: PolicyResponse) -> EnvRet:
+        return result_of(self.env_id, await self.env.step(self._preprocess_fn(policy_resp)))
+
+    def bare_step(self) -> Any:
+        return self.env.step
+
+    def close(self) -> Awaitable[None] | None:
+        close = getattr(self.env, "close", None)
+        return None if close is None else close()

@@ -1,8 +1,8 @@
-"""`EnvContract`: tests that hold for every env; the author of a backend inherits them.
+"""`EnvContract`: tests that every env must pass; the author of a backend inherits them.
 
-Rule: a subclass names a config and gets the tests; no test knows a simulator. Collected
-by pytest, but made without it, so that the package needs no test tools.
-Absent on purpose: how fast an env is, and what its observations mean.
+Rule: a subclass names a config and gets the tests; no test knows a simulator. pytest collects
+them, but the module does not import it, so the package needs no test tools.
+Left out: speed, and the meaning of observations.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ class EnvContract:
 
     Attributes:
         config: the config entry that the env is made from.
-        num_steps: how many steps the trajectories have.
-        seed: what they start from.
+        num_steps: length of the trajectories.
+        seed: of their first reset.
     """
 
     config: ClassVar[EnvConfig]
@@ -54,29 +54,29 @@ class EnvContract:
     seed: ClassVar[int] = 3
 
     def simulate(self, actions: Sequence[Any]) -> Iterator[Outcome]:
-        """The bare simulator's outcomes, of a reset with `seed` and of each action.
+        """Yield the bare simulator's outcomes of a reset with `seed` and of each action.
 
-        Override it to have the env compared with what it wraps; episodes that end are
-        reset, without a seed, in place of the next action.
+        Override it to compare the env with the simulator that it wraps. After the end of an
+        episode, a reset without a seed takes the place of the next action.
         """
         del actions
         raise SkipTest("no bare simulator to compare with")
 
     def actions(self, env: BaseEnv) -> list[Any]:
-        """Seeded random actions; override it where the action space is unbounded."""
+        """Return seeded random actions; override it if the action space is unbounded."""
         space = env.get_action_space()
         space.seed(self.seed)
         return [space.sample() for _ in range(self.num_steps)]
 
     def make_env(self) -> BaseEnv:
-        """The env under test, initialised."""
+        """Return the env under test, initialised."""
         env = ENVS.resolve(self.config.backend)(self.config)
         env.initialised()
         return env
 
     @contextlib.contextmanager
     def opened(self) -> Generator[BaseEnv]:
-        """The env under test, closed at the end."""
+        """Open the env under test, and close it at the end."""
         env = self.make_env()
         try:
             yield env
@@ -86,10 +86,10 @@ class EnvContract:
     def outcomes(
         self, env: BaseEnv, actions: Sequence[Any], *, seed: int | None = None
     ) -> Iterator[Outcome]:
-        """The env's outcomes, of a reset with `seed` (or the given one) and of each action.
+        """Yield the env's outcomes of a reset with `seed` (or the given one) and of each action.
 
-        As `simulate` does, an episode's end is followed by a reset in place of a step,
-        unless the env resets itself.
+        As in `simulate`, a reset takes the place of the step after the end of an episode, unless
+        the env resets itself.
         """
 
         def step(action: Any) -> Outcome:
@@ -115,7 +115,7 @@ class EnvContract:
     def test_every_result_fits_the_spaces_and_counts(self) -> None:
         """Observations are members of the space; rewards and flags have one entry each.
 
-        Bounds that are exceeded are a warning: a simulator's are not always true.
+        Exceeded bounds cause a warning, because simulators often declare wrong bounds.
         """
         with self.opened() as env:
             meta = env.get_metadata()
@@ -130,7 +130,7 @@ class EnvContract:
                 ended = _awaits_reset(env, outcome)
 
     def test_a_reset_gives_no_reward_and_ends_nothing(self) -> None:
-        """After a reset no agent has been rewarded; those that take part have not ended."""
+        """After a reset no agent has a reward, and no agent that takes part has ended."""
         with self.opened() as env:
             result = env.reset(seed=self.seed)
             assert isinstance(result, EnvRet | MultiAgentEnvRet), f"reset() gave {result}"
@@ -154,7 +154,7 @@ class EnvContract:
             assert not same(one, list(self.outcomes(env, actions, seed=self.seed + 1000)))
 
     def test_results_are_not_overwritten(self) -> None:
-        """What was handed out stays as it was, whatever the env does next."""
+        """A returned result stays unchanged during later steps."""
         with self.opened() as env:
             result = env.reset(seed=self.seed)
             kept = _copied(outcome_of(result))
@@ -189,12 +189,12 @@ class EnvContract:
                     break
 
     def _offers(self, bare_of: Callable[[BaseEnv], BareStep | None]) -> bool:
-        # A method of its own, as a raised error would keep alive what its frame refers to.
+        # A separate method: a raised error would keep the objects of its frame alive.
         with self.opened() as env:
             return bare_of(env) is not None
 
     def test_torch_actions_are_taken(self) -> None:
-        """An action may be a torch tensor; it does what the array does."""
+        """An action may be a torch tensor, with the same effect as the array."""
         tensor = _tensor_maker()
         with self.opened() as env, self.opened() as other:
             env.reset(seed=self.seed)
@@ -218,7 +218,7 @@ class EnvContract:
 
 
 def outcome_of(result: Any) -> Outcome:
-    """What a result says, without torch tensors."""
+    """Return observation, reward and ends of a result, without torch tensors."""
     assert isinstance(result, EnvRet | MultiAgentEnvRet), f"not a result: {result}"
     return cast(
         "Outcome",
@@ -237,7 +237,7 @@ def outcome_of(result: Any) -> Outcome:
 
 
 def same(one: Any, other: Any) -> bool:
-    """Whether two values are equal in structure, shapes and every bit; NaN equals NaN."""
+    """Return True if two values agree in structure, shapes and every bit; NaN equals NaN."""
     if isinstance(one, dict):
         entries = cast("dict[Any, Any]", one)
         return (
@@ -260,7 +260,7 @@ def _check_membership(task: str, observation: Any, space: gym.Space[Any]) -> Non
 
 
 def _check_columns(outcome: Outcome, agents: tuple[str, ...], shape: tuple[int, ...]) -> None:
-    """Rewards and flags have one entry for each agent and sub-environment."""
+    """Check that rewards and flags have one entry for each agent and sub-environment."""
     for name, value in zip(("reward", "terminated", "truncated"), outcome[1:], strict=True):
         arrays = list(map(np.asarray, _entries(value, agents)))
         assert {one.shape for one in arrays} == {shape}, f"{name}: {value}"
@@ -286,7 +286,7 @@ def _step(env: BaseEnv, action: Any) -> Any:
 
 
 def _entries(value: Any, agents: Sequence[str]) -> list[Any]:
-    """The values of all agents, or the one value; agents must be named where there are any."""
+    """Return the values of all agents in their order, or the one value of a single-agent env."""
     if not isinstance(value, dict):
         assert not agents, f"not by agent: {value}"
         return [value]
@@ -296,7 +296,7 @@ def _entries(value: Any, agents: Sequence[str]) -> list[Any]:
 
 
 def _awaits_reset(env: BaseEnv, outcome: Outcome) -> bool:
-    """Whether nobody is left in the episode, and nobody comes back unasked."""
+    """Return True if all have ended, and the env does not reset itself."""
     if env.autoreset != "disabled":
         return False
     _, _, terminated, truncated = outcome

@@ -1,8 +1,8 @@
-"""`envpool`: batches of EnvPool's C++ environments, in step or asynchronously.
+"""`envpool`: batches of EnvPool's C++ environments, synchronous or asynchronous.
 
-Rule: a result is what EnvPool's `recv` gave, untouched; actions go to those
-sub-environments that the last result came from.
-Absent on purpose: EnvPool's tasks with several players, whose batches vary in size.
+Rule: a result is the unchanged output of EnvPool's `recv`; actions go to the
+sub-environments of the last result.
+Left out: EnvPool's tasks with several players, whose batches vary in size.
 """
 
 from __future__ import annotations
@@ -39,23 +39,23 @@ __all__ = ["EnvPoolEnv"]
 # Optional and untyped, so imported by name.
 envpool: Any = import_module("envpool")
 
-# Largest int32: EnvPool's seeds lie below it, and as a step limit it means none.
+# Largest int32: EnvPool's seeds are below it, and as a step limit it means no limit.
 UNLIMITED = 2**31 - 1
 
 Places: TypeAlias = "int | dict[str, Places]"
-"""Where a value lies among a pool's arrays, or the parts of it do."""
+"""The position of a value among a pool's arrays, or the positions of its parts."""
 
 
 class EnvPoolEnv(BaseEnv):
     """A pool of ``num_envs`` C++ environments; ``env_kwargs`` go to `envpool.make`.
 
     With ``batch_size`` M below ``num_envs`` the pool is asynchronous: each result holds
-    the M sub-environments that were ready first, so that the others compute while the
-    policy thinks, and the env's spaces and its ``num_envs`` are those of M. In both modes
-    ``info["env_id"]`` (int32 ``[M]``) names the sub-environment of each row.
+    the M sub-environments that were ready first, while the others compute, and the env's
+    spaces and ``num_envs`` are those of M. In both modes ``info["env_id"]`` (int32 ``[M]``)
+    names the sub-environment of each row.
 
-    A sub-environment that has ended is reset by the step after, which ignores its action
-    and returns reward 0; the result before it holds the final observation.
+    The step after the end of a sub-environment's episode resets it, ignores its action and
+    returns reward 0; the result before it holds the final observation.
     """
 
     autoreset = "next_step"
@@ -71,7 +71,7 @@ class EnvPoolEnv(BaseEnv):
         super().__init__(config, worker_index, preprocess_fn, **kwargs)
         self.num_envs = self._batch_size()
         self._asynchronous = self.num_envs < config.num_envs
-        # EnvPool's own default is one fixed seed, which would make all envs alike.
+        # EnvPool's default is one fixed seed, which would make all envs equal.
         self._unseeded = np.random.default_rng()
         self._open(self._drawn_seeds())
         limit = int(self.env.config["max_episode_steps"])
@@ -82,7 +82,7 @@ class EnvPoolEnv(BaseEnv):
         batch_size = int(self.config.env_kwargs.get("batch_size") or count)
         if not 1 <= batch_size <= count:
             raise ConfigError(
-                f"env {self.env_id!r}: env_kwargs.batch_size is {batch_size}, but must lie "
+                f"env {self.env_id!r}: env_kwargs.batch_size is {batch_size}, but must be "
                 f"between 1 and num_envs, which is {count}"
             )
         return batch_size
@@ -91,7 +91,7 @@ class EnvPoolEnv(BaseEnv):
         return self._unseeded.integers(UNLIMITED, size=self.config.num_envs).tolist()
 
     def _open(self, seeds: list[int]) -> None:
-        """Make the pool; its seeds are fixed from then on."""
+        """Make the pool, whose seeds can't change later."""
         limit = self.config.max_episode_steps
         self.env = envpool.make(
             self.config.task,
@@ -118,8 +118,8 @@ class EnvPoolEnv(BaseEnv):
     ) -> EnvRet:
         """Reset every sub-environment.
 
-        A seed, and in asynchronous mode every reset but the first, makes a new pool:
-        EnvPool takes seeds at construction alone, and what it computes can't be recalled.
+        A seed makes a new pool, as EnvPool takes seeds only at construction. So does every reset
+        but the first in asynchronous mode, as steps in progress can't be cancelled.
 
         Raises:
             ValueError: any `options`; EnvPool has none that resets the whole pool.
@@ -135,7 +135,7 @@ class EnvPoolEnv(BaseEnv):
         return EnvRet(env_id=self.env_id, observation=observation, info=info)
 
     def step(self, policy_resp: PolicyResponse) -> EnvRet:
-        # The pool reads an action when it needs it; of this one the caller may make another.
+        # The pool reads the action later, and the caller may overwrite its array.
         action = np.array(as_numpy(self._preprocess_fn(policy_resp)))
         return result_of(self.env_id, self._step(action))
 
@@ -155,7 +155,7 @@ class EnvPoolEnv(BaseEnv):
         return self._receive()
 
     def _send(self, action: Any) -> None:
-        """Answer the last result with an action that nobody writes to any more."""
+        """Answer the last result with an action that won't be overwritten."""
         if self._ready is None:
             raise RuntimeError(f"env {self.env_id!r} was stepped before its first reset")
         action = np.asarray(action)
@@ -163,7 +163,7 @@ class EnvPoolEnv(BaseEnv):
 
     def _receive(self) -> BareResult:
         result = self._arrays.receive()
-        # A copy: the other one is the caller's.
+        # A copy, because the caller owns the original.
         self._ready = result[-1]["env_id"].copy()
         return result if self.num_envs > 1 else index(result, 0)
 
@@ -181,10 +181,10 @@ class EnvPoolEnv(BaseEnv):
 
 
 class _PoolArrays:
-    """What `send` and `recv` of a pool for single players do, prepared once for all steps.
+    """`send` and `recv` of a single-player pool, with their preparation done once.
 
-    They lay out and name the arrays that `_send` and `_recv` take and give, at every step
-    anew; next to short steps that takes long. As in EnvPool 1.2 (`python/envpool.py` and
+    The originals lay out and name the arrays of `_send` and `_recv` in every step, which takes
+    long compared with a short step. As in EnvPool 1.2 (`python/envpool.py` and
     `python/gymnasium_envpool.py`): `_send` takes ids, ids of players and the action, and
     `_recv` gives arrays in the order of `_state_keys`, such as ``info:env_id``, ``reward``,
     ``done``, ``trunc``, ``obs``, or ``obs:position`` for a Dict.
@@ -207,7 +207,7 @@ class _PoolArrays:
         )
 
     def send(self, action: Any, env_ids: NDArray[np.int32]) -> None:
-        """As the pool's `send`, which would copy the action: this one is the pool's own."""
+        """Do what the pool's `send` does, without copying the action."""
         action = np.ascontiguousarray(action, self._action_dtype)
         if action.shape != (len(env_ids), *self._action_shape):
             raise ValueError(
@@ -217,7 +217,7 @@ class _PoolArrays:
         self._pool._send([env_ids, env_ids, action])
 
     def receive(self) -> BareResult:
-        """As the pool's `recv`."""
+        """Do what the pool's `recv` does."""
         arrays = self._pool._recv()
         truncated = arrays[self._truncated]
         return (
@@ -230,7 +230,7 @@ class _PoolArrays:
 
 
 def _nested(keys: list[str]) -> dict[str, Places]:
-    """The positions of `keys` as the tree that they name: ``info:players.env_id``, say."""
+    """Return the positions of `keys` as a tree; a key is like ``info:players.env_id``."""
     tree: dict[str, Places] = {}
     for position, key in enumerate(keys):
         *path, name = key.replace(":", ".").split(".")
@@ -242,7 +242,7 @@ def _nested(keys: list[str]) -> dict[str, Places]:
 
 
 def _filled(places: Places, arrays: list[NDArray[Any]]) -> Any:
-    """`places` with the arrays that lie there."""
+    """Return the tree `places` with arrays instead of positions."""
     if isinstance(places, int):
         return arrays[places]
     return {

@@ -5,28 +5,35 @@ from __future__ import annotations
 import contextlib
 import importlib
 import warnings
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import SyncVectorEnv
 
+from rlightning_aio.envs.background import Background
 from rlightning_aio.envs.base import (
     BareReset,
     BareStep,
+    BareStepAsync,
+    BareStepWait,
     BaseEnv,
     PreprocessFn,
     result_of,
 )
 from rlightning_aio.envs.tensors import as_numpy
-from rlightning_aio.envs.wrappers import wrappers_of
+from rlightning_aio.envs.wrappers import autoreset_mode_of, has_wrapper
+from rlightning_aio.errors import ConfigError
+from rlightning_aio.sharing import num_cores
 from rlightning_aio.types import EnvRet, PolicyResponse
 
 if TYPE_CHECKING:
-    from collections.abc import Generator
+    from collections.abc import Callable, Generator
 
     from gymnasium.envs.registration import EnvSpec
 
     from rlightning_aio.config import EnvConfig
+    from rlightning_aio.envs.wrappers import ClassName
 
 __all__ = ["GymnasiumEnv", "MujocoEnv", "outdated_assets_accepted", "spec_of"]
 
@@ -34,9 +41,9 @@ __all__ = ["GymnasiumEnv", "MujocoEnv", "outdated_assets_accepted", "spec_of"]
 class GymnasiumEnv(BaseEnv):
     """A Gymnasium environment, or ``num_envs`` of them; ``env_kwargs`` go to `gymnasium.make`.
 
-    The step limit is the config's ``max_episode_steps``, or the registered one. Several are the
-    task's own vector environment, where it has one (its ``vector_entry_point``, to which
-    ``env_kwargs`` go then), and a loop over as many envs otherwise.
+    The step limit is the config's ``max_episode_steps``, or the registered one. If ``num_envs`` is
+    above 1, it is the task's own vector environment (its ``vector_entry_point``, which then takes
+    ``env_kwargs``), or a loop over that number of envs if the task has none.
     """
 
     def __init__(
@@ -51,13 +58,14 @@ class GymnasiumEnv(BaseEnv):
         self._is_vector = isinstance(self.env, gym.vector.VectorEnv)
         if self._is_vector:
             self.num_envs = int(self.env.num_envs)
-        mode = self.env.metadata.get("autoreset_mode", AutoresetMode.DISABLED)
-        self.autoreset = AutoresetMode(mode).name.lower()  # pyright: ignore[reportAttributeAccessIssue]
+            self.fresh_results = getattr(self.env.unwrapped, "fresh_results", False)
+        self.autoreset = autoreset_mode_of(self.env).name.lower()  # pyright: ignore[reportAttributeAccessIssue]
+        self.switches_task = bool(getattr(self.env.unwrapped, "switches_task", False))
         if self.max_episode_steps is None and self.env.spec is not None:
             self.max_episode_steps = self.env.spec.max_episode_steps
 
     def _make(self) -> Any:
-        """Make the simulator that the config names; subclasses wrap or replace it."""
+        """Make the simulator of the config; subclasses wrap or replace it."""
         config = self.config
         if config.num_envs == 1:
             return self._make_one()
@@ -65,15 +73,15 @@ class GymnasiumEnv(BaseEnv):
         if config.max_episode_steps is not None:
             make_kwargs["max_episode_steps"] = config.max_episode_steps
         if spec_of(config.task).vector_entry_point is None:
-            # Results are copied where the runtime takes them.
+            # The runtime copies results into their rows.
             make_kwargs["vector_kwargs"] = {"copy": False}
         else:
             del make_kwargs["disable_env_checker"]
         return gym.make_vec(config.task, config.num_envs, **make_kwargs)
 
     def _make_one(self) -> gym.Env[Any, Any]:
-        # The runtime checks observations against the space itself, once, where it
-        # copies them; Gymnasium's checker would stay in the path of every step.
+        # The runtime checks observations itself when it copies them; Gymnasium's checker would
+        # cost time in every step.
         make_kwargs: dict[str, Any] = {"disable_env_checker": True, **self.config.env_kwargs}
         limit = self.config.max_episode_steps
         return gym.make(self.config.task, max_episode_steps=limit, **make_kwargs)
@@ -89,23 +97,43 @@ class GymnasiumEnv(BaseEnv):
         return result_of(self.env_id, self.env.step(action))
 
     def bare_step(self) -> BareStep | None:
-        # The one sub-environment of a vector env has an axis that its row lacks.
+        # A vector env with one sub-environment has an axis that the row doesn't have.
         plain = type(self).step is GymnasiumEnv.step and self._is_vector == (self.num_envs > 1)
         return self.env.step if plain else None
+
+    def bare_step_async(self) -> tuple[BareStepAsync, BareStepWait] | None:
+        background = self._background
+        return None if background is None else (background.start, background.wait)
+
+    @cached_property
+    def _background(self) -> Background | None:
+        """A thread for the steps of a simulator that releases the GIL (a `MujocoBatch`)."""
+        step = self.bare_step()
+        releases_gil = getattr(self.env.unwrapped, "releases_gil", False)
+        return Background(step) if step is not None and releases_gil else None
+
+    def on_stepped(self, notify: Callable[[], None]) -> bool:
+        if self._background is None:
+            return False
+        self._background.notify = notify
+        return True
 
     def bare_reset(self) -> BareReset | None:
         return self.env.reset if type(self).reset is GymnasiumEnv.reset else None
 
     def call_wrapped(self, name: str, /, *args: Any, **kwargs: Any) -> Any:
-        """Call method `name` of the outermost wrapper that has it; an attribute's value is
-        returned as it is.
-        """
+        """Call method `name` of the outermost wrapper that has it, or return that attribute."""
         found = self.env.get_wrapper_attr(name)
         return found(*args, **kwargs) if callable(found) else found
 
-    def is_wrapped(self, wrapper_class: type[Any]) -> bool:
-        """Whether `wrapper_class` is among the env's wrappers."""
-        return any(isinstance(wrapper, wrapper_class) for wrapper in wrappers_of(self.env))
+    def look_up(self, name: str) -> tuple[bool, Any]:
+        """Return True and None if `call_wrapped` would call a method; otherwise the attribute."""
+        found = self.env.get_wrapper_attr(name)
+        return callable(found), None if callable(found) else found
+
+    def is_wrapped(self, name: ClassName) -> bool:
+        """Return True if the class of that name is among the env's wrappers."""
+        return has_wrapper(self.env, name)
 
     def render_one(self, sub_env: int) -> Any:
         if not self._is_vector:
@@ -117,11 +145,13 @@ class GymnasiumEnv(BaseEnv):
         return self.env.render()[sub_env] if own is None else own(sub_env)
 
     def close(self) -> None:
+        if self._background is not None:
+            self._background.close()
         self.env.close()
 
 
 def spec_of(task: str) -> EnvSpec:
-    """What Gymnasium knows of `task`, whose module is imported first if it names one."""
+    """Return Gymnasium's spec of `task`; import its module first if the task names one."""
     module, _, name = task.rpartition(":")
     if module:
         importlib.import_module(module)
@@ -131,10 +161,27 @@ def spec_of(task: str) -> EnvSpec:
 class MujocoEnv(GymnasiumEnv):
     """Gymnasium's MuJoCo tasks (HalfCheetah-v5, Ant-v5, …).
 
-    With ``num_envs`` a task of version 5 is stepped with one call for all; see `mujoco_batch`.
+    With ``num_envs`` a task of version 5 is stepped by MuJoCo's threads, as many as
+    ``env_kwargs.num_threads`` says, with models that differ as ``env_kwargs.randomize`` says; see
+    `mujoco_batch`.
     """
 
     def _make(self) -> Any:
+        num_threads = self.config.env_kwargs.pop("num_threads", None)
+        randomize = self.config.env_kwargs.pop("randomize", None)
+        if num_threads is None:
+            # The envs of an entry compute at the same time, in this process and in workers.
+            num_threads = max(1, num_cores() // self.config.num_workers)
+        elif type(num_threads) is not int or num_threads < 1:
+            raise ConfigError(
+                f"env {self.env_id!r}: env_kwargs.num_threads is {num_threads!r}, but must be an "
+                "int above 0"
+            )
+        if randomize and self.config.num_envs == 1:
+            raise ConfigError(
+                f"env {self.env_id!r}: env_kwargs.randomize needs simulations that are stepped "
+                "together: num_envs above 1"
+            )
         with outdated_assets_accepted():
             if self.config.num_envs == 1:
                 return super()._make()
@@ -143,7 +190,9 @@ class MujocoEnv(GymnasiumEnv):
 
             one = self._make_one()
             try:
-                return MujocoBatch(one, self.config.num_envs)
+                return MujocoBatch(
+                    one, self.config.num_envs, num_threads=num_threads, randomize=randomize
+                )
             except NotImplementedError as error:
                 one.close()
                 warnings.warn(
@@ -159,8 +208,8 @@ class MujocoEnv(GymnasiumEnv):
 def outdated_assets_accepted() -> Generator[None]:
     """Silence MuJoCo about deprecated attributes in a task's XML; nothing else.
 
-    Gymnasium's own assets use them, so each env of each worker would tell a user who can't
-    do anything about it. Whatever else MuJoCo warns of meanwhile is passed on.
+    Gymnasium's own assets use them, so each env of each worker would warn, and users can't fix
+    it. Other warnings of MuJoCo are passed on.
     """
     # Its stubs leave out half of it.
     mujoco: Any = importlib.import_module("mujoco")

@@ -1,9 +1,8 @@
 """`isaac_manager_based` and `isaac_marl`: tasks of Isaac Lab, batched on one device.
 
-Rule: the simulator's tensors stay tensors on their device, and what is handed out is
-a copy, because Isaac Lab reuses its buffers. How a task becomes a running
-environment, under Isaac Lab 3 or 2.3, is `isaac_task`'s.
-Absent on purpose: more than one live env in a process, which the simulator can't do.
+Rule: the simulator's tensors stay tensors on their device, and results are copies, because
+Isaac Lab reuses its buffers. `isaac_task` launches Isaac Lab 3 or 2.3 and builds the task.
+Left out: more than one live env in a process, which the simulator does not support.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ __all__ = ["IsaacManagerBasedEnv", "IsaacMarlEnv"]
 
 
 class _IsaacEnv(BaseEnv):
-    """What the two backends share: building, seeds, actions in, tensors out.
+    """The shared part of both backends: construction, seeds, conversion of actions and results.
 
     Sub-environments that finish are reset by the simulator within the same step, so the
     observation that comes with ``last_terminated`` or ``last_truncated`` is already the
@@ -81,14 +80,14 @@ class _IsaacEnv(BaseEnv):
         return self.env.reset(seed=first_seed, options=options)
 
     def _tensor(self, action: Any, space: gym.Space[Any]) -> Any:
-        """An action for all sub-environments, ``[num_envs, ...]`` on the simulation device."""
+        """Convert an action to ``[num_envs, ...]`` on the simulation device."""
         torch = self._torch
         discrete = isinstance(space, gym.spaces.Discrete)
         dtype = torch.float32 if isinstance(space, gym.spaces.Box) else torch.int64
         if isinstance(action, torch.Tensor):
             tensor = action.to(device=self.env.device, dtype=dtype)
         else:
-            # A copy: the simulator may keep it beyond the life of the caller's array.
+            # A copy, because the simulator may keep it longer than the caller keeps the array.
             tensor = torch.tensor(action, device=self.env.device, dtype=dtype)
         return tensor.reshape(self.num_envs, *((1,) if discrete else space.shape or ()))
 
@@ -96,7 +95,7 @@ class _IsaacEnv(BaseEnv):
         return space if self.num_envs == 1 else batch_space(space, self.num_envs)
 
     def _own(self, value: Any) -> Any:
-        """Copies of tensors, nested as they came; without the batch axis if it has one row."""
+        """Copy nested tensors, without the batch axis if there is one sub-environment."""
         if isinstance(value, Mapping):
             tree = cast("Mapping[str, Any]", value)
             return {key: self._own(item) for key, item in tree.items()}
@@ -110,13 +109,13 @@ class _IsaacEnv(BaseEnv):
 
     @abstractmethod
     def _final_obs(self, extras: Mapping[str, Any]) -> Any:
-        """The observations before the resets of this step, or None if none were computed."""
+        """Return the observations before the resets of this step, or None if not computed."""
 
     def _ended(self, extras: Mapping[str, Any]) -> dict[str, Any]:
-        """Info about the episodes that ended in this step.
+        """Return info about the episodes that ended in this step.
 
-        The simulator leaves the last log and final observation where they are, so they
-        count only in a step that reset something.
+        The simulator keeps the last log and final observation, so they are valid only in a
+        step that reset something.
         """
         if not bool(self.env.reset_buf.any()):
             return {}
@@ -178,9 +177,9 @@ class IsaacManagerBasedEnv(_IsaacEnv):
 class IsaacMarlEnv(_IsaacEnv):
     """A direct multi-agent task (``DirectMARLEnv``).
 
-    Every field of a result but the info is a dict by agent of what `IsaacManagerBasedEnv`
-    gives for one; actions are a dict by agent. ``info["final_obs"]`` is by agent too, and
-    what the task itself reports for an agent is in ``info[agent]``.
+    Actions, and every field of a result but the info, are dicts by agent; each value is as in
+    `IsaacManagerBasedEnv`. ``info["final_obs"]`` is by agent, and ``info[agent]`` holds the
+    task's own report for that agent.
     """
 
     def __init__(

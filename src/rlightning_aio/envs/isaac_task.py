@@ -8,7 +8,6 @@ Absent on purpose: stepping, which is `isaac`'s.
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import importlib.util
 import sys
@@ -21,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from rlightning_aio.envs.options import load_named, read_options
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.registry import BACKENDS
+from rlightning_aio.registry import BACKENDS, did_you_mean
 
 if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
@@ -61,8 +60,8 @@ def make_simulator(
         env_id: for messages.
         config: its ``task`` is a registered name, ``package:name`` with the package that
             registers it, or ``module::Class`` of a configuration.
-        default_env_class: ``module::Class`` built from a configuration class for which
-            ``env_kwargs.env_class`` names none.
+        default_env_class: ``module::Class`` built from a configuration class if
+            ``env_kwargs.env_class`` is missing.
         worker_index: of the env within its entry.
 
     Raises:
@@ -144,10 +143,9 @@ def _make_cfg(
 def _check_registered(env_id: str, name: str) -> None:
     if name in gym.registry:
         return
-    near = difflib.get_close_matches(name, gym.registry, n=1)
-    hint = f"; did you mean {near[0]!r}?" if near else ""
+    hint = did_you_mean(name, gym.registry)
     raise ConfigError(
-        f"{env_id}: task {name!r} is not registered{hint} "
+        f"{env_id}: task {name!r} is not registered{f'; {hint}' if hint else ''} "
         "Write 'package:name' if another package registers it, "
         "or 'module::Class' for a configuration class"
     )
@@ -174,11 +172,8 @@ def _child(parent: Any, name: str, field: str) -> Any:
     children = _children(parent)
     if name in children:
         return children[name]
-    near = difflib.get_close_matches(name, children, n=1)
-    hint = (
-        f"; did you mean {near[0]!r}?" if near else f"; it has {', '.join(children) or 'nothing'}"
-    )
-    raise ConfigError(f"{field}: there is no {name!r} in {type(parent).__name__}{hint}")
+    hint = did_you_mean(name, children) or f"it has {', '.join(children) or 'nothing'}"
+    raise ConfigError(f"{field}: there is no {name!r} in {type(parent).__name__}; {hint}")
 
 
 def _children(parent: Any) -> dict[str, Any]:

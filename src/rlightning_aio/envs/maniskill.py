@@ -45,7 +45,7 @@ class ManiskillEnv(BaseEnv):
     everything is a tensor ``[num_envs, ...]`` on the GPU.
 
     ``info["success"]`` and ``info["fail"]`` are the task's verdict on each step. Ended
-    sub-environments go on until they are reset; ``reset(options={"env_idx": [2, 5]})``
+    sub-environments continue until they are reset; ``reset(options={"env_idx": [2, 5]})``
     resets those alone, and ``{"reconfigure": True}`` rebuilds the scene.
 
     Raises:
@@ -70,14 +70,14 @@ class ManiskillEnv(BaseEnv):
             **self._simulation_arguments(),
             **self._render_arguments(),
         }
-        # ManiSkill seeds every env alike until it is told otherwise.
+        # Without a seed, ManiSkill seeds every env with the same number.
         self._unseeded = np.random.default_rng()
         self._open()
         self.max_episode_steps = find_max_episode_steps(self.env)
         self._spaces = self._read_spaces()
 
     def _simulation_arguments(self) -> dict[str, Any]:
-        """What the user gave, if sub-environments have what they need."""
+        """Return the user's ``env_kwargs``, after checking that they allow ``num_envs``."""
         given = self.config.env_kwargs
         if self.num_envs > 1:
             backend = str(given.get("sim_backend", "auto"))
@@ -91,7 +91,7 @@ class ManiskillEnv(BaseEnv):
         return given
 
     def _render_arguments(self) -> dict[str, Any]:
-        """What keeps the renderer away where there is no device for it."""
+        """Return arguments that turn the renderer off if there is no device for it."""
         if render_device_is_usable():
             return {}
         given = self.config.env_kwargs
@@ -125,7 +125,7 @@ class ManiskillEnv(BaseEnv):
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> EnvRet:
-        """Reset the sub-environments, all or those in ``options["env_idx"]``.
+        """Reset all sub-environments, or those in ``options["env_idx"]``.
 
         A seed sets the generators of all of them, also in a partial reset.
 
@@ -182,11 +182,11 @@ class ManiskillEnv(BaseEnv):
         )
 
     def _handed_out(self, value: Any, *, scalars: bool = False) -> Any:
-        """A copy of what the simulator gave, without the batch axis if there is one env.
+        """Copy a value from the simulator, without the batch axis if there is one env.
 
         Args:
             value: tensors with a leading batch axis, in dicts to any depth.
-            scalars: whether one number of one env becomes a Python scalar.
+            scalars: convert one number of one env to a Python scalar.
         """
         if isinstance(value, dict):
             entries = cast("dict[str, Any]", value)
@@ -208,7 +208,7 @@ class ManiskillEnv(BaseEnv):
         return self._spaces[1]
 
     def render(self) -> Any:
-        """Frames ``[height, width, 3]`` uint8, with a leading ``num_envs`` if vectorised."""
+        """Return frames ``[height, width, 3]`` uint8, with a leading ``num_envs`` if vectorised."""
         self._require_loaded()
         return as_numpy(self._handed_out(self.env.render()))
 
@@ -221,7 +221,7 @@ class ManiskillEnv(BaseEnv):
         self.clear_memory()
 
     def reload(self) -> None:
-        """Make the simulator again; it has to be reset before it is stepped."""
+        """Make the simulator again; reset it before the next step."""
         if self._is_offloaded:
             self._open()
 

@@ -1,9 +1,9 @@
 """Many simulations of one of Gymnasium's MuJoCo tasks, stepped with one call.
 
-Rule: to the bit what as many envs of `gymnasium.make` do. Gymnasium's own env, made once, reads
-the options, resets, renders and answers calls, for one simulation at a time; only steps are
-computed here, for all simulations at once, by `mujoco_tasks`. Absent on purpose: MuJoCo's own
-`rollout`, which does not carry each simulation's warm start from call to call.
+Rule: results are bit-identical to those of separate envs of `gymnasium.make`. One Gymnasium env
+reads the options, resets, renders and answers calls, for one simulation at a time. MuJoCo steps
+all simulations (`mujoco_threads`), and rewards and observations are computed as arrays
+(`mujoco_tasks`). Unlike in Gymnasium, a simulation that fails ends its episode.
 """
 
 from __future__ import annotations
@@ -17,81 +17,113 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from rlightning_aio.envs.mujoco_state import load_data, load_model, save_data, save_model
+from rlightning_aio.envs.mujoco_randomize import Randomizer
+from rlightning_aio.envs.mujoco_state import load_model, save_model
 from rlightning_aio.envs.mujoco_tasks import task_of
-from rlightning_aio.envs.wrappers import wrappers_of
+from rlightning_aio.envs.mujoco_threads import Simulations, state_of
+from rlightning_aio.envs.wrappers import ClassName, has_wrapper, wrappers_of
+from rlightning_aio.sharing import num_cores
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-__all__ = ["MujocoBatch"]
+__all__ = ["FAILED", "MujocoBatch"]
 
-# Its stubs leave out half of it.
+# Its stubs are incomplete.
 mujoco: Any = import_module("mujoco")
 
-_OWN: Final = ("data", "_np_random", "_np_random_seed", "goal", "goal_pos", "cylinder_pos")
-"""What of Gymnasium's env belongs to one simulation."""
-_FIXED: Final = (*_OWN, "model", "np_random", "_elapsed_steps")
-"""What can't be set from outside."""
+FAILED: Final = "simulation_failed"
+"""Key of an info with the reason why the simulation failed."""
+_OWN: Final = ("_np_random", "_np_random_seed", "goal", "goal_pos", "cylinder_pos")
+"""Attributes of the Gymnasium env that belong to one simulation, in addition to its data."""
+_FIXED: Final = (*_OWN, "data", "model", "np_random", "_elapsed_steps")
+"""Attributes that can't be set from outside."""
+_NEXT_STEP: Final = AutoresetMode.NEXT_STEP
+_SAME_STEP: Final = AutoresetMode.SAME_STEP
+_STATE: Final = ("_num_steps", "_before", "_substeps", "_observations", "_ended")
+"""Attributes that are part of the state, in addition to the simulations."""
 
 
 class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
     """Simulations of one task.
 
-    They share their model: what is changed in it is changed for all.
+    They share their model, so a change of it affects all, unless it is randomized.
 
     Args:
-        env: what `gymnasium.make` made of the task.
-        num_envs: how many.
-        autoreset_mode: what each does after its episode's end.
+        env: the task, from `gymnasium.make`.
+        num_envs: the number of simulations.
+        autoreset_mode: when a simulation is reset after the end of its episode.
+        num_threads: number of threads for steps, including the caller's; None for one per core
+            that this process may use.
+        randomize: factors of model fields, drawn at each reset; see `mujoco_randomize`. The info
+            of a reset has them as ``randomized``.
 
     Attributes:
-        env: the same, unwrapped; its state is that of the simulation it was lent to last.
-        takes_masks: it resets those that a mask names alone.
+        env: the unwrapped env, in the state of the simulation that used it last.
+        takes_masks: True, as it can reset only some simulations.
+        fresh_results: see `BaseEnv`.
+        releases_gil: True, as steps may be computed in a thread.
 
     Raises:
-        NotImplementedError: the task is none of Gymnasium's v5 tasks, or is wrapped.
+        NotImplementedError: the task isn't one of Gymnasium's v5 tasks, or is wrapped; or MuJoCo is
+            older than 3.17.
+        ConfigError: `randomize` is wrong.
     """
 
     takes_masks = True
+    fresh_results = True
+    releases_gil = True
 
     def __init__(
         self,
         env: gym.Env[Any, Any],
         num_envs: int,
         autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
+        *,
+        num_threads: int | None = None,
+        randomize: Mapping[str, Any] | None = None,
     ) -> None:
         self.env: Any = env.unwrapped
         self.num_envs = num_envs
         self.spec = env.spec
         self.metadata = {**env.metadata, "autoreset_mode": autoreset_mode}
         self.render_mode = self.env.render_mode
-        # Annotated here: Gymnasium leaves open what its spaces hold.
+        # Annotated here because Gymnasium doesn't say what its spaces hold.
         self.single_observation_space: gym.Space[Any] = self.env.observation_space
         self.single_action_space: gym.Space[Any] = self.env.action_space
         self.observation_space: gym.Space[Any] = batch_space(self.env.observation_space, num_envs)
         self.action_space: gym.Space[Any] = batch_space(self.env.action_space, num_envs)
-        model = self.env.model
-        # Not the env's own: that is the one that it renders.
-        self._shown = self.env.data
-        self._simulations = [mujoco.MjData(model) for _ in range(num_envs)]
-        self._controls = [simulation.ctrl for simulation in self._simulations]
+        kind = task_of(env)
+        self._simulations = Simulations(
+            self.env.model,
+            num_envs,
+            num_threads or num_cores(),
+            forces=kind.needs_forces,
+            own_models=bool(randomize),
+        )
+        self._randomizer = Randomizer(self._simulations, randomize) if randomize else None
+        self._task = kind(self.env, self._simulations)
+        # The Gymnasium env resets and renders with these data.
+        self._data = self.env.data
         self._made: Any = env
         self._own: list[dict[str, Any]] = [{} for _ in range(num_envs)]
-        for k, simulation in enumerate(self._simulations):
+        for k in range(num_envs):
             self._take_back(k)
-            self._own[k]["data"] = simulation
         self._mode = autoreset_mode
         self._read_options()
         self._num_steps = np.zeros(num_envs, np.int64)
+        # All data of a simulation follow from this state and a number of MuJoCo's steps; 0 means a
+        # reset.
+        self._before = self._simulations.rows.copy()
+        self._substeps = np.zeros(num_envs, np.int64)
+        self._observations = np.zeros((num_envs, *self.env.observation_space.shape))
         self._ended: NDArray[np.bool_] | None = None
         self._everywhere = np.ones(num_envs, np.bool_)
 
     def _read_options(self) -> None:
-        """Take up what the env was made with, or what was set since."""
-        self._task = task_of(self._made, self._simulations)
+        """Read the step limit of the env."""
         self._limiter: Any = None
         self._limit: int = np.iinfo(np.int64).max
         for wrapper in wrappers_of(self._made):
@@ -107,10 +139,10 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[NDArray[Any], dict[str, Any]]:
-        """Reset all, or those of ``options["reset_mask"]``, a bool array ``[num_envs]``.
+        """Reset all simulations, or those in ``options["reset_mask"]``, bools ``[num_envs]``.
 
         Args:
-            seed: simulation k gets ``seed + k``, or its own of a sequence.
+            seed: simulation k gets ``seed + k``, or element k of a sequence.
             options: passed to the task, without the mask.
         """
         if seed is None or isinstance(seed, int | np.integer):
@@ -128,26 +160,36 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             infos = self._add_info(infos, self._reset(k, seeds[k], options), k)
         ended = np.zeros(self.num_envs, np.bool_) if self._ended is None else self._ended
         self._ended = ended & ~mask
-        return self._task.observe(), infos
+        return self._observations.copy(), infos
 
     def _reset(
         self, k: int, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> dict[str, Any]:
-        """Have Gymnasium's env reset simulation k; its info."""
+        """Reset simulation k by the Gymnasium env, and store its observation. Return the info."""
+        factors = None if self._randomizer is None else self._randomizer.draw(k, seed)
+        self._simulations.show_model(k)
         self._lend(k)
-        _, info = self.env.reset(seed=seed, options=options)
-        _ = self.env.np_random  # Without a seed it gets its generator here, by chance.
+        self._observations[k], info = self.env.reset(seed=seed, options=options)
+        _ = self.env.np_random  # Without a seed, this makes a randomly seeded generator.
         self._take_back(k)
+        self._put(k, self._data)
+        self._before[k] = self._simulations.rows[k]
         self._num_steps[k] = 0
-        return info
+        return info if factors is None else {**info, "randomized": factors}
 
     def _lend(self, k: int) -> None:
-        """Have Gymnasium's env be the one of simulation k."""
+        """Set the attributes of the Gymnasium env to those of simulation k, except for its data."""
         self.env.__dict__.update(self._own[k])
 
     def _take_back(self, k: int) -> None:
         now = cast("dict[str, Any]", self.env.__dict__)
         self._own[k] = {name: now[name] for name in _OWN if name in now}
+
+    def _put(self, k: int, data: Any) -> None:
+        """Continue simulation k from `data`."""
+        state_of(self.env.model, data, self._simulations.rows[k])
+        self._task.moved(k, data)
+        self._substeps[k] = 0
 
     # -- steps --------------------------------------------------------------------------
 
@@ -156,83 +198,86 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
     ) -> tuple[
         NDArray[Any], NDArray[Any], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]
     ]:  # fmt: skip
-        """Step all; with `AutoresetMode.NEXT_STEP`, those that are over are reset instead.
+        """Step all simulations; with `AutoresetMode.NEXT_STEP`, reset those that are over instead.
+
+        A simulation that fails returns its last observation again, with reward 0, truncated; its
+        info has the cause as ``simulation_failed``.
 
         Args:
             actions: ``[num_envs, *action]``.
 
         Raises:
             ResetNeeded: there was no reset yet.
-            ValueError: the actions have another shape.
+            ValueError: the actions have the wrong shape.
         """
-        ended = self._ended
+        ended, actions = self._ended, np.asarray(actions)
         if ended is None:
             raise ResetNeeded("Cannot call env.step() before calling env.reset()")
-        if np.shape(actions) != self.action_space.shape:
+        if actions.shape != self.action_space.shape:
             raise ValueError(
-                f"actions must have shape {self.action_space.shape}, not {np.shape(actions)}"
+                f"actions must have shape {self.action_space.shape}, not {actions.shape}"
             )
-        resets: list[int] = []
-        if self._mode == AutoresetMode.NEXT_STEP:
-            resets = np.flatnonzero(ended).tolist()
-        self._task.begin(actions)
-        self._simulate(actions, set(resets))
+        # `any` of an array takes four times as long as `count_nonzero`.
+        due = ended if self._mode == _NEXT_STEP and np.count_nonzero(ended) else None
+        failures = self._simulate(actions, due)
+        observations, (rewards, terminated, infos) = self._task.stepped(actions)
         self._num_steps += 1
-        infos_of_resets = [self._reset(k) for k in resets]
-        observations = self._task.observe()
-        rewards, terminated, infos = self._task.judge()
         truncated = self._num_steps >= self._limit
-        masked = dict[str, Any]()
+        masked, everywhere = dict[str, Any](), self._everywhere.copy()
         for name, column in infos.items():
-            masked[name], masked["_" + name] = column, self._everywhere
-        if resets:
-            rewards[resets] = 0.0
-            terminated[resets] = truncated[resets] = False
-            masked = self._reset_infos(masked, ended, resets, infos_of_resets)
+            masked[name], masked["_" + name] = column, everywhere
+        # Infos of simulations that were not stepped.
+        apart = {k: {FAILED: cause} for k, cause in failures.items()}
+        if due is not None:
+            apart |= {k: self._reset(k) for k in np.flatnonzero(due).tolist()}
+        if apart:
+            chosen = list(apart)
+            observations[chosen] = self._observations[chosen]
+            rewards[chosen] = 0.0
+            terminated[chosen] = truncated[chosen] = False
+            truncated[list(failures)] = True
+            masked = self._replaced(masked, apart)
+        self._observations[:] = observations
         self._ended = ended = terminated | truncated
-        if self._mode == AutoresetMode.SAME_STEP and ended.any():
-            observations, masked = self._begun_anew(ended, observations, masked)
+        if self._mode == _SAME_STEP and np.count_nonzero(ended):
+            observations, masked = self._reset_ended(ended, observations, masked)
         return observations, rewards, terminated, truncated, masked
 
-    def _simulate(self, actions: NDArray[Any], without: set[int]) -> None:
-        step, model, num_frames = mujoco.mj_step, self.env.model, self.env.frame_skip
-        forces = mujoco.mj_rnePostConstraint if self._task.needs_forces else None
-        rows = actions.astype(np.float64)
-        for k, simulation in enumerate(self._simulations):
-            if k not in without:
-                self._controls[k][:] = rows[k]
-                step(model, simulation, num_frames)
-                if forces is not None:
-                    forces(model, simulation)
+    def _simulate(self, actions: NDArray[Any], due: NDArray[np.bool_] | None) -> dict[int, str]:
+        """Step all simulations except those due for a reset. Return failures with their reasons."""
+        simulations = self._simulations
+        self._before[:] = simulations.rows
+        self._substeps[:] = self.env.frame_skip
+        simulations.ctrl[:] = actions
+        ids = None if due is None else np.flatnonzero(~due).astype(np.int32)
+        failures = simulations.step(self.env.frame_skip, ids)
+        for k in failures:
+            self._before[k], self._substeps[k] = simulations.rows[k], 0
+        return failures
 
-    def _begun_anew(
+    def _reset_ended(
         self, ended: NDArray[np.bool_], last: NDArray[Any], infos: dict[str, Any]
     ) -> tuple[NDArray[Any], dict[str, Any]]:
-        """Reset those that have ended; their observations, and the last ones among the infos."""
-        chosen: list[int] = np.flatnonzero(ended).tolist()
+        """Reset simulations that have ended. Return observations, and infos with the last ones."""
         final = np.full(self.num_envs, None, object)
-        for k in chosen:
+        for k in np.flatnonzero(ended).tolist():
             final[k] = last[k].copy()
         final_info = _only(infos, ended)
-        infos = self._reset_infos(infos, ended, chosen, [self._reset(k) for k in chosen])
+        infos = self._replaced(infos, {k: self._reset(k) for k in np.flatnonzero(ended).tolist()})
         infos.update(final_obs=final, _final_obs=ended.copy())
         infos.update(final_info=final_info, _final_info=ended.copy())
-        return self._task.observe(), infos
+        return self._observations.copy(), infos
 
-    def _reset_infos(
-        self,
-        infos: dict[str, Any],
-        ended: NDArray[np.bool_],
-        resets: list[int],
-        infos_of_resets: list[dict[str, Any]],
-    ) -> dict[str, Any]:
-        """Infos of a step, with those of resets in place of the step's own."""
-        infos = _only(infos, ~ended)
-        for k, info in zip(resets, infos_of_resets, strict=True):
+    def _replaced(self, infos: dict[str, Any], others: dict[int, dict[str, Any]]) -> dict[str, Any]:
+        """Replace the infos of some simulations by `others`."""
+        chosen = self._everywhere.copy()
+        chosen[list(others)] = False
+        infos = _only(infos, chosen)
+        for k, info in others.items():
             infos = self._add_info(infos, info, k)
         return infos
 
-    # -- one of them --------------------------------------------------------------------
+    # -- calls --------------------------------------------------------------------------
 
     def call(self, name: str, /, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call method `name` of the env of each simulation, or get its attribute."""
@@ -245,23 +290,36 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
     def call_one(self, k: int, name: str, /, *args: Any, **kwargs: Any) -> Any:
         """Call method `name` of the env of simulation `k`, or get its attribute.
 
+        The env has a copy of the data of the simulation; changes of them take effect.
+
         Raises:
-            ValueError: it sets an attribute, which all simulations share.
+            ValueError: the call sets an attribute, which all simulations share.
         """
         if name == "set_wrapper_attr":
             raise _shared(_attribute(*args, **kwargs)[0])
         if name == "render":
             return self.render_one(k)
         self._lend(k)
+        self.env.data = data = self._data_of(k)
         if self._limiter is not None and self._ended is not None:
             self._limiter._elapsed_steps = int(self._num_steps[k])  # noqa: SLF001
-        found = self._made.get_wrapper_attr(name)
         try:
+            found = self._made.get_wrapper_attr(name)
             return found(*args, **kwargs) if callable(found) else found
         finally:
             self._take_back(k)
+            self.env.data = self._data
+            state = np.empty_like(self._before[k])
+            state_of(self.env.model, data, state)
+            if not np.array_equal(state, self._simulations.rows[k], equal_nan=True):
+                self._put(k, data)
+                self._before[k] = state
             if self._limiter is not None and self._limiter._elapsed_steps is not None:  # noqa: SLF001
                 self._num_steps[k] = self._limiter._elapsed_steps  # noqa: SLF001
+
+    def _data_of(self, k: int) -> Any:
+        """All data of simulation k, bit-identical to those of a Gymnasium env."""
+        return self._simulations.data_of(k, self._before[k], int(self._substeps[k]))
 
     def set_attr(self, name: str, values: Any) -> None:
         """Set attribute `name` of all envs to one value.
@@ -277,58 +335,59 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             raise _shared(name)
         self._made.set_wrapper_attr(name, values)
         self._read_options()
+        self._task = type(self._task)(self.env, self._simulations)
 
-    def is_wrapped(self, wrapper_class: type[Any]) -> bool:
-        """Whether `wrapper_class` is among the wrappers of each."""
-        return any(isinstance(wrapper, wrapper_class) for wrapper in wrappers_of(self._made))
+    def is_wrapped(self, name: ClassName) -> bool:
+        """Return True if the env has a wrapper of the class `name`."""
+        return has_wrapper(self._made, name)
 
-    # -- its state ----------------------------------------------------------------------
+    # -- state and rendering ------------------------------------------------------------
 
     def save_state(self) -> dict[str, Any]:
-        """All simulations as they are; see `BaseEnv.save_state`."""
+        """Save the state of all simulations; see `BaseEnv.save_state`."""
         return {
             "model": save_model(self.env.model),
-            "simulations": [save_data(simulation) for simulation in self._simulations],
-            "own": [{name: own[name] for name in own if name != "data"} for own in self._own],
-            "num_steps": self._num_steps,
-            "ended": self._ended,
+            "rows": self._simulations.rows.copy(),
+            "positions": self._task.positions,
+            "own": self._own,
+            "randomizer": None if self._randomizer is None else self._randomizer.save_state(),
+            **{name: getattr(self, name) for name in _STATE},
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Put all simulations back."""
+        """Restore the state of all simulations."""
         load_model(self.env.model, state["model"])
-        for simulation, saved in zip(self._simulations, state["simulations"], strict=True):
-            load_data(simulation, saved)
-        self._own = [
-            {**own, "data": simulation}
-            for own, simulation in zip(state["own"], self._simulations, strict=True)
-        ]
-        self._num_steps, self._ended = state["num_steps"], state["ended"]
+        self._simulations.rows[:] = state["rows"]
+        self._task.positions = state["positions"]
+        self._own = [dict(own) for own in state["own"]]
+        if self._randomizer is not None:
+            self._randomizer.load_state(state["randomizer"])
+        for name in _STATE:
+            setattr(self, name, state[name])
 
     def render(self) -> tuple[Any, ...]:
-        """A frame of each."""
+        """Render a frame of each simulation."""
         return tuple(self.render_one(k) for k in range(self.num_envs))
 
     def render_one(self, k: int) -> Any:
-        """A frame of simulation k, in the mode that the task was made with.
+        """Render a frame of simulation k in the render mode of the task.
 
         Raises:
             ResetNeeded: there was no reset yet.
         """
         if self._ended is None:
             raise ResetNeeded("Cannot call env.render() before calling env.reset()")
-        self.env.data = self._shown
-        mujoco.mj_copyData(self._shown, self.env.model, self._simulations[k])
+        mujoco.mj_copyData(self._data, self.env.model, self._data_of(k))
         return self.env.render()
 
     def close_extras(self, **kwargs: Any) -> None:
         del kwargs
-        self.env.data = self._shown
+        self._simulations.close()
         cast("gym.Env[Any, Any]", self.env).close()
 
 
 def _only(infos: dict[str, Any], chosen: NDArray[np.bool_]) -> dict[str, Any]:
-    """A copy of columns that are everywhere, for some alone, as Gymnasium has them."""
+    """Copy the columns for the simulations `chosen`, with masks as in Gymnasium."""
     if not chosen.any():
         return {}
     found: dict[str, Any] = {}
@@ -341,7 +400,7 @@ def _only(infos: dict[str, Any], chosen: NDArray[np.bool_]) -> dict[str, Any]:
 
 
 def _attribute(name: str, value: Any, *, force: bool = True) -> tuple[str, Any]:
-    """What `set_wrapper_attr` is called with."""
+    """Return name and value from the arguments of `set_wrapper_attr`."""
     del force
     return name, value
 
@@ -354,5 +413,5 @@ def _shared(name: str) -> ValueError:
 
 
 def _same(one: Any, other: Any) -> bool:
-    """Whether two values are of one type and equal, arrays included."""
+    """Return True if two values, or arrays, have the same type and are equal."""
     return one is other or (type(one) is type(other) and np.array_equal(one, other))

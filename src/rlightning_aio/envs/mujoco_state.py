@@ -1,11 +1,11 @@
-"""The state of MuJoCo's own structs: all that a simulation computes, to the bit.
+"""The exact state of MuJoCo's structs.
 
-Rule: not only what `mj_getState` knows, but every array of `MjData`: an env may read what the
-last step computed (positions of bodies lag one step behind) before it takes the next one.
-Contacts and constraints, which lie in an arena and are computed anew by each step, are those of
-`mj_forward`. Of a model, what a task may change as it goes (masses, friction, sizes, options):
-all but what was compiled from files.
-Absent on purpose: an import of MuJoCo, which only an env that uses it needs.
+Rule: the state of `MjData` is every array, not only those of `mj_getState`, because an env may read
+results of the last step (positions of bodies lag one step behind) before the next one. Contacts and
+constraints, which are in an arena and recomputed by each step, come from `mj_forward`. The state of
+a model is what a task may change (masses, friction, sizes, options), not what was compiled from
+files.
+Absent on purpose: an import of MuJoCo, which only envs that use it need.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ _COMPILED: Final = (
     "tex_", "mesh_", "hfield_", "skin_", "flex", "name_", "names", "text", "tuple_", "paths",
     "oct_", "plugin", "vis", "stat", "B_", "D_", "M_", "map",
 )  # fmt: skip
-"""How the names of model arrays begin that come from files, or from the model's structure."""
+"""Prefixes of model arrays that come from files, or from the structure of the model."""
 _FLAGS: Final = ("flg_energypos", "flg_energyvel", "flg_subtreevel", "flg_rnepost")
-"""What has been computed beside the last step."""
+"""Flags of quantities computed in addition to the last step."""
 
 _views: WeakKeyDictionary[Any, dict[str, NDArray[Any]]] = WeakKeyDictionary()
-"""Arrays of a struct by name, which stay where they are as long as it lives."""
+"""Arrays of a struct by name; their memory is fixed for the life of the struct."""
 
 
 def _views_of(
@@ -57,7 +57,7 @@ def _data_views(data: Any) -> dict[str, NDArray[Any]]:
     start = _address(data.qpos)
 
     def is_state(name: str, array: NDArray[Any]) -> bool:
-        # The others lie in the arena.
+        # Other arrays are in the arena.
         return name == "energy" or 0 <= _address(array) - start < data.nbuffer
 
     return _views_of(data, is_state)
@@ -68,20 +68,20 @@ def _address(array: NDArray[Any]) -> int:
 
 
 def save_data(data: Any) -> tuple[float, dict[str, Any], bytes]:
-    """All of a simulation; about as many bytes as ``data.nbuffer``."""
+    """Return the state of a simulation, of about ``data.nbuffer`` bytes."""
     flags = {name: getattr(data, name) for name in _FLAGS if hasattr(data, name)}
     return data.time, flags, _joined(_data_views(data))
 
 
 def load_data(data: Any, state: tuple[float, dict[str, Any], bytes]) -> None:
-    """Put a simulation back; its model must be back already."""
+    """Restore a simulation, after its model."""
     time, flags, arrays = state
     data.time = time
     views = _data_views(data)
     _copy_back(views, arrays)
     mujoco: Any = import_module("mujoco")
     mujoco.mj_forward(data.model, data)
-    # Of these, what differs was computed when the simulation was elsewhere.
+    # `mj_forward` has overwritten some of the restored arrays.
     _copy_back(views, arrays)
     for name, flag in flags.items():
         setattr(data, name, flag)
@@ -96,7 +96,7 @@ def _copy_back(views: dict[str, NDArray[Any]], joined: bytes) -> None:
     for view in views.values():
         own = joined[start : start + view.nbytes]
         start += view.nbytes
-        # Most of a model never changes.
+        # Most arrays of a model never change.
         if own != view.tobytes():
             view[...] = np.frombuffer(own, view.dtype).reshape(view.shape)
 
@@ -106,7 +106,7 @@ def _model_views(model: Any) -> dict[str, NDArray[Any]]:
 
 
 def save_model(model: Any) -> tuple[bytes, bytes]:
-    """What may change in a model."""
+    """Return the values of a model that may change."""
     options = {
         name: getattr(model.opt, name) for name in _options_of(cast("type[Any]", type(model.opt)))
     }
@@ -120,7 +120,7 @@ def _options_of(kind: type[Any]) -> tuple[str, ...]:
 
 
 def load_model(model: Any, state: tuple[bytes, bytes]) -> None:
-    """Put the values of a model of the same structure back."""
+    """Restore the values of a model with the same structure."""
     options, arrays = state
     for name, value in json.loads(options).items():
         if isinstance(value, list):

@@ -1,14 +1,15 @@
 # ruff: noqa: SLF001 (Gymnasium keeps its options in private attributes.)
-"""What Gymnasium's MuJoCo tasks, version 5, make of a step: whole arrays for many simulations.
+"""Rewards, terminations and observations of Gymnasium's MuJoCo tasks, version 5, over arrays.
 
-Rule: each formula is Gymnasium's (gymnasium/envs/mujoco/*_v5.py), with its order of operations
-and its dtypes, so that results are the same to the bit; options are read from Gymnasium's env.
-Where NumPy computes arrays otherwise than numbers, so is it said. Actions are
-``[n, *action]``; whatever is gathered from n simulations is ``[n, ...]`` float64.
+Rule: each formula is Gymnasium's (gymnasium/envs/mujoco/*_v5.py), with the same order of operations
+and dtypes, so results are bit-identical; options are read from the Gymnasium env. Comments say
+where NumPy computes arrays differently from numbers. Actions are ``[n, *action]``; values gathered
+from n simulations are ``[n, ...]`` float64.
 """
 
 from __future__ import annotations
 
+from importlib.metadata import version
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
@@ -29,90 +30,97 @@ Judgement = tuple[Any, Any, dict[str, Any]]
 
 
 class Task:
-    """What all tasks share.
+    """Base class of tasks.
 
     Args:
-        env: Gymnasium's, unwrapped.
-        simulations: n of them, of its model.
+        env: the unwrapped Gymnasium env.
+        fields: of n simulations, by MuJoCo's names: `mujoco_threads.Simulations`.
 
     Attributes:
-        needs_forces: `mj_rnePostConstraint` must follow each step.
-        position: reads where each simulation's body is, for its velocity.
+        needs_forces: True if the task reads contact forces.
+        positions: ``[n, ...]``, last position of the body, for its velocity.
         actions: of the step.
-        observations: after it.
+        observations: after the step.
     """
 
     needs_forces: ClassVar[bool] = False
 
-    def __init__(self, env: Any, simulations: list[Any]) -> None:
+    def __init__(self, env: Any, fields: Any) -> None:
         self.env = env
-        self._simulations = simulations
-        self._num = len(simulations)
+        self.fields = fields
+        self._options: Any = env.model.opt
+        self._num: int = fields.count
         self._observed = self.gathered(*self.observed())
-        self.position = self.gathered(*self.placed())
-        self._before: Any = None
+        self.positions: Any = self.position(fields)
         self.actions: Any = None
         self.observations: Any = None
 
     def gathered(self, *parts: Callable[[Any], Any]) -> Callable[[], NDArray[np.float64]]:
-        """What reads parts of each simulation's arrays, flat and one after the other."""
+        """Make a function that reads parts of all simulations, flattened and concatenated."""
+        views: list[NDArray[Any]] = [part(self.fields) for part in parts]
         num = self._num
-        views = [part(s).reshape(-1) for s in self._simulations for part in parts]
-        if not views:
-            return lambda: np.empty((num, 0))
-        return lambda: np.concatenate(views).reshape(num, -1)
+        if all(view.ndim == 2 for view in views):
+            return lambda: np.concatenate(views, axis=1)
+        return lambda: np.concatenate([view.reshape(num, -1) for view in views], axis=1)
 
-    # -- what a task says of itself -----------------------------------------------------
+    # -- the differences between tasks ----------------------------------------------------
 
     def observed(self) -> list[Callable[[Any], Any]]:
-        """The parts of a simulation that make an observation."""
+        """Parts of a simulation that form an observation."""
         raise NotImplementedError
 
     def finish(self, observations: NDArray[np.float64]) -> None:
-        """Change what was observed, in place."""
+        """Complete observations in place."""
 
-    def placed(self) -> list[Callable[[Any], Any]]:
-        """The parts that tell where its body is; none where nobody asks for its velocity."""
-        return []
+    def position(self, fields: Any) -> Any:
+        """Position of the body in `fields` of all simulations or of one; None if unused."""
 
     def judge(self) -> Judgement:
-        """What the step was worth, and where it ends an episode."""
+        """Compute rewards, terminations and infos of a step."""
         raise NotImplementedError
 
-    # -- what is done with it -----------------------------------------------------------
+    # -- use --------------------------------------------------------------------------------
 
-    def begin(self, actions: NDArray[Any]) -> None:
-        """Take note of the actions of a step, and of where all are before it."""
+    def stepped(self, actions: NDArray[Any]) -> tuple[NDArray[np.float64], Judgement]:
+        """Return observations, rewards, terminations and infos of a step with these actions."""
         self.actions = actions
-        self._before = self.position()
-
-    def observe(self) -> NDArray[np.float64]:
-        """Observations of all, as they are now."""
         self.observations = self._observed()
         self.finish(self.observations)
-        return self.observations
+        return self.observations, self.judge()
+
+    def moved(self, k: int, data: Any) -> None:
+        """Record the position of simulation k, which was moved to `data` without a step."""
+        if self.positions is not None:
+            self.positions = self.positions.copy()  # The last infos have views of it.
+            self.positions[k] = self.position(data)
 
     def velocity(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Positions now, and velocities since `begin`."""
-        after = self.position()
-        return after, (after - self._before) / self.env.dt
+        """Return current positions, and velocities since the last step."""
+        before: NDArray[np.float64] = self.positions
+        after: NDArray[np.float64] = self.position(self.fields)
+        self.positions = after
+        # Gymnasium's `dt`, read with one call of MuJoCo's bindings in place of two.
+        velocity: NDArray[np.float64] = (after - before) / (
+            self._options.timestep * self.env.frame_skip
+        )
+        return after, velocity
 
     def never(self) -> NDArray[np.bool_]:
         return np.zeros(self._num, np.bool_)
 
 
 def _skipping(env: Any, count: int) -> list[Callable[[Any], Any]]:
-    """Positions, without the first ones if they are excluded, and velocities."""
+    """Positions, without the first `count` if the env excludes them, and velocities."""
     skipped = count if env._exclude_current_positions_from_observation else 0
-    return [lambda s: s.qpos[skipped:], lambda s: s.qvel]
+    return [lambda s: s.qpos[:, skipped:], lambda s: s.qvel]
 
 
 def _squares(rows: NDArray[Any]) -> Any:
-    return np.square(rows).sum(axis=1)
+    return np.add.reduce(np.square(rows), axis=1)
 
 
 def _lengths(vectors: NDArray[np.float64]) -> Any:
-    # As `np.linalg.norm`, which takes a dot product.
+    # Like `np.linalg.norm`, which uses a dot product.
     return np.sqrt(np.vecdot(vectors, vectors))
 
 
@@ -120,11 +128,12 @@ class HalfCheetah(Task):
     def observed(self) -> list[Callable[[Any], Any]]:
         return _skipping(self.env, 1)
 
-    def placed(self) -> list[Callable[[Any], Any]]:
-        return [lambda s: s.qpos[:1]]
+    def position(self, fields: Any) -> Any:
+        return fields.qpos[..., :1].copy()
 
     def judge(self) -> Judgement:
-        x, velocity = (column[:, 0] for column in self.velocity())
+        positions, velocities = self.velocity()
+        x, velocity = positions[:, 0], velocities[:, 0]
         forward = self.env._forward_reward_weight * velocity
         control = self.env._ctrl_cost_weight * _squares(self.actions)
         infos = {
@@ -140,8 +149,8 @@ class Swimmer(Task):
     def observed(self) -> list[Callable[[Any], Any]]:
         return _skipping(self.env, 2)
 
-    def placed(self) -> list[Callable[[Any], Any]]:
-        return [lambda s: s.qpos[:2]]
+    def position(self, fields: Any) -> Any:
+        return fields.qpos[..., :2].copy()
 
     def judge(self) -> Judgement:
         xy, velocity = self.velocity()
@@ -160,8 +169,8 @@ class Swimmer(Task):
 
 
 class Hopper(Task):
-    def __init__(self, env: Any, simulations: list[Any]) -> None:
-        super().__init__(env, simulations)
+    def __init__(self, env: Any, fields: Any) -> None:
+        super().__init__(env, fields)
         self.state = self.gathered(lambda s: s.qpos, lambda s: s.qvel)
         self.velocities = env.observation_space.shape[0] - env.model.nv
 
@@ -172,8 +181,8 @@ class Hopper(Task):
         velocities = observations[:, self.velocities :]
         np.clip(velocities, -10, 10, out=velocities)
 
-    def placed(self) -> list[Callable[[Any], Any]]:
-        return [lambda s: s.qpos[:1]]
+    def position(self, fields: Any) -> Any:
+        return fields.qpos[..., :1].copy()
 
     def healthy(self, state: NDArray[np.float64]) -> NDArray[np.bool_]:
         least, most = self.env._healthy_state_range
@@ -187,7 +196,8 @@ class Hopper(Task):
 
     def judge(self) -> Judgement:
         env, state = self.env, self.state()
-        x, velocity = (column[:, 0] for column in self.velocity())
+        positions, velocities = self.velocity()
+        x, velocity = positions[:, 0], velocities[:, 0]
         healthy = self.healthy(state)
         forward = env._forward_reward_weight * velocity
         survive = healthy * env._healthy_reward
@@ -211,20 +221,20 @@ class Walker2d(Hopper):
 class Ant(Task):
     needs_forces = True
 
-    def __init__(self, env: Any, simulations: list[Any]) -> None:
-        super().__init__(env, simulations)
+    def __init__(self, env: Any, fields: Any) -> None:
+        self.body = env.model.body(env._main_body).id
+        super().__init__(env, fields)
         self.state = self.gathered(lambda s: s.qpos, lambda s: s.qvel)
         self.forces = self.gathered(lambda s: s.cfrc_ext)
         self.first_force = env.observation_structure["qpos"] + env.observation_structure["qvel"]
 
-    def placed(self) -> list[Callable[[Any], Any]]:
-        body = self.env.model.body(self.env._main_body).id
-        return [lambda s: s.xpos[body, :2]]
+    def position(self, fields: Any) -> Any:
+        return fields.xpos[..., self.body, :2].copy()
 
     def observed(self) -> list[Callable[[Any], Any]]:
         parts = _skipping(self.env, 2)
         if self.env._include_cfrc_ext_in_observation:
-            parts.append(lambda s: s.cfrc_ext[1:])
+            parts.append(lambda s: s.cfrc_ext[:, 1:])
         return parts
 
     def finish(self, observations: NDArray[np.float64]) -> None:
@@ -257,13 +267,13 @@ class Ant(Task):
 
 
 class _Humanoid(Task):
-    """What the two humanoids share."""
+    """Base class of the two humanoids."""
 
     needs_forces = True
 
-    def __init__(self, env: Any, simulations: list[Any]) -> None:
-        super().__init__(env, simulations)
-        self.start = self.gathered(lambda s: s.qpos[:3])
+    def __init__(self, env: Any, fields: Any) -> None:
+        super().__init__(env, fields)
+        self.start = self.gathered(lambda s: s.qpos[:, :3])
         self.controls = self.gathered(lambda s: s.ctrl)
         self.forces = self.gathered(lambda s: s.cfrc_ext)
         self.lengths = self.gathered(lambda s: s.ten_length)
@@ -272,30 +282,26 @@ class _Humanoid(Task):
     def observed(self) -> list[Callable[[Any], Any]]:
         env, parts = self.env, _skipping(self.env, 2)
         if env._include_cinert_in_observation is True:
-            parts.append(lambda s: s.cinert[1:])
+            parts.append(lambda s: s.cinert[:, 1:])
         if env._include_cvel_in_observation is True:
-            parts.append(lambda s: s.cvel[1:])
+            parts.append(lambda s: s.cvel[:, 1:])
         if env._include_qfrc_actuator_in_observation is True:
-            parts.append(lambda s: s.qfrc_actuator[6:])
+            parts.append(lambda s: s.qfrc_actuator[:, 6:])
         if env._include_cfrc_ext_in_observation is True:
-            parts.append(lambda s: s.cfrc_ext[1:])
+            parts.append(lambda s: s.cfrc_ext[:, 1:])
         return parts
 
     def clipped(self, weight: float, limits: tuple[float, float]) -> NDArray[np.float64]:
-        """What forces from outside cost."""
+        """Cost of external forces."""
         return np.clip(weight * _squares(self.forces()), *limits)
 
 
 class Humanoid(_Humanoid):
-    def __init__(self, env: Any, simulations: list[Any]) -> None:
-        super().__init__(env, simulations)
-        self.masses = env.model.body_mass
-        self.centres = self.gathered(lambda s: s.xipos)
-        self.position = self.centre_of_mass
-
-    def centre_of_mass(self) -> NDArray[np.float64]:
-        centres = self.centres().reshape(self._num, -1, 3)
-        return (np.einsum("b,kbj->kj", self.masses, centres) / self.masses.sum())[:, :2]
+    def position(self, fields: Any) -> Any:
+        single = fields is not self.fields
+        masses = self.env.model.body_mass if single else fields.model_field("body_mass")
+        weighted = masses[..., np.newaxis] * fields.xipos
+        return (weighted.sum(axis=-2) / masses.sum(axis=-1, keepdims=True))[..., :2]
 
     def judge(self) -> Judgement:
         env, start = self.env, self.start()
@@ -354,19 +360,19 @@ class InvertedPendulum(Task):
 
 
 class InvertedDoublePendulum(Task):
-    def __init__(self, env: Any, simulations: list[Any]) -> None:
-        super().__init__(env, simulations)
-        self.tip = self.gathered(lambda s: s.site_xpos[0])
-        self.speeds = self.gathered(lambda s: s.qvel[1:3])
+    def __init__(self, env: Any, fields: Any) -> None:
+        super().__init__(env, fields)
+        self.tip = self.gathered(lambda s: s.site_xpos[:, 0])
+        self.speeds = self.gathered(lambda s: s.qvel[:, 1:3])
 
     def observed(self) -> list[Callable[[Any], Any]]:
-        angles: Callable[[Any], Any] = lambda s: s.qpos[1:]  # noqa: E731
+        angles: Callable[[Any], Any] = lambda s: s.qpos[:, 1:]  # noqa: E731
         return [
-            lambda s: s.qpos[:1],
+            lambda s: s.qpos[:, :1],
             angles,
             angles,
             lambda s: s.qvel,
-            lambda s: s.qfrc_constraint[:1],
+            lambda s: s.qfrc_constraint[:, :1],
         ]
 
     def finish(self, observations: NDArray[np.float64]) -> None:
@@ -379,7 +385,7 @@ class InvertedDoublePendulum(Task):
 
     def judge(self) -> Judgement:
         tips, speeds = self.tip().tolist(), self.speeds().tolist()
-        # Of numbers NumPy takes the power that C does, of arrays the product.
+        # NumPy squares numbers by C's `pow`, but arrays by a product.
         distances = np.array([0.01 * x**2 + (y - 2) ** 2 for x, _, y in tips])
         velocities = np.array([1e-3 * v1**2 + 5e-3 * v2**2 for v1, v2 in speeds])
         terminated = np.array([y <= 1 for _, _, y in tips])
@@ -396,11 +402,11 @@ class Pusher(Task):
     def observed(self) -> list[Callable[[Any], Any]]:
         arm, thing, goal = (self.env.model.body(name).id for name in ("tips_arm", "object", "goal"))
         return [
-            lambda s: s.qpos[:7],
-            lambda s: s.qvel[:7],
-            lambda s: s.xpos[arm],
-            lambda s: s.xpos[thing],
-            lambda s: s.xpos[goal],
+            lambda s: s.qpos[:, :7],
+            lambda s: s.qvel[:, :7],
+            lambda s: s.xpos[:, arm],
+            lambda s: s.xpos[:, thing],
+            lambda s: s.xpos[:, goal],
         ]
 
     def judge(self) -> Judgement:
@@ -414,16 +420,22 @@ class Pusher(Task):
 
 
 class Reacher(Task):
-    def __init__(self, env: Any, simulations: list[Any]) -> None:
-        super().__init__(env, simulations)
+    def __init__(self, env: Any, fields: Any) -> None:
+        super().__init__(env, fields)
         tip, target = (env.model.body(name).id for name in ("fingertip", "target"))
-        self.tip = self.gathered(lambda s: s.xpos[tip])
-        self.target = self.gathered(lambda s: s.xpos[target])
+        self.tip = self.gathered(lambda s: s.xpos[:, tip])
+        self.target = self.gathered(lambda s: s.xpos[:, target])
 
     def observed(self) -> list[Callable[[Any], Any]]:
-        angles: Callable[[Any], Any] = lambda s: s.qpos[:2]  # noqa: E731
-        # The last is where the distance to the target goes.
-        return [angles, angles, lambda s: s.qpos[2:], lambda s: s.qvel[:2], lambda s: s.xpos[0, :2]]
+        angles: Callable[[Any], Any] = lambda s: s.qpos[:, :2]  # noqa: E731
+        # The last one is a placeholder for the distance to the target.
+        return [
+            angles,
+            angles,
+            lambda s: s.qpos[:, 2:],
+            lambda s: s.qvel[:, :2],
+            lambda s: s.xpos[:, 0, :2],
+        ]
 
     def finish(self, observations: NDArray[np.float64]) -> None:
         cosines, sines = observations[:, :2], observations[:, 2:4]
@@ -455,17 +467,17 @@ _KINDS: dict[str, type[Task]] = {
 
 
 def is_batched(spec: EnvSpec) -> bool:
-    """Whether `task_of` knows what `gymnasium.make` makes of `spec` without its checker."""
+    """Return True if `task_of` supports `spec` without the checker, and MuJoCo has batches."""
     entry = str(spec.entry_point).removeprefix("gymnasium.envs.mujoco.")
-    return entry in _KINDS and spec.order_enforce and not spec.additional_wrappers
+    known = entry in _KINDS and spec.order_enforce and not spec.additional_wrappers
+    return known and tuple(map(int, version("mujoco").split(".")[:2])) >= (3, 17)
 
 
-def task_of(env: gym.Env[Any, Any], simulations: list[Any]) -> Task:
-    """The task of an env that `gymnasium.make` made.
+def task_of(env: gym.Env[Any, Any]) -> type[Task]:
+    """Class of the task of `env`, which `gymnasium.make` has made.
 
     Raises:
-        NotImplementedError: it is none of Gymnasium's v5 tasks, or wrapped in something that
-            changes what it does.
+        NotImplementedError: it isn't one of Gymnasium's v5 tasks, or has a wrapper that changes it.
     """
     kind = type(env.unwrapped)
     found = _KINDS.get(
@@ -478,4 +490,4 @@ def task_of(env: gym.Env[Any, Any], simulations: list[Any]) -> Task:
     for wrapper in wrappers_of(env):
         if not isinstance(wrapper, gym.wrappers.OrderEnforcing | gym.wrappers.TimeLimit):
             raise NotImplementedError(f"it is wrapped in {type(wrapper).__name__}")
-    return found(env.unwrapped, simulations)
+    return found

@@ -1,4 +1,4 @@
-"""What makes envs of a task in a worker, which need not know its name."""
+"""Functions that make envs of a task in a worker that does not have the task registered."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from gymnasium.envs.registration import EnvSpec
-    from gymnasium.vector import AutoresetMode
 
 __all__ = ["BatchOf", "OneOf", "VectorOf"]
 
@@ -40,16 +39,21 @@ class OneOf:
 
 
 class BatchOf:
-    """Simulations of a MuJoCo task that are stepped together; see `mujoco_batch`."""
+    """Simulations of a MuJoCo task that are stepped together.
 
-    def __init__(self, make_one: OneOf, num_envs: int, mode: AutoresetMode) -> None:
-        self._make_one, self._num_envs, self._mode = make_one, num_envs, mode
+    Args:
+        make_one: makes one of them.
+        arguments: further ones of `mujoco_batch.MujocoBatch`.
+    """
+
+    def __init__(self, make_one: OneOf, *arguments: Any, **options: Any) -> None:
+        self._make_one, self._arguments, self._options = make_one, arguments, options
 
     def __call__(self) -> gym.vector.VectorEnv[Any, Any, Any]:
-        # Not at the top: few workers need it.
+        # Imported here because few workers need it.
         from rlightning_aio.envs.mujoco_batch import MujocoBatch
 
-        return MujocoBatch(self._make_one(), self._num_envs, self._mode)
+        return MujocoBatch(self._make_one(), *self._arguments, **self._options)
 
 
 class VectorOf:

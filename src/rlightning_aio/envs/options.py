@@ -1,6 +1,6 @@
-"""`env_kwargs` of backends that declare what they take as a pydantic model.
+"""Validate `env_kwargs` of backends that declare them as a pydantic model.
 
-Rule: what is wrong is said in one message that names the env and each field.
+Rule: one message names the env and every wrong field.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Options = TypeVar("Options", bound=BaseModel)
 
 
 def read_options(model: type[Options], env_id: str, env_kwargs: Mapping[str, Any]) -> Options:
-    """`env_kwargs` as `model`.
+    """Parse `env_kwargs` as `model`.
 
     Raises:
         ConfigError: a field is unknown, missing or of the wrong type or value.
@@ -35,7 +35,7 @@ def read_options(model: type[Options], env_id: str, env_kwargs: Mapping[str, Any
 
 
 def load_named(env_id: str, field: str, name: str, separator: str = ":") -> Any:
-    """The object that ``module:name`` (or ``module::name``) stands for.
+    """Import the object that ``module:name`` (or ``module::name``) names.
 
     Raises:
         ConfigError: the module can't be imported, or has no such name.

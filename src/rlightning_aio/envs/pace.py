@@ -1,7 +1,7 @@
 """`Pace`: the control rate of envs that live in real time.
 
-Rule: deadlines are kept on a grid, so that no error adds up; what was missed is never
-made up for in a rush.
+Rule: deadlines lie on a grid, so errors don't add up. A missed deadline is not made up for
+by shorter periods.
 """
 
 from __future__ import annotations
@@ -36,14 +36,13 @@ class Pace:
         self._due = clock() + self._period
 
     def restart(self) -> None:
-        """The next deadline is one period from now."""
+        """Set the next deadline to one period from now."""
         self._due = self._clock() + self._period
 
     def wait(self) -> float:
-        """Sleep until the deadline and set the next; by how many seconds it was missed.
+        """Sleep until the deadline, set the next one, and return the delay in seconds.
 
-        A deadline missed by less than a period leaves the grid where it is; after a longer
-        delay the grid starts anew.
+        A delay of less than a period keeps the grid; after a longer one the grid starts again.
         """
         late = self._clock() - self._due
         if late < 0:

@@ -1,13 +1,12 @@
 """`pettingzoo`: any parallel environment of PettingZoo, all its agents in each result.
 
-Rule: every result speaks of every possible agent, in the same order, so that a group
-can lay them out once; an agent that isn't taking part is said to have terminated.
-Absent on purpose: turn-based (AEC) environments; PettingZoo converts those itself.
+Rule: every result covers every possible agent in the same order, so that a group can lay
+them out once; an agent that doesn't take part counts as terminated.
+Left out: turn-based (AEC) environments; PettingZoo converts those itself.
 """
 
 from __future__ import annotations
 
-import difflib
 import math
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, cast
@@ -18,6 +17,7 @@ from gymnasium.spaces import Box, Dict, Discrete, Tuple
 from rlightning_aio.envs.base import BaseEnv, PreprocessFn
 from rlightning_aio.envs.tensors import as_numpy
 from rlightning_aio.errors import ConfigError
+from rlightning_aio.registry import did_you_mean
 from rlightning_aio.types import MultiAgentEnvRet, PolicyResponse
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class PettingZooEnv(BaseEnv):
     ``agents`` are the environment's possible agents, and its spaces are Dicts over them.
     An agent that has left before the episode's end, or hasn't joined yet, keeps an
     observation of zeros, a reward of 0.0 and the flags it left with (terminated, if it left
-    with none); its action is ignored. Infos are by agent, for those who reported any.
+    with none); its action is ignored. Infos are by agent, for agents that reported any.
 
     The config's ``max_episode_steps`` truncates the episode for all agents that are left.
     """
@@ -83,8 +83,8 @@ class PettingZooEnv(BaseEnv):
                 reason = "is turn-based; convert it in your own function (module:function)"
             else:
                 known: list[str] = list(pettingzoo.parallel_registry)
-                near = difflib.get_close_matches(name, known, n=1)
-                reason = f"is not registered{f'; did you mean {near[0]!r}?' if near else ''}"
+                hint = did_you_mean(name, known)
+                reason = f"is not registered; {hint}" if hint else "is not registered"
             raise ConfigError(f"env {self.env_id!r}: PettingZoo's {name!r} {reason}") from error
 
     def _factory(self) -> Any:
@@ -124,7 +124,7 @@ class PettingZooEnv(BaseEnv):
     def _note_flags(
         self, live: list[str], terminated: dict[str, bool], truncated: dict[str, bool]
     ) -> None:
-        """Bring the agents' flags up to date; `live` were there before the step."""
+        """Update the agents' flags; `live` took part before the step."""
         there = self.env.agents
         for agent in {*live, *there}:
             self._terminated[agent] = bool(terminated.get(agent, False))
@@ -162,8 +162,8 @@ class PettingZooEnv(BaseEnv):
 
 
 def _own_limit(simulator: Any) -> int | None:
-    """How many steps an episode has at most, where the simulator says so."""
-    # PettingZoo's own ones for SISL keep theirs one object further in.
+    """Return the simulator's step limit, if it has one."""
+    # PettingZoo's SISL envs keep it in an inner object.
     limits = (
         getattr(one, "max_cycles", None) for one in (simulator, getattr(simulator, "env", None))
     )
@@ -171,7 +171,7 @@ def _own_limit(simulator: Any) -> int | None:
 
 
 def _zeros(space: gym.Space[Any]) -> Any:
-    """The member of `space` that is nearest to zero."""
+    """Return the member of `space` that is nearest to zero."""
     match space:
         case Dict():
             return {key: _zeros(inner) for key, inner in space.spaces.items()}

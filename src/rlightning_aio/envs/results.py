@@ -8,6 +8,7 @@ with a list mean the same everywhere.
 
 from __future__ import annotations
 
+from inspect import iscoroutinefunction
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -29,6 +30,7 @@ __all__ = [
     "has_preprocess_fn",
     "input_of",
     "is_async_first",
+    "is_awaitable",
     "one_result",
     "reads_extras",
     "step_of",
@@ -36,21 +38,21 @@ __all__ = [
 
 
 def has_preprocess_fn(env: BaseEnv) -> bool:
-    """Whether actions of `env` go through a function of the user's."""
+    """Return True if actions of `env` pass through a function of the user."""
     return env._preprocess_fn is not default_env_preprocess_fn  # pyright: ignore[reportPrivateUsage]
 
 
 def reads_extras(env: BaseEnv) -> bool:
-    """Whether anything can read more of a response to `env` than its action."""
+    """Return True if `env` can read more of a response than its action."""
     built_in = type(env).__module__.startswith("rlightning_aio.envs.")
     return has_preprocess_fn(env) or not (built_in or env.bare_step() is not None)
 
 
 def input_of(env: BaseEnv) -> Callable[[Any, dict[str, Any]], Any]:
-    """What makes the input of one step, of an action and what the policy attached to it.
+    """Return a function that makes the input of a step from an action and the policy's extras.
 
-    For `bare_step`, where there is one, that is an action, which the preprocess function has
-    made; for `step_of` a `PolicyResponse`.
+    For `bare_step`, if the env has one, the input is an action, preprocessed if there is a
+    preprocess function. For `step_of` it is a `PolicyResponse`.
     """
     env_id = env.env_id
     if env.bare_step() is None:
@@ -62,7 +64,7 @@ def input_of(env: BaseEnv) -> Callable[[Any, dict[str, Any]], Any]:
 
 
 def is_async_first(env: BaseEnv) -> bool:
-    """Whether `env` is stepped by `BaseEnv.step_async` and `BaseEnv.collect_async`."""
+    """Return True if `env` steps by `BaseEnv.step_async` and `BaseEnv.collect_async`."""
     kind = type(env)
     return (
         kind.step_async is not BaseEnv.step_async
@@ -70,8 +72,22 @@ def is_async_first(env: BaseEnv) -> bool:
     )
 
 
+def is_awaitable(env: BaseEnv) -> bool:
+    """Return True if `reset` and `step` of `env` are coroutine functions.
+
+    Raises:
+        TypeError: only one of them is.
+    """
+    kinds = {iscoroutinefunction(env.reset), iscoroutinefunction(env.step)}
+    if len(kinds) > 1:
+        raise TypeError(
+            f"reset and step of env {env.env_id!r} must both be `async def`, or neither of them"
+        )
+    return kinds.pop()
+
+
 def step_of(env: BaseEnv) -> Callable[[PolicyResponse], Any]:
-    """What steps `env` and returns what it answers."""
+    """Return a function that steps `env` and returns its result."""
     if not is_async_first(env):
         return env.step
 
@@ -83,13 +99,13 @@ def step_of(env: BaseEnv) -> Callable[[PolicyResponse], Any]:
 
 
 def one_result(env: BaseEnv, method: str, returned: Any) -> EnvRet | MultiAgentEnvRet:
-    """What `method` of `env` returned, as one result.
+    """Convert the value that `method` of `env` returned to one result.
 
     A list holds one result for each sub-environment, in order; their arrays are stacked
     (as NumPy arrays) and their infos become Gymnasium's vector form.
 
     Raises:
-        TypeError: it is no result, and no list of as many as there are sub-environments.
+        TypeError: it is neither a result nor a list with one for each sub-environment.
     """
     if isinstance(returned, EnvRet | MultiAgentEnvRet):
         return returned

@@ -1,4 +1,4 @@
-"""Resets in the step that ends an episode, in the worker: no further round trip."""
+"""Reset in the worker, within the step that ends an episode, to save a round trip."""
 
 from __future__ import annotations
 
@@ -7,22 +7,24 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.vector import AutoresetMode
 
+from rlightning_aio.envs.wrappers import metadata_of
+
 __all__ = ["SameStep"]
 
 
 class SameStep(gym.Wrapper[Any, Any, Any, Any]):
-    """An env that begins its next episode in the step that ends the one before.
+    """An env that begins the next episode within the step that ends one.
 
-    That step's observation and info are the next episode's first; ``final_obs`` and
-    ``final_info`` are the last ones of the episode that has ended, as Gymnasium's vector
-    environments have them in `AutoresetMode.SAME_STEP`.
+    The observation and info of that step are the first of the next episode. ``final_obs`` and
+    ``final_info`` are the last of the episode that ended, as in Gymnasium's vector environments
+    with `AutoresetMode.SAME_STEP`.
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         super().__init__(env)
-        self.metadata = {**env.metadata, "autoreset_mode": AutoresetMode.SAME_STEP}
+        self.metadata = {**metadata_of(env), "autoreset_mode": AutoresetMode.SAME_STEP}
 
-    # Nobody is to find this wrapper among those of the env's author.
+    # This wrapper hides itself: lookups go to the wrappers of the env's author.
 
     def has_wrapper_attr(self, name: str) -> bool:
         return self.env.has_wrapper_attr(name)

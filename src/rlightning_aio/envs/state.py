@@ -1,11 +1,11 @@
-"""The state of an env, taken out of it and put back: of its simulator, wrappers and generators.
+"""Saves and restores the state of an env: simulator, wrappers and random generators.
 
-Rule: what an env consists of stays where it is; what that holds is replaced. Its *parts* are
-the env itself, the layers of its simulator (wrappers, sub-environments), and what only its
-library can copy (MuJoCo's data, an ALE console); `parts_of` finds them and names each by its
-path. Everything else that the parts hold is one pickle, in which parts are referred to.
-Absent on purpose: what lies outside of the env, as the process's own generators
-(`numpy.random`, `random`), files and windows.
+Rule: a restore keeps the objects that an env consists of, and replaces their contents. The *parts*
+are the env itself, the layers of its simulator (wrappers, sub-environments), and objects that only
+their library can copy (MuJoCo's data, an ALE console). `parts_of` finds them and names each by its
+path. All other contents of the parts are one pickle, with references to parts.
+Absent on purpose: state outside the env, such as global generators (`numpy.random`, `random`),
+files and windows.
 """
 
 from __future__ import annotations
@@ -23,14 +23,17 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
 from rlightning_aio.envs import mujoco_state
+from rlightning_aio.envs.ale_console import is_sticky
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
 __all__ = ["SavedState", "load_state", "parts_of", "save_state", "versions_of"]
 
-NOT_STATE: Final = frozenset(("config", "worker_index", "env_id", "trainer_pid", "_preprocess_fn"))
-"""Attributes of a `BaseEnv` that say which env it is."""
+NOT_STATE: Final = frozenset(
+    ("config", "worker_index", "env_id", "trainer_pid", "_preprocess_fn", "_background")
+)
+"""Attributes of a `BaseEnv` that identify the env."""
 _PLAIN: Final[tuple[type[Any], ...]] = (str, bytes, int, float, bool, type(None), np.generic)
 
 
@@ -39,11 +42,11 @@ _BUILT_IN: Final = frozenset((str, bytes, int, float, bool, type(None), tuple, l
 
 @dataclass(frozen=True)
 class SavedState:
-    """What an env held.
+    """The saved state of an env.
 
     Attributes:
-        parts: the path of each part, and its type.
-        pickled: what each part held, by path.
+        parts: path and type of each part.
+        pickled: contents of the parts by path.
     """
 
     parts: tuple[tuple[str, str], ...]
@@ -51,11 +54,11 @@ class SavedState:
 
 
 class _Kind(NamedTuple):
-    """What is done with parts of one kind.
+    """Functions for a kind of parts.
 
     Attributes:
-        save: what a part holds, picklable; load: puts that back.
-        is_layer: its attributes may be parts, too.
+        save: returns the contents of a part, picklable; load: restores them.
+        is_layer: attributes of the part may be parts too.
     """
 
     save: Callable[[Any], Any]
@@ -75,7 +78,7 @@ def _nothing(part: Any) -> None:
     del part
 
 
-def _as_it_is(part: Any, state: Any) -> None:
+def _unchanged(part: Any, state: Any) -> None:
     del part, state
 
 
@@ -108,8 +111,8 @@ def _spaces_in(space: Any) -> list[Any]:
 
 
 def _generators(space: Any) -> list[Any]:
-    """The generators of a space and of those in it; None for one that nobody has used."""
-    # Asking for one by its property would make it.
+    """Random generators of a space and of the spaces in it; None for unused ones."""
+    # The property would make one.
     own = space._np_random  # noqa: SLF001
     return [own, *map(_generators, _spaces_in(space))]
 
@@ -129,6 +132,12 @@ def _load_own_state(part: Any, state: Any) -> None:
 
 
 def _console_state(console: Any) -> Any:
+    if is_sticky(console):
+        raise NotImplementedError(
+            "a console with sticky actions repeats its last action at random, and ale-py's states "
+            "don't include that action: use backend: ale, which keeps it, or make the env with "
+            "repeat_action_probability=0"
+        )
     return console.cloneState(include_rng=True)
 
 
@@ -140,17 +149,18 @@ _ENV = _Kind(_env_attributes, _set_env_attributes, is_layer=True)
 _LAYER = _Kind(_attributes, _set_attributes, is_layer=True)
 _OWN = _Kind(_own_state, _load_own_state)
 _SPACE = _Kind(_generators, _set_generators)
-_KEPT = _Kind(_nothing, _as_it_is)
+_KEPT = _Kind(_nothing, _unchanged)
 _OF_LIBRARIES: Final[dict[str, dict[str, _Kind]]] = {
     "ale_py": {"ALEInterface": _Kind(_console_state, _set_console_state)},
+    "rlightning_aio": {"StickyConsole": _OWN},
     "mujoco": {
         "MjData": _Kind(mujoco_state.save_data, mujoco_state.load_data),
         "MjModel": _Kind(mujoco_state.save_model, mujoco_state.load_model),
     },
 }
-"""What only its library can copy, by module and name."""
+"""Objects that only their library can copy, by module and name."""
 _ON_SCREEN: Final = ("pygame", "glfw", "gymnasium.envs.mujoco.mujoco_rendering")
-"""Modules whose objects show an env, and tell nothing of what it does next."""
+"""Modules of objects that display an env, and don't affect its steps."""
 
 
 class _Plain:
@@ -158,12 +168,12 @@ class _Plain:
 
 
 def _kind_of(value: Any) -> _Kind | None:
-    """How `value` is saved in its place; None if it is a value as any other."""
+    """Kind of a value that is a part; None for any other value."""
     kind = cast("type[Any]", type(value))
     if kind is np.ndarray:
         return _KEPT if _is_view_of_a_simulator(value) else None
     if kind is FunctionType:
-        # Code is no state; what a closure holds may be.
+        # Code isn't state, but variables of a closure may be.
         return None if value.__closure__ else _KEPT
     if kind not in _kinds:
         _kinds[kind] = _kind_of_type(value)
@@ -191,7 +201,7 @@ def _kind_of_type(value: Any) -> _Kind | None:
 def _is_layer(value: Any) -> bool:
     if isinstance(value, gym.Env | gym.vector.VectorEnv):
         return True
-    # Without importing PettingZoo; and whatever pickles itself as what it was made of.
+    # By name, so that PettingZoo isn't imported. `EzPickle` pickles constructor arguments only.
     return not isinstance(value, type) and any(
         base.__name__ == "EzPickle"
         or (base.__name__ in ("AECEnv", "ParallelEnv") and base.__module__.startswith("pettingzoo"))
@@ -200,7 +210,7 @@ def _is_layer(value: Any) -> bool:
 
 
 def _is_view_of_a_simulator(array: np.ndarray[Any, Any]) -> bool:
-    """Whether its memory belongs to a library's object, and not to NumPy."""
+    """Return True if the memory of `array` belongs to an object of a library, not to NumPy."""
     base: Any = array
     while isinstance(base, np.ndarray):
         base = base.base
@@ -211,13 +221,13 @@ def _is_view_of_a_simulator(array: np.ndarray[Any, Any]) -> bool:
 
 
 def parts_of(env: Any) -> dict[str, _Part]:
-    """The parts of an env by path, from the outermost in; each once."""
+    """Parts of an env by path, from the outermost inwards, without duplicates."""
     found = {"env": _Part(env, _ENV)}
     known = {id(env)}
     for path, part in (queue := list(found.items())):
         if not part.kind.is_layer:
             continue
-        # By its plainest path: some hold what they wrap by another name, too.
+        # `env` first, because some wrappers also have the inner env under another name.
         for name, value in sorted(_held(part.value).items(), key=_env_first):
             if part.kind is _ENV and name in NOT_STATE:
                 continue
@@ -235,7 +245,7 @@ def _env_first(item: tuple[str, Any]) -> tuple[bool, str]:
 
 
 def _within(path: str, value: Any) -> Iterator[tuple[str, Any]]:
-    """`value`, and what it holds if it is a container."""
+    """Yield `value`, or its elements if it is a container."""
     items: Any = ()
     if type(value) in (list, tuple):
         items = enumerate(value) if value and not isinstance(value[0], _PLAIN) else ()
@@ -249,7 +259,7 @@ def _within(path: str, value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def versions_of(env: Any) -> dict[str, str]:
-    """The libraries that an env's parts come from, with their versions, sorted."""
+    """Versions of the libraries of an env's parts, sorted by name."""
     values: list[Any] = []
     for part in parts_of(env).values():
         values.append(part.value)
@@ -264,21 +274,21 @@ def versions_of(env: Any) -> dict[str, str]:
 
 
 class _Pickler(cloudpickle.Pickler):
-    """Refers to parts by their paths."""
+    """Replaces parts by references to their paths."""
 
     def __init__(self, file: io.BytesIO, paths: Mapping[int, str]) -> None:
         super().__init__(file, pickle.HIGHEST_PROTOCOL)  # pyright: ignore[reportUnknownMemberType]
         self._paths = paths
 
     def persistent_id(self, obj: Any) -> str | None:
-        if type(obj) in _BUILT_IN:  # As most are.
+        if type(obj) in _BUILT_IN:  # Most objects are.
             return None
         path = self._paths.get(id(obj))
         if path is None:
             kind = _kind_of(obj)
             if kind not in (None, _KEPT, _SPACE) or (kind is _KEPT and type(obj) is np.ndarray):
                 raise TypeError(
-                    f"a {type(obj).__name__} of a simulator lies where no layer holds it"
+                    f"a {type(obj).__name__} of a simulator is in an object that is not a layer"
                 )
         return path
 
@@ -293,7 +303,7 @@ class _Unpickler(pickle.Unpickler):
 
 
 def save_state(env: Any) -> SavedState:
-    """What an env holds, as a value.
+    """Return the state of an env.
 
     Raises:
         NotImplementedError: a part of it can't be saved; the message names it.
@@ -315,7 +325,7 @@ def save_state(env: Any) -> SavedState:
 
 
 def _name_of(part: _Part) -> str:
-    """The type of a part; of a MuJoCo model its structure, too."""
+    """Type of a part; of a MuJoCo model also its structure."""
     name = type(part.value).__qualname__
     return f"{name} {part.value.signature}" if name == "MjModel" else name
 
@@ -332,7 +342,7 @@ def _pickled(value: Any, paths: Mapping[int, str]) -> bytes:
 def _culprit(
     env: Any, states: Mapping[str, Any], paths: Mapping[int, str], error: Exception
 ) -> str:
-    """Says what it is that can't be pickled."""
+    """Describe the object that can't be pickled."""
     for path, state in states.items():
         held = cast("dict[str, Any]", state) if isinstance(state, dict) else {}
         for name, value in held.items():
@@ -347,10 +357,10 @@ def _culprit(
 
 
 def load_state(env: Any, state: SavedState) -> None:
-    """Put back what `save_state` has taken out of this env or of one like it.
+    """Restore the state of this env or of one with the same config.
 
     Raises:
-        ValueError: the env consists of other parts; nothing was changed.
+        ValueError: the env has other parts; nothing was changed.
     """
     parts = parts_of(env)
     for path, name in state.parts:
@@ -361,6 +371,6 @@ def load_state(env: Any, state: SavedState) -> None:
                 "another env, or has not been reset yet"
             )
     states = _Unpickler(io.BytesIO(state.pickled), parts).load()
-    # A model before what is computed with it.
+    # Models come before the data that are computed from them.
     for path, _ in sorted(state.parts, key=lambda part: not part[1].startswith("MjModel")):
         parts[path].kind.load(parts[path].value, states[path])

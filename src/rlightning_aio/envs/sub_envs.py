@@ -1,8 +1,4 @@
-"""What the adapters `vector` and `sb3` have of an env in its worker: their far end.
-
-To them the sub-environments of all vector environments are one row of envs, and are spoken to one
-by one.
-"""
+"""The worker side of the adapters `vector` and `sb3`, which address sub-environments one by one."""
 
 from __future__ import annotations
 
@@ -13,7 +9,7 @@ import gymnasium as gym
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 from rlightning_aio.envs.same_step import SameStep
-from rlightning_aio.envs.wrappers import wrappers_of
+from rlightning_aio.envs.wrappers import ClassName, autoreset_mode_of, has_wrapper
 from rlightning_aio.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -22,28 +18,28 @@ if TYPE_CHECKING:
 __all__ = ["SEEDS", "SubEnvs", "adapted"]
 
 _ONLY_READ: Final = ("get_wrapper_attr", "has_wrapper_attr", "render")
-"""What may be asked of more sub-environments than was wished for."""
+"""Methods without effects, which may be called on more sub-environments than requested."""
 SEEDS: Final = "rlightning_aio.seeds"
-"""Among the options of a reset: seeds that don't follow one another, one for each."""
+"""Option of a reset: a seed for each sub-environment, if they aren't consecutive."""
 
 
 def adapted(
     makers: Sequence[Callable[[], Any]], mode: AutoresetMode, max_episode_steps: int | None
 ) -> list[Callable[[], Any]]:
-    """`makers`, each of an env or a vector environment, as an adapter has them in its workers.
+    """Wrap callables that make envs or vector environments, to adapt the envs in the workers.
 
     Args:
-        makers: of the user's.
-        mode: what each env does after its episode's end.
-        max_episode_steps: which cuts an episode, where an entry says that. An env that is reset
-            in the same step must know of it.
+        makers: the user's callables.
+        mode: when an env is reset after the end of its episode.
+        max_episode_steps: step limit of the config entry, which an env with same-step autoreset
+            must apply itself.
     """
     own = {id(make): _Adapted(make, mode, max_episode_steps) for make in makers}
     return [own[id(make)] for make in makers]
 
 
 class _Adapted:
-    """Makes what a callable makes, and adapts it."""
+    """Calls a callable that makes an env, and adapts the env."""
 
     def __init__(
         self, make_env: Callable[[], Any], mode: AutoresetMode, max_episode_steps: int | None
@@ -62,16 +58,16 @@ class _Adapted:
                 "made"
             )
         vector = cast("gym.vector.VectorEnv[Any, Any, Any]", made)
-        own = vector.metadata.get("autoreset_mode")
+        own = autoreset_mode_of(vector)
         if own != self._mode:
             raise ValueError(
-                f"{type(vector).__name__} has autoreset_mode {own}, not {self._mode}; make it with "
-                "the mode that is asked for, or ask for its own"
+                f"{type(vector).__name__} has autoreset_mode {own}, not {self._mode}; use the same "
+                "mode for both"
             )
         return SubEnvs(vector)
 
 
-# Gymnasium 1.2 doesn't take parameters here.
+# In Gymnasium 1.2 this class takes no type parameters.
 if TYPE_CHECKING:
     _Wrapper = gym.vector.VectorWrapper[Any, Any, Any, Any, Any]
 else:
@@ -79,40 +75,40 @@ else:
 
 
 class SubEnvs(_Wrapper):
-    """Some vector environment, of Gymnasium's, of a task's or of this package."""
+    """Wraps a vector environment: Gymnasium's, a task's, or this package's."""
 
     def __init__(self, env: gym.vector.VectorEnv[Any, Any, Any]) -> None:
         super().__init__(env)
-        # A step takes no turn through here.
+        # Bypasses this wrapper.
         self.step = env.step  # pyright: ignore[reportIncompatibleMethodOverride]
         self._inner: Any = env.unwrapped
 
     @property
     def takes_masks(self) -> bool:
-        """Whether it can reset some of its sub-environments alone."""
+        """True if it can reset only some of its sub-environments."""
         one_by_one = isinstance(self._inner, SyncVectorEnv | AsyncVectorEnv)
         return one_by_one or getattr(self._inner, "takes_masks", False)
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """As the vector environment does; the seeds may be among the options."""
+        """Reset the vector environment; seeds may be given in the options (`SEEDS`)."""
         if options is not None and SEEDS in options:
             options = dict(options)
             seed = options.pop(SEEDS)
         return self.env.reset(seed=seed, options=options or None)
 
     def get_wrapper_attr(self, name: str) -> Any:
-        """What it tells of the whole."""
+        """Get an attribute of the whole vector environment."""
         return getattr(self, name)
 
     def call_sub_envs(
         self, name: str, args: Sequence[Any], kwargs: dict[str, Any], which: Sequence[int] | None
     ) -> list[Any]:
-        """Values of a method, or an attribute, of the sub-environments; of those in `which`.
+        """Call a method, or get an attribute, of all sub-environments or of those in `which`.
 
         Raises:
-            ValueError: the vector environment can call that of all of them only.
+            ValueError: the vector environment can call it only on all of them.
         """
         places = range(self.num_envs) if which is None else which
         some = len(set(places)) < self.num_envs and name not in _ONLY_READ
@@ -138,17 +134,22 @@ class SubEnvs(_Wrapper):
             )
         return call_one(k, name, *args, **kwargs)
 
+    def look_up_sub_env(self, place: int, name: str) -> list[tuple[bool, Any]]:
+        """Look up an attribute of one sub-environment, like `GymnasiumEnv.look_up`, in a list."""
+        found = self._call_one(place, "get_wrapper_attr", (name,), {})
+        return [(callable(found), None if callable(found) else found)]
+
     def set_sub_envs(self, name: str, values: Sequence[Any]) -> None:
-        """Set an attribute, with one value for each sub-environment."""
+        """Set an attribute of each sub-environment to its own value."""
         self._able_to("set_attr")(name, list(values))
 
-    def sub_envs_wrapped(self, wrapper_class: type[Any]) -> bool:
-        """Whether `wrapper_class` is among the wrappers of each sub-environment."""
+    def sub_envs_wrapped(self, name: ClassName) -> bool:
+        """Return True if the class of that name is among the wrappers of the sub-environments."""
         envs: list[Any] = getattr(self._inner, "envs", [])  # A `SyncVectorEnv`'s.
-        if any(isinstance(w, wrapper_class) for env in envs for w in wrappers_of(env)):
+        if any(has_wrapper(env, name) for env in envs):
             return True
-        tells = getattr(self._inner, "is_wrapped", None)
-        return False if tells is None else tells(wrapper_class)
+        is_wrapped = getattr(self._inner, "is_wrapped", None)
+        return False if is_wrapped is None else is_wrapped(name)
 
     def _able_to(self, method: str) -> Any:
         found = getattr(self._inner, method, None)

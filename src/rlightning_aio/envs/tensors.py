@@ -1,6 +1,6 @@
-"""Torch tensors where NumPy arrays are wanted.
+"""Convert torch tensors to NumPy arrays.
 
-Rule: torch is recognised, never imported; a user who has no torch pays for none.
+Rule: torch is recognised by name and never imported, so users without it pay nothing.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ __all__ = ["as_numpy", "holds_tensor", "is_tensor"]
 
 
 def is_tensor(value: Any) -> bool:
-    """Whether `value` is a torch tensor."""
+    """Return True if `value` is a torch tensor."""
     return type(value).__module__.partition(".")[0] == "torch" and hasattr(value, "detach")
 
 
 def holds_tensor(value: Any) -> bool:
-    """Whether `value` is a torch tensor, or a dict, tuple or list that holds one."""
+    """Return True if `value` is a torch tensor, or a dict, tuple or list that holds one."""
     if isinstance(value, dict):
         return any(map(holds_tensor, cast("dict[Any, Any]", value).values()))
     if isinstance(value, tuple | list):
@@ -27,9 +27,9 @@ def holds_tensor(value: Any) -> bool:
 
 
 def as_numpy(value: Any) -> Any:
-    """`value` with every torch tensor in it as a NumPy array; a CPU tensor's is no copy.
+    """Convert every torch tensor in `value` to a NumPy array, without a copy if it is on the CPU.
 
-    Looks into dicts, tuples and lists; anything else is returned as it is.
+    Looks into dicts, tuples and lists; returns anything else unchanged.
     """
     if is_tensor(value):
         return array_of_tensor(value)

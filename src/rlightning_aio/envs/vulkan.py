@@ -1,7 +1,7 @@
-"""Whether SAPIEN, ManiSkill's engine, can render here, and how to do without.
+"""Find out if SAPIEN, ManiSkill's engine, can render here, and work without a renderer.
 
-Rule: the question is asked in another process, once: Vulkan must not be touched in a
-process that forks workers, and a broken driver may crash the process that asks.
+Rule: another process tries it, once. Vulkan must not be used in a process that forks
+workers, and a broken driver may crash the process that tries.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ PROBE_TIMEOUT = 60.0
 
 @functools.cache
 def render_device_is_usable() -> bool:
-    """Whether SAPIEN finds a Vulkan device that is new enough for it."""
+    """Return True if SAPIEN finds a Vulkan device that is new enough."""
     try:
         probe = subprocess.run(  # noqa: S603 - this very interpreter and a constant
             [sys.executable, "-c", PROBE], capture_output=True, timeout=PROBE_TIMEOUT, check=False
@@ -34,9 +34,9 @@ def render_device_is_usable() -> bool:
 
 
 class UnseenMaterial:
-    """Stands where SAPIEN's `RenderMaterial` can't be made; nobody will see it.
+    """Replace SAPIEN's `RenderMaterial` where there is no renderer.
 
-    ManiSkill gives its objects materials even when nothing is rendered.
+    ManiSkill gives its objects materials even if nothing is rendered.
     """
 
     def __init__(self, *_: Any, **__: Any) -> None: ...
@@ -51,7 +51,7 @@ def _accept(*_: Any, **__: Any) -> None: ...
 
 
 def do_without_materials() -> None:
-    """Let objects be built with no render device; call it before `mani_skill` is imported."""
+    """Build objects without a render device; call this before `mani_skill` is imported."""
     for name in ("sapien.render", "sapien.pysapien.render"):
         module: Any = import_module(name)
         module.RenderMaterial = UnseenMaterial

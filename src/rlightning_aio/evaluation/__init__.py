@@ -1,13 +1,27 @@
-"""Evaluating a policy: equally many episodes of each env, and what they say of it.
+"""Evaluating a policy: a fixed set of episodes, and statistics over them.
 
-Rule: it stands on the public `EnvGroup` alone. To take the episodes that end first would favour
-envs, and outcomes, that end soon.
+Rule: it uses only the public `EnvGroup`. Either each env plays a fixed number of episodes, or the
+envs share a queue of episodes. Both sets are fixed before the first step, because taking the
+episodes that end first would favour short ones.
 """
 
 from __future__ import annotations
 
+from rlightning_aio.evaluation.episode_video import EpisodeVideo
 from rlightning_aio.evaluation.episodes import Episode, Evaluation
 from rlightning_aio.evaluation.estimates import Estimate
 from rlightning_aio.evaluation.evaluate import evaluate
+from rlightning_aio.evaluation.records import EpisodeRecord, EpisodeSpec, QueueEvaluation
+from rlightning_aio.evaluation.results_file import ResultsFile
 
-__all__ = ["Episode", "Estimate", "Evaluation", "evaluate"]
+__all__ = [
+    "Episode",
+    "EpisodeRecord",
+    "EpisodeSpec",
+    "EpisodeVideo",
+    "Estimate",
+    "Evaluation",
+    "QueueEvaluation",
+    "ResultsFile",
+    "evaluate",
+]

@@ -1,16 +1,17 @@
-"""`Episode` and `Evaluation`: what was played, and what is told of it."""
+"""`Episode` and `Evaluation`: the episodes played, and statistics over them."""
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rlightning_aio.evaluation.estimates import Estimate, mean_estimate, wilson_estimate
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
-__all__ = ["Episode", "Evaluation"]
+__all__ = ["Episode", "Evaluation", "Figures", "check_numbers"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,12 +20,11 @@ class Episode:
 
     Attributes:
         env_id: of the env.
-        sub_env: which of its sub-environments; 0 where there is one.
+        sub_env: index of the sub-environment; 0 if the env has only one.
         number: of the episode, from 0, among those of its env or sub-environment.
-        total_reward: the return, undiscounted; of several agents the sum.
+        total_reward: the undiscounted return, summed over agents.
         length: in steps.
-        success: what its last info says under ``success`` or ``is_success``; None where that
-            says nothing.
+        success: ``success`` or ``is_success`` of the last info; None if it has neither.
     """
 
     env_id: str
@@ -35,38 +35,67 @@ class Episode:
     success: bool | None
 
 
+def check_numbers(episodes: Iterable[Episode]) -> None:
+    """Raise `ValueError` unless the episodes of each sub-environment have numbers 0, 1, 2, …"""
+    counts = Counter[tuple[str, int]]()
+    for episode in episodes:
+        place = episode.env_id, episode.sub_env
+        if episode.number != counts[place]:
+            wrong = "is a duplicate" if episode.number < counts[place] else "is out of order"
+            raise ValueError(
+                f"episode {episode.number} of env {episode.env_id!r}, sub-environment "
+                f"{episode.sub_env}, {wrong}"
+            )
+        counts[place] += 1
+
+
+class Figures:
+    """Estimates over episodes."""
+
+    __slots__ = ()
+
+    def _outcomes(self) -> Sequence[Any]:
+        """Return the episodes to count, with `total_reward`, `length` and `success`."""
+        raise NotImplementedError
+
+    @property
+    def returns(self) -> list[float]:
+        """Return of each episode."""
+        return [episode.total_reward for episode in self._outcomes()]
+
+    @property
+    def total_reward(self) -> Estimate | None:
+        """Mean return, with Student's t interval; None without episodes."""
+        return mean_estimate(self.returns)
+
+    @property
+    def length(self) -> Estimate | None:
+        """Mean length in steps, with Student's t interval; None without episodes."""
+        return mean_estimate([float(episode.length) for episode in self._outcomes()])
+
+    @property
+    def success(self) -> Estimate | None:
+        """Success rate of episodes whose `success` is known, with Wilson's interval, or None."""
+        judged = [one.success for one in self._outcomes() if one.success is not None]
+        return wilson_estimate(sum(judged), len(judged))
+
+
 @dataclass(slots=True)
-class Evaluation:
-    """Episodes of a policy, equally many of each env and sub-environment.
+class Evaluation(Figures):
+    """Episodes of a policy, the same number of each env and sub-environment.
 
     Attributes:
-        episodes: in the order in which they ended, those that were given first.
-        lost: episodes that were begun anew, as their worker had ended in them.
+        episodes: those given as played, then the new ones in the order of their ends.
+        lost: number of episodes that were restarted because their worker ended.
     """
 
     episodes: list[Episode] = field(default_factory=list[Episode])
     lost: int = 0
 
-    @property
-    def total_reward(self) -> Estimate | None:
-        """The mean return, with Student's t interval; None without an episode."""
-        return mean_estimate([episode.total_reward for episode in self.episodes])
-
-    @property
-    def length(self) -> Estimate | None:
-        """The mean length in steps, with Student's t interval; None without an episode."""
-        return mean_estimate([float(episode.length) for episode in self.episodes])
-
-    @property
-    def success(self) -> Estimate | None:
-        """The success rate, with Wilson's interval, of the episodes that were judged.
-
-        None if none was.
-        """
-        judged = [episode.success for episode in self.episodes if episode.success is not None]
-        return wilson_estimate(sum(judged), len(judged))
+    def _outcomes(self) -> Sequence[Any]:
+        return self.episodes
 
     def of_envs(self, env_ids: Iterable[str]) -> Evaluation:
-        """The episodes of some envs; those that were lost are told of all envs together."""
+        """Select the episodes of some envs, without `lost`, which isn't counted by env."""
         wanted = set(env_ids)
         return Evaluation([episode for episode in self.episodes if episode.env_id in wanted])

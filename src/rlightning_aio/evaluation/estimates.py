@@ -1,4 +1,4 @@
-"""What a sample of episodes says of a policy: estimates with 95 % confidence intervals."""
+"""Estimates from a sample of episodes, with 95 % confidence intervals."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _T: Final = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.2
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A mean and where the true one lies, with 95 % confidence.
+    """A mean with its 95 % confidence interval.
 
     Attributes:
         mean: of the sample.
-        low, high: ends of the interval; None where one value says nothing of the spread.
-        count: values in the sample.
+        low, high: bounds of the interval; None if the values don't determine it.
+        count: number of values in the sample.
     """
 
     mean: float
@@ -34,21 +34,38 @@ class Estimate:
 
 
 def mean_estimate(values: Sequence[float]) -> Estimate | None:
-    """The mean of `values` with Student's t interval; None if there are none."""
+    """Mean of `values` with Student's t interval; None without values.
+
+    If a value is NaN or infinite, so is the mean, and there is no interval.
+    """
     if not values:
         return None
-    mean, count = fmean(values), len(values)
+    count = len(values)
+    if not all(map(math.isfinite, values)):
+        return Estimate(sum(values), None, None, count)
+    # Scaling by a power of two is exact, and keeps the sum of large values finite.
+    _, exponent = math.frexp(max(map(abs, values)))
+    scaled = [math.ldexp(value, -exponent) for value in values]
+    mean = fmean(scaled)
     if count == 1:
-        return Estimate(mean, None, None, 1)
-    half = _student_quantile(count - 1) * stdev(values) / math.sqrt(count)
-    return Estimate(mean, mean - half, mean + half, count)
+        return Estimate(values[0], None, None, 1)
+    half = _student_quantile(count - 1) * stdev(scaled) / math.sqrt(count)
+    low, middle, high = (_grown(value, exponent) for value in (mean - half, mean, mean + half))
+    return Estimate(middle, low, high, count)
+
+
+def _grown(value: float, exponent: int) -> float:
+    """Return ``value * 2**exponent``, or infinity on overflow."""
+    try:
+        return math.ldexp(value, exponent)
+    except OverflowError:
+        return math.copysign(math.inf, value)
 
 
 def wilson_estimate(successes: int, count: int) -> Estimate | None:
-    """The share of `successes` among `count` trials with Wilson's score interval.
+    """Share of `successes` in `count` trials with Wilson's score interval; None without trials.
 
-    It stays within 0 and 1, and is an interval also where all or none succeed. None if there
-    are no trials.
+    The interval stays within 0 and 1, and has a width even if all or none succeed.
     """
     if not count:
         return None
@@ -56,14 +73,14 @@ def wilson_estimate(successes: int, count: int) -> Estimate | None:
     middle = (share + z2 / (2 * count)) / (1 + z2 / count)
     spread = math.sqrt(share * (1 - share) / count + z2 / (4 * count * count))
     half = _Z * spread / (1 + z2 / count)
-    # At the ends the sums are exactly 0 and 1, but for rounding.
+    # Avoids rounding errors where the exact bounds are 0 and 1.
     low = 0.0 if successes == 0 else middle - half
     high = 1.0 if successes == count else middle + half
     return Estimate(share, low, high, count)
 
 
 def _student_quantile(freedom: int) -> float:
-    """The 97.5 % quantile of Student's t: from a table, then by its expansion (to 0.0002)."""
+    """97.5 % quantile of Student's t: from a table, then by its expansion (error 0.0002)."""
     if freedom <= len(_T):
         return _T[freedom - 1]
     z, n = _Z, freedom

@@ -1,24 +1,29 @@
-"""Responses become requests: actions are checked and written before anything is sent.
+"""Check the actions of a batch and write them into slab rows.
 
-Rule: all or nothing. A batch is looked through as a whole first, with few vector operations
-where it comes as columns, and only then does the first byte leave.
+Rule: all or nothing. The whole batch is checked before the first byte is sent. Columns are checked
+and copied with vector operations, separate values one by one.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from rlightning_aio.batch.data import columns_of_responses
+from rlightning_aio.batch.contents import columns_of_responses
+from rlightning_aio.batch.sent import columns_of_values
 from rlightning_aio.errors import BadAction
 from rlightning_aio.group.slab_layout import rows_in
 from rlightning_aio.hosts.messages import NO_ACTION
 from rlightning_aio.protocol.columns import Leaf, Rows, Tree, as_array, index, out_of_range
+from rlightning_aio.protocol.exchange import FEW_NUMBERS, sum_of_squares
+from rlightning_aio.spaces import Anything
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from gymnasium import spaces
     from numpy.typing import NDArray
 
@@ -27,15 +32,12 @@ if TYPE_CHECKING:
     from rlightning_aio.group.slab_layout import SlabLayout
     from rlightning_aio.protocol.slab import Slab
 
-__all__ = ["OutOfBandSteps", "write_actions"]
-
-_FEW: Final = 8192
-"""So many numbers BLAS multiplies in one thread."""
+__all__ = ["OutOfBandSteps", "number_limits", "write_actions", "write_column"]
 
 
 @dataclass(frozen=True, slots=True)
 class OutOfBandSteps:
-    """What travels out of band: (action, extras) for some positions of a batch."""
+    """Steps with arguments that the channel carries: (action, extras) by position in the batch."""
 
     positions: NDArray[np.intp]
     contents: list[tuple[Any, dict[str, Any]]]
@@ -46,11 +48,11 @@ def write_actions(
 ) -> OutOfBandSteps | None:
     """Check the actions of `batch` and write those that fit into their rows.
 
-    Returns what has to be sent out of band, or None if the rows hold all.
+    Returns the steps to send out of band, or None if the rows hold all actions.
 
     Raises:
-        BadAction: an action's shape, dtype or count doesn't fit its env, or a number its
-            space; rows of idle envs may have been written, nothing else has happened.
+        BadAction: an action doesn't match its env in shape, dtype or count, or holds a number
+            outside its space. Nothing was sent; rows of idle envs may have been written.
     """
     out_of_band = None
     if envs.any_out_of_band:
@@ -60,16 +62,16 @@ def write_actions(
     columns = columns_of_responses(batch)
     if columns is not None and len(layout.slabs) == 1 and out_of_band is None:
         rows = rows_in(layout, slots, envs.all)
-        _write_column(columns.get("action"), layout.slabs[0], slots, rows, envs)
+        write_column(columns.get("action"), layout.slabs[0], slots, rows, envs)
         return None
     _write_one_by_one(batch, slots, envs, layout, out_of_band)
     return out_of_band
 
 
-def _write_column(
+def write_column(
     action: Any, slab: Slab, slots: NDArray[np.intp], rows: Rows, envs: EnvTable
 ) -> None:
-    """Write the actions of a whole batch with one copy for each array."""
+    """Write the actions of a whole batch, one copy per leaf of the action space."""
     for leaf, target in slab.action_columns:
         source = _as_array(_column_at(action, leaf) if leaf.path else action)
         if source.shape != (len(slots), *leaf.shape) or not _castable(source, leaf):
@@ -79,6 +81,17 @@ def _write_column(
         target[rows] = source
 
 
+def number_limits(dtype: np.dtype[Any]) -> dict[np.dtype[Any], float | None]:
+    """The dtypes that can be written to a column of `dtype` unconverted.
+
+    Each maps to the limit on the sum of the squares of an action, or None if all numbers fit.
+    """
+    if dtype.kind != "f":
+        return {dtype: None}
+    floats = (np.dtype(np.float32), np.dtype(np.float64))
+    return {own: _largest(own, dtype)[1] for own in floats}
+
+
 def _write_one_by_one(
     batch: BatchedData,
     slots: NDArray[np.intp],
@@ -86,7 +99,7 @@ def _write_one_by_one(
     layout: SlabLayout,
     out_of_band: OutOfBandSteps | None,
 ) -> None:
-    """Write actions that came as separate values, or for envs of several layouts."""
+    """Write actions given as separate values, or for envs with different layouts."""
     elsewhere = set(out_of_band.positions.tolist()) if out_of_band is not None else set[int]()
     actions = actions_of(batch)
     by_slab: dict[int, list[int]] = {}
@@ -115,7 +128,7 @@ def _unfit_error(
     slots: NDArray[np.intp],
     envs: EnvTable,
 ) -> BadAction:
-    """Names the first of the actions of `slots` that is `unfit` somewhere."""
+    """The error that names the first of `slots` with an `unfit` number."""
     row = int(unfit.reshape(len(slots), -1).any(axis=1).argmax())
     number = source[row][unfit[row]].flat[0]
     return BadAction(
@@ -125,17 +138,17 @@ def _unfit_error(
 
 
 def _unfit(source: NDArray[Any], leaf: Leaf, slab: Slab) -> NDArray[np.bool_] | None:
-    """Where numbers have no meaning in their space; None if nowhere.
+    """A mask of the numbers that the space can't hold, or None if there are none.
 
-    NaN, what the dtype can't hold, and infinity in a place where the space is bounded. Finite
-    numbers outside of the bounds are the env's affair.
+    These are NaN, numbers outside the range of the dtype, and infinity where the space is bounded.
+    Finite numbers outside the bounds are left to the env.
     """
     if leaf.dtype.kind != "f" or source.dtype.kind != "f":
         return out_of_range(source, leaf.dtype)
     most, most_squared = _largest(source.dtype, leaf.dtype)
-    if source.size <= _FEW:
-        # One multiplication tells of any NaN, any infinity, and any number that may be too large.
-        if float(np.vdot(source, source)) <= most_squared:
+    if source.size <= FEW_NUMBERS:
+        # One multiplication detects NaN, infinity, and any number that may be too large.
+        if sum_of_squares(source) <= most_squared:
             return None
     elif source.max() <= most and source.min() >= -most:
         return None
@@ -152,7 +165,7 @@ def _unfit(source: NDArray[Any], leaf: Leaf, slab: Slab) -> NDArray[np.bool_] | 
 
 @cache
 def _largest(one: np.dtype[Any], other: np.dtype[Any]) -> tuple[float, float]:
-    """The largest number that both dtypes hold, and its square as far as it is finite."""
+    """The largest number that both dtypes hold, and its square (itself where that overflows)."""
     most = min(float(np.finfo(one).max), float(np.finfo(other).max))
     return most, most * most if most < 1e100 else most
 
@@ -176,7 +189,7 @@ def actions_of(batch: BatchedData) -> list[Any]:
 def _chosen_out_of_band(
     batch: BatchedData, slots: NDArray[np.intp], envs: EnvTable, layout: SlabLayout
 ) -> OutOfBandSteps | None:
-    """What the channel must carry: actions without a row, and extras that somebody reads."""
+    """The steps that the channel carries: actions that fit no row, and extras that envs read."""
     columns = columns_of_responses(batch)
     any_extras = columns is None or len(columns) > 1
     chosen = envs.out_of_band_actions[slots]
@@ -191,27 +204,43 @@ def _chosen_out_of_band(
             if not any_extras:
                 return None
             _write(action, layout.slabs[0], rows_in(layout, slots, envs.all))
-            readers = np.flatnonzero(envs.reads_extras[slots])
-            contents = [(NO_ACTION, _extras(batch, k)) for k in readers.tolist()]
-            return OutOfBandSteps(readers, contents) if contents else None
+            return _extras_alone(batch, slots, envs)
     actions = actions_of(batch)
     contents: list[tuple[Any, dict[str, Any]]] = []
     kept: list[int] = []
     for k in positions.tolist():
         slot = int(slots[k])
         extras = _extras(batch, k) if envs.reads_extras[slot] else {}
-        action = actions[k]
-        slab = layout.slabs[int(layout.slab[slot])]
-        if _fits(action, slab):
-            if not extras:
-                continue
-            _write(action, slab, int(layout.row[slot]))
-            action = NO_ACTION
-        elif not envs.out_of_band_actions[slot]:
-            continue
-        kept.append(k)
-        contents.append((_plain(action), extras))
+        slab, row = layout.of(slot)
+        if not _fits(actions[k], slab):
+            if envs.out_of_band_actions[slot]:
+                kept.append(k)
+                contents.append((_plain(actions[k]), extras))
+        elif extras:
+            _write(actions[k], slab, row)
+            kept.append(k)
+            contents.append((NO_ACTION, extras))
     return OutOfBandSteps(np.array(kept, np.intp), contents) if kept else None
+
+
+def response_columns(
+    batch: BatchedData, slots: NDArray[np.intp], layout: SlabLayout
+) -> Mapping[str, Any]:
+    """Return the columns of a batch of responses to `slots`."""
+    columns = columns_of_responses(batch)
+    if columns is not None:
+        return columns
+    space = layout.of(int(slots[0]))[0].layout.action_space if len(slots) else None
+    return columns_of_values(batch.values(), actions_as_list=isinstance(space, Anything))
+
+
+def _extras_alone(
+    batch: BatchedData, slots: NDArray[np.intp], envs: EnvTable
+) -> OutOfBandSteps | None:
+    """The extras that envs read, of steps whose actions are in their rows."""
+    readers = np.flatnonzero(envs.reads_extras[slots])
+    contents = [(NO_ACTION, _extras(batch, k)) for k in readers.tolist()]
+    return OutOfBandSteps(readers, contents) if contents else None
 
 
 def _extras(batch: BatchedData, position: int) -> dict[str, Any]:
@@ -222,7 +251,7 @@ def _extras(batch: BatchedData, position: int) -> dict[str, Any]:
 
 
 def _fits(action: Any, slab: Slab, *count: int) -> bool:
-    """Whether a row can hold an action; or `count` rows those of a whole batch."""
+    """True if a row can hold `action`, or `count` rows the actions of a whole batch."""
     at = _column_at if count else _at
     try:
         return slab.action is not None and all(
@@ -236,21 +265,21 @@ def _fits(action: Any, slab: Slab, *count: int) -> bool:
 
 
 def _write(action: Any, slab: Slab, rows: Any) -> None:
-    """Write what fits: one action into its row, or a whole batch."""
+    """Write one action into its row, or a whole batch into `rows`."""
     at = _at if isinstance(rows, int) else _column_at
     for leaf, target in slab.action_columns:
         target[rows] = _as_array(at(action, leaf))
 
 
 def _plain(action: Any) -> Any:
-    """A tensor as an array: a worker need not have torch."""
+    """Convert a tensor to an array, as workers may lack torch."""
     return _as_array(action) if hasattr(action, "detach") else action
 
 
 def _as_array(value: Any) -> NDArray[Any]:
     try:
         return as_array(value)
-    except (ValueError, TypeError, RuntimeError) as error:  # Of tensors: what NumPy has not.
+    except (ValueError, TypeError, RuntimeError) as error:  # Tensors NumPy can't convert.
         raise BadAction(f"an action is not an array: {error}; nothing was sent") from None
 
 
@@ -267,7 +296,7 @@ def _at(tree: Tree, leaf: Leaf) -> Any:
 
 
 def _column_at(action: Any, leaf: Leaf) -> Any:
-    """The column of a batch's actions that belongs to `leaf`; a list holds them one by one."""
+    """The column of a batch's actions that belongs to `leaf`; lists hold one action per item."""
     if isinstance(action, list) and leaf.path:
         return [_at(one, leaf) for one in cast("list[Tree]", action)]
     return _at(action, leaf)

@@ -1,8 +1,6 @@
-"""The asynchronous `EnvGroup` and the driver that waits on an asyncio event loop.
+"""The asynchronous `EnvGroup`: the methods of `interface` as coroutines, and the driver that waits.
 
-A call that waits has one future, and any source (a worker, a fork server, an env_server) fulfils
-it. With a future for each source, the cost of a collect would grow with the number of workers.
-Absent on purpose: rules. All of them are in the core.
+Left out: rules and documentation. The rules are in the core, the docstrings in `interface`.
 """
 
 from __future__ import annotations
@@ -13,20 +11,25 @@ import time
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from rlightning_aio.errors import RLightningError
-from rlightning_aio.group.build import PreprocessFn, plan_group
-from rlightning_aio.group.facade import Facade, ServerView, check_process, only_result, steps_of
+from rlightning_aio.group.episode import EnvEpisode
+from rlightning_aio.group.facade import forked_from, only_result, steps_of, this_process
+from rlightning_aio.group.interface import (
+    EnvHandleInterface,
+    GroupInterface,
+    ServerHandleInterface,
+)
+from rlightning_aio.group.plan import PreprocessFn, plan_group
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Mapping, Sequence
+    from collections.abc import Callable, Coroutine, Mapping, Sequence, Sized
     from types import TracebackType
 
     from rlightning_aio.batch import BatchedData
-    from rlightning_aio.group.core import Core
     from rlightning_aio.group.wait import Procedure
-    from rlightning_aio.hosts.base import Host, Membership, Source
+    from rlightning_aio.hosts.base import Source
     from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
 
-__all__ = ["AioDriver", "EnvGroup", "EnvHandle", "ServerHandle"]
+__all__ = ["AioDriver", "EnvEpisode", "EnvGroup", "EnvHandle", "ServerHandle"]
 
 T = TypeVar("T")
 
@@ -34,44 +37,55 @@ T = TypeVar("T")
 def _nothing() -> None: ...
 
 
-class AioDriver:
-    """Watches sources with `loop.add_reader` and waits for procedures to end.
+def _wake(woken: asyncio.Future[None]) -> None:
+    if not woken.done():
+        woken.set_result(None)
 
-    It belongs to the loop in which `settle` was called; nobody waits in another.
+
+class AioDriver:
+    """Watches sources with `loop.add_reader`, and runs procedures until they return.
+
+    Each waiting call has one future that any source (a worker, a fork server, an env_server) sets.
+    With one future per source, the cost of a collect would grow with the number of workers. Calls
+    don't share futures, so cancelling one call doesn't affect the others.
+
+    The driver belongs to the event loop that ran when `settle` was called.
     """
 
     def __init__(self) -> None:
-        # Takes in what sources have told; set by the group.
+        # The queue of completions, and the function that applies them; set by the group.
+        self.completions: Sized = ()
         self.drain: Callable[[], None] = _nothing
-        # Invariant: the future of those who wait now; None while nobody does. A call that starts
-        # to wait gets one that is not done: what was told before is in the core already.
-        self._told: asyncio.Future[None] | None = None
+        # The future of each waiting call, until it is woken.
+        self._waiting: list[asyncio.Future[None]] = []
         self._loop: asyncio.AbstractEventLoop | None = None
         self._pid = os.getpid()
         self._descriptors: dict[Source, int] = {}
         self._writing: set[Source] = set()
-        # What a source's callback has raised, until somebody is told.
+        # An error from a source's callback, until a call raises it.
         self._raised: BaseException | None = None
 
-    # -- whose it is --------------------------------------------------------------
+    # -- ownership --------------------------------------------------------------
 
     def settle(self) -> None:
-        """Belong to the running loop from now on.
+        """Bind the driver to the running loop.
 
         Raises:
-            RLightningError: it belongs to another, or to another process.
+            RLightningError: it belongs to another loop, or to another process.
         """
-        check_process(self._pid)
+        if this_process[0] != self._pid:
+            raise forked_from(self._pid)
         if self._loop is None:
             self._loop = asyncio.get_running_loop()
         self.check_caller()
 
     def check_caller(self) -> None:
-        """See `facade.Driver.check_caller`. While the loop is not running, plain code may ask."""
-        check_process(self._pid)
+        """Check the loop as `facade.Driver` says; plain code may call while the loop is stopped."""
+        if this_process[0] != self._pid:
+            raise forked_from(self._pid)
         ours = self._loop
         if ours is None:
-            return  # Not initialised, as the core will say.
+            return  # Not initialised; the core raises.
         try:
             running = asyncio.get_running_loop()
         except RuntimeError:
@@ -80,12 +94,13 @@ class AioDriver:
             raise self._elsewhere(ours)
 
     def move(self) -> None:
-        """Belong to the running loop, if the one that it belongs to does not run.
+        """Bind the driver to the running loop, if its own loop is not running.
 
         Raises:
-            RLightningError: it runs, in another thread; or it is another process's.
+            RLightningError: its loop runs in another thread, or it belongs to another process.
         """
-        check_process(self._pid)
+        if this_process[0] != self._pid:
+            raise forked_from(self._pid)
         ours, loop = self._loop, asyncio.get_running_loop()
         if ours is None or ours is loop:
             return
@@ -117,15 +132,14 @@ class AioDriver:
     # -- sources ------------------------------------------------------------------
 
     def watch(self, source: Source) -> None:
-        """See `base.Watcher.watch`."""
-        # Not the running loop: a replacement may be started by code that no loop runs.
+        # The running loop won't do: plain code may start a replacement while no loop runs.
         assert self._loop is not None
         descriptor = source.fileno()
         self._loop.add_reader(descriptor, self._readable, source)
         self._descriptors[source] = descriptor
 
     def unwatch(self, source: Source) -> None:
-        """See `base.Watcher.unwatch`. A call that waits for `source` wakes."""
+        """Stop watching `source`, and wake calls that wait for it."""
         descriptor = self._descriptors.pop(source, None)
         if descriptor is None or self._loop is None:
             return
@@ -140,7 +154,6 @@ class AioDriver:
             loop.remove_writer(descriptor)
 
     def watch_writable(self, source: Source, wanted: bool) -> None:
-        """See `base.Watcher.watch_writable`."""
         descriptor = self._descriptors.get(source)
         if descriptor is None or self._loop is None:
             return
@@ -152,29 +165,29 @@ class AioDriver:
             self._loop.remove_writer(descriptor)
 
     def wake(self) -> None:
-        """See `base.Watcher.wake`."""
-        told, self._told = self._told, None
-        if told is not None and not told.done() and not told.get_loop().is_closed():
-            told.set_result(None)
+        waiting, self._waiting = self._waiting, []
+        for woken in waiting:
+            if not woken.done() and not woken.get_loop().is_closed():
+                woken.set_result(None)
 
     def forget(self) -> None:
-        """See `facade.Driver.forget`."""
         self._descriptors.clear()
         self._writing.clear()
 
     def _readable(self, source: Source) -> None:
         if source not in self._descriptors:
-            return  # This process was forked while the loop ran, and it runs on.
+            return  # In a child forked while the loop ran, which still runs there.
         try:
             source.on_readable()
-            self.drain()
+            if self.completions:
+                self.drain()
         except BaseException as error:
             self._keep(error)
         self.wake()
 
     def _writable(self, source: Source) -> None:
         if source not in self._writing:
-            return  # As above.
+            return  # In a forked child, as in `_readable`.
         try:
             source.on_writable()
         except BaseException as error:
@@ -182,11 +195,11 @@ class AioDriver:
             self.wake()
 
     def _keep(self, error: BaseException) -> None:
-        """Have the next who waits raise `error`: a loop would log it and let them hang."""
+        """Keep `error` for the next call that waits, as the loop would only log it."""
         self._raised = self._raised or error
 
     def _raise_kept(self) -> None:
-        """Raise, once, what a callback has raised."""
+        """Raise the error of a callback, once."""
         error, self._raised = self._raised, None
         if error is not None:
             raise error
@@ -194,7 +207,7 @@ class AioDriver:
     # -- waiting ------------------------------------------------------------------
 
     async def run(self, procedure: Procedure[T]) -> T:
-        """Wait until `procedure` ends; its result. It gets to clean up if it is cancelled.
+        """Run `procedure` and return its result; cancellation is thrown into it.
 
         Raises:
             RLightningError: the group belongs to another loop, or to another process.
@@ -205,10 +218,13 @@ class AioDriver:
             while True:
                 try:
                     await self._block(wait.until)
-                    self._raise_kept()
-                    self.drain()
+                    if self._raised is not None:
+                        await asyncio.sleep(0)  # Let the loop read the source again.
+                        self._raise_kept()
+                    if self.completions:
+                        self.drain()
                 except BaseException as error:
-                    # Thrown, not closed: closing down takes waiting, too.
+                    # Thrown, as a closed generator couldn't wait while cleaning up.
                     wait = procedure.throw(error)
                 else:
                     wait = procedure.send(time.monotonic())
@@ -216,9 +232,9 @@ class AioDriver:
             return stop.value
 
     async def run_last(self, procedure: Procedure[None]) -> None:
-        """Wait until the group is closed, in whichever loop.
+        """Run the procedure that closes the group, on any loop.
 
-        What a callback has raised before doesn't keep it from closing, and is raised after.
+        An earlier error of a callback is raised after the group is closed.
         """
         self.move()
         kept, self._raised = self._raised, None
@@ -228,15 +244,23 @@ class AioDriver:
 
     async def _block(self, until: float | None) -> None:
         timeout = None if until is None else until - time.monotonic()
-        if (timeout is None and not self._descriptors) or (timeout is not None and timeout <= 0):
+        if timeout is not None and timeout <= 0:
             await asyncio.sleep(0)
             return
-        if self._told is None:
-            self._told = asyncio.get_running_loop().create_future()
-        await asyncio.wait((self._told,), timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
+        loop = asyncio.get_running_loop()
+        woken = loop.create_future()
+        timer = None if timeout is None else loop.call_later(timeout, _wake, woken)
+        self._waiting.append(woken)
+        try:
+            await woken
+        finally:
+            if woken in self._waiting:
+                self._waiting.remove(woken)
+            if timer is not None:
+                timer.cancel()
 
 
-class EnvGroup(Facade):
+class EnvGroup(GroupInterface):
     """Many envs used as one, from an asyncio event loop.
 
     Make one with `build_env_group` and use it as a context manager, which initialises it on
@@ -245,8 +269,9 @@ class EnvGroup(Facade):
         async with build_env_group(load_config("configs/halfcheetah.yaml")) as group:
             batch, _ = await group.reset(seed=0)
 
-    It belongs to the loop that initialised it: use from another, or from another thread, raises
-    RLightningError. `close` works in any loop, unless its own is running elsewhere.
+    The group belongs to the loop that initialised it: use from another loop, or from another
+    thread, raises RLightningError. `close` works in any loop, unless the group's own loop is
+    running in another thread.
     """
 
     _driver: AioDriver
@@ -256,17 +281,6 @@ class EnvGroup(Facade):
         return AioDriver()
 
     async def init(self) -> list[EnvMeta]:
-        """Start all workers, in parallel, and build their envs.
-
-        Returns one `EnvMeta` for each local env, then one without spaces for each env_server,
-        in the order of `env_ids`. If it fails or is cancelled, nothing is left running.
-
-        Raises:
-            StartFailed: an env could not be built, or took longer than ``start_timeout``.
-            ConfigError: the envs' action spaces have different shapes (a `ValueError`).
-            GroupClosed: the group was closed before.
-            RLightningError: another event loop has initialised the group.
-        """
         self._driver.settle()
         try:
             return await self._driver.run(self._core.start(time.monotonic()))
@@ -293,55 +307,10 @@ class EnvGroup(Facade):
         options: dict[str, Any] | None = None,
         env_ids: Sequence[str] | None = None,
     ) -> tuple[BatchedData, list[bool]]:
-        """Start a new episode in all envs, or in those of `env_ids`.
-
-        Args:
-            seed: env k of the group gets ``seed + k`` (k counts sub-environments); a sequence
-                gives one seed for each env, a mapping seeds by id.
-            options: passed to each env.
-            env_ids: which envs; the results come in this order. None: all local envs, then the
-                clients of env_servers, for which it waits.
-
-        Returns the first observations, in fresh arrays (views, where the group was built with
-        ``zero_copy``), and flags that are all False. Cancelled, it leaves the results to
-        `collect_async`.
-
-        Raises:
-            EnvBusy: an env has a reply outstanding, or appears twice; nothing was sent.
-            UnknownEnv: no env of this group has that id.
-            ValueError: a seed is not an int from 0 to 2**62 - 1, or there isn't one for each env.
-            TypeError: the options can't be sent to a worker or a client.
-            TimeoutError: too few clients of an env_server have joined in time.
-            EnvRaised, WorkerDied, EnvHung, EnvAway: an env failed, or its client is away; the
-                others' results are in the error's ``results``.
-            GroupClosed: the group was not initialised, or is closed.
-        """
         return await self._driver.run(self._core.reset(time.monotonic(), seed, options, env_ids))
 
     async def step(self, batch: BatchedData) -> tuple[BatchedData, list[bool] | None]:
-        """Step the envs of `batch` and wait for all of them.
-
-        Args:
-            batch: a batch of responses, from `BatchedData.respond` (columns, fast) or made of
-                `PolicyResponse` values; any of the local envs, in any order.
-
-        Returns results with the same ids in the same order, in fresh arrays (views, where the
-        group was built with ``zero_copy``), and None; inside `auto_reset` a flag for each
-        result. Cancelled, it leaves the results to `collect_async`.
-
-        Raises:
-            BadAction: an action's shape, dtype or count doesn't fit; it holds NaN, a number that
-                its dtype can't hold, or infinity where its space is bounded; or this is not a
-                batch.
-                Nothing was sent.
-            EnvBusy: an env has a reply outstanding, or appears twice; nothing was sent.
-            UnknownEnv: no env of this group has that id.
-            NotImplementedError: the env is a client's, which answers when it can.
-            EnvRaised, WorkerDied, EnvHung: an env failed; the others' results are in the
-                error's ``results``.
-            GroupClosed: the group was not initialised, or is closed.
-        """
-        return await self._driver.run(self._core.step(batch, time.monotonic()))
+        return await self._driver.run(self._steps.step(batch, time.monotonic()))
 
     async def collect_async(
         self,
@@ -353,300 +322,117 @@ class EnvGroup(Facade):
         entries: Sequence[str] | None = None,
         ordered: bool = False,
     ) -> tuple[BatchedData, list[bool]]:
-        """Wait for results of `step_async`; never returns an empty batch.
-
-        Args:
-            timeout: seconds of a further window, opened when the first result is ready, in
-                which more results join.
-            wait_all: wait for all that are pending; `timeout` is ignored then, with a warning.
-            min_results: don't return before this many are ready (or all that are pending). None
-                is the sum of the config entries' ``min_results``, or 1.
-            max_results: leave results above this number to the next call, first come, first
-                served.
-            deadline: limit in seconds, from now.
-            entries: take results of these config entries only; those of others stay.
-            ordered: in the group's order instead of that of arrival. With ``wait_all`` that
-                makes a run reproducible.
-
-        Returns results, in fresh arrays (views, where the group was built with ``zero_copy``),
-        and a flag for each: inside `auto_reset` whether it reached the step limit, which
-        `BatchedData.limit_reached` tells as well. Cancelling loses no result.
-
-        Raises:
-            NothingPending: no request is outstanding (of `entries`), and no client can join.
-            UnknownEnv: no config entry has such a name.
-            ValueError: a time isn't above 0, a number isn't above 0, or `min_results` is above
-                `max_results`.
-            TimeoutError: `deadline` has passed; the next call returns the results.
-            EnvRaised, WorkerDied, EnvHung: the answer to one request; the results of others
-                stay for the next call.
-            GroupClosed: the group was not initialised, or is closed.
-            RLightningError: another collector is waiting.
-        """
         procedure = self._collect(
             timeout, wait_all, min_results, max_results, deadline, entries, ordered
         )
         return await self._driver.run(procedure)
 
     async def collect_calls(self, deadline: float | None = None) -> list[Any]:
-        """Wait for the values of all calls that `call_async` has sent.
-
-        Args:
-            deadline: limit in seconds, from now.
-
-        Returns them in the order in which they were sent: from a worker copies, from an inline
-        env the objects themselves. Cancelled, it loses none.
-
-        Raises:
-            NothingPending: no call is outstanding.
-            TimeoutError: `deadline` has passed; the next `collect_calls` gets the values.
-            EnvRaised: a method raised, or its value can't be pickled; what else went wrong is
-                in ``others``, and the values of the others are gone.
-            WorkerDied, EnvHung: a worker ended meanwhile; a replacement does not repeat the call.
-            GroupClosed: the group was not initialised, or is closed.
-            RLightningError: another task is waiting in it.
-        """
         return await self._driver.run(self._collect_calls(deadline))
 
     async def snapshot(self, env_ids: Sequence[str] | None = None) -> bytes:
-        """Everything that envs need to continue from here exactly as they would have, as bytes.
-
-        Args:
-            env_ids: which envs, all idle and reset before; None: all local ones.
-
-        It holds the simulators' and wrappers' state, their generators, the sums of the current
-        episodes, the counters of `auto_reset`, and which envs are due for a reset. docs/state.md
-        also says what it leaves out. The bytes can be stored, and `restore` takes them in
-        this group or another, in this process or another.
-
-        Raises:
-            EnvBusy: an env has a reply outstanding; nothing was sent.
-            UnknownEnv: no env of this group has that id.
-            SnapshotError: an env is a robot's, or was never reset.
-            NotImplementedError: an env is a client's.
-            EnvRaised: an env can't give its state; the message says why.
-            WorkerDied, EnvHung: a worker ended meanwhile.
-            GroupClosed: the group was not initialised, or is closed.
-        """
         return await self._driver.run(self._core.snapshot(time.monotonic(), env_ids))
 
     async def restore(
         self, snapshot: bytes, env_ids: Sequence[str] | None = None
     ) -> tuple[BatchedData, list[bool]]:
-        """Restore envs to the state of a snapshot: all of them, or none.
-
-        Args:
-            snapshot: what `snapshot` returned. It holds pickles, which can make a worker execute
-                anything: only use what you have written yourself.
-            env_ids: into which envs, all idle, in the order of the snapshot's; None: into those
-                of the same ids. Any env of an equal entry will do.
-
-        Returns the envs' last observations at the time of the snapshot, as `reset` returns first
-        observations: with `is_reset`, because no transition ends here, and without reward. If it
-        is cancelled, the envs start a new episode with their next step, marked as after a
-        restart.
-
-        Raises:
-            SnapshotError: the bytes are damaged, or of another number of envs, another task,
-                other options or another version of a library; nothing was changed.
-            EnvBusy: an env has a reply outstanding; nothing was sent.
-            UnknownEnv: no env of this group has that id.
-            NotImplementedError: an env is a client's.
-            EnvRaised, WorkerDied, EnvHung: an env failed; the others are where they were before.
-            GroupClosed: the group was not initialised, or is closed.
-        """
         return await self._driver.run(self._core.restore(time.monotonic(), snapshot, env_ids))
 
     def __getitem__(self, env_id: str) -> EnvHandle:
-        """A handle on one env (an `EnvHandle`), or on one env_server (a `ServerHandle`).
+        """Return a handle on one env (`EnvHandle`), or on one env_server (`ServerHandle`).
 
         Raises:
             UnknownEnv: the group has neither of that id.
         """
-        server = self._core.supervisor.env_server(env_id)
+        server = self._core.supervisor.members.server(env_id)
         if server is not None:
             return ServerHandle(self, self._core, self._driver, server)
         self._core.envs.find_one(env_id)
         return EnvHandle(self, self._core, self._driver, env_id)
 
-    async def offload(self) -> None:
-        """Make every local env free its device memory until `reload`; done when it returns.
+    def episode(
+        self, env_id: str, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> EnvEpisode:
+        """Play one episode of one env, in an agent that is one coroutine for each env::
 
-        Cancelled, it leaves the envs to free it by themselves; `collect_async` has nothing of
-        it.
+            async with group.episode("tools-3", seed=7) as episode:
+                while not episode.is_over:
+                    await episode.step(await choose(episode.last.observation))
+
+        On entry the env is reset. On exit it is idle: the result of a step during which the agent
+        was cancelled is dropped. Other envs can be collected in batches meanwhile.
+
+        Args:
+            env_id: which env, idle.
+            seed: of its reset.
+            options: passed to the env.
 
         Raises:
-            EnvBusy: an env has a reply outstanding; nothing was sent.
-            EnvRaised: an env can't, or failed to; what else went wrong is in ``others``.
-            WorkerDied, EnvHung: a worker ended meanwhile; a replacement does not repeat it.
-            GroupClosed: the group was not initialised, or is closed.
+            UnknownEnv: no env of this group has that id.
         """
+        return EnvEpisode(self[env_id], seed, options)
+
+    async def offload(self) -> None:
         await self._driver.run(self._core.calls.call_all(time.monotonic(), "offload"))
 
     async def reload(self) -> None:
-        """Make every local env allocate its device memory again; done when it returns.
-
-        Cancellation and errors are those of `offload`.
-        """
         await self._driver.run(self._core.calls.call_all(time.monotonic(), "reload"))
 
     async def close(self) -> None:
-        """Close all envs and end their workers, by force after a second and a half.
-
-        Idempotent. A task that waits on the group gets `GroupClosed`; results that were not
-        collected are gone. Cancelled, it ends what is left by force. An env that raises in its
-        own `close` is named in a warning.
-
-        Raises:
-            RLightningError: the loop that the group belongs to runs in another thread.
-        """
         try:
             await self._driver.run_last(self._core.close(time.monotonic()))
         finally:
             self._closed()
 
 
-class EnvHandle:
+class EnvHandle(EnvHandleInterface):
     """One env of an asynchronous group.
 
-    Each method is done when the env has answered, and raises `EnvBusy` while an earlier reply
-    of it is outstanding.
+    Each method raises `EnvBusy` while an earlier reply of the env is outstanding.
     """
-
-    def __init__(self, group: EnvGroup, core: Core, driver: AioDriver, env_id: str) -> None:
-        self._group = group
-        self._core = core
-        self._driver = driver
-        self._env_id = env_id
-
-    @property
-    def env_id(self) -> str:
-        """Its id, as in `EnvGroup.env_ids`."""
-        return self._env_id
 
     async def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> EnvRet | MultiAgentEnvRet:
-        """Start a new episode and wait for its first observation.
-
-        Args:
-            seed: the env's own; sub-environment k gets ``seed + k`` (counting
-                sub-environments).
-            options: passed to the env.
-
-        Returns the result as a value; its arrays are as those of `EnvGroup.reset`. Cancelled,
-        it leaves the result to the group's `collect_async`. Errors are those of
-        `EnvGroup.reset`.
-        """
         seeds = None if seed is None else [seed]
         return only_result(await self._group.reset(seeds, options, [self.env_id]))
 
     async def step(self, response: PolicyResponse | Any) -> EnvRet | MultiAgentEnvRet:
-        """Step with a `PolicyResponse`, or with a bare action, and wait for the result.
-
-        Returns the result as a value, inside `auto_reset` that of a reset where one is due;
-        its arrays are as those of `EnvGroup.step`. Cancelled, it leaves the result to the
-        group's `collect_async`. Errors are those of `EnvGroup.step`.
-        """
         return only_result(await self._group.step(steps_of(self.env_id, response)))
 
     async def call(self, name: str, /, *args: Any, **kwargs: Any) -> Any:
-        """Call method `name` of the env, or of the first that has one of its simulator's wrappers,
-        from the outermost in, and the simulator.
-
-        Returns its value: from a worker a copy, from an inline env the object itself.
-        Cancelled, it leaves the method to end by itself, and its value is dropped.
-
-        Raises:
-            EnvRaised: the method raised, or its value can't be pickled.
-            EnvBusy: the env has a reply outstanding; nothing was sent.
-            TypeError: the arguments can't be sent to a worker; nothing was sent.
-            WorkerDied, EnvHung: the worker ended meanwhile; a replacement does not repeat it.
-            UnknownEnv: a client that has gone, and another has its place.
-            GroupClosed: the group was not initialised, or is closed.
-        """
         slot = self._core.envs.find_one(self._env_id)
         procedure = self._core.calls.call(time.monotonic(), slot, (name, args, kwargs))
         return await self._driver.run(procedure)
 
     async def get_attr(self, name: str, target: str = "unwrapped") -> Any:
-        """Attribute `name` of the simulator; of its outermost wrapper with target ``outer``.
-
-        Returns it as `call` returns a value, and raises what `call` raises.
-        """
-        return await self.call("get_attr", name, target)
+        return await super().get_attr(name, target)
 
     async def set_attr(self, name: str, value: Any, target: str = "unwrapped") -> None:
-        """Set attribute `name` of the simulator or its outermost wrapper; done on return.
-
-        Raises what `call` raises.
-        """
-        await self.call("set_attr", name, value, target)
+        await super().set_attr(name, value, target)
 
     async def render(self) -> Any:
-        """One frame, as the simulator renders it; raises what `call` raises."""
-        return await self.call("render")
+        return await super().render()
 
     async def offload(self) -> None:
-        """Free its device memory until `reload`; done on return. Raises what `call` raises."""
-        await self.call("offload")
+        await super().offload()
 
     async def reload(self) -> None:
-        """Take its device memory again; done on return. Raises what `call` raises."""
-        await self.call("reload")
+        await super().reload()
 
 
-class ServerHandle(ServerView, EnvHandle):
+class ServerHandle(ServerHandleInterface, EnvHandle):
     """An env_server of an asynchronous group; its clients' envs have handles of their own.
 
     Methods of remote envs can't be called: `call`, `get_attr`, `set_attr`, `render`, `offload`
     and `reload` raise NotImplementedError.
     """
 
-    def __init__(
-        self,
-        group: EnvGroup,
-        core: Core,
-        driver: AioDriver,
-        server: tuple[Host, Membership],
-    ) -> None:
-        super().__init__(group, core, driver, server[1].server_id)
-        self._server = server
-        self._membership = server[1]
-
     async def reset(  # pyright: ignore[reportIncompatibleMethodOverride]  # One for each client.
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> list[EnvRet | MultiAgentEnvRet]:
-        """Reset all clients and wait for them; each env_server must have ``min_clients`` first.
-
-        Args:
-            seed: client k, in the order of their names, gets ``seed + k`` (counting
-                sub-environments).
-            options: passed to each.
-
-        Returns one result for each client, in the order of their names. Cancelled while the
-        clients reset, it leaves the results to the group's `collect_async`.
-
-        Raises:
-            TimeoutError: too few clients have joined within ``connect_timeout``.
-            EnvBusy: a client has a reply outstanding; nothing was sent.
-            TypeError: the options can't be sent to a client; nothing was sent.
-            EnvRaised, EnvAway: a client's env failed, or the client is away; the others'
-                results are in the error's ``results``.
-            GroupClosed: the group was not initialised, or is closed.
-        """
         procedure = self._core.reset_members(time.monotonic(), self._server, seed, options)
         return (await self._driver.run(procedure))[0].values()
-
-    async def step(self, response: PolicyResponse | Any) -> EnvRet | MultiAgentEnvRet:
-        """Raises NotImplementedError: remote envs answer when they can."""
-        raise NotImplementedError(
-            f"{self.env_id} is an env_server; use the group's step_async and collect_async"
-        )
-
-    async def call(self, name: str, /, *args: Any, **kwargs: Any) -> Any:
-        """Raises NotImplementedError: methods of remote envs can't be called."""
-        raise NotImplementedError(f"{self.env_id} is an env_server; it can't call {name}()")
 
 
 def build_env_group(
@@ -655,16 +441,16 @@ def build_env_group(
     mixed_actions: bool = False,
     zero_copy: bool = False,
 ) -> EnvGroup:
-    """A group of the configured envs; nothing is started yet.
+    """Build a group of the configured envs; nothing is started yet.
 
     Args:
         env_cfgs: an `EnvConfig`, a list of them, plain dicts, or OmegaConf nodes.
         preprocess_fn: turns a `PolicyResponse` into what the simulator steps with; one for
             all, a list with one for each entry, or one for each env. Anything that
-            cloudpickle takes.
+            cloudpickle can pickle.
         mixed_actions: allow envs whose action spaces have different shapes.
         zero_copy: return observations as read-only views, valid until that env's next
-            request, where the envs' rows are contiguous.
+            request, if the envs' rows are contiguous.
 
     Raises:
         ConfigError: something is wrong with the configuration or a preprocess function.
@@ -674,10 +460,10 @@ def build_env_group(
 
 
 def run(main: Coroutine[Any, Any, T]) -> T:
-    """Run `main` to its end on a uvloop event loop (or asyncio's, where uvloop is missing).
+    """Run `main` to its end on a uvloop event loop, or on asyncio's if uvloop is missing.
 
     Raises:
-        RuntimeError: an event loop runs already in this thread.
+        RuntimeError: an event loop already runs in this thread.
     """
     if _is_loop_running():
         main.close()

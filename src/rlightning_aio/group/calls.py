@@ -1,4 +1,4 @@
-"""`Calls`: calls of envs' methods, and whatever else is answered by a value of its own."""
+"""`Calls`: method calls of envs, and other requests that return a value instead of a result."""
 
 from __future__ import annotations
 
@@ -13,13 +13,10 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from rlightning_aio.group.auto_reset import AutoReset
     from rlightning_aio.group.dispatch import Dispatch
-    from rlightning_aio.group.env_table import EnvTable
     from rlightning_aio.group.intake import Intake
-    from rlightning_aio.group.requests import Requests, Ticket
-    from rlightning_aio.group.resumption import Resumption
-    from rlightning_aio.group.supervisor import Supervisor
+    from rlightning_aio.group.requests import Ticket
+    from rlightning_aio.group.tables import Tables
     from rlightning_aio.group.wait import Procedure
     from rlightning_aio.group.waiting import Waiting
 
@@ -30,38 +27,35 @@ Call: TypeAlias = "tuple[str, tuple[Any, ...], dict[str, Any]]"
 
 
 class Calls:
-    """See the module; its arguments are the group's parts."""
+    """Send method calls, and collect the returned values."""
 
     def __init__(
         self,
-        envs: EnvTable,
-        requests: Requests,
-        supervisor: Supervisor,
+        tables: Tables,
         dispatch: Dispatch,
         intake: Intake,
-        auto: AutoReset,
-        resumption: Resumption,
         waiting: Waiting,
     ) -> None:
-        self._envs = envs
-        self._requests = requests
-        self._supervisor = supervisor
+        self._observed = tables.observed
+        self._envs = tables.envs
+        self._requests = tables.requests
+        self._lifetime = tables.lifetime
         self._dispatch = dispatch
         self._intake = intake
-        self._auto = auto
-        self._resumption = resumption
         self._waiting = waiting
-        # Calls that `collect_calls` will answer.
+        # Calls that `collect_calls` returns next.
         self._sent: list[Ticket] = []
         self._collecting = False
 
     def call(self, now: float, slot: int, call: Call) -> Procedure[Any]:
-        """Call a method of one env; its value."""
-        return (yield from self._call(now, self._requests.alone(slot), call))[0]
+        """Call a method of one env and return its value."""
+        with self._observed.call("call", now):
+            return (yield from self._call(now, self._requests.alone(slot), call))[0]
 
     def call_all(self, now: float, name: str) -> Procedure[None]:
-        """Call a method of every env, all at once."""
-        yield from self._call(now, self._envs.all, (name, (), {}))
+        """Call a method of every local env, in parallel."""
+        with self._observed.call("call", now):
+            yield from self._call(now, self._envs.all, (name, (), {}))
 
     def _call(self, now: float, slots: NDArray[np.intp], call: Call) -> Procedure[list[Any]]:
         ticket = self._send_calls(now, slots, call)
@@ -69,9 +63,10 @@ class Calls:
         return values_of([ticket])
 
     def call_async(self, now: float, env_ids: Sequence[str] | None, call: Call) -> None:
-        """Send calls of a method that `collect_calls` will answer."""
-        slots = self._envs.all if env_ids is None else self._dispatch.distinct(env_ids)
-        self._sent.append(self._send_calls(now, slots, call))
+        """Call a method without waiting; `collect_calls` returns the values."""
+        with self._observed.call("call_async", now):
+            slots = self._envs.all if env_ids is None else self._dispatch.distinct(env_ids)
+            self._sent.append(self._send_calls(now, slots, call))
 
     def _send_calls(self, now: float, slots: NDArray[np.intp], call: Call) -> Ticket:
         return self.ask(
@@ -92,8 +87,15 @@ class Calls:
         arguments: Sequence[Any],
         what: str,
     ) -> Ticket:
-        """Send what is answered by a value: to each slot `op`, known as `name`, with one of the
-        `arguments`, known as `what`.
+        """Send requests that return a value.
+
+        Args:
+            now: monotonic seconds.
+            slots: of local envs.
+            op: the operation.
+            name: of the operation, for messages.
+            arguments: of the request to each slot.
+            what: describes the arguments in messages.
         """
         self._intake.drain()
         self._dispatch.check_local(slots, f"call {name} of")
@@ -102,16 +104,18 @@ class Calls:
             self._dispatch.packed(slot, own, what)
             for slot, own in zip(slots.tolist(), arguments, strict=True)
         ]
-        ticket = self._requests.open_ticket(slots, method=name)
+        ticket = self._requests.tickets.open(slots, method=name)
         entries = self._requests.submit(slots, op, ticket.owner, now)
-        self._auto.not_completed(slots)
-        self._resumption.note_no_step(slots.tolist())
         self._dispatch.hand_over(slots, entries, packed)
         return ticket
 
     def collect_calls(self, now: float, deadline: float | None) -> Procedure[list[Any]]:
-        """See `EnvGroup.collect_calls`."""
-        self._supervisor.check_open()
+        """Wait for all calls of `call_async`, and return their values in order of sending."""
+        with self._observed.call("collect_calls", now):
+            return (yield from self._collect(now, deadline))
+
+    def _collect(self, now: float, deadline: float | None) -> Procedure[list[Any]]:
+        self._lifetime.check_open()
         if self._collecting:
             raise RLightningError(
                 "another collect_calls is already waiting on this group; one at a time"
@@ -142,9 +146,9 @@ class Calls:
 
 
 def values_of(tickets: Sequence[Ticket]) -> list[Any]:
-    """What calls have returned, in the order in which they were sent.
+    """The values that calls returned, in order of sending.
 
-    Raises their faults instead, if there are any: the first, with the others.
+    If calls failed, the first error is raised, with the rest as its `others`.
     """
     faults = [fault for ticket in tickets for fault in ticket.faults]
     if faults:

@@ -1,11 +1,9 @@
-"""The core: decides what every request, reply and failure means, and never waits.
+"""The core: the operations of a group for every case, without waiting itself.
 
-It holds the table of requests, the supervisor of hosts and the poller, none of which calls
-it back, and says what follows from what. Its procedures are generators: where one
-can't go on, it yields a `Wait`; the driver blocks until a source has told something or the
-time has come, has what was told taken in (`drain`), and sends the time back in.
-Rule: no I/O beyond handing bytes to hosts, no clock, no event loop. Everything that is
-asynchronous and everything that is synchronous runs through this one implementation.
+It connects the parts of a group, none of which calls it back. Its procedures are generators that
+yield a `Wait` when they need a reply; the driver blocks until a source is readable or the time has
+come, calls `drain`, and sends the time in. Both kinds of group run through it.
+Rule: no I/O beyond passing bytes to hosts, no clock, no event loop.
 """
 
 from __future__ import annotations
@@ -14,53 +12,44 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from rlightning_aio.batch.data import (
-    BatchedData,
-    Origin,
-    batch_of_results,
-    columns_of_responses,
-    names_of,
-    slots_of,
-)
-from rlightning_aio.batch.sent import columns_of_values
+from rlightning_aio.batch.contents import slots_of
+from rlightning_aio.batch.data import BatchedData, batch_of_results
 from rlightning_aio.errors import (
     BadAction,
     NothingPending,
     RLightningError,
 )
-from rlightning_aio.group.actions import write_actions
-from rlightning_aio.group.auto_reset import NO_RESETS, AutoReset
+from rlightning_aio.group.actions import response_columns, write_actions
+from rlightning_aio.group.arrivals import Arrivals
 from rlightning_aio.group.calls import Calls
+from rlightning_aio.group.checked import CheckedRequests, CheckedSteps
+from rlightning_aio.group.conditions import FIRST_RESULTS
 from rlightning_aio.group.dispatch import Dispatch
-from rlightning_aio.group.first_looks import FirstLooks
+from rlightning_aio.group.first_observations import FirstObservations
 from rlightning_aio.group.hint import HINT_AFTER_BATCHES
 from rlightning_aio.group.intake import Intake
-from rlightning_aio.group.recovery import Recovery
-from rlightning_aio.group.requests import COLLECTOR
+from rlightning_aio.group.request_states import COLLECTOR
+from rlightning_aio.group.resets import Resets
 from rlightning_aio.group.results import Results
-from rlightning_aio.group.seeds import checked_seed, seeds_for
-from rlightning_aio.group.states import States
+from rlightning_aio.group.snapshots import Snapshots
 from rlightning_aio.group.stats import Stats
-from rlightning_aio.group.wait import Procedure, Wait, earliest
+from rlightning_aio.group.steps import Steps
+from rlightning_aio.group.wait import Procedure, earliest
 from rlightning_aio.group.waiting import Waiting
 from rlightning_aio.protocol.entries import Operation
-from rlightning_aio.protocol.slab import AS_RESTORED, TRUNCATED
+from rlightning_aio.protocol.slab import TRUNCATED
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
     from rlightning_aio.batch.columns import ResultColumns
-    from rlightning_aio.group.env_table import EnvTable
-    from rlightning_aio.group.poller import Poller
-    from rlightning_aio.group.requests import Requests, Ticket
-    from rlightning_aio.group.resumption import Resumption
+    from rlightning_aio.group.parts import Parts
+    from rlightning_aio.group.requests import Ticket
     from rlightning_aio.group.seeds import Seeds
-    from rlightning_aio.group.slab_layout import SlabLayout
-    from rlightning_aio.group.supervisor import Supervisor
-    from rlightning_aio.hosts.base import Host, Membership, Watcher
-    from rlightning_aio.hosts.messages import Completions
+    from rlightning_aio.group.wait import CollectRules
+    from rlightning_aio.hosts.base import Host, Membership
     from rlightning_aio.types import EnvMeta
 
 __all__ = ["Core", "Flags"]
@@ -69,132 +58,103 @@ Flags: TypeAlias = "list[bool]"
 
 
 class Core:
-    """What an `EnvGroup` can be asked to do.
+    """The operations of an `EnvGroup`, correct for every case; methods have its names.
 
     Args:
-        envs, requests, layout, resumption: the group's tables.
-        supervisor, poller: of its hosts.
-        completions: where these tell what has become of requests.
-        watcher: the driver.
-        zero_copy: observations are handed out as views where their rows are contiguous.
-    """
+        parts: of the group.
+        zero_copy: return observations as views if their rows are contiguous.
+        shares_thread: other tasks may use the group while a procedure waits.
 
-    # The dict is for what a timeline covers its methods with. Attributes that were in it too would
-    # take longer to read from then on.
-    __slots__ = (
-        "__dict__",
-        "__weakref__",
-        "_collecting",
-        "_dispatch",
-        "_first_looks",
-        "_handed_out",
-        "_intake",
-        "_layout",
-        "_recovery",
-        "_results",
-        "_resumption",
-        "_states",
-        "_waiting",
-        "auto",
-        "calls",
-        "drain",
-        "envs",
-        "requests",
-        "stats",
-        "supervisor",
-    )
+    Attributes:
+        steps: the ordinary step, which callers try first.
+        collecting: a call of `collect` waits.
+    """
 
     def __init__(
         self,
-        envs: EnvTable,
-        requests: Requests,
-        layout: SlabLayout,
-        resumption: Resumption,
-        supervisor: Supervisor,
-        poller: Poller,
-        completions: Completions,
-        watcher: Watcher,
+        parts: Parts,
         *,
         zero_copy: bool,
+        shares_thread: bool,
     ) -> None:
+        tables, supervisor = parts.tables, parts.supervisor
+        envs, requests, layout = tables.envs, tables.requests, tables.layout
+        continuity, conditions = tables.continuity, tables.conditions
+        self._conditions = conditions
         self.envs = envs
         self.requests = requests
         self.supervisor = supervisor
-        self.auto = AutoReset(envs, requests)
+        self.continuity = continuity
+        self.observed = tables.observed
+        self.lifetime = tables.lifetime
         self.stats = Stats(envs, requests)
         self._layout = layout
-        self._results = Results(envs, layout, zero_copy=zero_copy)
-        self._first_looks = FirstLooks(envs)
-        self._recovery = Recovery()
-        self._resumption = resumption
-        self._dispatch = Dispatch(envs, requests, supervisor)
-        self._intake = Intake(
-            completions,
-            envs,
-            requests,
-            layout,
-            supervisor,
-            self._dispatch,
-            self._results,
-            self._recovery,
-            resumption,
-            self.auto,
-            self.stats,
-        )
-        # Takes in what hosts have told; a driver calls it before a procedure goes on.
+        self._num_cores = parts.poller.num_cores
+        self._results = Results(envs, layout, conditions, zero_copy=zero_copy)
+        self._first_observations = FirstObservations(envs)
+        self._dispatch = Dispatch(tables, supervisor)
+        self._arrivals = Arrivals(tables, self._results, self.stats)
+        self._intake = Intake(parts.completions, tables, supervisor, self._results, self._arrivals)
+        # The queue of completions; a driver applies them before it resumes a procedure.
+        self.completions = parts.completions
         self.drain = self._intake.drain
-        self._waiting = Waiting(requests, supervisor, poller, self._intake, watcher)
+        self._waiting = Waiting(requests, supervisor, parts.poller, self._intake, parts.watcher)
         self.calls = Calls(
-            envs,
-            requests,
-            supervisor,
+            tables,
             self._dispatch,
             self._intake,
-            self.auto,
-            resumption,
             self._waiting,
         )
-        self._states = States(
-            envs,
-            supervisor,
-            self._dispatch,
-            self.calls,
-            self.auto,
-            self._recovery,
-            resumption,
-            self._waiting,
+        self._snapshots = Snapshots(
+            envs, supervisor, self._dispatch, self.calls, continuity, self._waiting
         )
-        self._collecting = False
-        self._handed_out = 0
+        self._resets = Resets(
+            tables, supervisor, self._dispatch, self._results, self._intake, self._waiting
+        )
+        self.collecting = False
+        steps = CheckedSteps if isinstance(requests, CheckedRequests) else Steps
+        self.steps = steps(
+            self,
+            parts,
+            self._results,
+            self.stats,
+            self._intake,
+            self._waiting,
+            shares_thread=shares_thread,
+        )
 
     # -- life -------------------------------------------------------------------------
 
     def start(self, now: float) -> Procedure[list[EnvMeta]]:
-        """See `EnvGroup.init`."""
+        """Start the hosts and make the ordinary step ready."""
         for host in self.supervisor.hosts:
             self._results.begin_schemas(range(host.first_slot, host.first_slot + host.num_envs))
-        return self.supervisor.start(now)
+        with self.observed.call("init", now):
+            metas = yield from self.supervisor.start(now)
+        self.steps.begin()
+        return metas
 
     def close(self, now: float) -> Procedure[None]:
-        """See `EnvGroup.close`."""
-        return self.supervisor.close(now)
+        """Close the hosts."""
+        return self.supervisor.shutdown.close(now)
 
     def describe_workers(self, now_ns: int) -> list[dict[str, Any]]:
-        """See `EnvGroup.get_workers`."""
-        if self.supervisor.open:
-            self._waiting.poll()  # Results that lie there are owed no more.
-        return self.supervisor.describe(now_ns)
+        """Describe each host and its outstanding requests."""
+        if self.lifetime.open:
+            self._waiting.poll()  # Results that are ready are no longer outstanding.
+        return self.supervisor.workers.describe(now_ns)
 
     # -- requests ---------------------------------------------------------------------
 
     def step_async(self, batch: BatchedData, now: float) -> None:
-        """Send a batch of steps that `collect` will answer."""
-        self._send_steps(batch, self._slots_of(batch), None, now)
-        # The collector has not asked these envs' workers to wake it.
+        """Send a batch of steps, whose results `collect` returns."""
+        with self.observed.call("step_async", now):
+            self._send_steps(batch, self._slots_of(batch), None, now)
+        # A waiting collector has not armed the bell for these results.
         self._waiting.wake()
 
     def _slots_of(self, batch: BatchedData) -> NDArray[np.intp]:
-        """Slots of a batch's envs; free for a batch that answers one of ours."""
+        """Return the slots of a batch's envs; a batch that answers our results knows them."""
         if not isinstance(batch, BatchedData):  # pyright: ignore[reportUnnecessaryIsInstance]
             raise BadAction(
                 f"a step takes a batch of responses, not a {type(batch).__name__}: answer the last "
@@ -208,102 +168,53 @@ class Core:
     ) -> None:
         self._intake.now = now
         self._intake.drain()
-        if self.supervisor.has_members:
-            batch, slots = self._without_gone(batch, slots)
+        if self.supervisor.members.possible:
+            batch, slots = self._arrivals.without_gone(batch, slots)
             if not len(slots):
                 return
         self._dispatch.check_sendable(slots, "step")
         out_of_band = write_actions(batch, slots, self.envs, self._layout)
         packed = [] if out_of_band is None else self._dispatch.packed_steps(slots, out_of_band)
-        self._results.note_sent(slots, _columns(batch))
-        resets = self.auto.due(slots)
-        if self._recovery.any_untold:
-            telling = self._recovery.tell(slots)
-            self._show_standings(slots[telling], ~np.broadcast_to(resets, len(slots))[telling])
-            resets = resets | telling
-            self.supervisor.note_recovery(any_telling=self._recovery.any_telling)
+        self._results.note_sent(slots, response_columns(batch, slots, self._layout))
+        resets = self.continuity.resets(slots)
+        if self.continuity.exceptional:
+            reports, seeds = self.continuity.report_losses(slots, ~resets)
+            self._layout.write_seeds(slots[reports], seeds[reports])
+            resets = resets | reports
         entries = self.requests.submit(slots, Operation.STEP, _owner(ticket), now)
-        if resets is not NO_RESETS and np.count_nonzero(resets):
-            self.requests.into_resets(slots, entries, resets)
-        else:
-            resets = None
+        if np.count_nonzero(resets):
+            self.requests.numbering.into_resets(slots, entries, resets)
         if out_of_band is None:
             self._dispatch.hand_over(slots, entries)
         else:
             self._dispatch.hand_over_out_of_band(
                 slots, entries, out_of_band.positions, packed, resets
             )
-        if self.supervisor.has_members:
-            self._intake.drain()  # What was withdrawn at once.
-
-    def _show_standings(self, slots: NDArray[np.intp], stepped: NDArray[np.bool_]) -> None:
-        """Have envs of replaced workers show where they stand, if they would be `stepped`."""
-        seeds, lost = self._resumption.seeds(slots, stepped)
-        self._layout.write_seeds(slots, seeds)
-        for slot, num_steps in lost.items():
-            self.auto.rewind(slot, num_steps, owes=False)
-
-    def _without_gone(
-        self, batch: BatchedData, slots: NDArray[np.intp]
-    ) -> tuple[BatchedData, NDArray[np.intp]]:
-        """`batch` without the clients that have gone since it was handed out, and are back or
-        have left their slots to others.
-
-        What they would be asked was meant for the episode that they have lost. Of one that is
-        back, the first result of the new episode, which waits to be collected, is the answer.
-        """
-        names, is_current = self.envs.names, names_of(batch) is self.envs.names
-        if is_current and not self.requests.num_ready:
-            return batch, slots
-        gone = self.requests.joined(slots)
-        if not is_current:
-            pairs = zip(batch.env_ids(), names.ids(slots), strict=True)
-            gone |= np.array([then != now for then, now in pairs], np.bool_)
-        if not gone.any():
-            return batch, slots
-        kept = np.flatnonzero(~gone).tolist()
-        env_ids, values = batch.env_ids(), batch.values()
-        return BatchedData([env_ids[k] for k in kept], [values[k] for k in kept]), slots[kept]
+        if self.supervisor.members.possible:
+            self._intake.drain()  # Requests to absent envs are withdrawn immediately.
 
     # -- collect ----------------------------------------------------------------------
 
-    def collect(
-        self,
-        now: float,
-        *,
-        timeout: float | None,
-        wait_all: bool,
-        min_results: int,
-        max_results: int | None,
-        deadline: float | None,
-        entries: Sequence[str] | None = None,
-        ordered: bool = False,
-    ) -> Procedure[tuple[BatchedData, Flags]]:
-        """See `EnvGroup.collect_async`."""
-        self.supervisor.check_open()
-        if self._collecting:
+    def collect(self, now: float, rules: CollectRules) -> Procedure[tuple[BatchedData, Flags]]:
+        """Wait for results by the rules of `EnvGroup.collect_async`, and return them."""
+        with self.observed.call("collect_async", now):
+            return (yield from self._collect(now, rules))
+
+    def _collect(self, now: float, rules: CollectRules) -> Procedure[tuple[BatchedData, Flags]]:
+        timeout, deadline = rules.timeout, rules.deadline
+        self.lifetime.check_open()
+        if self.collecting:
             raise RLightningError(
                 "another collect_async is already waiting on this group; one collector at a time"
             )
-        among = None if entries is None else self.envs.of_entries(entries)
-        self._collecting = True
+        among = None if rules.entries is None else self.envs.of_entries(rules.entries)
+        self.collecting = True
         try:
             end = None if deadline is None else now + deadline
             window = None
             now = yield from self._waiting.check_liveness(now)
             while True:
-                self._waiting.poll()
-                if self.requests.faults:
-                    self._raise_fault(among)
-                ready, total = self.requests.pending(among)
-                if not total and not self.supervisor.has_members:
-                    whose = "" if entries is None else f" of entries {', '.join(entries)}"
-                    raise NothingPending(
-                        f"nothing to collect: no request{whose} is outstanding; send one with "
-                        "step_async"
-                    )
-                most = total if max_results is None else min(total, max_results)
-                need = most if wait_all else min(min_results, most)
+                ready, most, need = self._counts(rules, among)
                 if ready and timeout is not None and window is None:
                     window = now + timeout
                 open_window = window is not None and now < window and ready < most
@@ -319,73 +230,111 @@ class Core:
                 until = earliest(end, window if open_window else None)
                 now = yield from self._waiting.turn(wanted, until)
         finally:
-            self._collecting = False
+            self.collecting = False
             self._waiting.end()
-        slots = self.requests.take(most, among)
-        return self.hand_out(np.sort(slots) if ordered else slots, synchronous=False)
+        slots = self.requests.collector.take(most, among)
+        return self.hand_out(np.sort(slots) if rules.ordered else slots, synchronous=False)
+
+    def _counts(self, rules: CollectRules, among: NDArray[np.bool_] | None) -> tuple[int, int, int]:
+        """Read replies; return the numbers of results that are ready, possible, and needed.
+
+        Raises:
+            EnvFault: an env of these slots ended in an error.
+            NothingPending: no result can come.
+        """
+        self._waiting.poll()
+        if self.requests.collector.faults:
+            self._raise_fault(among)
+        ready, total = self.requests.pending(among)
+        if not total and not self.supervisor.members.possible:
+            whose = "" if rules.entries is None else f" of entries {', '.join(rules.entries)}"
+            raise NothingPending(
+                f"nothing to collect: no request{whose} is outstanding; send one with step_async"
+            )
+        most = total if rules.max_results is None else min(total, rules.max_results)
+        return ready, most, most if rules.wait_all else min(rules.min_results, most)
 
     def _raise_fault(self, among: NDArray[np.bool_] | None) -> None:
-        """Raise the oldest error for the collector, if there is one of these slots."""
-        for fault in self.requests.faults:
+        """Raise the collector's oldest error of these slots, if there is one."""
+        for fault in self.requests.collector.faults:
             if among is None or among[self.envs.find_one(fault.env_id)]:
-                self.requests.faults.remove(fault)
+                self.requests.collector.take_fault(fault)
                 raise fault
 
     def hand_out(self, slots: NDArray[np.intp], *, synchronous: bool) -> tuple[BatchedData, Flags]:
-        """The results of `slots`, all ready. They stay so until the batch is complete: where
-        memory runs out on the way, the next collect hands them out.
+        """Return the results of `slots`, all ready.
+
+        They stay ready until the batch is complete: if memory runs out on the way, the next
+        collect returns them.
         """
+        observer = self.observed.observer
+        noted = None if observer is None else observer.before_results(slots)
         try:
-            batch, limits, parts = self._batch(slots)
-            if self._first_looks.left:
-                self._first_looks.look(parts)
-            flags = [False] * len(slots) if limits is None else limits.tolist()
+            parts = self._results.gather(slots)
+            flagged = [part for part in parts if np.count_nonzero(part.flags)]
+            verdict = self.continuity.judge(slots, flagged)
+            batch = self._batch(slots, parts, flagged, verdict.is_cut)
+            if self._first_observations.left:
+                self._first_observations.check(parts)
+                self._conditions.note(FIRST_RESULTS, bool(self._first_observations.left))
+            flags = [False] * len(slots) if verdict.is_cut is None else verdict.is_cut.tolist()
             self.stats.account(parts, synchronous=synchronous)
+            self.continuity.returned(slots, flagged, verdict)
             self._results.let_go(slots)
             self.requests.hand_out(slots)
         except BaseException:
             self.requests.put_back(slots)
             raise
-        self._handed_out += 1
-        if self._handed_out == HINT_AFTER_BATCHES:
-            self.supervisor.give_hint(self.stats.summary()["latency_us"])
-        if self._intake.held_back:
-            self._intake.admit(slots)
+        if self.stats.num_batches == HINT_AFTER_BATCHES:
+            self.give_hint()
+        if observer is not None:
+            observer.after_results(noted, parts)
+        if self._arrivals.held_back:
+            self._arrivals.admit(slots, self._intake.now)
         return batch, flags
 
+    def give_hint(self) -> None:
+        """Log if the measured times suggest other settings."""
+        latency_us = self.stats.summary()["latency_us"]
+        self.supervisor.workers.give_hint(self._num_cores, latency_us)
+
     def _batch(
-        self, slots: NDArray[np.intp]
-    ) -> tuple[BatchedData, NDArray[np.bool_] | None, list[ResultColumns]]:
-        """A batch, where the step limit was reached, and its parts. Doing it twice is harmless."""
+        self,
+        slots: NDArray[np.intp],
+        parts: list[ResultColumns],
+        flagged: Sequence[ResultColumns],
+        is_cut: NDArray[np.bool_] | None,
+    ) -> BatchedData:
+        """Make a batch of `parts`, and mark where the step limit cuts an episode."""
         results = self._results
-        parts = results.gather(slots)
-        flagged = [part for part in parts if np.count_nonzero(part.flags)]
-        limits = self.auto.account(slots, flagged)
-        for part in flagged if limits is None else parts:
-            if limits is not None:
-                part.limit_reached = limits if part.positions is None else limits[part.positions]
-                if self.auto.mark_truncated:
+        for part in flagged if is_cut is None else parts:
+            if is_cut is not None:
+                part.limit_reached = is_cut if part.positions is None else is_cut[part.positions]
+                if self.continuity.mark_truncated:
                     part.flags[part.limit_reached, ..., TRUNCATED] = True
             results.add_episodes(part)
-        origin = Origin(self, slots, self.envs.names)
-        return batch_of_results(parts, origin, results.sources(slots)), limits, parts
+        return batch_of_results(parts, self, slots, self.envs.names, results.sources(slots))
 
     def step(self, batch: BatchedData, now: float) -> Procedure[tuple[BatchedData, Flags | None]]:
-        """See `EnvGroup.step`."""
+        """Send a batch of steps and wait for all of them."""
+        with self.observed.call("step", now):
+            return (yield from self._step(batch, now))
+
+    def _step(self, batch: BatchedData, now: float) -> Procedure[tuple[BatchedData, Flags | None]]:
         slots = self._slots_of(batch)
         self._dispatch.check_local(slots, "step")
-        ticket = self.requests.open_ticket(slots)
+        ticket = self.requests.tickets.open(slots)
         try:
             self._send_steps(batch, slots, ticket, now)
         except BaseException:
-            self.requests.drop(ticket)
+            self.requests.tickets.drop(ticket)
             raise
         yield from self._waiting.until_replied(ticket)
-        results, flags = self._settled(ticket, slots)
-        return results, flags if self.auto.active else None
+        results, flags = self.settled(ticket, slots)
+        return results, flags if self.continuity.active else None
 
-    def _settled(self, ticket: Ticket, slots: NDArray[np.intp]) -> tuple[BatchedData, Flags]:
-        """The results of a call, in its order; its faults, with the results, as an error."""
+    def settled(self, ticket: Ticket, slots: NDArray[np.intp]) -> tuple[BatchedData, Flags]:
+        """Return the results of a call in its order, or raise its faults with the results."""
         if not ticket.faults:
             return self.hand_out(slots, synchronous=True)
         done = self.requests.ready(slots)
@@ -395,7 +344,7 @@ class Core:
             try:
                 fault.results = self.hand_out(done, synchronous=True)[0]
             except BaseException:
-                self.requests.faults.extend(ticket.faults)
+                self.requests.collector.faults.extend(ticket.faults)
                 raise
             fault.add_note(
                 f"{len(done)} other envs of the same call are done; their results are in "
@@ -410,11 +359,9 @@ class Core:
         options: dict[str, Any] | None,
         env_ids: Sequence[str] | None,
     ) -> Procedure[tuple[BatchedData, Flags]]:
-        """See `EnvGroup.reset`."""
-        if env_ids is None and self.supervisor.has_members:
-            now = yield from self._await_members(now)
-        slots = self._everyone() if env_ids is None else self._dispatch.distinct(env_ids)
-        return (yield from self._reset(now, seed, options, slots))
+        """Reset envs and wait for all of them."""
+        with self.observed.call("reset", now):
+            return self.settled(*(yield from self._resets.reset(now, seed, options, env_ids)))
 
     def reset_members(
         self,
@@ -423,29 +370,10 @@ class Core:
         seed: int | None,
         options: dict[str, Any] | None,
     ) -> Procedure[tuple[BatchedData, Flags]]:
-        """See `ServerHandle.reset`."""
-        now = yield from self._await_members(now)
-        host, membership = server
-        slots = np.array(membership.member_indices(), np.intp) + host.first_slot
-        seeds = None
-        if seed is not None:
-            self.supervisor.rank_members()
-            offsets = self.envs.seed_offset[slots]
-            seeds = (checked_seed(seed) + offsets - offsets[:1]).tolist()
-        return (yield from self._reset(now, seeds, options, slots))
-
-    def _everyone(self) -> NDArray[np.intp]:
-        """Slots of the local envs and of the clients that are here."""
-        members = self.supervisor.member_slots()
-        return np.concatenate((self.envs.all, members)) if members else self.envs.all
-
-    def _await_members(self, now: float) -> Procedure[float]:
-        """Until each env_server has the clients that it needs."""
-        began = now
-        while (missing := self.supervisor.missing(now - began)) is not None:
-            now = yield Wait(earliest(began + missing, self.supervisor.next_check()))
-            self._waiting.check(now)
-        return now
+        """Reset all envs that have joined a host and wait for them."""
+        with self.observed.call("reset", now):
+            replied = yield from self._resets.reset_members(now, server, seed, options)
+            return self.settled(*replied)
 
     def reset_async(
         self,
@@ -454,97 +382,29 @@ class Core:
         options: dict[str, Any] | None,
         env_ids: Sequence[str] | None,
     ) -> None:
-        """Send resets that `collect` will answer."""
-        slots = self._everyone() if env_ids is None else self._dispatch.distinct(env_ids)
-        seeds = self._seeds_for(slots, seed, now)
-        self._dispatch.check_sendable(slots, "reset")
-        packed = self._packed_resets(slots, seeds, options)
-        self._forget_losses(slots)
-        self._submit_resets(slots, seeds, packed, COLLECTOR, now)
+        """Send resets, whose results `collect` returns."""
+        with self.observed.call("reset_async", now):
+            self._resets.reset_async(now, seed, options, env_ids)
         self._waiting.wake()
-
-    def _forget_losses(self, slots: NDArray[np.intp]) -> None:
-        """Whoever resets begins a new episode anyway, and needn't be told of the one before."""
-        self._recovery.forget(slots.tolist())
-        if self._recovery.any_telling:
-            self.supervisor.note_recovery(any_telling=True)
-
-    def _reset(
-        self, now: float, seed: Seeds, options: dict[str, Any] | None, slots: NDArray[np.intp]
-    ) -> Procedure[tuple[BatchedData, Flags]]:
-        seeds = self._seeds_for(slots, seed, now)
-        joined = self.requests.joined(slots)
-        self._dispatch.check_sendable(slots[~joined], "reset")
-        packed = self._packed_resets(slots, seeds, options)
-        self._forget_losses(slots)
-        ticket = self.requests.open_ticket(slots)
-        asked = slots
-        if joined.any():
-            enough = seed is None and options is None
-            self._take_first_results(slots[joined], ticket, enough=enough)
-            if enough:
-                asked, seeds = slots[~joined], seeds[~joined]
-        self._submit_resets(asked, seeds, packed, ticket.owner, now)
-        yield from self._waiting.until_replied(ticket)
-        return self._settled(ticket, slots)
-
-    def _seeds_for(self, slots: NDArray[np.intp], seed: Seeds, now: float) -> NDArray[np.int64]:
-        """The seeds of resets that are about to be sent to `slots`, as things are now."""
-        self._intake.now = now
-        self._intake.drain()
-        if self.supervisor.has_members:
-            self.supervisor.rank_members()
-        return seeds_for(self.envs, seed, slots)
-
-    def _packed_resets(
-        self, slots: NDArray[np.intp], seeds: NDArray[np.int64], options: dict[str, Any] | None
-    ) -> list[Any] | None:
-        return None if options is None else self._dispatch.packed_resets(slots, seeds, options)
-
-    def _submit_resets(
-        self,
-        slots: NDArray[np.intp],
-        seeds: NDArray[np.int64],
-        packed: list[Any] | None,
-        owner: int,
-        now: float,
-    ) -> None:
-        entries = self.requests.submit(slots, Operation.RESET, owner, now)
-        self._results.note_sent(slots, None)
-        if packed is None:
-            self._layout.write_seeds(slots, seeds)
-        self._dispatch.hand_over(slots, entries, packed)
-
-    def _take_first_results(self, slots: NDArray[np.intp], ticket: Ticket, *, enough: bool) -> None:
-        """Let a reset have the first results of clients that have only just joined.
-
-        Joining was a reset; unless this one asks for more than that, it was `enough`: an env
-        that takes minutes to reset, as a robot may, isn't reset twice.
-        """
-        self.requests.take_joined(slots, ticket if enough else None)
-        if not enough:
-            for slot in slots.tolist():
-                self._results.drop(slot)
 
     # -- states of envs ---------------------------------------------------------------
 
     def snapshot(self, now: float, env_ids: Sequence[str] | None) -> Procedure[bytes]:
-        """See `EnvGroup.snapshot`."""
-        return self._states.snapshot(now, env_ids)
+        """Take a snapshot of envs."""
+        with self.observed.call("snapshot", now):
+            return (yield from self._snapshots.take(now, env_ids))
 
     def restore(
         self, now: float, data: bytes, env_ids: Sequence[str] | None
     ) -> Procedure[tuple[BatchedData, Flags]]:
-        """See `EnvGroup.restore`."""
-        slots = yield from self._states.put_back(now, data, env_ids)
-        self._forget_losses(slots)
-        ticket = self.requests.open_ticket(slots)
-        self._submit_resets(slots, np.full(len(slots), AS_RESTORED), None, ticket.owner, now)
-        yield from self._waiting.until_replied(ticket)
-        return self._settled(ticket, slots)
+        """Restore envs, and return their last results as first observations."""
+        with self.observed.call("restore", now):
+            slots, positions = yield from self._snapshots.put_back(now, data, env_ids)
+            self.continuity.note_shows(slots.tolist(), positions)
+            return self.settled(*(yield from self._resets.show_restored(now, slots)))
 
     def pending(self) -> int:
-        """Requests that `collect_async` has still to answer, ready or not."""
+        """Return the number of requests that `collect_async` has to answer, ready or not."""
         self._intake.drain()
         return self.requests.pending()[1]
 
@@ -554,7 +414,7 @@ def _owner(ticket: Ticket | None) -> int:
 
 
 def _answered(batch: BatchedData) -> list[str]:
-    """The envs that a batch of somebody's own making answers."""
+    """Return the ids of the envs that a batch of the user's own values answers."""
     env_ids = batch.env_ids()
     for id_, env_id in zip(batch.ids(), env_ids, strict=True):
         if env_id != id_ and not env_id.startswith(f"{id_}/"):
@@ -563,9 +423,3 @@ def _answered(batch: BatchedData) -> list[str]:
                 "env's id; nothing was sent"
             )
     return env_ids
-
-
-def _columns(batch: BatchedData) -> Mapping[str, Any]:
-    """What a batch of responses attaches, as columns."""
-    columns = columns_of_responses(batch)
-    return columns_of_values(batch.values()) if columns is None else columns

@@ -1,9 +1,9 @@
 """GPUs of this machine, assigned to the workers whose entries ask for them.
 
-Rule: they are assigned before anything starts, in the order of the workers. A worker has its
-devices to itself, or shares one with workers whose shares add up to it. Only devices that the
-trainer's own `CUDA_VISIBLE_DEVICES` leaves are assigned; a worker sees its own by that variable.
-Absent on purpose: CUDA. Nothing here initialises a device.
+Rule: devices are assigned before any worker starts, in the order of the workers. A worker has whole
+devices, or shares one with workers whose fractions add up to at most 1. Only devices in this
+process's `CUDA_VISIBLE_DEVICES` are assigned, and each worker gets its own value of that variable.
+Left out: CUDA. Nothing here initialises a device.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ if TYPE_CHECKING:
 
     from rlightning_aio.config import EnvConfig
 
-__all__ = ["dealt_out", "visible_devices"]
+__all__ = ["check_own_devices", "dealt_out", "visible_devices"]
 
 _VISIBLE: Final = "CUDA_VISIBLE_DEVICES"
 _ENOUGH: Final = 1e-9
-"""Thirds add up to a whole."""
+"""Tolerance for rounding: three thirds make a whole device."""
 _LISTING_SECONDS: Final = 20.0
 
 
 def visible_devices() -> tuple[list[str], str]:
-    """The devices that this process may use, as CUDA calls them, and how that is known."""
+    """CUDA's names of the devices that this process may use, and the source of that knowledge."""
     given = os.environ.get(_VISIBLE)
     if given is not None:
         names = [name.strip() for name in given.split(",")]
-        # As CUDA has it: what follows an invalid name is not there.
+        # CUDA ignores an invalid name and all that follow it.
         invalid = next((k for k, name in enumerate(names) if name in ("", "-1")), len(names))
         return names[:invalid], f"{_VISIBLE}={given}"
     nodes = [node for node in Path("/dev").glob("nvidia*") if node.name[6:].isdigit()]
@@ -54,13 +54,13 @@ def visible_devices() -> tuple[list[str], str]:
 
 
 def dealt_out(workers: Sequence[EnvConfig]) -> list[dict[str, str]]:
-    """The environment variables by which each worker sees its devices; none for one without.
+    """The environment variables that assign devices to each worker; empty without devices.
 
     Args:
-        workers: the entry of each, those that live elsewhere left out.
+        workers: the entry of each worker on this machine.
 
     Raises:
-        ConfigError: a worker asks for what can't be, or all for more than there is.
+        ConfigError: a worker asks for 1.5 devices, say, or all workers for more than there are.
     """
     if not any(config.num_gpus for config in workers):
         return [{} for _ in workers]
@@ -75,13 +75,21 @@ def dealt_out(workers: Sequence[EnvConfig]) -> list[dict[str, str]]:
     return dealt
 
 
+def check_own_devices(config: EnvConfig) -> None:
+    """Raise `ConfigError` if an inline entry asks for GPUs and this process sees none."""
+    if config.num_gpus and not (known := visible_devices())[0]:
+        raise ConfigError(
+            f"entry {config.name!r}, num_gpus: with placement: {config.placement} its envs share "
+            f"this process's GPUs, and none is visible here ({known[1]}); leave num_gpus out"
+        )
+
+
 def _chosen(config: EnvConfig, left: list[float]) -> list[int] | None:
-    """The devices of one worker, taken off what is `left` of each; None if there are too few."""
+    """Choose the devices of one worker and subtract its share from `left`; None if too few."""
     wished = config.num_gpus
     if wished > 1 and wished != int(wished):
         raise ConfigError(
-            f"entry {config.name!r}, num_gpus: a worker has whole devices or a fraction of one, "
-            "not "
+            f"entry {config.name!r}, num_gpus: must be a whole number or less than 1, not "
             f"{wished:g}"
         )
     count, share = (1, wished) if wished < 1 else (int(wished), 1.0)
@@ -98,7 +106,7 @@ def _variables(names: list[str]) -> dict[str, str]:
         return {}
     variables = {_VISIBLE: ",".join(names)}
     if names[0].isdigit():
-        # EGL counts all devices of the machine, and knows none by CUDA's identifiers.
+        # EGL numbers all devices of the machine, and doesn't accept CUDA's UUIDs.
         variables["MUJOCO_EGL_DEVICE_ID"] = names[0]
     return variables
 
@@ -116,7 +124,6 @@ def _shortage(
     )
     there = f"{len(names)} ({', '.join(names)})" if names else "none"
     return (
-        f"entry {config.name!r}, num_gpus: there are too few GPUs: requested are {asked}; visible "
-        f"here: {there}, by {known_by}; lower num_gpus, or put more envs into a worker "
-        "(envs_per_process)"
+        f"entry {config.name!r}, num_gpus: too few GPUs: requested: {asked}; visible here "
+        f"({known_by}): {there}; lower num_gpus, or put more envs into a worker (envs_per_process)"
     )

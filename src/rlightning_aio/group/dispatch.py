@@ -1,7 +1,6 @@
-"""`Dispatch`: how requests leave: who may be asked, with what arguments, through which host.
+"""`Dispatch`: checks requests, packs their arguments, and gives them to hosts.
 
-Rule: all or nothing. Everything that can be refused is refused, and all arguments are
-packed, before the first request is handed over.
+Rule: all or nothing. All checks are done and all arguments packed before the first request is sent.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from rlightning_aio.errors import BadAction, EnvBusy
-from rlightning_aio.group.requests import State
+from rlightning_aio.group.request_states import State
 from rlightning_aio.protocol.slab import NO_SEED
 
 if TYPE_CHECKING:
@@ -20,24 +19,24 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio.group.actions import OutOfBandSteps
-    from rlightning_aio.group.env_table import EnvTable
-    from rlightning_aio.group.requests import Requests
     from rlightning_aio.group.supervisor import Supervisor
+    from rlightning_aio.group.tables import Tables
     from rlightning_aio.hosts.base import Host, Membership
 
 __all__ = ["Dispatch"]
 
 
 class Dispatch:
-    """See the module; its arguments are the group's parts."""
+    """The outgoing side of a group."""
 
-    def __init__(self, envs: EnvTable, requests: Requests, supervisor: Supervisor) -> None:
-        self._envs = envs
-        self._requests = requests
+    def __init__(self, tables: Tables, supervisor: Supervisor) -> None:
+        self._envs = tables.envs
+        self._requests = tables.requests
+        self._lifetime = tables.lifetime
         self._supervisor = supervisor
 
     def distinct(self, env_ids: Sequence[str]) -> NDArray[np.intp]:
-        """Slots of `env_ids`, each of which may come once."""
+        """The slots of `env_ids`; `EnvBusy` if an id appears twice."""
         slots = self._envs.find(env_ids)
         if slots is not self._envs.all and len(set(env_ids)) < len(slots):
             double = next(id_ for k, id_ in enumerate(env_ids) if id_ in env_ids[:k])
@@ -45,7 +44,8 @@ class Dispatch:
         return slots
 
     def check_sendable(self, slots: NDArray[np.intp], what: str) -> None:
-        self._supervisor.check_open()
+        """Raise an error if the group is closed, or an env of `slots` is busy or gone."""
+        self._lifetime.check_open()
         self._supervisor.check_usable(slots)
         slot = self._requests.first_not_idle(slots)
         if slot is not None:
@@ -57,15 +57,18 @@ class Dispatch:
             )
 
     def check_local(self, slots: NDArray[np.intp], what: str) -> None:
-        """Raises NotImplementedError if any of `slots` belongs to a client."""
-        if self._supervisor.has_members and (remote := slots[slots >= len(self._envs.all)]).size:
+        """Raise `NotImplementedError` if any of `slots` belongs to a member."""
+        if (
+            self._supervisor.members.possible
+            and (remote := slots[slots >= len(self._envs.all)]).size
+        ):
             raise NotImplementedError(
                 f"can't {what} {self._envs.describe(int(remote[0]))}: remote envs answer when they "
                 "can; use step_async and collect_async"
             )
 
     def packed_steps(self, slots: NDArray[np.intp], out_of_band: OutOfBandSteps) -> list[Any]:
-        """What goes out of band, packed before anything is sent."""
+        """The packed arguments of steps that go out of band."""
         chosen = slots[out_of_band.positions].tolist()
         try:
             for slot, (action, extras) in zip(chosen, out_of_band.contents, strict=True):
@@ -107,7 +110,7 @@ class Dispatch:
             ) from error
 
     def _host_of(self, slot: int) -> Host:
-        return self._supervisor.hosts[self._requests.host_of(slot)]
+        return self._supervisor.hosts[self._requests.hosts.item(slot)]
 
     def hand_over(
         self,
@@ -115,7 +118,7 @@ class Dispatch:
         entries: NDArray[np.int64],
         arguments: Sequence[Any] | None = None,
     ) -> None:
-        """Give submitted requests to their hosts, with one call for each run of one host."""
+        """Give submitted requests to their hosts, one call per run of slots of the same host."""
         for host_id, part in self._requests.by_host(slots):
             given = None if arguments is None else arguments[part]
             self._supervisor.submit(host_id, entries[part], given)
@@ -128,7 +131,10 @@ class Dispatch:
         packed: Sequence[Any],
         resets: NDArray[np.bool_] | None,
     ) -> None:
-        """The same where `positions` have arguments out of band, unless they became resets."""
+        """Give submitted requests to their hosts, with out-of-band arguments at `positions`.
+
+        Positions that became resets go without arguments.
+        """
         out_of_band = np.zeros(len(slots), np.bool_)
         out_of_band[positions] = True
         if resets is not None:

@@ -1,7 +1,7 @@
-"""`EnvTable`: who the envs of a group are, by slot, and what they make of requests.
+"""`EnvTable`: names and properties of a group's envs, by slot.
 
-A slot is an env's position in its group: local envs first, then so many places for each
-env_server as it may have clients. Nothing here changes with a step.
+A slot is an env's position in its group: local envs first, then one slot for each env that may join
+a host while the group runs (a member). No step changes anything here.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ class EnvTable:
 
     Args:
         configs, env_ids: of the local envs.
-        servers: id, config and number of slots of each env_server.
+        servers: id, config and number of slots of each host that envs join.
 
     Attributes:
-        names: of each slot; replaced when a client takes one.
-        configs: of each slot.
-        local_ids, server_ids: of the local envs, and of the env_servers.
+        names: of each slot; replaced when a member takes a slot.
+        configs: the entry of each slot.
+        local_ids, server_ids: ids of the local envs, and of the hosts that envs join.
         all: slots of the local envs.
-        step_limits: of an episode, configured or the simulator's own; 0 for none.
-        out_of_band_actions: actions may not fit the row; reads_extras: responses' extras are
-            read there; any_out_of_band: either is true of any env.
-        num_sub_envs: of each; seed_offset: how many seeds come before its own; num_seeds:
-            those of all local envs.
-        resets_itself: it needs no reset after an end; any_resets_itself: true of any env.
+        step_limits: steps per episode, configured or from the simulator; 0 for no limit.
+        out_of_band_actions: True where actions may not fit the row; reads_extras: True where
+            extras of responses are read; any_out_of_band: either holds for any slot.
+        num_sub_envs: sub-environments of each slot; seed_offset: the number of seeds before its
+            own; num_seeds: the number for all local envs.
+        resets_itself: True where envs need no reset after an end; any_resets_itself: for any slot.
         observation_spaces: of the local envs.
     """
 
@@ -92,20 +92,20 @@ class EnvTable:
 
     @property
     def env_ids(self) -> Sequence[str]:
-        """Of each slot; empty for one that no client has taken."""
+        """The env id of each slot; empty for a free slot of a member."""
         return self.names.env_ids
 
-    # -- what envs tell of themselves -------------------------------------------------
+    # -- properties -------------------------------------------------------------------
 
     def note_started(self, started: Sequence[EnvStarted]) -> None:
-        """Take note of what the local envs are like, in the order of their slots."""
+        """Record the properties of the local envs, in the order of their slots."""
         self.observation_spaces = [env.meta.observation_space for env in started]
         for slot, env in enumerate(started):
             fits_row = env.layout.action_leaves is not None
             self.out_of_band_actions[slot] = env.transforms_actions or not fits_row
             self.reads_extras[slot] = env.reads_extras
             self._note_meta(slot, env.meta)
-            # Seeds are the sub-environments', of which a result may hold some only.
+            # Each sub-environment has a seed, though a result may hold only some of them.
             in_all = self.configs[slot].num_envs
             self.names.turns[slot] = in_all > env.meta.num_envs
             self.num_sub_envs[slot] = max(env.meta.num_envs, in_all)
@@ -118,14 +118,14 @@ class EnvTable:
     def note_joined(
         self, slot: int, first_slot: int, meta: EnvMeta, traits: ClientTraits, *, has_row: bool
     ) -> None:
-        """Take note of a client that has taken a slot, perhaps from another.
+        """Record the properties of a member that has taken a slot, free or of another one.
 
         Args:
-            slot: the client's.
-            first_slot: that of its env_server.
-            meta: what it told of its env.
-            traits: what it makes of requests.
-            has_row: its actions have a place in its row.
+            slot: of the member.
+            first_slot: of its host.
+            meta: reported by the member.
+            traits: how the member treats requests.
+            has_row: its actions fit its row.
         """
         self._slot_of.pop(self.env_ids[slot], None)
         self._slot_of[meta.env_id] = slot
@@ -133,7 +133,7 @@ class EnvTable:
         self.reads_extras[slot] = traits.reads_extras
         self._note_meta(slot, meta)
         self.num_sub_envs[slot] = meta.num_envs
-        # Clients of one env_server are of one kind.
+        # All members of a host have the same number of sub-environments.
         behind = (first_slot - len(self.all)) + (slot - first_slot) * meta.num_envs
         self.names = self.names.renamed(slot, meta.env_id, self.num_seeds + behind)
         self._note_any()
@@ -149,10 +149,10 @@ class EnvTable:
     # -- names ------------------------------------------------------------------------
 
     def find(self, env_ids: Sequence[str]) -> NDArray[np.intp]:
-        """Slots of `env_ids`, in their order.
+        """The slots of `env_ids`, in that order.
 
         Raises:
-            UnknownEnv: an id is no env's of this group.
+            UnknownEnv: no env of this group has one of the ids.
         """
         if len(env_ids) == len(self.local_ids) and list(env_ids) == self.local_ids:
             return self.all
@@ -163,7 +163,7 @@ class EnvTable:
             raise UnknownEnv(self._unknown(missing.args[0])) from None
 
     def find_one(self, env_id: str) -> int:
-        """Slot of `env_id`; raises `UnknownEnv`."""
+        """The slot of `env_id`; raises `UnknownEnv`."""
         try:
             return self._slot_of[env_id]
         except KeyError:
@@ -175,10 +175,10 @@ class EnvTable:
         return f"no env of this group is called {env_id!r}; its envs are {known}"
 
     def of_entries(self, names: Sequence[str]) -> NDArray[np.bool_]:
-        """Which slots belong to the config entries called `names`.
+        """A mask of the slots that belong to the config entries called `names`.
 
         Raises:
-            UnknownEnv: there is no such entry.
+            UnknownEnv: the group has no entry of that name.
         """
         entry_names = self.names.entry_names
         for name in names:
@@ -188,13 +188,13 @@ class EnvTable:
         return np.isin(self.names.entries, [entry_names.index(name) for name in names])
 
     def usual_min_results(self, names: Sequence[str] | None) -> int:
-        """Results for which a collect of some entries waits, or of all, if nobody says another."""
+        """The default `min_results` of a collect of the entries `names`, or of all entries."""
         wanted = self._min_results
         known = wanted.values() if names is None else (wanted.get(name, 0) for name in names)
         return max(1, sum(known))
 
     def describe(self, slot: int) -> str:
-        """How an error message names the env."""
+        """The name of an env in messages, with its entry, backend and task."""
         config = self.configs[slot]
         env_id = self.env_ids[slot] or self.names.shared_ids[slot]
         makers: Any = config.make_env
@@ -206,5 +206,5 @@ class EnvTable:
 
 
 def _name(function: Any) -> str:
-    """What a callable is called where it was written."""
+    """The qualified name of a callable."""
     return getattr(function, "__qualname__", type(function).__name__)

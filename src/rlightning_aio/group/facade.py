@@ -1,4 +1,4 @@
-"""What the asynchronous and the synchronous `EnvGroup` share: everything that never waits."""
+"""The methods that the asynchronous and the synchronous `EnvGroup` share: those that never wait."""
 
 from __future__ import annotations
 
@@ -6,28 +6,37 @@ import os
 import time
 import warnings
 import weakref
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import BadAction, RLightningError
-from rlightning_aio.group.build import Plan, assemble
+from rlightning_aio.group.build import assemble
+from rlightning_aio.group.observed import NO_SPAN
 from rlightning_aio.group.scope import Scope
-from rlightning_aio.group.trace import NO_SPAN, Trace
+from rlightning_aio.group.trace import Trace
+from rlightning_aio.group.wait import CollectRules
 from rlightning_aio.hosts.base import Watcher
 from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence, Sized
     from contextlib import AbstractContextManager
     from pathlib import Path
 
     import gymnasium as gym
 
     from rlightning_aio.group.core import Core
+    from rlightning_aio.group.plan import Plan
     from rlightning_aio.group.wait import Procedure
-    from rlightning_aio.hosts.base import Membership
 
-__all__ = ["AutoResetContext", "Facade", "ServerView", "check_process", "only_result", "steps_of"]
+__all__ = [
+    "AutoResetContext",
+    "Facade",
+    "forked_from",
+    "only_result",
+    "steps_of",
+    "this_process",
+]
 
 
 def only_result(results: tuple[BatchedData, Any]) -> EnvRet | MultiAgentEnvRet:
@@ -36,7 +45,7 @@ def only_result(results: tuple[BatchedData, Any]) -> EnvRet | MultiAgentEnvRet:
 
 
 def steps_of(env_id: str, response: PolicyResponse | Any) -> BatchedData:
-    """A batch of one step; `BadAction` for a response to another env."""
+    """A batch of one step; raises `BadAction` for a response to another env."""
     if not isinstance(response, PolicyResponse):
         response = PolicyResponse(env_id, response)
     elif response.env_id != env_id and not response.env_id.startswith(f"{env_id}/"):  # Its client.
@@ -48,13 +57,13 @@ def steps_of(env_id: str, response: PolicyResponse | Any) -> BatchedData:
 
 
 class AutoResetContext(Scope):
-    """What `EnvGroup.auto_reset` returns: its rule holds from entry to exit.
+    """The context of `EnvGroup.auto_reset`: envs are reset at their limit from entry to exit.
 
-    It may be entered again after an exit.
+    It can be entered again after an exit.
     """
 
     def __init__(
-        self, core: Core, max_episode_steps: int | None, on_done: bool, mark_truncated: bool
+        self, core: Core, max_episode_steps: float | None, on_done: bool, mark_truncated: bool
     ) -> None:
         self._core = core
         self._limit = max_episode_steps
@@ -62,69 +71,45 @@ class AutoResetContext(Scope):
         self._mark_truncated = mark_truncated
 
     def _enter(self) -> None:
-        self._core.auto.begin(
+        self._core.continuity.begin(
             self._limit, on_done=self._on_done, mark_truncated=self._mark_truncated
         )
 
     def _leave(self) -> None:
-        self._core.auto.end()
-
-
-class ServerView:
-    """What both kinds of `ServerHandle` know without waiting."""
-
-    _membership: Membership
-
-    @property
-    def env_id(self) -> str:
-        """Its id, as in `EnvGroup.env_ids` and in batches of its clients' results."""
-        return self._membership.server_id
-
-    @property
-    def address(self) -> str:
-        """Where clients connect to, as ``tcp://host:port``, with the port that was picked.
-
-        Raises:
-            RuntimeError: it does not listen yet, before `init`.
-        """
-        return self._membership.address()
-
-    @property
-    def clients(self) -> list[str]:
-        """Ids of the envs of the clients that are connected, ``<server id>/<client name>``."""
-        return [f"{self.env_id}/{name}" for name in self._membership.members()]
-
-    @property
-    def metas(self) -> list[EnvMeta]:
-        """The metadata of these clients' envs, in the same order."""
-        return list(self._membership.members().values())
+        self._core.continuity.end()
 
 
 class Driver(Watcher, Protocol):
-    """What waits for a group.
+    """Waits for the sources of a group.
 
     Attributes:
-        drain: takes in what sources have told; to be called whenever one has.
+        completions: queue of the outcomes that sources posted.
+        drain: applies them; the driver calls it whenever the queue isn't empty.
     """
+
+    completions: Sized
 
     drain: Callable[[], None]
 
     def check_caller(self) -> None:
-        """Raises `RLightningError` if the group is in use, or belongs, elsewhere."""
+        """Raise `RLightningError` if another thread uses the group, or another loop owns it."""
         ...
 
     def forget(self) -> None:
-        """Forget all sources, without a word to the kernel: another process watches them."""
+        """Forget all sources without unregistering them, as the parent still watches them."""
         ...
 
 
-def check_process(pid: int) -> None:
-    """Raises `RLightningError` in a child that process `pid` has forked."""
-    if _this_process[0] != pid:
-        raise RLightningError(
-            f"this group belongs to process {pid}, which has forked this one; only it can use and "
-            "close the group; build another one here"
-        )
+this_process: Final = [os.getpid()]
+"""The pid, updated in forked children; `os.getpid` would double the time of each check."""
+
+
+def forked_from(pid: int) -> RLightningError:
+    """The error for a call in a child forked by process `pid`."""
+    return RLightningError(
+        f"this group belongs to process {pid}, which has forked this one; only that process can "
+        "use and close the group; build another one here"
+    )
 
 
 class Facade:
@@ -133,25 +118,29 @@ class Facade:
     def __init__(self, plan: Plan) -> None:
         self._driver = self._new_driver()
         self._core = assemble(plan, self._driver, shares_thread=self._shares_thread)
+        self._steps = self._core.steps
+        self._driver.completions = self._core.completions
         self._driver.drain = self._core.drain
-        supervisor = self._core.supervisor
-        self._finalizer = weakref.finalize(self, supervisor.abandon)
+        self._finalizer = weakref.finalize(self, self._core.supervisor.shutdown.abandon)
         self._disowned = False
         self._traces: list[Trace] = []
         _groups.add(self)
 
     _shares_thread = False
-    """Whether other tasks may use the group while a call waits."""
+    """True if other tasks may use the group while a call waits."""
 
     def _new_driver(self) -> Driver:
         raise NotImplementedError
 
     @property
     def _metas(self) -> list[EnvMeta]:
-        self._core.supervisor.check_open()
+        self._core.lifetime.check_open()
         return self._core.supervisor.metas
 
-    # -- what it holds ------------------------------------------------------------
+    # -- envs ---------------------------------------------------------------------
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self._core.supervisor.workers.summary()})"
 
     @property
     def env_ids(self) -> list[str]:
@@ -160,16 +149,16 @@ class Facade:
         return [*envs.local_ids, *envs.server_ids]
 
     def __len__(self) -> int:
-        """Envs of the group, each env_server counted once."""
+        """The number of envs, each env_server counted once."""
         return len(self.env_ids)
 
     def size(self) -> int:
-        """Local envs of the group."""
+        """The number of local envs."""
         return len(self._core.envs.local_ids)
 
     @property
     def metas(self) -> list[EnvMeta]:
-        """What `init` has returned.
+        """The metadata of each env, as returned by `init`.
 
         Raises:
             GroupClosed: the group was not initialised, or is closed.
@@ -215,7 +204,7 @@ class Facade:
             RLightningError: another thread is using the group, or it belongs to another loop.
         """
         self._driver.check_caller()
-        self._core.step_async(batch, time.monotonic())
+        self._steps.step_async(batch, time.monotonic())
 
     def reset_async(
         self,
@@ -223,13 +212,14 @@ class Facade:
         options: dict[str, Any] | None = None,
         env_ids: Sequence[str] | None = None,
     ) -> None:
-        """Send a reset to all envs, or to those of `env_ids`; `collect_async` returns the first
-        observations. Never blocks, and doesn't wait for clients of an env_server.
+        """Send a reset to each env; `collect_async` returns the first observations.
+
+        Never blocks, and doesn't wait for clients of an env_server.
 
         Args:
-            seed: as of `reset`.
+            seed: as for `reset`.
             options: passed to each env.
-            env_ids: which envs; None: all local ones and the clients that are connected.
+            env_ids: the envs to reset; None for all local ones and all connected clients.
 
         Raises (before anything is sent):
             EnvBusy: an env has a reply outstanding, or appears twice.
@@ -246,14 +236,15 @@ class Facade:
     def call_async(
         self, name: str, /, *args: Any, env_ids: Sequence[str] | None = None, **kwargs: Any
     ) -> None:
-        """Call method `name` of all local envs, or of those of `env_ids`, all at once;
+        """Call method `name` of the envs `env_ids` in parallel; None for all local envs.
+
         `collect_calls` returns the values. Never blocks.
 
         Raises (before anything is sent):
             EnvBusy: an env has a reply outstanding, or appears twice.
             UnknownEnv: no env of this group has that id.
             TypeError: the arguments can't be sent to a worker.
-            NotImplementedError: an env is a client's, whose methods can't be called.
+            NotImplementedError: an env belongs to a client; its methods can't be called.
             WorkerDied, EnvHung: an env's worker is gone and is not replaced.
             GroupClosed: the group was not initialised, or is closed.
             RLightningError: another thread is using the group, or it belongs to another loop.
@@ -275,10 +266,11 @@ class Facade:
         entries: Sequence[str] | None,
         ordered: bool,
     ) -> Procedure[tuple[BatchedData, list[bool]]]:
-        _check_seconds("timeout", timeout)
-        _check_seconds("deadline", deadline)
+        if timeout is not None or deadline is not None:
+            _check_seconds("timeout", timeout)
+            _check_seconds("deadline", deadline)
         if min_results is None:
-            usual = self._core.envs.usual_min_results(entries)
+            usual = 1 if wait_all else self._core.envs.usual_min_results(entries)
             min_results = usual if max_results is None else max(1, min(usual, max_results))
         if min_results < 1:
             raise ValueError(f"min_results must be at least 1, not {min_results!r}")
@@ -289,8 +281,7 @@ class Facade:
         if wait_all and timeout is not None:
             warnings.warn("collect_async(wait_all=True) ignores timeout", stacklevel=3)
             timeout = None
-        return self._core.collect(
-            time.monotonic(),
+        rules = CollectRules(
             timeout=timeout,
             wait_all=wait_all,
             min_results=min_results,
@@ -299,69 +290,73 @@ class Facade:
             entries=entries,
             ordered=ordered,
         )
+        return self._steps.collect(time.monotonic(), rules)
 
     def auto_reset(
         self,
-        max_episode_steps: int | None = None,
+        max_episode_steps: float | None = None,
         on_done: bool = True,
         mark_truncated: bool = False,
     ) -> AutoResetContext:
         """Reset envs at their step limit, in place of their next step.
 
-        The result of the step that reaches the limit says so (`BatchedData.limit_reached`, and
-        the flag that comes with it). The env's next step is replaced by a
-        reset, which returns reward 0 and `BatchedData.is_reset`. Works with ``with`` and
-        ``async with``.
+        The step that reaches the limit sets `BatchedData.limit_reached` and the flag returned with
+        the batch. The next step of that env performs a reset instead, which returns reward 0 and
+        sets `BatchedData.is_reset`. Works with ``with`` and ``async with``.
 
         Args:
-            max_episode_steps: the limit for all envs; None takes each entry's own, or the
-                simulator's.
-            on_done: also reset envs whose episode has ended by itself: with sub-environments
-                or agents, when all of them have ended.
-            mark_truncated: set `BatchedData.truncated`, too, where the limit is reached.
+            max_episode_steps: the limit for all envs; None uses the limit of each entry, or else
+                of its simulator; `math.inf` sets no limit, for envs that end their own episodes.
+            on_done: also reset envs when their episode ends; an env with sub-environments or
+                agents when the episodes of all of them have ended.
+            mark_truncated: also set `BatchedData.truncated` at the limit.
 
         Raises:
-            ValueError: the limit isn't a positive int, or it is None and an env has none.
-            RuntimeError: contexts don't nest.
+            ValueError: the limit is neither a positive int nor `math.inf`, or it is None and an
+                env has no limit.
+            RuntimeError: another `auto_reset` context is open; contexts don't nest.
         """
         return AutoResetContext(self._core, max_episode_steps, on_done, mark_truncated)
 
     @property
     def resets_by_itself(self) -> bool:
-        """Whether an `auto_reset` context is open."""
-        return self._core.auto.active
+        """True while an `auto_reset` context is open."""
+        return self._core.continuity.active
 
-    # -- what was measured --------------------------------------------------------
+    # -- measurements -------------------------------------------------------------
 
     def get_stats(self) -> dict[str, Any]:
-        """Throughput and latencies over the last ten seconds, or the last thousand batches.
+        """Throughput and latencies over the last ten seconds, at most the last thousand batches.
 
         An env step is a step of one sub-environment: a result of an env with ``num_envs: n``
-        stands for n of them, that of a multi-agent env for one, a reset for none.
+        counts as n steps, a result of a multi-agent env as one, a reset as none.
 
         Keys: ``steps_per_second`` (env steps); ``entries`` (by config entry, env steps per
-        second of ``step``, as ``sync``, and of ``collect_async``, as ``async``);
-        ``batch_size`` (results in a batch: mean, min, max); ``latency_us`` with ``p50`` and
-        ``p99`` of the steps' ``step`` (in the env), ``wait`` (from sending until the env
-        begins) and ``transfer`` (from the env's end until the result is returned). Where
-        nothing was measured yet, a dict is empty.
+        second from ``step``, as ``sync``, and from ``collect_async``, as ``async``);
+        ``batch_size`` (results per batch: mean, min, max); ``latency_us`` (``p50`` and ``p99`` of
+        ``step``, the time in the env; ``wait``, from sending until the env begins; and
+        ``transfer``, from the end in the env until the result is returned). The dicts are empty
+        before anything was measured.
         """
         return self._core.stats.summary()
 
     def get_env_stats(
         self, reset: bool = False, by_entry: bool = False
     ) -> dict[str, dict[str, Any]]:
-        """By env id: requests sent, episodes ended, mean and last return and length.
+        """Requests sent, episodes ended, and mean and last return and length, by env id.
 
-        An episode ends by itself or at the step limit of `auto_reset`. Where the env judges its
-        episodes (``info["success"]`` and ``info["fail"]`` of the results that end them),
-        ``success_rate`` and ``fail_rate`` are the shares that were true; None where it doesn't.
+        The means are over all ended episodes, so envs with short episodes contribute more of them.
+        To measure a policy, use `rlightning_aio.evaluation.evaluate`.
 
-        A client whose place in the group another has taken counts only in its entry's sums.
+        An episode ends by itself or at the step limit of `auto_reset`. ``success_rate`` and
+        ``fail_rate`` are the shares of True in ``info["success"]`` and ``info["fail"]`` of the
+        results that end episodes; None if the env sets no such key.
+
+        A former client, its slot taken by another, counts only in the figures of its entry.
 
         Args:
-            reset: start the sums from zero after this call.
-            by_entry: add up the figures of each config entry.
+            reset: set the figures to zero after this call.
+            by_entry: return the figures of each config entry instead.
         """
         stats = self._core.stats
         found = stats.by_entry() if by_entry else stats.by_env()
@@ -370,17 +365,15 @@ class Facade:
         return found
 
     def get_workers(self) -> list[dict[str, Any]]:
-        """What each place where envs live is doing now: each worker, this process, each env_server.
+        """The current state of each host: each worker, this process, and each env_server.
 
-        It waits for nothing, and may be called while another task waits for results, or for
-        `init`.
+        Never waits; other tasks may be waiting for results or for `init`.
 
-        Keys: ``entry``; ``env_ids`` (of a server, those of clients that have joined); ``pid`` (of
-        a process on this machine, else None); ``state`` (``"new"`` before `init`, ``"starting"``,
-        ``"up"``, ``"down"`` where a replacement is due, ``"failed"``, ``"closed"``);
-        ``owed`` (ids of the envs whose results are outstanding, the oldest first, which is the
-        order in which a worker executes them) and ``owed_seconds``, for how long that of the
-        first is; ``restarts`` (how often it was replaced).
+        Keys: ``entry``; ``env_ids`` (for an env_server, of the connected clients); ``pid`` (of a
+        process on this machine, else None); ``state`` (``"new"`` before `init`, ``"starting"``,
+        ``"up"``, ``"down"`` before a replacement, ``"failed"``, ``"closed"``); ``owed`` (ids of
+        envs with a request in flight, the oldest first, which is the order of execution);
+        ``owed_seconds`` (the age of the oldest); ``restarts`` (the number of replacements).
 
         Raises:
             RLightningError: another thread is using the group, or it belongs to another loop.
@@ -400,56 +393,53 @@ class Facade:
     def trace(self, path: str | Path) -> Trace:
         """Record a timeline of this group into a file that https://ui.perfetto.dev opens.
 
-        ``with group.trace("run.json"):`` (or ``async with``) records what happens within; so do
-        `Trace.start` and `Trace.stop`. It shows when each env stepped and was reset, what its
-        worker and the trainer waited for, which request led to which result, and restarts, hangs
-        and step limits: docs/timeline.md. `span` adds the trainer's other work.
+        Use ``with group.trace("run.json"):`` (or ``async with``), or `Trace.start` and
+        `Trace.stop`. The timeline shows steps and resets of each env, waits of workers and trainer,
+        the path of each request to its result, restarts, hangs and step limits: see
+        docs/timeline.md. `span` adds other work of the trainer.
 
         Args:
             path: of the file, in Chrome's trace event format (JSON). It is written when the
-                recording ends, also by an error, Ctrl-C or `close`, and replaces what was there.
+                recording ends, also by an error, Ctrl-C or `close`, and replaces an existing file.
 
         Raises:
-            OSError: the file can't be written there.
+            OSError: the file can't be written.
         """
         return Trace(self._core, path, self._traces, by_task=self._shares_thread)
 
     def span(self, name: str) -> AbstractContextManager[Any]:
-        """Mark, with ``with group.span("learner"):``, what the trainer does as a slice of the
-        timeline. It may stay in the program: while nothing is recorded, nothing happens.
+        """Add a slice to the timeline for other work: ``with group.span("learner"):``.
+
+        Does nothing while no timeline is recorded, so the call may stay in the program.
         """
         return self._traces[0].span(name) if self._traces else NO_SPAN
 
     def _disown(self) -> None:
-        """Leave it to the process that has forked this one: let go of all that they share."""
+        """Release this group in a forked child, and leave it intact in the parent."""
         self._disowned = True
         self._driver.forget()
-        self._core.supervisor.disown()
+        self._core.supervisor.shutdown.disown()
 
     def _closed(self) -> None:
-        if not self._core.supervisor.closed:
-            return  # It was refused.
+        if not self._core.lifetime.closed:
+            return  # `close` raised before it closed anything.
         self._finalizer.detach()
         for trace in list(self._traces):
             trace.stop()
         close_errors = self._core.supervisor.close_errors
         errors = list(close_errors)
-        close_errors.clear()  # Told once, however often it is closed.
+        close_errors.clear()  # Warn once, however often `close` is called.
         _warn_of(errors)
 
 
 _groups: weakref.WeakSet[Facade] = weakref.WeakSet()
 
 
-# Every call asks for it, and asking the system takes as long as all the rest of its checks.
-_this_process = [os.getpid()]
-
-
 def _disown_all() -> None:
-    """Leave all groups to the process that has forked this one."""
-    _this_process[0] = os.getpid()
+    """Release all groups in a forked child."""
+    this_process[0] = os.getpid()
     for group in list(_groups):
-        group._disown()  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]  # Nobody else's.
+        group._disown()  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]  # Same module.
 
 
 os.register_at_fork(after_in_child=_disown_all)

@@ -1,15 +1,14 @@
-"""What is said of a worker that is gone: which env it fell to, why, and what it owed."""
+"""Error messages about dead, hung and late workers: the env at fault, the cause, lost replies."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rlightning_aio.errors import EnvHung, StartFailed, WorkerDied
-from rlightning_aio.protocol.entries import Operation, number_of, slot_of
+from rlightning_aio.protocol.entries import Operation, slot_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     import numpy as np
     from numpy.typing import NDArray
 
@@ -18,11 +17,18 @@ if TYPE_CHECKING:
     from rlightning_aio.group.requests import Requests
     from rlightning_aio.hosts.messages import Death
 
-__all__ = ["cause_of", "culprit_of", "death_error", "late_fault", "start_fault"]
+__all__ = [
+    "DeathReport",
+    "cause_of",
+    "culprit_of",
+    "death_report",
+    "late_fault",
+    "start_fault",
+]
 
 
 def start_fault(envs: EnvTable, record: HostRecord, death: Death) -> StartFailed:
-    """The error for a worker that ended while it started."""
+    """The error for a worker that exited while starting."""
     if record.late:
         return late_fault(envs, record, death)
     slot = _starting(record, death)
@@ -34,9 +40,9 @@ def start_fault(envs: EnvTable, record: HostRecord, death: Death) -> StartFailed
 
 
 def late_fault(envs: EnvTable, record: HostRecord, death: Death) -> StartFailed:
-    """The error for a worker that was too late to start."""
+    """The error for a worker that exceeded `start_timeout`."""
     slot = _starting(record, death)
-    # How it was killed says nothing; what it went down with may say all.
+    # An exit code only shows that it was killed; any other cause may explain the delay.
     why = f" (it {death.cause})" if death.cause and death.exit_code is None else ""
     return StartFailed(
         f"{envs.describe(slot)} did not start within {record.config.start_timeout} s"
@@ -46,33 +52,33 @@ def late_fault(envs: EnvTable, record: HostRecord, death: Death) -> StartFailed:
 
 
 def _starting(record: HostRecord, death: Death) -> int:
-    """The env that a worker was building when it died."""
+    """The slot of the env that a worker was building when it died."""
     slot = slot_of(death.requests[0]) if death.requests else 0
     return max(slot, record.host.first_slot)
 
 
 def culprit_of(
-    record: HostRecord, death: Death, requests: Requests, owed: NDArray[np.intp]
+    record: HostRecord, death: Death, requests: Requests, unanswered: NDArray[np.intp]
 ) -> int | None:
-    """The env that a worker was executing when it died, as far as can be known.
+    """The slot of the env that a worker was executing when it died, or None if unknown.
 
     Args:
         record: of its host.
-        death: what is known of its end.
+        death: of the worker.
         requests: of the group.
-        owed: slots of which it owed a reply.
+        unanswered: its slots with a request in flight.
     """
     if record.hung_slot is not None:
         return record.hung_slot
+    slot_of_entry = {requests.numbering.entry.item(slot): slot for slot in unanswered.tolist()}
     for entry in death.requests:
-        slot = slot_of(entry)
-        if slot in owed and requests.number(slot) == number_of(entry):
-            return slot
-    return int(owed[0]) if len(owed) else None
+        if entry in slot_of_entry:
+            return slot_of_entry[entry]
+    return int(unanswered[0]) if len(unanswered) else None
 
 
 def cause_of(record: HostRecord, death: Death, requests: Requests) -> str:
-    """Why a worker is gone, as far as the supervisor knows it better than the kernel."""
+    """The cause of a worker's end: the supervisor's reason for killing it, else its exit."""
     if record.hung_slot is not None:
         return f"hung in {_doing(requests, record.hung_slot)} and was killed"
     if record.rebuild_error is not None:
@@ -85,41 +91,72 @@ def cause_of(record: HostRecord, death: Death, requests: Requests) -> str:
 
 
 def _doing(requests: Requests, slot: int) -> str:
-    op, method = requests.op(slot), requests.method(slot)
+    op, method = requests.numbering.op(slot), requests.method(slot)
     if op in (Operation.STEP, Operation.RESET, Operation.SNAPSHOT, Operation.RESTORE):
         return f"a {Operation(op).name.lower()}"
     return f"a call of {method}()" if method else "a call"
 
 
-def death_error(
+@dataclass(frozen=True)
+class DeathReport:
+    """The description of a death, made when it was found.
+
+    Attributes:
+        what: the subject and the cause; last: the last request of the env at fault.
+        outcome: what happens to the worker now.
+        slot: of the env at fault.
+    """
+
+    envs: EnvTable
+    death: Death
+    kind: type[WorkerDied]
+    what: str
+    last: str
+    outcome: str
+    slot: int
+
+    def message(self, unanswered: NDArray[np.intp]) -> str:
+        """The message about the death; `unanswered` had a request in flight."""
+        names = ", ".join(self._ids(unanswered)) or "none"
+        return (
+            f"{self.what} (last request: {self.last}; envs that owed a reply: {names}); "
+            f"{self.outcome}"
+        )
+
+    def error(self, unanswered: NDArray[np.intp]) -> WorkerDied:
+        """The error for these slots, with the last lines of the worker's stderr."""
+        error = self.kind(
+            self.message(unanswered) + _said(self.death.stderr_tail),
+            env_id=self.envs.env_ids[self.slot],
+            exit_code=self.death.exit_code,
+            stderr_tail=self.death.stderr_tail,
+        )
+        error.env_ids = tuple(self._ids(unanswered))
+        return error
+
+    def _ids(self, slots: NDArray[np.intp]) -> list[str]:
+        env_ids = self.envs.env_ids
+        chosen: list[int] = slots.tolist()
+        return [env_ids[slot] for slot in chosen]
+
+
+def death_report(
     envs: EnvTable, record: HostRecord, death: Death, requests: Requests, outcome: str
-) -> Callable[[NDArray[np.intp]], WorkerDied]:
-    """Makes the error for those of the slots that owed a reply, as things are now."""
+) -> DeathReport:
+    """Describe a death; `outcome` says what happens to the worker now."""
     slot = record.host.first_slot if record.culprit is None else record.culprit
-    doing, number = _doing(requests, slot), requests.number(slot)
+    doing, number = _doing(requests, slot), requests.numbering.number(slot)
     last = f"request {number}, {doing}" if number else "none"
     if record.hung_slot is not None:
         config = record.config
-        stepped = requests.op(slot) == Operation.STEP
+        stepped = requests.numbering.op(slot) == Operation.STEP
         limit = config.step_timeout if stepped else config.reset_timeout
         what = f"{envs.describe(slot)} took longer than {limit} s for {doing} and was killed"
     else:
         what = f"the worker of {envs.describe(slot)} {death.cause}"
     kind = WorkerDied if record.hung_slot is None else EnvHung
 
-    def error_for(owed: NDArray[np.intp]) -> WorkerDied:
-        names = ", ".join(envs.names.ids(owed)) or "none"
-        error = kind(
-            f"{what} (last request: {last}; envs that owed a reply: {names}); {outcome}"
-            + _said(death.stderr_tail),
-            env_id=envs.env_ids[slot],
-            exit_code=death.exit_code,
-            stderr_tail=death.stderr_tail,
-        )
-        error.env_ids = tuple(envs.names.ids(owed))
-        return error
-
-    return error_for
+    return DeathReport(envs, death, kind, what, last, outcome, slot)
 
 
 def _said(stderr_tail: str) -> str:

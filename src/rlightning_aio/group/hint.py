@@ -1,4 +1,4 @@
-"""What measured times say of a group's settings, said once.
+"""Suggest a faster setting from measured times.
 
 Rule: a hint is a guess from a few numbers; ``rlightning-aio tune`` measures.
 """
@@ -16,7 +16,7 @@ __all__ = ["HINT_AFTER_BATCHES", "hint"]
 
 HINT_AFTER_BATCHES: Final = 1000
 _SHORT_US: Final = 1000.0
-"""A step that computes and doesn't wait: simulators' steps, not robots'."""
+"""Limit of steps that compute, as in simulators; robots wait longer."""
 _TINY_US: Final = 30.0
 
 
@@ -26,13 +26,13 @@ def hint(
     num_cores: int,
     latency_us: Mapping[str, Mapping[str, Any]],
 ) -> str | None:
-    """Which other setting would be faster, or None.
+    """A message that suggests a faster setting, or None.
 
     Args:
         configs: the entries.
         num_workers: workers of each entry, by its name.
         num_cores: cores that this process and its workers may use.
-        latency_us: as in `EnvGroup.get_stats`; empty while nothing was measured.
+        latency_us: from `EnvGroup.get_stats`; empty before anything was measured.
     """
     if not latency_us:
         return None

@@ -1,4 +1,4 @@
-"""`HostRecord`: what the supervisor knows of one host, from its first start to its end."""
+"""`HostRecord`: the supervisor's state of one host, from its first start until it is closed."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from enum import Enum, auto
 from typing import TYPE_CHECKING, Any
 
 from rlightning_aio.hosts.base import Killable
-from rlightning_aio.registry import placement_of
+from rlightning_aio.registry import ENVS, placement_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -24,7 +24,7 @@ __all__ = ["HostRecord", "Stage"]
 
 
 class Stage(Enum):
-    """How far a host has come."""
+    """The stage of a host in its life."""
 
     NEW = auto()
     BUILDING = auto()
@@ -32,29 +32,35 @@ class Stage(Enum):
     ATTACHING = auto()
     UP = auto()
     DOWN = auto()
-    """Dead; it will be started again."""
+    """Dead, and to be restarted."""
     FAILED = auto()
     CLOSED = auto()
 
 
 @dataclass
 class HostRecord:
-    """See the module.
+    """The state of one host. Times are monotonic seconds.
 
     Attributes:
-        start_by: when it must be up; late: it wasn't, and is being killed.
-        restart_at: when a dead one is started again; restarts: how often one was.
-        held: what was asked of it since it died, entries and arguments, until a replacement is
-            up; None while none is needed.
-        deaths: by slot, of workers that died while they executed that env, since the env
-            last completed a step; None where no env is known. culprit: the last one's.
-        dying: it was killed, and that has not been told yet; die_by: when it must have been.
-        hung_slot: the env for which it is being killed.
-        idle: how far it had got when it was last seen to do nothing (`Supervisor._progress`).
-        failure: makes the error for a caller that asks a host that was given up.
-        killable: the host, if it can be ended by force.
-        is_local: its envs use this machine's cores.
-        timed: any of its requests has a time limit, which the supervisor must watch.
+        started: its envs, once built.
+        order: the rows of its envs, once assigned.
+        start_by: the deadline of its start; late: it missed that, and is being killed.
+        restart_at: the time of its next restart; restarts: the number so far.
+        refusals: consecutive attempts to start a replacement that the system refused;
+            refused_since: the time of the first.
+        held: requests (entries and arguments) since its death, kept until a replacement is up;
+            None while it needs none.
+        deaths: by slot, deaths of workers that were executing that env since it last completed a
+            step; key None for deaths of unknown cause. culprit: the slot of the last death.
+        dying: it was killed, and its exit was not reported yet; die_by: the deadline of that.
+        hung_slot: the env that hung, while its worker is being killed.
+        idle: its progress when it was last seen idle, and idle_since the time (`HangDetector`).
+        rebuild_error: the error of its replacement while rebuilding the envs.
+        failure: makes the error for requests to a host that was given up.
+        killable: the host, if it can be killed.
+        is_local: its envs use this machine's cores; is_hardware: they move in the real world.
+        slots: of its envs.
+        timed: some of its requests have a time limit, which the supervisor watches.
     """
 
     host: Host
@@ -66,6 +72,8 @@ class HostRecord:
     late: bool = False
     restart_at: float | None = None
     restarts: int = 0
+    refusals: int = 0
+    refused_since: float | None = None
     held: list[tuple[NDArray[np.int64], Sequence[Any] | None]] | None = None
     deaths: dict[int | None, int] = field(default_factory=dict[int | None, int])
     culprit: int | None = None
@@ -79,19 +87,18 @@ class HostRecord:
     killable: Killable | None = field(init=False)
     timed: bool = field(init=False)
     is_local: bool = field(init=False)
+    is_hardware: bool = field(init=False)
+    slots: range = field(init=False)
 
     def __post_init__(self) -> None:
         limits = (self.config.step_timeout, self.config.reset_timeout)
         self.killable = self.host if isinstance(self.host, Killable) else None
         self.timed = self.killable is not None and limits != (None, None)
         self.is_local = placement_of(self.config.backend, self.config.placement).local
-
-    @property
-    def slots(self) -> range:
-        """Of its envs."""
-        return range(self.host.first_slot, self.host.first_slot + self.host.num_envs)
+        self.is_hardware = ENVS.is_hardware(self.config.backend)
+        self.slots = range(self.host.first_slot, self.host.first_slot + self.host.num_envs)
 
     def kill(self, *, dump: bool) -> None:
-        """End it, if it can be ended."""
+        """Kill its worker, if it has one; `dump` first writes the worker's stacks to stderr."""
         if self.killable is not None:
             self.killable.kill(dump=dump)

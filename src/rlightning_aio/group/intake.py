@@ -1,8 +1,8 @@
-"""`Intake`: what completions mean: for requests, for results, and after a death.
+"""`Intake`: applies completions to requests and results, and carries out what a death means.
 
-Hosts append to one queue. What they report takes effect here, and nowhere else.
-Rule: it sends no requests of its own, except those that a dead worker owed; the replacement
-answers them.
+Hosts post to one queue, and only this module applies its completions.
+Rule: it sends no requests of its own. After a death it sends outstanding ones again, to the
+replacement.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from rlightning_aio.errors import ActionRefused, BadAction, EnvAway, EnvRaised
-from rlightning_aio.group.requests import COLLECTOR
+from rlightning_aio.errors import EnvAway, EnvRaised
+from rlightning_aio.group.request_states import COLLECTOR
 from rlightning_aio.group.supervisor import GivenUp, Replaced
 from rlightning_aio.hosts.messages import (
     Attached,
@@ -39,60 +39,40 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio.errors import EnvFault
-    from rlightning_aio.group.auto_reset import AutoReset
-    from rlightning_aio.group.dispatch import Dispatch
-    from rlightning_aio.group.env_table import EnvTable
-    from rlightning_aio.group.recovery import Recovery
-    from rlightning_aio.group.requests import Requests
+    from rlightning_aio.group.arrivals import Arrivals
     from rlightning_aio.group.results import Results
-    from rlightning_aio.group.resumption import Resumption
-    from rlightning_aio.group.slab_layout import SlabLayout
-    from rlightning_aio.group.stats import Stats
     from rlightning_aio.group.supervisor import Supervisor
+    from rlightning_aio.group.tables import Tables
     from rlightning_aio.hosts.base import Host
     from rlightning_aio.hosts.messages import Completions
 
 __all__ = ["Intake"]
 
-_BAD_ACTION = f"{BadAction.__module__}.{BadAction.__qualname__}"
-
 
 class Intake:
-    """See the module; its arguments are the group's parts.
+    """See the module; the arguments are the group's parts.
 
     Attributes:
-        now: when the driver looked last (monotonic seconds).
-        held_back: envs that have come back before the last result of their going was
-            collected, by slot; see `admit`.
+        now: when the driver last looked at sources (monotonic seconds).
     """
 
     def __init__(
         self,
         completions: Completions,
-        envs: EnvTable,
-        requests: Requests,
-        layout: SlabLayout,
+        tables: Tables,
         supervisor: Supervisor,
-        dispatch: Dispatch,
         results: Results,
-        recovery: Recovery,
-        resumption: Resumption,
-        auto: AutoReset,
-        stats: Stats,
+        arrivals: Arrivals,
     ) -> None:
         self.now = 0.0
         self._completions = completions
-        self._envs = envs
-        self._requests = requests
-        self._layout = layout
+        self._envs = tables.envs
+        self._requests = tables.requests
+        self._layout = tables.layout
         self._supervisor = supervisor
-        self._dispatch = dispatch
         self._results = results
-        self._recovery = recovery
-        self._resumption = resumption
-        self._auto = auto
-        self._stats = stats
-        self.held_back: dict[int, Joined] = {}
+        self._continuity = tables.continuity
+        self._arrivals = arrivals
         self._handlers: dict[type, Callable[[Any], None]] = {
             Reported: self._on_reported,
             Result: self._on_result,
@@ -108,52 +88,51 @@ class Intake:
         }
 
     def drain(self) -> None:
-        """Take in what hosts have told. Here, and nowhere else, completions take effect."""
+        """Apply queued completions."""
         completions, handlers = self._completions, self._handlers
         while completions:
-            told = completions.popleft()
-            handlers[type(told)](told)
+            completion = completions.popleft()
+            handlers[type(completion)](completion)
 
-    def _on_reported(self, told: Reported) -> None:
-        reports = [told]
+    def _on_reported(self, completion: Reported) -> None:
+        reports = [completion]
         completions = self._completions
         while completions and type(completions[0]) is Reported:
             reports.append(cast("Reported", completions.popleft()))
-        slots = self._requests.complete(reports)
-        if self._supervisor.recovering:
-            self._note_recovered(slots)
+        self._note_answered(self._requests.complete(reports))
 
-    def _on_result(self, told: Result) -> None:
-        slot = self._requests.complete_one(told.host_id, told.entry)
+    def _on_result(self, completion: Result) -> None:
+        slot = self._requests.complete_one(completion.host_id, completion.entry)
         if slot is not None:
-            self._results.keep(slot, told.out_of_band)
-            if told.is_loss:
+            self._results.keep(slot, completion.out_of_band)
+            if completion.is_loss:
                 self._results.mark_lost(slot)
-            if self._supervisor.recovering:
-                self._note_recovered(self._requests.alone(slot))
+            if completion.restarted:
+                self._supervisor.note_rebuilt(completion.host_id, slot, completion.restarted)
+                self._results.mark_restarted(slot, completion.restarted, None)
+            self._note_answered(self._requests.alone(slot))
 
-    def _on_value(self, told: Value) -> None:
-        slot = self._requests.end(told.host_id, told.entry)
+    def _on_value(self, completion: Value) -> None:
+        slot = self._requests.end(completion.host_id, completion.entry)
         if slot is not None:
-            self._requests.set_value(slot, told.value)
+            self._requests.set_value(slot, completion.value)
 
-    def _on_raised(self, told: Raised) -> None:
-        slot = self._requests.end(told.host_id, told.entry)
+    def _on_raised(self, completion: Raised) -> None:
+        slot = self._requests.end(completion.host_id, completion.entry)
         if slot is not None:
-            self._fail(self._requests.alone(slot), lambda _: self.raised(slot, told.error))
+            self._fail(self._requests.alone(slot), lambda _: self.raised(slot, completion.error))
 
     def raised(self, slot: int, error: ErrorText) -> EnvRaised:
-        """What the caller is told of `error`, in which the current request of `slot` ended."""
-        cause = self._recovery.failed(slot)
+        """Make the error for the current request of `slot`, which ended in `error`."""
+        cause = self._continuity.raised(slot)
         after = f" (its worker {cause}, and was replaced)" if cause else ""
-        op = self._requests.op(slot)
+        op = self._requests.numbering.op(slot)
         doing = Operation(op).name.lower()
         go_on = "reset the env to go on"
         if answers_with_value(op):
             doing = f"the call of {self._requests.method(slot)}()"
             go_on = "the env is still usable"
-        kind = ActionRefused if error.type_name == _BAD_ACTION else EnvRaised
-        return kind(
+        return EnvRaised.of(
             f"{self._envs.describe(slot)} raised in {doing}: {error.summary}{after}; the remote "
             f"traceback is above; {go_on}",
             env_id=self._envs.env_ids[slot],
@@ -162,18 +141,17 @@ class Intake:
             traceback_text=error.traceback,
         )
 
-    def _on_failed(self, told: Failed) -> None:
-        slot = self._requests.end(told.host_id, told.entry)
+    def _on_failed(self, completion: Failed) -> None:
+        slot = self._requests.end(completion.host_id, completion.entry)
         if slot is not None:
-            self._fail(self._requests.alone(slot), lambda _: told.fault)
+            self._fail(self._requests.alone(slot), lambda _: completion.fault)
 
-    def _on_withdrawn(self, told: Withdrawn) -> None:
-        slot = self._requests.end(told.host_id, told.entry)
+    def _on_withdrawn(self, completion: Withdrawn) -> None:
+        slot = self._requests.end(completion.host_id, completion.entry)
         if slot is None:
             return
         if self._requests.owner[slot] == COLLECTOR:
-            self._requests.withdraw(slot)
-            self._auto.not_completed(self._requests.alone(slot))
+            self._arrivals.withdraw(slot)
             return
         text = (
             f"the client of {self._envs.describe(slot)} is not connected; its next first result "
@@ -182,95 +160,69 @@ class Intake:
         away = EnvAway(text, env_id=self._envs.env_ids[slot])
         self._fail(self._requests.alone(slot), lambda _: away)
 
-    def _on_new_schema(self, told: NewSchema) -> None:
-        host = self._supervisor.hosts[told.host_id]
-        self._results.note_schema(host.first_slot, told.number, told.schema)
+    def _on_new_schema(self, completion: NewSchema) -> None:
+        host = self._supervisor.hosts[completion.host_id]
+        self._results.note_schema(host.first_slot, completion.number, completion.schema)
 
-    def _on_joined(self, told: Joined) -> None:
-        host = self._supervisor.hosts[told.host_id]
-        slot = host.first_slot + told.env_index
-        if told.slab is not None:
-            self._layout.add(told.slab, host.first_slot)
-        if not self._requests.is_idle(slot):
-            self.held_back[slot] = told
-            return
-        has_row = self._layout.of(slot)[0].action is not None
-        if self._envs.env_ids[slot] not in ("", told.meta.env_id):
-            self._stats.begin_anew(slot)
-        self._envs.note_joined(slot, host.first_slot, told.meta, told.traits, has_row=has_row)
-        self._auto.note_joined(slot)
-        self._requests.join(slot, self.now)
-        self._results.note_sent(self._requests.alone(slot), None)
-        self._results.keep(slot, told.write() or {})
+    def _on_joined(self, completion: Joined) -> None:
+        first_slot = self._supervisor.hosts[completion.host_id].first_slot
+        self._arrivals.join(completion, first_slot, self.now)
 
-    def _on_saved(self, told: Saved) -> None:
-        slot = self._supervisor.hosts[told.host_id].first_slot + told.env_index
-        self._resumption.note_saved(slot, told.standing, before=told.before)
+    def _on_saved(self, completion: Saved) -> None:
+        slot = self._supervisor.hosts[completion.host_id].first_slot + completion.env_index
+        numbering = self._requests.numbering
+        entry, is_step = numbering.entry.item(slot), numbering.op(slot) == Operation.STEP
+        self._continuity.save(
+            slot, completion.checkpoint, entry, before=completion.before, is_step=is_step
+        )
 
     def _fail(
         self, slots: NDArray[np.intp], error_for: Callable[[NDArray[np.intp]], EnvFault]
     ) -> None:
-        """End requests that are in flight no more with one error for each caller."""
-        self._auto.not_completed(slots[~self._awaits_value(slots)])
+        """End requests that are no longer in flight, with one error for each caller."""
         for owner, mine in self._requests.owners(slots).items():
             self._requests.fail(mine, owner, error_for(mine))
 
-    def _on_died(self, told: Died) -> None:
-        verdict = self._supervisor.bury(told)
+    def _on_died(self, completion: Died) -> None:
+        verdict = self._supervisor.handle_exit(completion)
         if isinstance(verdict, GivenUp):
-            self._recovery.give_up(_slots_of_host(verdict.host))
-            self._resumption.forget(_slots_of_host(verdict.host))
-            self._supervisor.note_recovery(any_telling=self._recovery.any_telling)
+            self._continuity.give_up(_slots_of_host(verdict.host))
             self._fail(verdict.owed, verdict.error_for)
         elif verdict is not None:
-            self._go_on(verdict)
+            self._replace_host(verdict)
 
-    def _go_on(self, verdict: Replaced) -> None:
-        """Have the replacement of a worker answer what its predecessor owed."""
+    def _replace_host(self, verdict: Replaced) -> None:
+        """Send the outstanding requests of a dead worker to its replacement."""
         host, owed = verdict.host, verdict.owed
         slots = _slots_of_host(host)
         for slot in self._requests.ready(np.array(slots, np.intp)).tolist():
-            # Decoded now: what can read it is about to change.
+            # Decoded now, because the replacement announces other schemas.
             self._results.detach_info(slot)
         self._results.begin_schemas(slots)
         if not verdict.resets:
             self._fail(owed, verdict.error_for)
             return
-        self._recovery.lose(slots, verdict.cause)
-        # A replacement answers for steps and resets, but not for calls.
-        calls = self._awaits_value(owed)
+        self._continuity.lose(slots, verdict.cause)
+        # A replacement answers steps and resets, but not calls.
+        calls = self._requests.numbering.awaits_value(owed)
         self._fail(owed[calls], verdict.error_for)
         owed = owed[~calls]
         if len(owed):
-            self._recovery.tell(owed)
-            stepped = self._requests.ops(owed) == int(Operation.STEP)
-            seeds, lost = self._resumption.seeds(owed, stepped)
-            for slot, num_steps in lost.items():
-                self._auto.rewind(slot, num_steps, owes=True)
-            entries = self._requests.restart(owed)
+            is_step = self._requests.numbering.ops(owed) == int(Operation.STEP)
+            _, seeds = self._continuity.report_losses(owed, is_step)
+            entries = self._requests.restart(host.host_id, owed)
             self._layout.write_seeds(owed, seeds)
-            self._dispatch.hand_over(owed, entries)
+            self._supervisor.submit(host.host_id, entries, None)
 
-    def _awaits_value(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Which of `slots` were asked for a value, and not for a result."""
-        ops: list[int] = self._requests.ops(slots).tolist()
-        return np.array([answers_with_value(op) for op in ops], np.bool_)
-
-    def _note_recovered(self, slots: NDArray[np.intp]) -> None:
-        """Mark replies that come from a replacement; count what shows that it works."""
-        for slot in slots.tolist():
-            cause = self._recovery.told(slot)
-            if cause is not None:
-                self._results.mark_restarted(slot, cause, self._resumption.told(slot))
-            elif self._requests.op(slot) == Operation.STEP:
-                self._supervisor.note_step(slot)
-        self._supervisor.note_recovery(any_telling=self._recovery.any_telling)
-
-    def admit(self, slots: NDArray[np.intp]) -> None:
-        """Take in those that have come back to `slots`, whose rows are free now."""
-        for slot in slots.tolist():
-            if slot in self.held_back:
-                self._on_joined(self.held_back.pop(slot)._replace(slab=None))
+    def _note_answered(self, slots: NDArray[np.intp]) -> None:
+        """Mark results that report a loss, and let steps show that a replacement works."""
+        if self._continuity.exceptional:
+            for report in self._continuity.answered(slots):
+                self._results.mark_restarted(report.slot, report.cause, report.steps_lost)
+        if self._supervisor.any_deaths:
+            for slot in slots.tolist():
+                if self._requests.numbering.op(slot) == Operation.STEP:
+                    self._supervisor.note_step(slot)
 
 
 def _slots_of_host(host: Host) -> range:

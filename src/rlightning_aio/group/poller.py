@@ -1,8 +1,8 @@
-"""`Poller`: how the trainer comes by results, with as few wake-ups as can be.
+"""`Poller`: gets results from hosts with as few wake-ups as possible.
 
-It looks for them itself for a moment, arms the bell of the workers, takes in what came
-without one, and has inline hosts execute what is asked of them. The wait for a number of
-results ends when that many are there, however long the other envs take: see `arm`.
+It spins briefly for results, arms the bell of the workers, polls hosts that ring no bell, and runs
+the requests of inline hosts. A wait for a number of results ends when that many are ready, however
+long the other envs take: see `arm`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING
 
-from rlightning_aio.hosts.base import Executing, Membership, Polled
+from rlightning_aio.hosts.base import Executing, Membership, Polled, SharesThread
 from rlightning_aio.hosts.spinner import Spinner
 
 if TYPE_CHECKING:
@@ -19,19 +19,19 @@ if TYPE_CHECKING:
 
     from rlightning_aio.group.requests import Requests
     from rlightning_aio.hosts.base import Host
-    from rlightning_aio.protocol.bell import TrainerBell
+    from rlightning_aio.protocol.exchange import TrainerBell
 
 __all__ = ["Poller"]
 
 
 class Poller:
-    """Over the hosts of one group.
+    """Polls the hosts of one group.
 
     Args:
-        requests: tells what is in flight where.
-        bell: the workers'.
+        requests: counts the requests in flight at each host.
+        bell: of the workers.
         num_cores: cores that this process and its workers may use.
-        clock: monotonic seconds; asked only between the envs of inline hosts.
+        clock: monotonic seconds; read only between the envs of inline hosts.
     """
 
     def __init__(
@@ -46,39 +46,42 @@ class Poller:
         self._bell = bell
         self._clock = clock
         self._workers: dict[int, Polled] = {}
-        self._env_servers: dict[int, Membership] = {}
+        self._on_loop: list[int] = []
+        self._memberships: dict[int, Membership] = {}
         self._executing: deque[tuple[int, Executing]] = deque()
         self._spinner = Spinner(enabled=True)
         self._spun = False
 
     def add(self, host: Host) -> None:
-        """Take in a host of the group."""
+        """Add a host of the group."""
         if isinstance(host, Executing):
             self._executing.append((host.host_id, host))
         elif isinstance(host, Membership):
-            self._env_servers[host.host_id] = host
+            self._memberships[host.host_id] = host
         elif isinstance(host, Polled):
             self._workers[host.host_id] = host
+        if isinstance(host, SharesThread):
+            self._on_loop.append(host.host_id)
 
-    # -- taking in --------------------------------------------------------------------
+    # -- reading results --------------------------------------------------------------
 
     def poll(self) -> None:
-        """Take in results that wake nobody."""
+        """Read results that are ready without a wake-up."""
         workers = self._workers
         for host_id in self._bell.with_news() if workers else ():
             workers[host_id].poll()
-        for host_id, server in self._env_servers.items():
+        for host_id, server in self._memberships.items():
             if self._requests.in_flight[host_id]:
                 server.poll()
 
     def execute(self, wanted: int, until: float | None) -> bool:
-        """Have inline hosts execute what waits: one request, or as many as nobody else can give.
+        """Execute requests of inline hosts: one, or `wanted` if no other host has any in flight.
 
         Args:
-            wanted: results; no more are executed.
-            until: when to stop, between two envs.
+            wanted: the largest number of requests to execute.
+            until: monotonic seconds at which to stop, between two envs.
 
-        Returns whether any did.
+        Returns True if any request was executed.
         """
         if not self._executing:
             return False
@@ -86,18 +89,19 @@ class Poller:
         waiting = sum([in_flight[host_id] for host_id, _ in self._executing])
         if not waiting:
             return False
-        if self._requests.total_in_flight() > waiting:
+        if sum(self._requests.in_flight) > waiting:
             wanted = 1
-        for count in range(wanted):
-            late = count and until is not None and self._clock() >= until
-            if late or not self._execute_next():
+        count = 0
+        while count < wanted and self._execute_next():
+            count += 1
+            if until is not None and self._clock() >= until:
                 break
         for _, host in self._executing:
             host.poll()
-        return True
+        return count > 0
 
     def _execute_next(self) -> bool:
-        """One request of the next inline host in turn, so that none waits for ever."""
+        """Execute one request of the next inline host, in turn so that none waits forever."""
         for _ in range(len(self._executing)):
             _, host = self._executing[0]
             self._executing.rotate(-1)
@@ -108,22 +112,25 @@ class Poller:
     # -- waiting for workers ----------------------------------------------------------
 
     def spin(self, wanted: int) -> bool:
-        """Whether `wanted` results have come within a moment of looking for them.
+        """Spin briefly for `wanted` results; True if they are ready.
 
-        Tried only while there are more cores than workers at work: theirs come first. So do
-        those of clients, which may be processes of this machine, too.
+        Spin only while there are more cores than busy workers and members (which may run on this
+        machine), and while no env that shares this thread is busy, as it couldn't make progress.
         """
         in_flight = self._requests.in_flight
-        at_work = 0
+        self._spun = False
+        if any(in_flight[host_id] for host_id in self._on_loop):
+            return False
+        num_busy = 0
         for host_id in self._workers:
             if in_flight[host_id]:
-                at_work += 1
+                num_busy += 1
         servers: list[Membership] = []
-        for host_id, server in self._env_servers.items():
+        for host_id, server in self._memberships.items():
             if in_flight[host_id]:
-                at_work += in_flight[host_id]
+                num_busy += in_flight[host_id]
                 servers.append(server)
-        self._spun = 0 < at_work < self.num_cores
+        self._spun = 0 < num_busy < self.num_cores
         if not self._spun:
             return False
         self._bell.disarm()
@@ -135,15 +142,15 @@ class Poller:
         )
 
     def slept(self) -> None:
-        """A wait that was no spin is over."""
+        """Report to the spinner that a spin was followed by a sleep."""
         if self._spun:
             self._spinner.slept()
 
     def arm(self, wanted: int) -> None:
-        """Have the workers wake us when `wanted` results are ready, or all that they owe.
+        """Have the workers wake this process when `wanted` results are ready, or all in flight.
 
         Args:
-            wanted: by the call that wants the fewest.
+            wanted: the number that the call with the fewest waits for.
         """
         in_flight = self._requests.in_flight
         total = sum([in_flight[host_id] for host_id in self._workers])
@@ -153,10 +160,10 @@ class Poller:
         else:
             self._bell.disarm()
 
-    def came(self) -> bool:
-        """Whether they are ready already; to be asked last before the trainer sleeps."""
+    def is_reached(self) -> bool:
+        """True if the armed number is ready; check this last before sleeping."""
         return self._bell.reached()
 
     def disarm(self) -> None:
-        """Nobody waits any more."""
+        """Disarm the bell, as no call waits."""
         self._bell.disarm()

@@ -1,28 +1,31 @@
-"""`Requests`: what was asked of each env, for whom, and how far it has come.
+"""`Requests`: the current request of each env, its owner, and its state.
 
-A pure table over slots, the positions of envs in their group: it knows hosts by their
-numbers only, no time and no I/O. One request of an env is outstanding at a time; each of
-them ends once, in a result, a value, an error or a withdrawal, and goes to the call that
-waits for it or else to `collect`. What may happen to a request, and what it is then, is
-said in `LEGAL`, from which the tests are made.
+A pure table over slots, the positions of envs in their group. It knows hosts by number only, no
+time and no I/O. An env has one request at a time. Each request ends once, in a result, a value, an
+error or a withdrawal, and goes to the call that waits for it, or else to `collect`. `LEGAL` lists
+every transition: tests are generated from it, and the debug mode (`checked`) executes it.
 
-Facts are arrays, so that a batch of thousands costs a few vector operations.
+The table consists of arrays, so that a batch of thousands costs a few vector operations.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field
-from enum import Enum, IntEnum, auto
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from rlightning_aio.group.conditions import FAULT, Conditions
+from rlightning_aio.group.request_states import COLLECTOR, NOBODY, State
 from rlightning_aio.protocol.entries import (
+    ANSWERS_WITH_VALUE,
     NUMBER_SHIFT,
     OP_BITS,
+    OP_BITS_ARRAY,
     OP_MASK,
-    SLOT_MASK,
+    SLOT_MASK_ARRAY,
+    WITHOUT_OP,
     Operation,
     slot_of,
 )
@@ -34,109 +37,26 @@ if TYPE_CHECKING:
 
     from rlightning_aio.errors import EnvFault
 
-__all__ = ["COLLECTOR", "LEGAL", "NOBODY", "Event", "Owner", "Requests", "State", "Ticket"]
+__all__ = ["CollectorQueue", "Numbering", "Requests", "Ticket", "Tickets"]
 
-
-class State(IntEnum):
-    """How far the request of a slot has come."""
-
-    IDLE = 0
-    """Nothing is outstanding: the env can be asked."""
-    BUSY = 1
-    """Asked, and not answered."""
-    READY = 2
-    """A result lies in the row, and has not been handed out."""
-    SPENT = 3
-    """Ended without a result, in a call that still waits for other envs."""
-
-
-class Owner(Enum):
-    """Who gets what becomes of a request."""
-
-    COLLECTOR = auto()
-    TICKET = auto()
-    NOBODY = auto()
-
-
-class Event(Enum):
-    """What can happen to a request."""
-
-    SENT = auto()
-    SENT_FOR_CALL = auto()
-    JOINED = auto()
-    CLAIMED = auto()
-    """A call takes a first result that waited for the collector."""
-    DROPPED = auto()
-    """A call asks for more than that first result."""
-    RESULT = auto()
-    VALUE = auto()
-    FAULT = auto()
-    WITHDRAWN = auto()
-    RESTARTED = auto()
-    HANDED_OUT = auto()
-    SETTLED = auto()
-    """Its call has all that it waited for."""
-    GIVEN_UP = auto()
-    """Its call waits no more."""
-    METHOD_GIVEN_UP = auto()
-    """The same for a method, whose value nobody else can use."""
-
-
-_IDLE, _BUSY, _READY, _SPENT = State
-_C, _T, _N = Owner
-
-LEGAL: Final[dict[tuple[State, Owner, Event], tuple[State, Owner]]] = {
-    # An idle slot belongs to nobody in particular, which is written as to the collector.
-    (_IDLE, _C, Event.SENT): (_BUSY, _C),
-    (_IDLE, _C, Event.SENT_FOR_CALL): (_BUSY, _T),
-    (_IDLE, _C, Event.JOINED): (_READY, _C),
-    (_BUSY, _C, Event.RESULT): (_READY, _C),
-    (_BUSY, _C, Event.FAULT): (_IDLE, _C),
-    (_BUSY, _C, Event.WITHDRAWN): (_IDLE, _C),
-    (_BUSY, _C, Event.RESTARTED): (_BUSY, _C),
-    (_READY, _C, Event.HANDED_OUT): (_IDLE, _C),
-    (_READY, _C, Event.CLAIMED): (_READY, _T),
-    (_READY, _C, Event.DROPPED): (_IDLE, _C),
-    (_BUSY, _T, Event.RESULT): (_READY, _T),
-    (_BUSY, _T, Event.VALUE): (_SPENT, _T),
-    (_BUSY, _T, Event.FAULT): (_SPENT, _T),
-    (_BUSY, _T, Event.RESTARTED): (_BUSY, _T),
-    (_BUSY, _T, Event.GIVEN_UP): (_BUSY, _C),
-    (_BUSY, _T, Event.METHOD_GIVEN_UP): (_BUSY, _N),
-    (_READY, _T, Event.GIVEN_UP): (_READY, _C),
-    (_SPENT, _T, Event.GIVEN_UP): (_IDLE, _C),
-    (_READY, _T, Event.SETTLED): (_READY, _C),
-    (_SPENT, _T, Event.SETTLED): (_IDLE, _C),
-    (_BUSY, _N, Event.VALUE): (_IDLE, _C),
-    (_BUSY, _N, Event.FAULT): (_IDLE, _C),
-}
-"""State and owner after each event that can come; what is missing can't."""
-
-COLLECTOR: Final = 0
-NOBODY: Final = -1
-"""Owners as the table holds them; a ticket's own number is above 0."""
 
 # Plain ints: NumPy takes several times as long over members of an enum.
 _IDLE_CODE, _BUSY_CODE, _READY_CODE, _SPENT_CODE = map(int, State)
 _STEP, _RESET, _JOIN = map(int, (Operation.STEP, Operation.RESET, Operation.JOIN))
 
-# 0-d arrays: NumPy takes twice as long over a Python int.
-_WITHOUT_OP: Final = np.array(~OP_MASK)
 _OP: Final = np.array(OP_MASK)
-_OP_BITS: Final = np.array(OP_BITS)
-_SLOT_MASK: Final = np.array(SLOT_MASK)
 _NEXT: Final = {op: np.array((1 << NUMBER_SHIFT) + op) for op in map(int, Operation)}
-"""To be added to an entry without an operation."""
+"""Numbers to add to an entry without an operation."""
 
 
 @dataclass(slots=True)
 class Ticket:
-    """A call that waits for requests of its own, beside `collect`.
+    """A call that waits for its own requests, independently of `collect`.
 
     Attributes:
-        remaining: of them that have not ended.
-        method: whose calls they are; empty where they are none.
-        values: what calls have returned, by slot.
+        remaining: number of its requests that have not ended.
+        method: name of the method that it calls; empty for steps and resets.
+        values: returned by method calls, by slot.
     """
 
     owner: int
@@ -148,45 +68,47 @@ class Ticket:
 
     @property
     def calls(self) -> bool:
-        """Whether the requests are calls of a method."""
+        """True if the requests are calls of a method."""
         return bool(self.method)
 
 
-class Requests:
-    """See the module.
-
-    Args:
-        size: of the table; host_of: the host of each slot, in runs.
-        num_hosts: numbered from 0.
+class Tickets:
+    """The calls that wait for their own requests.
 
     Attributes:
-        entry: of each slot's current request, or its last: number, slot and operation.
-        state: `State`; owner: of the current request.
-        sent_ns: when it was sent.
-        in_flight: requests of each host that are not answered; the only count of them.
-        num_ready: results for the collector; num_awaited: requests whose results it will get.
-        faults: errors for the collector, oldest first.
-        answered: something has ended since this was set to False.
+        waiting: by owner.
     """
 
-    def __init__(self, host_of: NDArray[np.int64], num_hosts: int) -> None:
-        size = len(host_of)
-        self._each = np.arange(size)
-        self._host_of = host_of
-        self.entry = np.arange(size) << OP_BITS
-        self.state = np.zeros(size, np.int8)
-        self.owner = np.zeros(size, np.int64)
-        self.sent_ns = np.zeros(size, np.int64)
-        self.in_flight = [0] * num_hosts
-        self.num_ready = 0
-        self.num_awaited = 0
-        self.faults: deque[EnvFault] = deque()
-        self.answered = False
-        self._ready: deque[NDArray[np.intp]] = deque()
-        self._tickets: dict[int, Ticket] = {}
-        self._next_ticket = 1
+    def __init__(self) -> None:
+        self.waiting: dict[int, Ticket] = {}
+        self._next_owner = 1
 
-    # -- what is known ------------------------------------------------------------
+    def open(self, slots: NDArray[np.intp], *, method: str = "") -> Ticket:
+        """Open a ticket for a call whose requests are about to be submitted.
+
+        Args:
+            slots: whose requests.
+            method: of the envs that is called; empty for steps and resets.
+        """
+        ticket = Ticket(self._next_owner, slots, len(slots), method)
+        self._next_owner += 1
+        self.waiting[ticket.owner] = ticket
+        return ticket
+
+    def drop(self, ticket: Ticket) -> None:
+        """Drop a ticket for which nothing was submitted."""
+        del self.waiting[ticket.owner]
+
+
+class Numbering:
+    """The number and the operation of each slot's current request, or its last.
+
+    Attributes:
+        entry: number, slot and operation, by slot.
+    """
+
+    def __init__(self, size: int) -> None:
+        self.entry = np.arange(size) << OP_BITS
 
     def number(self, slot: int) -> int:
         """Number of the current request; 0 before the first."""
@@ -204,62 +126,18 @@ class Requests:
         """Operations of the current requests of `slots`."""
         return self.entry[slots] & _OP
 
-    def host_of(self, slot: int) -> int:
-        """Number of the host of a slot."""
-        return self._host_of.item(slot)
+    def awaits_value(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Return which of `slots` have requests that are answered by a value, not a result."""
+        return ANSWERS_WITH_VALUE[self.ops(slots)]
 
-    def is_idle(self, slot: int) -> bool:
-        """Whether nothing was asked of a slot, and nothing of it waits to be collected."""
-        return bool(self.state[slot] == _IDLE_CODE)
-
-    def first_not_idle(self, slots: NDArray[np.intp]) -> int | None:
-        """The first of `slots` that can't be asked, if any."""
-        states = self.state[slots]
-        return int(slots[np.flatnonzero(states)[0]]) if np.count_nonzero(states) else None
-
-    def owed(self, slots: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Those of `slots` whose reply is outstanding."""
-        return slots[self.state[slots] == _BUSY_CODE]
-
-    def ready(self, slots: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Those of `slots` whose result lies in the row."""
-        return slots[self.state[slots] == _READY_CODE]
-
-    def pending(self, among: NDArray[np.bool_] | None = None) -> tuple[int, int]:
-        """How many results for the collector are ready, and how many with those to come.
-
-        Args:
-            among: of these slots only.
-        """
-        if among is None:
-            return self.num_ready, self.num_ready + self.num_awaited
-        states = self.state[among & (self.owner == COLLECTOR)]
-        return int(np.count_nonzero(states == _READY_CODE)), int(np.count_nonzero(states))
-
-    def total_in_flight(self) -> int:
-        """Requests of all hosts that are not answered."""
-        return sum(self.in_flight)
-
-    # -- asking -------------------------------------------------------------------
-
-    def submit(self, slots: NDArray[np.intp], op: int, owner: int, now: float) -> NDArray[np.int64]:
-        """Number the next request of each of `slots`, all idle; their entries."""
-        entries = self._renumbered(slots, op)
-        self.state[slots] = _BUSY_CODE
-        self.sent_ns[slots] = int(now * 1e9)
-        if owner:
-            self.owner[slots] = owner
-        else:
-            self.num_awaited += len(slots)
-        return entries
-
-    def _renumbered(self, slots: NDArray[np.intp], op: int) -> NDArray[np.int64]:
+    def renew(self, slots: NDArray[np.intp], op: int) -> NDArray[np.int64]:
+        """Number the next request of each of `slots`, and return their entries."""
         if len(slots) == 1:  # As most results come one by one: in a third of the time.
             slot = slots.item()
             self.entry[slot] = (self.entry.item(slot) & ~OP_MASK) + (1 << NUMBER_SHIFT) + op
             return self.entry[slots]
         entries = self.entry[slots]
-        entries &= _WITHOUT_OP
+        entries &= WITHOUT_OP
         entries += _NEXT[op]
         self.entry[slots] = entries
         return entries
@@ -271,6 +149,151 @@ class Requests:
         entries += which  # RESET == STEP + 1
         self.entry[slots] = entries
 
+
+class CollectorQueue:
+    """The results and errors that wait for the collector, in the order of their arrival.
+
+    Attributes:
+        num_ready: results; num_awaited: requests whose results it will get.
+        ready: slots of those results.
+        faults: errors; see `note_faults`.
+    """
+
+    def __init__(self, conditions: Conditions) -> None:
+        self._conditions = conditions
+        self.num_ready = 0
+        self.num_awaited = 0
+        self.ready: deque[NDArray[np.intp]] = deque()
+        self.faults: deque[EnvFault] = deque()
+
+    def append(self, slots: NDArray[np.intp]) -> None:
+        """Add awaited results that are ready."""
+        self.ready.append(slots)
+        self.num_ready += len(slots)
+        self.num_awaited -= len(slots)
+
+    def take(self, most: int, among: NDArray[np.bool_] | None = None) -> NDArray[np.intp]:
+        """Return slots of the collector's ready results, first come, first served.
+
+        Args:
+            most: how many at most.
+            among: of these slots only.
+        """
+        taken: list[NDArray[np.intp]] = []
+        left: list[NDArray[np.intp]] = []
+        count = 0
+        while self.ready and count < most:
+            slots = self.ready.popleft()
+            if among is not None:
+                left.append(slots[~among[slots]])
+                slots = slots[among[slots]]
+            if count + len(slots) > most:
+                self.ready.appendleft(slots[most - count :])
+                slots = slots[: most - count]
+            taken.append(slots)
+            count += len(slots)
+        if left:
+            self.ready.extendleft(slots for slots in reversed(left) if len(slots))
+        self.num_ready -= count
+        return taken[0] if len(taken) == 1 else np.concatenate(taken)
+
+    def put_back(self, slots: NDArray[np.intp]) -> None:
+        """Make taken results the next ones."""
+        self.ready.appendleft(slots)
+        self.num_ready += len(slots)
+
+    def remove(self, slots: NDArray[np.intp]) -> None:
+        """Remove results that the collector does not get."""
+        self.ready = deque(kept for q in self.ready if len(kept := q[~np.isin(q, slots)]))
+        self.num_ready -= len(slots)
+
+    def note_faults(self, faults: Sequence[EnvFault]) -> None:
+        """Keep errors for the collector."""
+        self.faults.extend(faults)
+        self._conditions.note(FAULT, bool(self.faults))
+
+    def take_fault(self, fault: EnvFault) -> None:
+        """Remove an error that the collector raises."""
+        self.faults.remove(fault)
+        self._conditions.note(FAULT, bool(self.faults))
+
+
+class Requests:
+    """See the module.
+
+    Args:
+        size: of the table; host_of: the host of each slot, in runs.
+        num_hosts: numbered from 0.
+        conditions: of the group.
+
+    Attributes:
+        hosts: the host of each slot.
+        numbering: of each slot's current request; tickets: calls that wait; collector: its queue.
+        state: `State`; owner: of the current request.
+        sent_ns: when it was sent.
+        in_flight: requests of each host that are not answered; the only count of them.
+        answered: something has ended since this was set to False.
+    """
+
+    def __init__(
+        self, host_of: NDArray[np.int64], num_hosts: int, conditions: Conditions | None = None
+    ) -> None:
+        size = len(host_of)
+        self._each = np.arange(size)
+        self.hosts = host_of
+        self.numbering = Numbering(size)
+        self.tickets = Tickets()
+        self.collector = CollectorQueue(conditions or Conditions())
+        self.state = np.zeros(size, np.int8)
+        self.owner = np.zeros(size, np.int64)
+        self.sent_ns = np.zeros(size, np.int64)
+        self.in_flight = [0] * num_hosts
+        self.answered = False
+
+    # -- what is known ------------------------------------------------------------
+
+    def is_idle(self, slot: int) -> bool:
+        """Return True if a slot has no request and no result that waits to be collected."""
+        return bool(self.state[slot] == _IDLE_CODE)
+
+    def first_not_idle(self, slots: NDArray[np.intp]) -> int | None:
+        """Return the first of `slots` that is not idle, or None."""
+        states = self.state[slots]
+        return int(slots[np.flatnonzero(states)[0]]) if np.count_nonzero(states) else None
+
+    def owed(self, slots: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Return the slots of `slots` whose replies are outstanding."""
+        return slots[self.state[slots] == _BUSY_CODE]
+
+    def ready(self, slots: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Return the slots of `slots` whose results are ready."""
+        return slots[self.state[slots] == _READY_CODE]
+
+    def pending(self, among: NDArray[np.bool_] | None = None) -> tuple[int, int]:
+        """Return the number of the collector's ready results, and with outstanding ones added.
+
+        Args:
+            among: count these slots only.
+        """
+        if among is None:
+            num_ready = self.collector.num_ready
+            return num_ready, num_ready + self.collector.num_awaited
+        states = self.state[among & (self.owner == COLLECTOR)]
+        return int(np.count_nonzero(states == _READY_CODE)), int(np.count_nonzero(states))
+
+    # -- asking -------------------------------------------------------------------
+
+    def submit(self, slots: NDArray[np.intp], op: int, owner: int, now: float) -> NDArray[np.int64]:
+        """Number the next request of each of `slots`, all idle; return their entries."""
+        entries = self.numbering.renew(slots, op)
+        self.state[slots] = _BUSY_CODE
+        self.sent_ns[slots] = int(now * 1e9)
+        if owner:
+            self.owner[slots] = owner
+        else:
+            self.collector.num_awaited += len(slots)
+        return entries
+
     def by_host(self, slots: NDArray[np.intp]) -> list[tuple[int, slice]]:
         """Each host with its part of submitted `slots`: in flight from now on.
 
@@ -279,7 +302,7 @@ class Requests:
         count = len(slots)
         if not count:
             return []
-        hosts = self._host_of[slots]
+        hosts = self.hosts[slots]
         first = hosts.item(0)
         if count == 1 or (first == hosts.item(-1) and not np.count_nonzero(hosts != first)):
             self.in_flight[first] += count
@@ -295,29 +318,33 @@ class Requests:
 
     def step_answered_at_once(self, slot: int, now: float) -> None:
         """Number a step that was executed without being submitted."""
-        self._renumbered(self.alone(slot), _STEP)
+        self.numbering.renew(self.alone(slot), _STEP)
         self.sent_ns[slot] = int(now * 1e9)
 
     def answer_at_once(self, slot: int) -> None:
         """Take note that the result of such a step lies in its row, to be handed out."""
         self.state[slot] = _READY_CODE
 
-    def restart(self, slots: NDArray[np.intp]) -> NDArray[np.int64]:
-        """Ask owed steps and resets anew, as resets; their entries."""
-        return self._renumbered(slots, _RESET)
+    def restart(self, host_id: int, slots: NDArray[np.intp]) -> NDArray[np.int64]:
+        """Number outstanding steps and resets of a host again, as resets; return their entries.
+
+        They are in flight again.
+        """
+        self.in_flight[host_id] += len(slots)
+        return self.numbering.renew(slots, _RESET)
 
     def lose_host(self, host_id: int) -> None:
-        """Nothing of what is in flight there will be answered by it."""
+        """Record that a host will answer none of its outstanding requests."""
         self.in_flight[host_id] = 0
 
     def alone(self, slot: int) -> NDArray[np.intp]:
-        """One slot as an array of slots."""
+        """Return one slot as an array of slots."""
         return self._each[slot : slot + 1]
 
     # -- ending -------------------------------------------------------------------
 
     def complete(self, reports: Sequence[tuple[int, NDArray[np.int64]]]) -> NDArray[np.intp]:
-        """Take note of results that lie in their rows; their slots.
+        """Record results that are in their rows; return their slots.
 
         Late replies, to requests that were asked anew, are dropped.
 
@@ -327,100 +354,100 @@ class Requests:
         entries = reports[0][1]
         if len(reports) > 1:
             entries = np.concatenate([entries for _, entries in reports])
-        slots = (entries >> _OP_BITS) & _SLOT_MASK
-        current = self.entry[slots] == entries
+        slots = entries >> OP_BITS_ARRAY
+        slots &= SLOT_MASK_ARRAY
+        current = self.numbering.entry[slots] == entries
         if np.count_nonzero(current) < len(slots):
             slots = slots[current]
             for host_id in {host_id for host_id, _ in reports}:
-                self.in_flight[host_id] -= int(np.count_nonzero(self._host_of[slots] == host_id))
+                self.in_flight[host_id] -= int(np.count_nonzero(self.hosts[slots] == host_id))
         else:
             for host_id, own in reports:
                 self.in_flight[host_id] -= len(own)
-        self._deliver(slots)
+        self.deliver(slots)
         return slots
 
     def complete_one(self, host_id: int, entry: int) -> int | None:
-        """The same for one; None if it was late."""
+        """Record one result; return its slot, or None if it was late."""
         slot = self.end(host_id, entry)
         if slot is not None:
-            self._deliver(self.alone(slot))
+            self.deliver(self.alone(slot))
         return slot
 
     def end(self, host_id: int, entry: int) -> int | None:
-        """The slot whose current request `entry` is; it is no more in flight. None if late."""
+        """End the request `entry`, and return its slot; None if the reply is late."""
         slot = slot_of(entry)
-        if self.state[slot] != _BUSY_CODE or self.entry.item(slot) != entry:
+        if self.state[slot] != _BUSY_CODE or self.numbering.entry.item(slot) != entry:
             return None
         self.in_flight[host_id] -= 1
         return slot
 
     def join(self, slot: int, now: float) -> None:
-        """Take note of a first result that nobody asked for; the slot is idle."""
+        """Record a first result without a request; the slot is idle."""
         slots = self.alone(slot)
         self.submit(slots, _JOIN, COLLECTOR, now)
-        self._deliver(slots)
+        self.deliver(slots)
 
-    def _deliver(self, slots: NDArray[np.intp]) -> None:
+    def deliver(self, slots: NDArray[np.intp]) -> None:
+        """Deliver the results of `slots`, which are no longer in flight, to their owners."""
         if not len(slots):
             return
         self.answered = True
         self.state[slots] = _READY_CODE
-        if not self._tickets:
-            self._queue(slots)
-        elif len(self._tickets) == 1 and not self.num_awaited:
-            (ticket,) = self._tickets.values()
+        collector, tickets = self.collector, self.tickets.waiting
+        if not tickets:  # As `CollectorQueue.append`, without a call.
+            collector.ready.append(slots)
+            collector.num_ready += len(slots)
+            collector.num_awaited -= len(slots)
+        elif len(tickets) == 1 and not collector.num_awaited:
+            (ticket,) = tickets.values()
             ticket.remaining -= len(slots)
         else:
             owners = self.owner[slots]
             for owner in set(owners.tolist()):
                 mine = slots[owners == owner]
                 if owner:
-                    self._tickets[owner].remaining -= len(mine)
+                    tickets[owner].remaining -= len(mine)
                 else:
-                    self._queue(mine)
-
-    def _queue(self, slots: NDArray[np.intp]) -> None:
-        self._ready.append(slots)
-        self.num_ready += len(slots)
-        self.num_awaited -= len(slots)
+                    collector.append(mine)
 
     def set_value(self, slot: int, value: Any) -> None:
-        """Take note of what a call returned."""
+        """Record the value of a method call."""
         self.answered = True
         owner = int(self.owner[slot])
         if owner == NOBODY:
             self._forget(self.alone(slot))
         else:
-            ticket = self._tickets[owner]
+            ticket = self.tickets.waiting[owner]
             ticket.values[slot] = value
             ticket.remaining -= 1
             self.state[slot] = _SPENT_CODE
 
     def owners(self, slots: NDArray[np.intp]) -> dict[int, NDArray[np.intp]]:
-        """The slots of each owner among `slots`."""
-        # Not `np.unique`, which imports a module when it is first called: after a death there
-        # may be no descriptor left to read one.
+        """Return the slots of each owner among `slots`."""
+        # `np.unique` would import a module at its first call, and after a death there may be no
+        # free descriptor to read it.
         found: list[int] = sorted({*self.owner[slots].tolist()})
         return {owner: slots[self.owner[slots] == owner] for owner in found}
 
     def fail(self, slots: NDArray[np.intp], owner: int, fault: EnvFault) -> None:
-        """End requests that are in flight no more, all of one owner, in one error."""
+        """End requests of one owner that are no longer in flight, in one error."""
         self.answered = True
         if owner > 0:
-            ticket = self._tickets[owner]
+            ticket = self.tickets.waiting[owner]
             ticket.remaining -= len(slots)
             ticket.faults.append(fault)
             self.state[slots] = _SPENT_CODE
             return
         self._forget(slots)
         if owner == COLLECTOR:
-            self.num_awaited -= len(slots)
-            self.faults.append(fault)
+            self.collector.num_awaited -= len(slots)
+            self.collector.note_faults([fault])
 
     def withdraw(self, slot: int) -> None:
-        """End a request of the collector's in nothing: it knows why."""
+        """End a request of the collector without a result."""
         self._forget(self.alone(slot))
-        self.num_awaited -= 1
+        self.collector.num_awaited -= 1
 
     def _forget(self, slots: NDArray[np.intp]) -> None:
         self.state[slots] = _IDLE_CODE
@@ -428,51 +455,24 @@ class Requests:
 
     # -- the collector ------------------------------------------------------------
 
-    def take(self, most: int, among: NDArray[np.bool_] | None = None) -> NDArray[np.intp]:
-        """Slots of ready results for the collector, first come first served.
-
-        Args:
-            most: how many at most.
-            among: of these slots only.
-        """
-        taken: list[NDArray[np.intp]] = []
-        left: list[NDArray[np.intp]] = []
-        count = 0
-        while self._ready and count < most:
-            slots = self._ready.popleft()
-            if among is not None:
-                left.append(slots[~among[slots]])
-                slots = slots[among[slots]]
-            if count + len(slots) > most:
-                self._ready.appendleft(slots[most - count :])
-                slots = slots[: most - count]
-            taken.append(slots)
-            count += len(slots)
-        if left:
-            self._ready.extendleft(slots for slots in reversed(left) if len(slots))
-        self.num_ready -= count
-        return taken[0] if len(taken) == 1 else np.concatenate(taken)
-
     def hand_out(self, slots: NDArray[np.intp]) -> None:
-        """Take note that results are handed out: their rows may be written again."""
+        """Record that results were returned: their rows may be written again."""
         self.state[slots] = _IDLE_CODE
 
     def put_back(self, slots: NDArray[np.intp]) -> None:
-        """Those of `slots` whose results were not handed out wait for the collector again."""
+        """Make results of `slots` that were not returned wait for the collector again."""
         kept = self.ready(slots)
         if len(kept):
-            self._ready.appendleft(kept)
-            self.num_ready += len(kept)
+            self.collector.put_back(kept)
 
     def joined(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Which of `slots` have a first result that nobody has collected."""
+        """Return which of `slots` have a first result that has not been collected."""
         ready = (self.state[slots] == _READY_CODE) & (self.owner[slots] == COLLECTOR)
-        return ready & (self.ops(slots) == _JOIN)
+        return ready & (self.numbering.ops(slots) == _JOIN)
 
     def take_joined(self, slots: NDArray[np.intp], ticket: Ticket | None) -> None:
-        """Give first results that wait for the collector to a call; None drops them."""
-        self._ready = deque(kept for q in self._ready if len(kept := q[~np.isin(q, slots)]))
-        self.num_ready -= len(slots)
+        """Give first results of the collector to a call; None drops them."""
+        self.collector.remove(slots)
         if ticket is None:
             self.state[slots] = _IDLE_CODE
         else:
@@ -481,43 +481,27 @@ class Requests:
 
     # -- calls that wait for their own replies ------------------------------------
 
-    def open_ticket(self, slots: NDArray[np.intp], *, method: str = "") -> Ticket:
-        """A call's claim to what becomes of its requests, which are about to be submitted.
-
-        Args:
-            slots: whose requests.
-            method: of the envs that is called; empty for steps and resets.
-        """
-        ticket = Ticket(self._next_ticket, slots, len(slots), method)
-        self._next_ticket += 1
-        self._tickets[ticket.owner] = ticket
-        return ticket
-
     def method(self, slot: int) -> str:
-        """The method whose call is the current request of `slot`, if somebody waits for it."""
-        ticket = self._tickets.get(self.owner.item(slot))
+        """Return the method of the current request of `slot`, or an empty string."""
+        ticket = self.tickets.waiting.get(self.owner.item(slot))
         return "" if ticket is None else ticket.method
 
-    def drop(self, ticket: Ticket) -> None:
-        """Nothing was submitted for it."""
-        del self._tickets[ticket.owner]
-
     def settle(self, ticket: Ticket) -> None:
-        """The call has all that it waited for: results may be handed out, the rest is idle."""
-        del self._tickets[ticket.owner]
+        """Close a ticket that has all replies: results may be returned, the rest is idle."""
+        del self.tickets.waiting[ticket.owner]
         self.owner[ticket.slots] = COLLECTOR
-        if ticket.calls or ticket.faults:
+        if ticket.method or ticket.faults:
             self._forget(ticket.slots[self.state[ticket.slots] == _SPENT_CODE])
 
     def give_up(self, ticket: Ticket) -> None:
-        """The call waits no more: the collector gets what was stepped and reset for it."""
+        """Close a ticket that no longer waits: its steps and resets go to the collector."""
         self.settle(ticket)
         slots = ticket.slots
         if ticket.calls:
             self.owner[self.owed(slots)] = NOBODY
             return
         ready = self.ready(slots)
-        self.num_awaited += len(self.owed(slots)) + len(ready)
-        self.faults.extend(ticket.faults)
+        self.collector.num_awaited += len(self.owed(slots)) + len(ready)
+        self.collector.note_faults(ticket.faults)
         if len(ready):
-            self._queue(ready)
+            self.collector.append(ready)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import pickle
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from rlightning_aio.batch.columns import ResultColumns
-from rlightning_aio.batch.sent import kept_columns
-from rlightning_aio.group.slab_layout import rows_in
+from rlightning_aio.batch.sent import UNASKED, copied
+from rlightning_aio.group.conditions import BESIDE_ROWS
+from rlightning_aio.protocol import exchange
 from rlightning_aio.protocol.columns import Rows, gather, mapped, stacked
 from rlightning_aio.protocol.info import NO_INFO, PICKLED
 from rlightning_aio.protocol.slab import TRUNCATED
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio.batch.sent import Sources
+    from rlightning_aio.group.conditions import Conditions
     from rlightning_aio.group.env_table import EnvTable
     from rlightning_aio.group.slab_layout import SlabLayout
     from rlightning_aio.hosts.messages import OutOfBand
@@ -33,12 +35,15 @@ class Results:
     """What lies in the rows of a group, and what came out of band.
 
     Args:
-        envs: names them; layout: where their rows are.
+        envs: names them; layout: where their rows are; conditions: of the group.
         zero_copy: observations are handed out as views where their rows are contiguous.
     """
 
-    def __init__(self, envs: EnvTable, layout: SlabLayout, *, zero_copy: bool) -> None:
+    def __init__(
+        self, envs: EnvTable, layout: SlabLayout, conditions: Conditions, *, zero_copy: bool
+    ) -> None:
         self._envs = envs
+        self._conditions = conditions
         self._layout = layout
         self._zero_copy = zero_copy
         self._out_of_band: dict[int, Any] = {}
@@ -51,16 +56,37 @@ class Results:
         # What was sent, by slot; that of the last batch is entered when that is needed.
         self._sent_columns = np.full(len(envs), None, object)
         self._sent_rows = np.zeros(len(envs), np.intp)
-        self._last_sent: tuple[NDArray[np.intp], Mapping[str, Any] | None] | None = None
+        self._last_sent: tuple[NDArray[np.intp], Mapping[str, Any]] | None = None
+        # The columns sent last to each entry: examples for rows that answer no request.
+        self._examples: list[dict[str, Any]] = [{} for _ in envs.names.entry_names]
         self._each = np.arange(len(envs))
 
     # -- what comes in ----------------------------------------------------------------
 
-    def note_sent(self, slots: NDArray[np.intp], columns: Mapping[str, Any] | None) -> None:
-        """Keep what a policy has sent to `slots`, one row for each, for their results."""
+    def note_sent(self, slots: NDArray[np.intp], columns: Mapping[str, Any]) -> None:
+        """Keep the columns that a policy sent to `slots`, one row for each, for their results."""
         if self._last_sent is not None and self._last_sent[0] is not slots:
             self._enter_last_sent()  # Else all of it is replaced.
-        self._last_sent = slots, None if columns is None else kept_columns(columns)
+        kept: dict[str, Any] = {}
+        for name, column in columns.items():  # Their maker may go on writing to them.
+            kept[name] = column.copy() if type(column) is np.ndarray else copied(column)
+        self._last_sent = slots, kept
+        entries = {0}
+        if len(self._examples) > 1:
+            entries = set(cast("list[int]", self._envs.names.entries[slots].tolist()))
+        for k in entries:
+            self._examples[k].clear()
+            self._examples[k].update(kept)
+
+    def note_unasked(self, slots: NDArray[np.intp]) -> None:
+        """Note that the next results of `slots` answer no response."""
+        self._enter_last_sent()
+        entries = self._envs.names.entries
+        for slot in slots.tolist():
+            example = self._sent_columns[slot] = self._examples[entries.item(slot)]
+            if not example and (action := self._layout.of(slot)[0].action) is not None:
+                example["action"] = mapped(_without_rows, action)
+        self._sent_rows[slots] = UNASKED
 
     def _enter_last_sent(self) -> None:
         if self._last_sent is not None:
@@ -73,6 +99,11 @@ class Results:
         """Keep what of a result has no place in its row."""
         if out_of_band:
             self._out_of_band[slot] = out_of_band
+            self._conditions.note(BESIDE_ROWS, True)
+
+    def keep_at_once(self, slot: int, out_of_band: OutOfBand) -> None:
+        """Keep what of a result has no place in its row until it is handed out in the same call."""
+        self._out_of_band[slot] = out_of_band
 
     def drop(self, slot: int) -> None:
         """Nobody will ask for the result of `slot`."""
@@ -110,6 +141,7 @@ class Results:
     def mark_lost(self, slot: int) -> None:
         """Mark a result as one whose episode before was lost; it will be truncated."""
         self._restarted[slot] = self._any_restarted = True
+        self._conditions.note(BESIDE_ROWS, True)
 
     def detach_info(self, slot: int) -> None:
         """Decode the info of a result that is ready, while its row and schemas are there."""
@@ -125,6 +157,7 @@ class Results:
             info = self._schemas[slot][mark].decode(memoryview(slab.info[row]))
         slab.info_mark[row] = PICKLED
         self._out_of_band[slot] = {**kept, "info": dict(info)}
+        self._conditions.note(BESIDE_ROWS, True)
 
     # -- what goes out ----------------------------------------------------------------
 
@@ -135,21 +168,23 @@ class Results:
         """
         layout = self._layout
         if len(layout.slabs) == 1:
-            return [self._part(layout.slabs[0], slots, None)]
+            return [self.part(layout.slabs[0], slots)]
         slabs = layout.slab[slots]
         present: list[int] = np.flatnonzero(np.bincount(slabs)).tolist()
         return [
-            self._part(layout.slabs[slab], slots[places], places)
+            self.part(layout.slabs[slab], slots[places], places)
             for slab in present
             for places in (np.flatnonzero(slabs == slab),)
         ]
 
     def add_episodes(self, part: ResultColumns) -> None:
         """Copy the sums of the episodes that end in `part`; its rows are as they were."""
-        slab = self._slab_of(part)
-        rows = rows_in(self._layout, part.slots, self._envs.all)
-        part.episode_return = _copy(slab.episode_return, rows)
-        part.episode_length = _copy(slab.episode_length, rows)
+        slots, layout = part.slots, self._layout
+        slab = layout.slabs[layout.slab.item(slots.item(0))]
+        rows = slice(0, len(slots)) if slots is self._envs.all else layout.row[slots]
+        part.episode_return, part.episode_length = exchange.gather(
+            (slab.episode_return, slab.episode_length), rows
+        )
 
     def let_go(self, slots: NDArray[np.intp]) -> None:
         """The results of `slots` are handed out: what is kept for them beside their rows goes."""
@@ -159,43 +194,57 @@ class Results:
         if self._out_of_band:
             for slot in slots.tolist():
                 self._out_of_band.pop(slot, None)
+        self._conditions.note(BESIDE_ROWS, self._any_restarted or bool(self._out_of_band))
 
     def sources(self, slots: NDArray[np.intp]) -> Sources:
-        """What was sent for the results of `slots`."""
+        """Return the columns that were sent for the results of `slots`."""
         if self._last_sent is not None and self._last_sent[0] is slots:
             return self._last_sent[1], None  # As `step` asks and is answered.
         self._enter_last_sent()
         return self._sent_columns[slots], self._sent_rows[slots]
 
-    def _slab_of(self, part: ResultColumns) -> Slab:
-        return self._layout.slabs[self._layout.slab.item(part.slots.item(0))]
-
-    def _part(
-        self, slab: Slab, slots: NDArray[np.intp], positions: NDArray[np.intp] | None
+    def part(
+        self, slab: Slab, slots: NDArray[np.intp], positions: NDArray[np.intp] | None = None
     ) -> ResultColumns:
-        layout, everyone = self._layout, self._envs.all
-        rows = rows_in(layout, slots, everyone) if positions is None else layout.row[slots]
-        flags = gather(slab.flags, rows)
-        restarted = self._restarted[slots] if self._any_restarted else None
-        if restarted is not None:
+        """Copy the results of `slots`, whose rows are in `slab`; see `gather`."""
+        layout, width = self._layout, self._info_width
+        if positions is None and slots is self._envs.all:
+            rows: Rows = slice(0, len(slots))
+        else:
+            rows = slots if layout.row_is_slot else layout.row[slots]
+        columns = [slab.reward, slab.flags, slab.times]
+        if width:
+            columns += (slab.info_mark, slab.info[:, :width])
+        observation: Any = slab.observation
+        in_rows = type(observation) is np.ndarray and not self._zero_copy
+        if in_rows:
+            columns.append(observation)
+        reward, flags, times, *others = exchange.gather(columns, rows)
+        out_of_band: dict[int, Any] = {}
+        restarted, whole = None, False
+        if self._any_restarted:
+            restarted = self._restarted[slots]
             # Here and not in the row, where envs write their flags only when they change.
             flags[restarted, ..., TRUNCATED] = True
-        out_of_band, whole = self._out_of_band_of(slots) if self._out_of_band else ({}, False)
-        width = self._info_width
-        observation, out_of_band = self._observations(slab, rows, out_of_band)
+        if self._out_of_band:
+            out_of_band, whole = self._out_of_band_of(slots)
+        if in_rows:
+            observation = others[-1]
+        else:
+            observation, out_of_band = self._observations(slab, rows, out_of_band)
         return ResultColumns(
             slots=slots,
             names=self._envs.names,
             positions=positions,
             observation=observation,
-            reward=_copy(slab.reward, rows),
+            reward=reward,
             flags=flags,
-            info_marks=_copy(slab.info_mark, rows) if width else None,
-            info=_copy(slab.info[:, :width], rows) if width else None,
+            info_marks=others[0] if width else None,
+            info=others[1] if width else None,
             schemas=self._schemas,
             out_of_band=out_of_band,
             restarted=restarted,
-            times=gather(slab.times, rows),
+            times=times,
             sent_ns=None if slab.sent_ns is None else gather(slab.sent_ns, rows),
             agents=slab.layout.agents,
             observation_space=slab.layout.observation_space,
@@ -203,7 +252,7 @@ class Results:
         )
 
     def _out_of_band_of(self, slots: NDArray[np.intp]) -> tuple[dict[int, Any], bool]:
-        """What belongs to `slots`, by row of the batch; whether some is a whole result."""
+        """Return out-of-band data of `slots` by batch row, and True if any is a whole result."""
         found: dict[int, Any] = {}
         whole = False
         for row, slot in enumerate(slots.tolist()):
@@ -225,6 +274,10 @@ class Results:
             handed_over = slab.layout.observations_out_of_band and len(out_of_band) > 0
             if not handed_over or not all("observation" in kept for kept in out_of_band.values()):
                 return None, out_of_band
+            if len(out_of_band) == 1:
+                ((row, kept),) = out_of_band.items()
+                beside = dict(kept)
+                return stacked([beside.pop("observation")]), {row: beside}
             columns = stacked([kept["observation"] for kept in out_of_band.values()])
             beside = {
                 row: {name: value for name, value in kept.items() if name != "observation"}
@@ -243,9 +296,9 @@ class Results:
         return mapped(view, slab.observation), out_of_band
 
 
-def _copy(column: NDArray[Any], rows: Rows) -> NDArray[Any]:
-    """Rows of a narrow column: for those, indexing is the quickest copy."""
-    return column[rows].copy() if type(rows) is slice else column[rows]
+def _without_rows(column: NDArray[Any]) -> NDArray[Any]:
+    """An empty array with the dtype and the shape of a row of `column`."""
+    return np.empty((0, *column.shape[1:]), column.dtype)
 
 
 def _contiguous(rows: Rows) -> slice | None:

@@ -1,4 +1,4 @@
-"""`Scope`: what holds within a ``with``, be it plain or asynchronous."""
+"""`Scope`: a context manager for both ``with`` and ``async with``."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ __all__ = ["Scope"]
 
 
 class Scope(ABC):
-    """Neither entering nor leaving it waits for anything, so both kinds of ``with`` will do."""
+    """A context manager that never waits, so it supports both kinds of ``with``."""
 
     @abstractmethod
     def _enter(self) -> None:
-        """What entering does."""
+        """Enter the context."""
 
     @abstractmethod
     def _leave(self) -> None:
-        """What leaving does, also after an error."""
+        """Leave the context, also after an error."""
 
     def __enter__(self) -> Self:
         self._enter()

@@ -1,4 +1,4 @@
-"""Which seed each env gets, from what a user gave."""
+"""Seeds of the envs, from the `seed` argument of a reset."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from rlightning_aio.group.auto_reset import as_int
+from rlightning_aio.group.continuity import as_int
 from rlightning_aio.protocol.slab import NO_SEED
 
 if TYPE_CHECKING:
@@ -21,7 +21,13 @@ Seeds: TypeAlias = "int | Sequence[int] | Mapping[str, int] | None"
 
 
 def seeds_for(envs: EnvTable, seed: Seeds, slots: NDArray[np.intp]) -> NDArray[np.int64]:
-    """One seed for each slot: env k gets ``seed + k``, counting sub-environments."""
+    """The seed of each slot, ``[n]``; `NO_SEED` for none.
+
+    From an int, sub-environment k of the group gets ``seed + k``.
+
+    Raises:
+        ValueError: a seed is out of range, or there isn't one for each slot.
+    """
     if seed is None:
         return np.full(len(slots), NO_SEED)
     if isinstance(seed, Mapping):
@@ -36,9 +42,13 @@ def seeds_for(envs: EnvTable, seed: Seeds, slots: NDArray[np.intp]) -> NDArray[n
     return np.array(chosen, np.int64)
 
 
-def checked_seed(seed: Any) -> int:
-    """`seed` as an int that every env can count on from."""
+def checked_seed(seed: Any, whose: str = "") -> int:
+    """`seed` as an int, small enough that adding an offset can't overflow an int64.
+
+    Raises:
+        ValueError: it isn't an int from 0 to 2**62 - 1; `whose` ends its name in the message.
+    """
     value = as_int(seed)
     if value is None or not 0 <= value < 1 << 62:
-        raise ValueError(f"a seed must be an int from 0 to 2**62 - 1, not {seed!r}")
+        raise ValueError(f"the seed{whose} must be an int from 0 to 2**62 - 1, not {seed!r}")
     return value

@@ -1,7 +1,7 @@
-"""`SlabLayout`: where the results of each env lie: which slab, and which row of it.
+"""`SlabLayout`: the slab and the row of each env.
 
-Local envs get their rows all at once, when they are built; those of an env_server bring a
-slab of their own with the first of them.
+Local envs get their rows together, after all are built. The first env that joins a host brings a
+slab with rows for all that may.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ __all__ = ["SlabLayout", "check_actions", "rows_in"]
 
 
 def rows_in(layout: SlabLayout, slots: NDArray[np.intp], everyone: NDArray[np.intp]) -> Rows:
-    """Rows of `slots` in the only slab; one slice, where they are `everyone`."""
+    """The rows of `slots` in the only slab; a slice if `slots` is the array `everyone`."""
     if slots is everyone:
         return slice(0, len(slots))
     return slots if layout.row_is_slot else layout.row[slots]
 
 
 def check_actions(metas: Sequence[EnvMeta]) -> None:
-    """Raises `ConfigError` if the envs' actions have different shapes."""
+    """Raise `ConfigError` if the actions of envs differ in shape."""
     for meta in metas[1:]:
         first = metas[0]
         if _action_shape(meta) != _action_shape(first):
@@ -49,12 +49,12 @@ def check_actions(metas: Sequence[EnvMeta]) -> None:
 
 
 def _action_shape(meta: EnvMeta) -> Any:
-    """Shapes of an action, without the batch axis."""
+    """The shapes of an action, without the batch axis."""
     if meta.action_space is None:
         return None
     found = leaves(meta.action_space)
     if found is None:
-        # A space of the user's own that doesn't describe itself would be named by its address.
+        # The default repr of a user-defined space contains its address, which differs.
         described = type(meta.action_space).__repr__ is not object.__repr__
         return str(meta.action_space) if described else type(meta.action_space).__qualname__
     skip = 1 if meta.num_envs > 1 else 0
@@ -62,12 +62,12 @@ def _action_shape(meta: EnvMeta) -> Any:
 
 
 class SlabLayout:
-    """Over the slots of a group.
+    """The slabs of a group, and the position of each slot in them.
 
     Attributes:
-        slabs: all there are.
-        slab, row: of each slot; row_is_slot: of every slot, for which `row` need not be
-            asked then.
+        slabs: all slabs.
+        slab, row: the index of the slab of each slot, and its row there.
+        row_is_slot: the row of every slot is the slot itself, so `row` isn't needed.
     """
 
     def __init__(self, size: int) -> None:
@@ -82,7 +82,7 @@ class SlabLayout:
 
         Args:
             started: the envs, in the order of their slots.
-            arena: takes the slabs.
+            arena: holds the memory of the slabs.
         """
         keys: dict[tuple[object, ...], int] = {}
         layouts: list[RowLayout] = []
@@ -102,13 +102,13 @@ class SlabLayout:
         self._note_rows()
 
     def order_for(self, first_slot: int, num_envs: int) -> AttachOrder:
-        """What a host of local envs is told of their rows."""
+        """The message that gives a host of local envs their rows."""
         slots = range(first_slot, first_slot + num_envs)
         rows = tuple((int(self.slab[slot]), int(self.row[slot])) for slot in slots)
         return AttachOrder(tuple(self._places), rows)
 
     def add(self, slab: Slab, first_slot: int) -> None:
-        """Take in the slab of an env_server, whose rows are its slots in order."""
+        """Add the slab of a host that envs join, with one row for each of its slots in order."""
         slots = slice(first_slot, first_slot + slab.rows)
         self.slab[slots] = len(self.slabs)
         self.row[slots] = np.arange(slab.rows)
@@ -119,11 +119,11 @@ class SlabLayout:
         self.row_is_slot = bool((self.row == np.arange(len(self.row))).all())
 
     def of(self, slot: int) -> tuple[Slab, int]:
-        """Slab and row of a slot."""
+        """The slab and the row of a slot."""
         return self.slabs[self.slab.item(slot)], self.row.item(slot)
 
     def write_seeds(self, slots: NDArray[np.intp], seeds: NDArray[np.int64]) -> None:
-        """Put the seeds of resets into the rows; `NO_SEED` for none."""
+        """Write the seeds of resets into the rows; `NO_SEED` for none."""
         if len(self.slabs) == 1:
             self.slabs[0].seed[self.row[slots]] = seeds + 1
             return
@@ -132,5 +132,5 @@ class SlabLayout:
             slab.seed[row] = seed + 1
 
     def release(self) -> None:
-        """Let go of the memory; batches that were handed out keep theirs."""
+        """Drop the slabs; batches that were returned keep the memory that they use."""
         self.slabs.clear()

@@ -1,116 +1,164 @@
-"""What a snapshot is: the standings of some envs, with what must be the same where they go.
+"""`Snapshots`: take the state of envs out of them, and put it back.
 
-Rule: it is checked as a whole before anything is put back, and before anything in it is
-unpickled: first its checksum, then, env by env, what the env is. Only workers unpickle.
-Absent on purpose: a signature. Whoever can write the file can have a worker execute anything.
+A restore is all or nothing: it first takes the current state of every env, so that a failure can
+be undone. `Continuity` records what the next results then report; `snapshot_format` has the bytes.
 """
 
 from __future__ import annotations
 
-import hashlib
-import re
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING
 
-import msgspec
-
-from rlightning_aio.errors import SnapshotError
+from rlightning_aio.errors import EnvFault, SnapshotError, WorkerDied
+from rlightning_aio.group.calls import values_of
+from rlightning_aio.group.continuity import Position
+from rlightning_aio.group.snapshot_format import EnvSnapshot, check_same, identity_of, pack, unpack
+from rlightning_aio.protocol.entries import Operation
+from rlightning_aio.registry import ENVS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
-    from rlightning_aio.config import EnvConfig
-    from rlightning_aio.types import EnvMeta
+    import numpy as np
+    from numpy.typing import NDArray
 
-__all__ = ["EnvSnapshot", "check_same", "identity_of", "pack", "unpack"]
+    from rlightning_aio.group.calls import Calls
+    from rlightning_aio.group.continuity import Continuity
+    from rlightning_aio.group.dispatch import Dispatch
+    from rlightning_aio.group.env_table import EnvTable
+    from rlightning_aio.group.supervisor import Supervisor
+    from rlightning_aio.group.wait import Procedure
+    from rlightning_aio.group.waiting import Waiting
 
-_BEGINNING: Final = b"rlightning-aio snapshot 1\n"
-_DIGEST: Final = hashlib.sha256
-_ADDRESS: Final = re.compile(r" at 0x[0-9a-f]+")
-_VERSION: Final = "version of "
-
-
-class EnvSnapshot(msgspec.Struct, array_like=True):
-    """One env of a snapshot.
-
-    Attributes:
-        env_id: of the env that it was taken of.
-        identity: what must be the same where it goes, see `identity_of`.
-        count, cut: of `auto_reset`: steps since the last reset, and whether its limit was
-            reached by the last one.
-        standing: where the env stands, a pickle.
-    """
-
-    env_id: str
-    identity: dict[str, str]
-    count: int
-    cut: bool
-    standing: bytes
+__all__ = ["Snapshots"]
 
 
-def identity_of(config: EnvConfig, meta: EnvMeta, versions: Mapping[str, str]) -> dict[str, str]:
-    """What tells an env from those that can't stand where it does, in words.
+class Snapshots:
+    """See the module; the arguments are the group's parts."""
 
-    Args:
-        config: its entry.
-        meta: what it told of itself.
-        versions: of the libraries that it consists of, where it lives.
-    """
-    maker: Any = config.make_env
-    maker = cast("tuple[Any, ...]", maker)[0] if isinstance(maker, tuple) else maker
-    made_by = getattr(maker, "__qualname__", type(maker).__name__) if maker else config.task
-    return {
-        "backend": config.backend,
-        "task": made_by,
-        "env_kwargs": _ADDRESS.sub("", repr(sorted(config.env_kwargs.items()))),
-        "num_envs": str(config.num_envs),
-        "max_episode_steps": str(config.max_episode_steps),
-        "observation space": _ADDRESS.sub("", str(meta.observation_space)),
-        "action space": _ADDRESS.sub("", str(meta.action_space)),
-        **{f"{_VERSION}{name}": version for name, version in versions.items()},
-    }
+    def __init__(
+        self,
+        envs: EnvTable,
+        supervisor: Supervisor,
+        dispatch: Dispatch,
+        calls: Calls,
+        continuity: Continuity,
+        waiting: Waiting,
+    ) -> None:
+        self._envs = envs
+        self._supervisor = supervisor
+        self._dispatch = dispatch
+        self._calls = calls
+        self._continuity = continuity
+        self._waiting = waiting
 
+    def take(self, now: float, env_ids: Sequence[str] | None) -> Procedure[bytes]:
+        """See `EnvGroup.snapshot`."""
+        slots = self._envs.all if env_ids is None else self._dispatch.distinct(env_ids)
+        self._check_restorable(slots)
+        snapshots = yield from self._take(now, slots)
+        for snapshot, was_reset in snapshots:
+            if not was_reset:
+                raise SnapshotError(
+                    f"env {snapshot.env_id!r} has no state yet: reset it before its snapshot is "
+                    "taken"
+                )
+        return pack([snapshot for snapshot, _ in snapshots])
 
-def check_same(snapshot: EnvSnapshot, identity: Mapping[str, str], described: str) -> None:
-    """Raise `SnapshotError` if a snapshot is of another env than the one that is `described`."""
-    ours = snapshot.identity
-    for name in {**ours, **identity}:
-        if name.startswith(_VERSION) and not (name in ours and name in identity):
-            continue  # One of them holds nothing of that library yet, as before its first reset.
-        if ours.get(name) != identity.get(name):
+    def _check_restorable(self, slots: NDArray[np.intp]) -> None:
+        self._dispatch.check_local(slots, "take a snapshot of, or restore,")
+        each: list[int] = slots.tolist()
+        for slot in each:
+            if ENVS.is_hardware(self._envs.configs[slot].backend):
+                raise SnapshotError(
+                    f"{self._envs.describe(slot)} moves something real, which a snapshot can't "
+                    "restore"
+                )
+
+    def _take(
+        self, now: float, slots: NDArray[np.intp]
+    ) -> Procedure[list[tuple[EnvSnapshot, bool]]]:
+        """Take one snapshot per env, and say whether the env was ever reset."""
+        op, nothing = Operation.SNAPSHOT, [()] * len(slots)
+        ticket = self._calls.ask(now, slots, op, "snapshot", nothing, "nothing")
+        yield from self._waiting.until_replied(ticket)
+        each: list[int] = slots.tolist()
+        replies = zip(each, self._continuity.positions(slots), values_of([ticket]), strict=True)
+        snapshots: list[tuple[EnvSnapshot, bool]] = []
+        for slot, (num_steps, is_cut), (versions, was_reset, state) in replies:
+            identity = identity_of(self._envs.configs[slot], self._supervisor.metas[slot], versions)
+            env_id = self._envs.env_ids[slot]
+            snapshots.append((EnvSnapshot(env_id, identity, num_steps, is_cut, state), was_reset))
+        return snapshots
+
+    def put_back(
+        self, now: float, data: bytes, env_ids: Sequence[str] | None
+    ) -> Procedure[tuple[NDArray[np.intp], list[Position]]]:
+        """Put envs into the state of their snapshots, which a reset `AS_RESTORED` then shows.
+
+        Returns their slots and their positions in their episodes.
+        """
+        snapshots = unpack(data)
+        slots = self._slots_for(snapshots, env_ids)
+        self._check_restorable(slots)
+        before = yield from self._take(now, slots)
+        for slot, snapshot, (own, _) in zip(slots.tolist(), snapshots, before, strict=True):
+            check_same(snapshot, own.identity, self._envs.describe(slot))
+        yield from self._put_back(now, slots, snapshots, [own.state for own, _ in before])
+        return slots, [Position(snapshot.num_steps, snapshot.is_cut) for snapshot in snapshots]
+
+    def _slots_for(
+        self, snapshots: Sequence[EnvSnapshot], env_ids: Sequence[str] | None
+    ) -> NDArray[np.intp]:
+        """Return the slots of `env_ids`, or else of all envs, if these are what was saved."""
+        taken_of = [snapshot.env_id for snapshot in snapshots]
+        where = len(self._envs.all) if env_ids is None else len(env_ids)
+        if where != len(snapshots):
             raise SnapshotError(
-                f"the snapshot of {snapshot.env_id!r} can't be put into {described}: its {name} is "
-                f"{ours.get(name, 'unknown')}, and here it is {identity.get(name, 'unknown')}; "
-                "nothing was changed"
+                f"the snapshot is of {len(snapshots)} envs, but should go into {where}; "
+                "name as many in env_ids, in order; nothing was changed"
             )
+        if env_ids is None and (missing := set(taken_of) - set(self._envs.env_ids)):
+            raise SnapshotError(
+                f"the snapshot is of {min(missing)!r}, and this group has no such env; name in "
+                "env_ids where each should go, in order; nothing was changed"
+            )
+        return self._dispatch.distinct(taken_of if env_ids is None else env_ids)
 
+    def _put_back(
+        self,
+        now: float,
+        slots: NDArray[np.intp],
+        snapshots: Sequence[EnvSnapshot],
+        before: Sequence[bytes],
+    ) -> Procedure[None]:
+        """Load the state of each snapshot; if one fails, load the states from `before` again.
 
-def pack(snapshots: Sequence[EnvSnapshot]) -> bytes:
-    """The bytes that `EnvGroup.snapshot` returns."""
-    content = msgspec.msgpack.encode(snapshots)
-    return b"".join((_BEGINNING, _DIGEST(content).digest(), content))
+        An env that can't even go back begins a new episode, and so do all if this is cancelled.
+        """
+        states = [(snapshot.state, True) for snapshot in snapshots]
+        try:
+            yield from self._load(now, slots, states)
+        except EnvFault as fault:
+            failed = {one.env_id for one in (fault, *fault.others) if isinstance(one, WorkerDied)}
+            kept = [k for k, slot in enumerate(slots) if self._envs.env_ids[slot] not in failed]
+            back = [(before[k], False) for k in kept]
+            try:
+                yield from self._load(now, slots[kept], back)
+            except EnvFault as again:
+                lost = {one.env_id for one in (again, *again.others)}
+                left = [slot for slot in slots[kept].tolist() if self._envs.env_ids[slot] in lost]
+                self._continuity.lose(left, "could not be put back")
+            fault.add_note("nothing was restored: the other envs are where they were before")
+            raise
+        except BaseException:
+            self._continuity.lose(slots.tolist(), "was being restored when that was cancelled")
+            raise
 
-
-def unpack(data: bytes) -> list[EnvSnapshot]:
-    """What was packed.
-
-    Raises:
-        SnapshotError: it is no snapshot, or was changed or cut since.
-    """
-    if not isinstance(data, bytes | bytearray | memoryview):  # pyright: ignore[reportUnnecessaryIsInstance]
-        raise SnapshotError(
-            f"a snapshot is the bytes that snapshot() returned, not a {type(data).__name__}"
-        )
-    data = bytes(data)
-    start = len(_BEGINNING) + _DIGEST().digest_size
-    if not data.startswith(_BEGINNING):
-        raise SnapshotError(
-            "these bytes are not a snapshot of this version of rlightning_aio: they don't start "
-            "like one; nothing was changed"
-        )
-    if _DIGEST(data[start:]).digest() != data[len(_BEGINNING) : start]:
-        raise SnapshotError(
-            "the snapshot was changed or truncated since it was taken: its checksum doesn't "
-            "match; read "
-            "the file again, in binary; nothing was changed"
-        )
-    return msgspec.msgpack.decode(data[start:], type=list[EnvSnapshot])
+    def _load(
+        self, now: float, slots: NDArray[np.intp], states: Sequence[tuple[bytes, bool]]
+    ) -> Procedure[None]:
+        """Have envs load states; each comes with whether the env is to show it afterwards."""
+        op = Operation.RESTORE
+        ticket = self._calls.ask(now, slots, op, "restore", states, "its snapshot")
+        yield from self._waiting.until_replied(ticket)
+        values_of([ticket])

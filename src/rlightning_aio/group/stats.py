@@ -1,7 +1,7 @@
-"""What the group has measured: throughput, batch sizes, latencies, episodes.
+"""`Stats`: throughput, batch sizes, latencies and episodes of a group.
 
-Rule: the hot path appends arrays it has anyway to a window; everything that is computed
-from them is computed when somebody asks.
+Rule: the hot path only appends arrays that it already has to a window; figures are computed from
+them on request.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+
+from rlightning_aio.protocol.slab import IS_RESET, TERMINATED, TRUNCATED
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -28,17 +30,17 @@ __all__ = ["Stats"]
 _WINDOW_SAMPLES: Final = 1024
 _WINDOW_SECONDS: Final = 10.0
 _VERDICTS: Final = ("success", "fail")
-"""Booleans in an info by which an env judges its episodes."""
+"""Keys of booleans in the info that ends an episode: the env's verdicts on it."""
 
 
 @dataclass(slots=True)
 class _Sample:
-    """Results of one layout in a batch that was handed out. Times in ns of the monotonic clock.
+    """The results with one layout of a returned batch. Times in ns of the monotonic clock.
 
     Attributes:
         batch: number of the batch.
-        num_envs: sub-environments of each result.
-        resets: which of them were reset; None where none was.
+        num_envs: sub-environments per result.
+        resets: mask of the sub-environments that were reset; None if none was.
     """
 
     batch: int
@@ -51,7 +53,7 @@ class _Sample:
     synchronous: bool
 
     def steps(self) -> NDArray[np.int64]:
-        """Env steps that each result stands for: ``[n]``."""
+        """The number of env steps in each result, ``[n]``."""
         if self.resets is None:
             return np.full(len(self.slots), self.num_envs)
         return self.num_envs - self.resets.reshape(len(self.slots), -1).sum(axis=1)
@@ -59,7 +61,7 @@ class _Sample:
 
 @dataclass(slots=True)
 class _Verdicts:
-    """How many episodes of each slot an env has judged, and how many of these were true."""
+    """The number of episodes of each slot with a verdict, and of those where it was true."""
 
     count: NDArray[np.int64]
     true: NDArray[np.int64]
@@ -74,15 +76,19 @@ class _Verdicts:
 
 
 class Stats:
-    """Windows over what was handed out, and sums over the episodes that have ended."""
+    """A window over returned results, and sums over ended episodes.
+
+    Attributes:
+        num_batches: the number of returned batches.
+    """
 
     def __init__(self, envs: EnvTable, requests: Requests) -> None:
         self._envs = envs
         self._requests = requests
         self._samples: deque[_Sample] = deque(maxlen=_WINDOW_SAMPLES)
-        self._batches = 0
-        # Sums have one more place for each config entry, for clients whose slots others have
-        # taken. By slot: episodes, the sum of their returns, that of their lengths.
+        self.num_batches = 0
+        # Sums have one more row per config entry, for former members whose slots were taken by
+        # others. Columns: number of episodes, sum of their returns, sum of their lengths.
         size = len(envs) + len(envs.names.entry_names)
         self._sums = np.zeros((size, 3))
         # Return and length of the last episode.
@@ -90,21 +96,19 @@ class Stats:
         self._requests_before = np.zeros(size, np.int64)
         self._verdicts = {name: _Verdicts.of(size) for name in _VERDICTS}
 
-    def begin_anew(self, slot: int) -> None:
-        """Another client is about to take `slot`: what was summed up of the one that had it
-        stays with its entry.
-        """
+    def move_to_entry(self, slot: int) -> None:
+        """Move the sums of `slot` to its entry's former members, before another one takes it."""
         former = self._former(self._envs.names.entries.item(slot))
         for sums in self._all_sums():
             sums[former] += sums[slot]
             sums[slot] = 0
         self._last[slot] = 0
-        number = self._requests.number(slot)
+        number = self._requests.numbering.number(slot)
         self._requests_before[former] += self._requests_before[slot] - number
         self._requests_before[slot] = number
 
     def _former(self, entry: int) -> int:
-        """The place of those that were clients of an entry."""
+        """The row of an entry's former members in the sums."""
         return len(self._envs) + entry
 
     def _all_sums(self) -> list[NDArray[Any]]:
@@ -112,23 +116,26 @@ class Stats:
         return [self._sums, *(v.count for v in verdicts), *(v.true for v in verdicts)]
 
     def account(self, parts: Sequence[ResultColumns], *, synchronous: bool) -> None:
-        """Take note of results that are handed out."""
+        """Record results that are about to be returned."""
         now = time.monotonic_ns()
         sent_ns = self._requests.sent_ns
-        self._batches += 1
+        self.num_batches += 1
         for part in parts:
             slots, shape = part.slots, part.reward.shape
             has_sub_envs = len(shape) > (2 if part.agents else 1)
-            any_flagged = part.episode_return is not None
+            resets = None
+            if part.episode_return is not None:  # Flags are set.
+                resets = part.flags[:, IS_RESET] if part.flags.ndim == 2 else part.is_reset
+                resets = resets.copy()
             self._samples.append(
                 _Sample(
-                    self._batches,
+                    self.num_batches,
                     now,
                     slots,
                     sent_ns[slots],
                     part.times,
                     shape[-1] if has_sub_envs else 1,
-                    part.is_reset.copy() if any_flagged else None,
+                    resets,
                     synchronous,
                 )
             )
@@ -138,25 +145,32 @@ class Stats:
     def _note_episodes(
         self, part: ResultColumns, returns: NDArray[np.float64], lengths: NDArray[np.int64]
     ) -> None:
-        ended = part.done & (lengths > 0)
+        flags = part.flags
+        ended = flags[..., TERMINATED] | flags[..., TRUNCATED]
+        if part.limit_reached is not None:
+            ended = part.done
+        ended &= lengths > 0
         if part.restarted is not None:
             ended[part.restarted] = False
-        if not np.count_nonzero(ended):
+        if not len(ended.nonzero()[0]):
             return
-        if ended.ndim == 1:
-            rows = ended.nonzero()[0]
-            slots = part.slots[rows]
-            outcomes = np.empty((len(rows), 3))
-            outcomes[:, 0], outcomes[:, 1], outcomes[:, 2] = 1, returns[rows], lengths[rows]
-            self._sums[slots] += outcomes
-            self._last[slots] = outcomes[:, 1:]
-        else:
-            rows = self._note_several(part.slots, ended, returns, lengths)
-            slots = part.slots[rows]
+        with np.errstate(over="ignore", invalid="ignore"):  # The means show them.
+            if ended.ndim == 1:
+                rows = ended.nonzero()[0]
+                slots = part.slots[rows]
+                outcomes = np.empty((len(rows), 3))
+                outcomes[:, 0], outcomes[:, 1], outcomes[:, 2] = 1, returns[rows], lengths[rows]
+                self._sums[slots] += outcomes
+                self._last[slots] = outcomes[:, 1:]
+            else:
+                rows = self._note_several(part.slots, ended, returns, lengths)
+                slots = part.slots[rows]
         if part.info_marks is not None or part.out_of_band:
             for slot, row in zip(slots.tolist(), rows.tolist(), strict=True):
                 if part.may_hold(row, _VERDICTS):
-                    with suppress(Exception):  # It may hold anything; its reader learns.
+                    with suppress(
+                        Exception
+                    ):  # The info may be malformed; its reader gets the error.
                         self._note_verdicts(slot, part.info_of(row), ended[row])
 
     def _note_several(
@@ -166,9 +180,9 @@ class Stats:
         returns: NDArray[np.float64],
         lengths: NDArray[np.int64],
     ) -> NDArray[np.intp]:
-        """Count episodes of sub-environments or agents, of which several may end in one result.
+        """Count ended episodes of sub-environments or agents; a result may end several.
 
-        Returns the rows in which any has ended.
+        Returns the rows of results that end any.
         """
         flat = ended.reshape(-1).nonzero()[0]
         owners = flat // (ended.size // len(ended))
@@ -181,23 +195,23 @@ class Stats:
         outcomes[:, 1] = np.bincount(owners, own_returns)[rows]
         outcomes[:, 2] = np.bincount(owners, own_lengths)[rows]
         self._sums[chosen] += outcomes
-        # A row's last one comes before the next row's first.
+        # Episodes are ordered by row, so these are the last ones of each row.
         ends = np.add.accumulate(counts[rows]) - 1
         self._last[chosen, 0], self._last[chosen, 1] = own_returns[ends], own_lengths[ends]
         return rows
 
     def _note_verdicts(self, slot: int, info: dict[str, Any], ended: NDArray[np.bool_]) -> None:
-        """Count what the env says of the episodes that have `ended`."""
+        """Count the verdicts in `info` on the episodes that have `ended`."""
         for name, verdicts in self._verdicts.items():
             given: Any = info.get(name)
-            # A tensor may lie on another device.
+            # A tensor may be on another device, where NumPy can't read it.
             array = np.asarray(given.tolist() if hasattr(given, "tolist") else given)
             if array.dtype.kind == "b" and array.shape == ended.shape:
                 verdicts.count[slot] += np.count_nonzero(ended)
                 verdicts.true[slot] += np.count_nonzero(array & ended)
 
     def summary(self) -> dict[str, Any]:
-        """See `EnvGroup.get_stats`."""
+        """The figures that `EnvGroup.get_stats` documents, over the window."""
         samples = self._window()
         if not samples:
             return {"steps_per_second": 0.0, "entries": {}, "batch_size": {}, "latency_us": {}}
@@ -205,7 +219,7 @@ class Stats:
         sizes = Counter[int]()
         for sample in samples:
             sizes[sample.batch] += len(sample.slots)
-        # The first batch opens the window: what it holds was made before.
+        # The first batch opens the window, so its steps were made before the window.
         counted = [sample for sample in samples if sample.batch != samples[0].batch]
         return {
             "steps_per_second": sum(int(s.steps().sum()) for s in counted) / seconds,
@@ -245,22 +259,16 @@ class Stats:
         if not stepped.any():
             return {}
         kinds = {"step": busy, "wait": done - busy - sent, "transfer": taken - done}
-        return {
-            kind: {
-                "p50": float(np.percentile(values[stepped], 50)) / 1e3,
-                "p99": float(np.percentile(values[stepped], 99)) / 1e3,
-            }
-            for kind, values in kinds.items()
-        }
+        return {kind: _percentiles(values[stepped] / 1e3) for kind, values in kinds.items()}
 
     def by_env(self) -> dict[str, dict[str, Any]]:
-        """See `EnvGroup.get_env_stats`."""
+        """The figures of each env that `EnvGroup.get_env_stats` documents."""
         return {
             env_id: self._summed([slot]) for slot, env_id in enumerate(self._envs.env_ids) if env_id
         }
 
     def by_entry(self) -> dict[str, dict[str, Any]]:
-        """The same for each config entry, over all of its envs."""
+        """The figures of each config entry, over all of its envs and former members."""
         names = self._envs.names
         found: dict[str, dict[str, Any]] = {}
         for entry, name in enumerate(names.entry_names):
@@ -269,8 +277,10 @@ class Stats:
         return found
 
     def _summed(self, slots: list[int]) -> dict[str, Any]:
-        numbers = self._requests.numbers([slot for slot in slots if slot < len(self._envs)])
-        episodes, total_return, total_length = self._sums[slots].sum(axis=0).tolist()
+        present = [slot for slot in slots if slot < len(self._envs)]
+        numbers = self._requests.numbering.numbers(present)
+        with np.errstate(over="ignore", invalid="ignore"):
+            episodes, total_return, total_length = self._sums[slots].sum(axis=0).tolist()
         found = {
             "requests": int(numbers.sum() - self._requests_before[slots].sum()),
             "episodes": int(episodes),
@@ -284,7 +294,18 @@ class Stats:
         return found | {f"{name}_rate": v.rate(slots) for name, v in self._verdicts.items()}
 
     def reset_envs(self) -> None:
-        """Start the sums over episodes anew."""
+        """Set the sums over episodes and requests to zero."""
         for sums in (*self._all_sums(), self._last, self._requests_before):
             sums[:] = 0
-        self._requests_before[: len(self._envs)] = self._requests.numbers()
+        self._requests_before[: len(self._envs)] = self._requests.numbering.numbers()
+
+
+def _percentiles(values: NDArray[np.float64]) -> dict[str, float]:
+    """Return the median and the 99th percentile of at least one value.
+
+    `numpy.percentile` gives the same, but imports a module at its first call. That fails in a
+    process that is out of descriptors, which must still be able to collect.
+    """
+    ranks = np.array([0.5, 0.99]) * (len(values) - 1)
+    p50, p99 = np.interp(ranks, np.arange(len(values)), np.sort(values)).tolist()
+    return {"p50": p50, "p99": p99}

@@ -1,9 +1,8 @@
-"""What was recorded as a file in Chrome's trace event format, which Perfetto opens.
+"""Convert a timeline to Chrome's trace event format, which Perfetto opens.
 
-One process of the format for the trainer and one for each host. A host's first track is its
-worker's, then comes one for each of its envs; the trainer has one for each task or thread that
-was at work. A flow leads from where a request was sent, through the env that executed it, to where
-its result was handed out.
+The file has one process for the trainer and one for each host. The first track of a host is for its
+worker, followed by one track per env. The trainer has a track for each task or thread. A flow
+connects the sending of a request, its execution in the env, and the return of its result.
 Rule: slices of a track nest.
 """
 
@@ -16,19 +15,19 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from rlightning_aio.protocol.entries import NUMBER_SHIFT, OP_BITS, OP_MASK, SLOT_MASK, Operation
+from rlightning_aio.protocol.entries import NUMBER_SHIFT, OP_MASK, Operation, slots_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
-    from rlightning_aio.group.trace_records import Mark, Results, Span
+    from rlightning_aio.group.trace_records import Mark, Span, TracedResults
 
 __all__ = ["SENDING", "HostTrack", "Timeline", "events"]
 
 SENDING: Final = frozenset({"step", "step_async", "reset", "reset_async", "restore"})
-"""Spans in which requests are sent whose results are handed out."""
+"""Names of spans that send requests with results."""
 _NAMES: Final = {
     int(Operation.STEP): "step",
     int(Operation.RESET): "reset",
@@ -39,11 +38,11 @@ _TRAINER: Final = 1
 
 @dataclass(frozen=True)
 class HostTrack:
-    """A host, as it is to be called.
+    """The names of a host and its tracks.
 
     Attributes:
-        own: of the track that is about no env in particular.
-        env_names: of its envs, the first of which has `first_slot`.
+        own: name of the track for events without an env.
+        env_names: of its envs, in the order of their slots from `first_slot`.
     """
 
     name: str
@@ -54,11 +53,11 @@ class HostTrack:
 
 @dataclass(frozen=True)
 class Timeline:
-    """All that is to be shown. Times in ns of the monotonic clock.
+    """The content of a trace file. Times in ns of the monotonic clock.
 
     Attributes:
-        began: when recording began; since: all that came after this is there.
-        lanes: names of the trainer's tracks.
+        began: the start of the recording; since: the start of the part that was kept completely.
+        lanes: names of the tracks of the trainer.
     """
 
     began: int
@@ -66,7 +65,7 @@ class Timeline:
     lanes: Sequence[str]
     hosts: Sequence[HostTrack]
     spans: Sequence[Span]
-    results: Results
+    results: TracedResults
     marks: Sequence[Mark]
 
 
@@ -78,7 +77,7 @@ class _Slice(NamedTuple):
 
 
 def events(timeline: Timeline) -> Iterator[str]:
-    """Each event of the trace, as JSON."""
+    """The events of the trace, each as JSON."""
     return _Events(timeline).all()
 
 
@@ -87,7 +86,7 @@ class _Events:
         self._timeline = timeline
         self._base = timeline.began
         count = max((host.first_slot + len(host.env_names) for host in timeline.hosts), default=0)
-        # By slot. Tracks are numbered through, whosever they are.
+        # By slot. Track numbers are unique over all processes of the file.
         self._host_of = np.zeros(count, np.int64)
         self._track_of = np.zeros(count, np.int64)
         self._host_tracks: list[int] = []
@@ -98,8 +97,8 @@ class _Events:
             self._host_of[slots] = host_id
             self._track_of[slots] = track + 1 + np.arange(len(slots))
             track += 1 + len(slots)
-        self._results = timeline.results.of(timeline.results.sent >= timeline.since)
-        self._slots = self._results.entries >> OP_BITS & SLOT_MASK
+        self._results = timeline.results.where(timeline.results.sent >= timeline.since)
+        self._slots = slots_of(self._results.entries)
 
     def all(self) -> Iterator[str]:
         yield from self._named()
@@ -107,11 +106,11 @@ class _Events:
         for lane, slices in sorted(spans.items()):
             yield from self._slices(_TRAINER, lane + 1, slices)
         yield from self._steps()
-        yield from self._of_hosts()
+        yield from self._host_slices()
         yield from self._marks()
         yield from self._flows(spans)
 
-    # -- who there is -----------------------------------------------------------------
+    # -- names ------------------------------------------------------------------------
 
     def _named(self) -> Iterator[str]:
         yield from _process(_TRAINER, "trainer")
@@ -122,13 +121,13 @@ class _Events:
             yield from _process(pid, host.name)
             yield from _thread(pid, track, host.own)
             for index, name in enumerate(host.env_names):
-                if name:  # A client's place may be free.
+                if name:  # A member's slot may be free.
                     yield from _thread(pid, track + 1 + index, name)
 
     # -- slices -----------------------------------------------------------------------
 
     def _spans(self) -> dict[int, list[_Slice]]:
-        """The trainer's slices by lane, in order."""
+        """The slices of the trainer by lane, in order."""
         since = self._timeline.since
         lanes: dict[int, list[_Slice]] = {}
         for span in self._timeline.spans:
@@ -147,8 +146,8 @@ class _Events:
             )
 
     def _times(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """When the env began with each request, and when it was done."""
-        # A client's time says how long it took, on a clock of its own.
+        """The times at which the env began and ended each request."""
+        # A member uses another clock, so only the duration of its steps is known.
         began = np.maximum(self._results.done - self._results.busy, self._results.sent)
         return began, np.maximum(self._results.done, began)
 
@@ -169,8 +168,8 @@ class _Events:
                 f'"dur":{dur},"args":{{"request":{number}}}}}'
             )
 
-    def _of_hosts(self) -> Iterator[str]:
-        """What workers waited for."""
+    def _host_slices(self) -> Iterator[str]:
+        """The slices of the hosts' own tracks: idle time, and marks without an env."""
         _, ended = self._times()
         hosts = self._host_of[self._slots]
         slices: dict[int, list[_Slice]] = {}
@@ -214,7 +213,7 @@ class _Events:
             )
 
     def _flows(self, spans: dict[int, list[_Slice]]) -> Iterator[str]:
-        """From each request to its result, where it was seen being sent."""
+        """The flows from requests to results; requests outside any known span have none."""
         sends = sorted(
             (span.began, span.ended, lane)
             for lane, slices in spans.items()
@@ -267,7 +266,7 @@ def _thread(pid: int, tid: int, name: str) -> Iterator[str]:
 
 
 def nested(slices: list[_Slice]) -> list[_Slice]:
-    """`slices` of one track in order, each cut where the one around it ends."""
+    """The slices of one track in order, each cut at the end of its enclosing slice."""
     found: list[_Slice] = []
     around: list[int] = []
     for one in sorted(slices, key=lambda each: (each.began, -each.ended)):
@@ -280,7 +279,7 @@ def nested(slices: list[_Slice]) -> list[_Slice]:
 
 
 def _gaps(sent: NDArray[np.int64], ended: NDArray[np.int64]) -> list[tuple[int, int]]:
-    """When nothing was outstanding, between the first request and the last."""
+    """The periods without requests in flight, between the first request and the last."""
     order = np.argsort(sent, kind="stable")
     begins = sent[order][1:]
     until = np.maximum.accumulate(ended[order])[:-1]

@@ -1,34 +1,34 @@
-"""`Records`: what a timeline is made of, in bounded memory.
+"""`Records`: the records of a timeline, in bounded memory.
 
-Numbers only: a result takes 48 bytes, and a span of the trainer some 170. Of a long run the newest
-are kept, `KEPT` of each kind.
+A result takes 48 bytes, and a span of the trainer about 170. The newest `KEPT` results and as many
+spans are kept.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["KEPT", "Mark", "Records", "Results", "Span"]
+__all__ = ["KEPT", "Mark", "Records", "Span", "TracedResults"]
 
 KEPT: Final = 1 << 18
-"""How many results are kept, and how many spans: the newest."""
+"""The number of results that are kept, and of spans."""
 _MARKS: Final = 10_000
 _BATCHES_APART: Final = 512
 _RESULTS_APART: Final = KEPT // 16
-"""So many are joined at a time: each batch alone would take more memory for its arrays' headers
-than for what is in them."""
+"""Batches are joined when they hold this many results, as array headers would take more memory than
+the content of small batches."""
 
 _Batch: TypeAlias = "tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], int, int]"
 
 
 class Span(NamedTuple):
-    """Something that the trainer did. Times in ns of the monotonic clock, here as everywhere."""
+    """A period of work in the trainer. All times in this module are ns of the monotonic clock."""
 
     name: str
     lane: int
@@ -37,12 +37,12 @@ class Span(NamedTuple):
 
 
 class Mark(NamedTuple):
-    """Something out of the ordinary that has happened.
+    """An unusual event.
 
     Attributes:
-        at: when, or until when; began: since when, 0 where it took no time.
-        host_id: where; slot: to which env, -1 if to none in particular.
-        text: what is to be said of it.
+        at: its time or end; began: its start, 0 for an event without a duration.
+        host_id: of its host; slot: of its env, or -1.
+        text: its cause.
     """
 
     name: str
@@ -53,13 +53,13 @@ class Mark(NamedTuple):
     text: str = ""
 
 
-class Results(NamedTuple):
-    """Results that were handed out, in that order.
+class TracedResults(NamedTuple):
+    """Columns over results, in the order of their return.
 
     Attributes:
-        entries: of their requests; sent: when these were sent.
-        done: when each was ready; busy: the time that the env took.
-        taken: when it was handed out; lanes: in which of the trainer's lanes.
+        entries: of their requests; sent: the times of sending.
+        done: the times at which they were ready; busy: the durations in the env.
+        taken: the times of their return; lanes: the lanes of the trainer that got them.
     """
 
     entries: NDArray[np.int64]
@@ -69,17 +69,17 @@ class Results(NamedTuple):
     taken: NDArray[np.int64]
     lanes: NDArray[np.int64]
 
-    def of(self, which: NDArray[Any]) -> Results:
-        """Some of them."""
-        return Results(*(column[which] for column in self))
+    def where(self, mask: NDArray[np.bool_]) -> TracedResults:
+        """The results that `mask` selects."""
+        return TracedResults(*(column[mask] for column in self))
 
 
 class Records:
-    """See the module.
+    """The newest spans, results and marks of a recording.
 
     Attributes:
-        add_span: keeps a span as a tuple: the number of its name, its lane, its two times.
-        marks: the newest.
+        add_span: adds a span, a tuple of the number of its name, its lane, its start and its end.
+        marks: the newest 10,000.
     """
 
     def __init__(self) -> None:
@@ -87,15 +87,15 @@ class Records:
         self._spans: deque[tuple[int, int, int, int]] = deque(maxlen=KEPT)
         self.add_span = self._spans.append
         self.marks: deque[Mark] = deque(maxlen=_MARKS)
-        # Batches as they came, and those before joined to fewer and longer arrays.
+        # The latest batches, and earlier ones joined into longer arrays.
         self._batches: list[_Batch] = []
-        self._results: deque[Results] = deque()
+        self._results: deque[TracedResults] = deque()
         self._num_apart = self._num_joined = 0
-        # When the last result that was dropped had been handed out.
+        # The time at which the last dropped result was returned.
         self._dropped_until = 0
 
     def name(self, name: str) -> int:
-        """The number that stands for a span's name."""
+        """The number of a span's name."""
         return self._names.setdefault(name, len(self._names))
 
     def add_results(
@@ -106,9 +106,14 @@ class Records:
         taken: int,
         lane: int,
     ) -> None:
-        """Keep results that were handed out together; the arrays are nobody else's to change.
+        """Add results that were returned together; the caller must not change the arrays later.
 
-        `times` are those of `ResultColumns`.
+        Args:
+            entries: of the requests.
+            sent: the times of sending.
+            times: of `ResultColumns`.
+            taken: the time of the return.
+            lane: of the trainer.
         """
         self._batches.append((entries, sent, times, taken, lane))
         self._num_apart += len(entries)
@@ -121,7 +126,7 @@ class Records:
         self._num_apart = 0
         counts = [len(part) for part in entries]
         done, busy = np.concatenate(times).T
-        found = Results(
+        found = TracedResults(
             np.concatenate(entries),
             np.concatenate(sent),
             done,
@@ -138,20 +143,20 @@ class Records:
 
     @property
     def complete_since(self) -> int:
-        """All that came after this is kept."""
+        """The time since which no record was dropped."""
         full = len(self._spans) == KEPT
         return max(self._dropped_until, self._spans[0][-1] if full else 0)
 
-    def results(self) -> Results:
-        """All results that are kept."""
+    def results(self) -> TracedResults:
+        """The kept results."""
         if self._batches:
             self._join()
         nothing = np.empty(0, np.int64)
         if not self._results:
-            return Results(*[nothing] * len(Results._fields))
-        return Results(*(np.concatenate(parts) for parts in zip(*self._results, strict=True)))
+            return TracedResults(*[nothing] * len(TracedResults._fields))
+        return TracedResults(*(np.concatenate(parts) for parts in zip(*self._results, strict=True)))
 
     def spans(self) -> list[Span]:
-        """All spans that are kept, in the order in which they ended."""
+        """The kept spans, in the order of their ends."""
         names = list(self._names)
         return [Span(names[name], *rest) for name, *rest in self._spans]

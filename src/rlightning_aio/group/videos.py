@@ -1,13 +1,12 @@
-"""Checks what filming needs, before anything is started."""
+"""Check the requirements of video recording before anything is started."""
 
 from __future__ import annotations
 
 import importlib.util
-import tempfile
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rlightning_aio.errors import ConfigError
+from rlightning_aio.files import check_folder
 from rlightning_aio.registry import placement_of
 
 if TYPE_CHECKING:
@@ -19,31 +18,36 @@ __all__ = ["check_videos", "filmed_alone"]
 
 
 def check_videos(configs: Iterable[EnvConfig]) -> None:
-    """Look for the encoder, and for a place for the files; where those are another machine's, or
-    the encoder another Python's, it is not known here.
+    """Check that the encoder is installed and the folder writable.
+
+    Entries on other machines are skipped, and so is the encoder of another interpreter.
 
     Raises:
-        ConfigError: one of them is missing; the message names entry and field.
+        ConfigError: the encoder is missing, the folder isn't writable, or the env can't render.
     """
     for config in configs:
-        if config.video is None or not placement_of(config.backend, config.placement).local:
+        if config.video is None:
             continue
         where = f"entry {config.name!r}, video"
+        if config.backend == "ale" and config.num_envs > 1:
+            raise ConfigError(
+                f"{where}: ale-py's vector env, which num_envs: {config.num_envs} makes, renders "
+                "nothing; film an entry with num_envs: 1"
+            )
+        if not placement_of(config.backend, config.placement).local:
+            continue
         if config.interpreter is None and importlib.util.find_spec("imageio_ffmpeg") is None:
             raise ConfigError(f"{where}: needs imageio-ffmpeg: pip install 'rlightning-aio[video]'")
-        folder = Path(config.video.folder)
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=folder):
-                pass
+            check_folder(config.video.folder)
         except OSError as error:
             raise ConfigError(
-                f"{where}.folder: nothing can be written to {folder}: {error.strerror}"
+                f"{where}.folder: nothing can be written to {error.filename}: {error.strerror}"
             ) from None
 
 
 def filmed_alone(config: EnvConfig) -> set[int]:
-    """Which envs of an entry have a worker of their own, as others would wait for their frames."""
+    """The filmed envs of an entry; each gets its own worker, as rendering would delay others."""
     if config.video is None or config.envs_per_process != "auto":
         return set()
     return set(config.video.envs)

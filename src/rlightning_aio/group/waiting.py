@@ -1,14 +1,14 @@
-"""`Waiting`: how the calls of a group wait, side by side, for what hosts report.
+"""`Waiting`: lets concurrent calls of a group wait for replies.
 
-Each call is a procedure that takes turns here until its replies are there. They are woken as
-early as the least patient of them asks for.
+Each call is a procedure that takes turns here until its replies are ready. The bell is armed for
+the call that waits for the fewest.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rlightning_aio.group.wait import TURN, Procedure, Wait, earliest
+from rlightning_aio.group.wait import TURN, Procedure, Wait
 
 if TYPE_CHECKING:
     from rlightning_aio.group.intake import Intake
@@ -21,7 +21,11 @@ __all__ = ["Waiting"]
 
 
 class Waiting:
-    """See the module; its arguments are the group's parts."""
+    """The waiting calls of a group.
+
+    Attributes:
+        wanted: the number of results that each call waits for.
+    """
 
     def __init__(
         self,
@@ -36,19 +40,18 @@ class Waiting:
         self._poller = poller
         self._intake = intake
         self._watcher = watcher
-        # How many results each call that waits wants.
-        self._wanted: list[int] = []
+        self.wanted: list[int] = []
 
     def poll(self) -> None:
-        """Take in what hosts have ready."""
+        """Read and apply the replies that are ready."""
         self._poller.poll()
         self._drain()
 
     def _drain(self) -> None:
-        """Have what hosts have told take effect.
+        """Apply queued completions.
 
-        Invariant: a call that waits looks again, and arms the bell anew, after every reply that
-        is taken in; here another call takes it.
+        Invariant: a waiting call checks its replies and arms the bell again after every reply that
+        is applied, also if another call applies it here.
         """
         self._intake.drain()
         if self._requests.answered:
@@ -56,60 +59,66 @@ class Waiting:
             self.wake()
 
     def wake(self) -> None:
-        """Have calls that wait look again: they have not asked these envs' workers to wake them,
-        or the goal of all of them has changed.
+        """Wake all waiting calls, to check their replies and arm the bell again.
+
+        Needed after requests that the armed bell doesn't count, and when the number to arm changes.
         """
-        if self._wanted:
+        if self.wanted:
             self._watcher.wake()
 
     def check_liveness(self, now: float) -> Procedure[float]:
-        """Look at all hosts now and then: a caller that always finds enough ready never has to
-        wait, and would never hear of the dead and the hung.
+        """Check all hosts from time to time; return the time.
+
+        A caller that always finds enough results ready never waits, so it would miss dead and hung
+        workers otherwise.
         """
-        if self._supervisor.is_overdue(now):
+        if now >= self._supervisor.look_by:
             now = yield Wait(0.0)
             self.check(now)
         return now
 
     def check(self, now: float) -> None:
-        """Look at all hosts."""
+        """Check all hosts for deaths and hangs, and apply the outcome."""
         self._intake.now = now
-        if self._supervisor.timed:
-            self.poll()  # What is done is not hung.
+        if self._supervisor.detector.timed:
+            self.poll()  # An env that has replied is not hung.
         self._supervisor.check(now)
         self._drain()
 
     def turn(self, wanted: int, until: float | None) -> Procedure[float]:
-        """One turn of waiting for `wanted` more replies; the time after it."""
-        self._wanted.append(wanted)
+        """Wait once for `wanted` more replies, and return the time after it; the caller loops."""
+        self.wanted.append(wanted)
         try:
-            # The other calls that wait must be woken as early as they asked for.
-            poller, first = self._poller, min(self._wanted)
+            # Other calls may wait for fewer results.
+            poller, first = self._poller, min(self.wanted)
             if poller.execute(wanted, until):
                 return (yield from self.check_liveness((yield Wait(0.0))))
             if poller.spin(first):
                 return (yield from self.check_liveness((yield TURN)))
             poller.arm(first)
-            until = earliest(until, self._supervisor.next_check())
-            if poller.came():
+            until = self._supervisor.next_check(until)
+            if poller.is_reached():
                 return (yield from self.check_liveness((yield TURN)))
             now = yield Wait(until)
             poller.slept()
         finally:
-            self._wanted.remove(wanted)
+            self.wanted.remove(wanted)
         self.check(now)
         return now
 
     def end(self) -> None:
-        """A call waits no more."""
-        if not self._wanted:
+        """Disarm the bell if no call waits now."""
+        if not self.wanted:
             self._poller.disarm()
 
     def until_replied(self, ticket: Ticket) -> Procedure[None]:
-        """Until all replies of `ticket` are there. Given up, they go to `collect_async`."""
+        """Wait for all replies of `ticket`.
+
+        After an error or cancellation, `collect_async` gets them.
+        """
         try:
-            if self._supervisor.has_members:
-                self.poll()  # What clients have sent already may wake nobody any more.
+            if self._supervisor.members.possible:
+                self.poll()  # Replies of members that were read before cause no wake-up.
             while ticket.remaining > 0:
                 yield from self.turn(ticket.remaining, None)
                 self.poll()

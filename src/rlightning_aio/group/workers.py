@@ -1,19 +1,27 @@
-"""What the hosts of a group are doing now, for whoever watches it."""
+"""`Workers`: describes the current state of a group's hosts, for monitoring."""
 
 from __future__ import annotations
 
+import logging
+from collections import Counter
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from rlightning_aio.group.hint import hint
 from rlightning_aio.group.host_record import Stage
+from rlightning_aio.registry import placement_of
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
     from rlightning_aio.group.env_table import EnvTable
     from rlightning_aio.group.host_record import HostRecord
     from rlightning_aio.group.requests import Requests
 
-__all__ = ["describe"]
+__all__ = ["Workers"]
+
+_log = logging.getLogger("rlightning_aio")
 
 _STATES: Final = {
     Stage.NEW: "new",
@@ -24,17 +32,74 @@ _STATES: Final = {
 }
 
 
-def describe(record: HostRecord, envs: EnvTable, requests: Requests, now_ns: int) -> dict[str, Any]:
-    """See `EnvGroup.get_workers`. `now_ns` is of the monotonic clock."""
-    slots = np.array(record.slots, np.intp)
-    owed = requests.owed(slots)
-    owed = owed[np.argsort(requests.sent_ns[owed], kind="stable")]
-    return {
-        "entry": record.config.name,
-        "env_ids": [env_id for slot in slots if (env_id := envs.env_ids[slot])],
-        "pid": getattr(record.host, "pid", None),
-        "state": _STATES.get(record.stage, "starting"),
-        "owed": [envs.env_ids[slot] for slot in owed],
-        "owed_seconds": (now_ns - int(requests.sent_ns[owed[0]])) / 1e9 if len(owed) else 0.0,
-        "restarts": record.restarts,
-    }
+class Workers:
+    """See the module.
+
+    Args:
+        records: of the group's hosts; the list grows until the group starts.
+        envs, requests: of the group.
+    """
+
+    def __init__(self, records: Sequence[HostRecord], envs: EnvTable, requests: Requests) -> None:
+        self._records = records
+        self._envs = envs
+        self._requests = requests
+
+    def describe(self, now_ns: int) -> list[dict[str, Any]]:
+        """Describe each host and its outstanding requests, as `EnvGroup.get_workers`.
+
+        `now_ns` is from the monotonic clock.
+        """
+        return [self._described(record, now_ns) for record in self._records]
+
+    def _described(self, record: HostRecord, now_ns: int) -> dict[str, Any]:
+        env_ids, requests = self._envs.env_ids, self._requests
+        slots = np.array(record.slots, np.intp)
+        busy = requests.owed(slots)
+        busy = busy[np.argsort(requests.sent_ns[busy], kind="stable")]
+        return {
+            "entry": record.config.name,
+            "env_ids": [env_id for slot in slots if (env_id := env_ids[slot])],
+            "pid": getattr(record.host, "pid", None),
+            "state": _STATES.get(record.stage, "starting"),
+            "owed": [env_ids[slot] for slot in busy],
+            "owed_seconds": (now_ns - int(requests.sent_ns[busy[0]])) / 1e9 if len(busy) else 0.0,
+            "restarts": record.restarts,
+        }
+
+    def summary(self) -> str:
+        """Summarise entries, envs, placement and worker processes in one line."""
+        entries: dict[str, list[HostRecord]] = {}
+        for record in self._records:
+            entries.setdefault(record.config.name, []).append(record)
+        return "; ".join(f"{name}: {_entry(own)}" for name, own in entries.items())
+
+    def give_hint(self, num_cores: int, latency_us: Mapping[str, Mapping[str, Any]]) -> None:
+        """Log at INFO if the measured times suggest other settings.
+
+        Args:
+            num_cores: cores that this process and its workers may use.
+            latency_us: from `EnvGroup.get_stats`.
+        """
+        workers = Counter(
+            record.config.name
+            for record in self._records
+            if record.killable is not None and record.is_local
+        )
+        configs = [record.config for record in self._records]
+        text = hint(configs, workers, num_cores, latency_us)
+        if text is not None:
+            _log.info("%s; `rlightning-aio tune` measures what is best", text)
+
+
+def _entry(records: Sequence[HostRecord]) -> str:
+    config = records[0].config
+    if placement_of(config.backend, config.placement).max_members:
+        return config.backend
+    sizes = f" of {config.num_envs} sub-environments" if config.num_envs > 1 else ""
+    envs = sum(record.host.num_envs for record in records)
+    workers = sum(record.killable is not None for record in records)
+    return (
+        f"{envs} env{'' if envs == 1 else 's'}{sizes}, placement {config.placement}, "
+        f"{workers} worker process{'' if workers == 1 else 'es'}"
+    )

@@ -1,8 +1,8 @@
 """`EnvActor`: the envs of one host, in a process that shares no memory with the trainer.
 
-It runs as a Ray actor, but knows nothing of Ray: its methods are called one after the other,
-and what they take and return are arrays, bytes and text. What a user's class is part of travels
-as bytes, which only the methods here and `hosts.ray` read, where whatever that raises is told.
+It runs as a Ray actor, but doesn't depend on Ray: its methods are called one after the other, with
+arrays, bytes and text. Objects that may have a user's class travel as pickles. Only the methods
+here and in `ray_host` unpickle them, and report errors.
 Rule: one call executes the requests of a batch in turn, and answers each of them.
 """
 
@@ -46,9 +46,9 @@ class Batch(NamedTuple):
     """Requests to envs of one actor.
 
     Attributes:
-        entries: in the order in which they are executed.
-        columns: what lies in the rows for them, see `RowTable.requests`.
-        arguments: packed, one for each; None where they lie in the rows.
+        entries: in the order of execution.
+        columns: their inputs, see `RowTable.requests`.
+        arguments: packed, one for each; None if they are in the columns.
     """
 
     entries: NDArray[np.int64]
@@ -57,20 +57,20 @@ class Batch(NamedTuple):
 
 
 class Reply(NamedTuple):
-    """What has become of a batch; each of its entries is in one of the first four.
+    """The outcome of a batch; each entry is in one of the first four.
 
     Attributes:
-        done: those whose result lies in the columns and nowhere else.
-        beside: the others that have a result, with what of it is out of band (a pickle).
+        done: entries whose whole result is in the columns.
+        partial: entries whose result is partly out of band, with that part (a pickle).
         values: of calls, pickled.
-        errors: what requests have raised.
-        columns: results of `done`, then of `beside`; see `RowTable.results`.
-        schemas: in which infos lie, where they are new, with their numbers.
-        saved: standings, as of `messages.Saved` but for the host.
+        errors: raised by requests.
+        columns: results of `done`, then of `partial`; see `RowTable.results`.
+        schemas: new schemas of infos, with their numbers.
+        saved: checkpoints, as in `messages.Saved`, without the host.
     """
 
     done: NDArray[np.int64]
-    beside: list[tuple[int, bytes]]
+    partial: list[tuple[int, bytes]]
     values: list[tuple[int, bytes]]
     errors: list[tuple[int, ErrorText]]
     columns: Columns
@@ -78,21 +78,21 @@ class Reply(NamedTuple):
     saved: list[tuple[int, bytes, bool]]
 
     def with_rows(self) -> NDArray[np.int64]:
-        """Entries of the results that `columns` hold, in their order."""
-        if not self.beside:
+        """Return the entries of the results in `columns`, in order."""
+        if not self.partial:
             return self.done
-        return np.array([*self.done.tolist(), *(entry for entry, _ in self.beside)], np.int64)
+        return np.array([*self.done.tolist(), *(entry for entry, _ in self.partial)], np.int64)
 
 
 class NotStarted(NamedTuple):
-    """The env of that index could not be built."""
+    """The env of index `env_index` could not be built."""
 
     env_index: int
     error: ErrorText
 
 
 class Late(NamedTuple):
-    """A request takes longer than it may.
+    """A request exceeds its time limit.
 
     Attributes:
         entry: of the request.
@@ -106,12 +106,12 @@ class Late(NamedTuple):
 
 
 class EnvActor:
-    """See the module.
+    """Builds envs and executes batches of requests.
 
     Args:
         first_slot: slot of its first env in the group.
-        limits: how many seconds an operation may take.
-        path: where the trainer finds modules; what of it this process lacks is looked at last.
+        limits: in seconds, by operation.
+        path: `sys.path` of the trainer; folders that are missing here are appended.
     """
 
     def __init__(self, first_slot: int, limits: Mapping[int, float], path: Sequence[str]) -> None:
@@ -123,20 +123,20 @@ class EnvActor:
         self._schemas = InfoSchemas(self._announce)
         self._saved: list[tuple[int, bytes, bool]] = []
         self._info_width = 0
-        # Entry and beginning (monotonic ns) of what is being executed; read by another thread.
+        # The current entry and its start (monotonic ns); another thread reads them.
         self._executing = (0, 0)
 
     def _announce(self, number: int, schema: InfoSchema) -> None:
         self._new_schemas.append((number, schema))
 
-    def _keep(self, index: int, standing: bytes, before: bool) -> None:
-        self._saved.append((index, standing, before))
+    def _save(self, index: int, checkpoint: bytes, before: bool) -> None:
+        self._saved.append((index, checkpoint, before))
 
     def hello(self) -> None:
-        """Returns: so there is a place for it."""
+        """Return, which shows that a node has started this actor."""
 
     def build(self, order: bytes) -> bytes | NotStarted:
-        """Build the envs, and give each a row here.
+        """Build the envs, and give each a row in this process.
 
         Args:
             order: a `StartOrder`, pickled.
@@ -162,22 +162,20 @@ class EnvActor:
 
     def _attach(self) -> None:
         places = list(_placed_here(self._runners))
-        for runner, (slab, row) in zip(self._runners, places, strict=True):
-            runner.attach(slab, row, self._schemas.announce)
-        for index, runner in enumerate(self._runners):
-            runner.keep_with(partial(self._keep, index))
+        for index, (runner, (slab, row)) in enumerate(zip(self._runners, places, strict=True)):
+            runner.attach(slab, row, self._schemas.announce, partial(self._save, index))
         self._table = RowTable(self._first_slot, places)
 
-    def resume(self, standings: Sequence[bytes | None]) -> NotStarted | None:
-        """Have the envs of a replacement stand where they were kept."""
+    def resume(self, checkpoints: Sequence[bytes | None]) -> NotStarted | None:
+        """Restore the envs of a replacement."""
         try:
-            resume_all(self._runners, standings)
+            resume_all(self._runners, checkpoints)
         except BaseException as error:
             return NotStarted(0, ErrorText.of(error))
         return None
 
     def execute(self, batch: Batch) -> Reply:
-        """Execute requests, one after the other."""
+        """Execute requests one after the other."""
         entries, columns, arguments = batch
         self._table.put_requests(entries, columns, seeds=arguments is None)
         done: list[int] = []
@@ -192,7 +190,7 @@ class EnvActor:
                 elif outcome is None:
                     done.append(entry)
                 else:
-                    reply.beside.append((entry, dumped(outcome, "the result")))
+                    reply.partial.append((entry, dumped(outcome, "the result")))
             except BaseException as error:
                 reply.errors.append((entry, ErrorText.of(error)))
         self._executing = 0, 0
@@ -212,14 +210,14 @@ class EnvActor:
         return reply._replace(columns=columns, schemas=schemas, saved=saved)
 
     def watch(self) -> Late:
-        """Return when a request takes longer than it may; runs in a thread of its own."""
+        """Return when a request exceeds its time limit; runs in its own thread."""
         shortest = min(self._limits.values())
         while True:
             entry, since_ns = self._executing
             limit = self._limits.get(op_of(entry))
             taken_ns = time.monotonic_ns() - since_ns
             if limit is None:
-                # What begins from now on may take as long at least.
+                # A request that begins now has at least this long.
                 time.sleep(shortest)
             elif taken_ns < limit * 1e9:
                 time.sleep(limit - taken_ns / 1e9)
@@ -227,12 +225,12 @@ class EnvActor:
                 return Late(entry, taken_ns, _stacks())
 
     def close(self) -> list[tuple[int, ErrorText]]:
-        """Close the envs; what that raised, by index."""
+        """Close the envs; return what that raised, with their indices."""
         return close_all(self._runners)
 
 
 def _placed_here(runners: Sequence[EnvRunner]) -> Iterator[tuple[Slab, int]]:
-    """A row for each env, in memory of this process; those of one layout share a slab."""
+    """Yield a row for each env, in memory of this process; equal layouts share a slab."""
     counts: dict[tuple[object, ...], int] = {}
     for runner in runners:
         counts[runner.layout.key] = counts.get(runner.layout.key, 0) + 1
@@ -248,7 +246,7 @@ def _placed_here(runners: Sequence[EnvRunner]) -> Iterator[tuple[Slab, int]]:
 
 
 def _stacks() -> str:
-    """What every thread of this process is doing."""
+    """Return the stacks of all threads."""
     with tempfile.TemporaryFile() as file:
         faulthandler.dump_traceback(file, all_threads=True)
         file.seek(0)

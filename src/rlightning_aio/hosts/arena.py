@@ -1,8 +1,8 @@
 """The arena: all shared memory of one group, in one file without a name.
 
-The trainer makes it and hands its descriptor to each worker; parts are appended at
-page boundaries, so that each side maps just what it needs. Nothing has to be cleaned
-up: the memory goes with the last process that maps it.
+The trainer creates it and passes its descriptor to each worker. Parts begin at page boundaries, so
+that each side maps only what it needs. The system frees the memory with the last process that maps
+it, so nothing has to be cleaned up.
 """
 
 from __future__ import annotations
@@ -20,15 +20,12 @@ _MAP_FIXED: Final = 0x10
 
 
 def map_shared(descriptor: int, offset: int, size: int) -> memoryview:
-    """Map a part of an arena, readable and writable; unmapped when nothing refers to it."""
+    """Map a part of an arena, readable and writable, until nothing refers to it."""
     return memoryview(mmap.mmap(descriptor, size, offset=offset))
 
 
 def make_private(memory: memoryview) -> None:
-    """Have nobody else see what this process writes into a part of an arena from now on.
-
-    It stays where it is, and holds what it held.
-    """
+    """Make a part of an arena private to this process, with the same address and contents."""
     held = bytes(memory)
     address = ctypes.addressof(ctypes.c_char.from_buffer(memory))
     libc = ctypes.CDLL(None, use_errno=True)
@@ -52,19 +49,19 @@ class Arena:
     """The trainer's end: owns the descriptor and appends parts."""
 
     def __init__(self) -> None:
-        occupy_standard_streams()  # It is a group's first descriptor.
+        occupy_standard_streams()  # The arena is the first descriptor of a group.
         self.descriptor = os.memfd_create("rlightning_aio", os.MFD_CLOEXEC)
         self._size = 0
 
     def append(self, size: int) -> int:
-        """Reserve `size` zeroed bytes; their offset."""
+        """Reserve `size` zeroed bytes and return their offset."""
         offset = self._size
         self._size += -(-max(size, 1) // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY
         os.ftruncate(self.descriptor, self._size)
         return offset
 
     def close(self) -> None:
-        """Give the descriptor back; what is mapped stays mapped."""
+        """Close the descriptor; mapped parts stay mapped."""
         if self.descriptor >= 0:
             os.close(self.descriptor)
             self.descriptor = -1

@@ -1,11 +1,11 @@
-"""The seam between a group's core and the places where envs live.
+"""The seam between the core of a group and the places that run envs.
 
-A `Host` starts, is asked, and ends; what becomes of that it appends to its group's queue
-of completions (see `messages`). Beyond that a host does only what it can: one with a
-descriptor is a `Source`, one whose results may lie there unnoticed is `Polled`, one that
-executes in the caller's thread is `Executing`, and one whose envs come and go has
-`Membership`. The core asks what a host can do, never what it is.
-Absent on purpose: waiting. Neither side ever does.
+A `Host` starts, accepts requests, and ends. It reports everything by completions, which it appends
+to the queue of its group (see `messages`). The other protocols are optional: a host with a
+descriptor is a `Source`, a host whose results don't wake the driver is `Polled`, a host that
+executes in the thread of the caller is `Executing`, and a host whose envs join and leave has
+`Membership`. The core checks for these protocols, never for a class of hosts.
+Left out on purpose: waiting. Neither side ever waits.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.hosts.arena import Arena
     from rlightning_aio.hosts.messages import AttachOrder, Completions, StartOrder
-    from rlightning_aio.protocol.bell import TrainerBell
+    from rlightning_aio.protocol.exchange import Ring, TrainerBell
     from rlightning_aio.types import EnvMeta
 
 __all__ = [
@@ -32,6 +32,7 @@ __all__ = [
     "Killable",
     "Membership",
     "Polled",
+    "SharesThread",
     "Source",
     "Watcher",
     "Wiring",
@@ -39,26 +40,26 @@ __all__ = [
 
 
 class Source(Protocol):
-    """Something with a descriptor, which stays the same while it is watched."""
+    """An object with a descriptor, which stays the same while it is watched."""
 
     def fileno(self) -> int:
         """The descriptor to watch; level-triggered."""
         ...
 
     def on_readable(self) -> None:
-        """Read what there is, without blocking; append what it means to the completions."""
+        """Read without blocking, and append completions."""
         ...
 
     def on_writable(self) -> None:
-        """Write what could not be written before, without blocking."""
+        """Write pending data without blocking."""
         ...
 
 
 class Watcher(Protocol):
-    """What a driver does for sources."""
+    """The part of a driver that watches sources."""
 
     def watch(self, source: Source) -> None:
-        """Call `source.on_readable` whenever its descriptor is readable, from now on."""
+        """Call `source.on_readable` whenever its descriptor is readable."""
         ...
 
     def unwatch(self, source: Source) -> None:
@@ -70,17 +71,17 @@ class Watcher(Protocol):
         ...
 
     def wake(self) -> None:
-        """Have every operation that waits look again, as if a source had told something."""
+        """Wake all waiters, as if a source had posted a completion."""
         ...
 
 
 class Host(Protocol):
-    """Envs that live in one place, numbered by index from 0.
+    """Envs in one place, with indices from 0.
 
     Attributes:
-        host_id: position among the group's hosts.
-        first_slot: the group's slot of index 0; the other envs follow.
-        num_envs: envs here, or places for them.
+        host_id: its index among the hosts of the group.
+        first_slot: slot of the env of index 0; the other envs follow.
+        num_envs: the most envs it can have.
     """
 
     host_id: int
@@ -93,35 +94,34 @@ class Host(Protocol):
         Called again after `Died`, for a replacement.
 
         Raises:
-            OSError: no place for them can be made.
+            OSError: the system refuses to start one.
         """
         ...
 
     def attach(self, order: AttachOrder) -> None:
         """Give the envs their rows; `Attached` follows.
 
-        For a replacement it comes before the envs are built, with the rows of the first time.
+        A replacement gets this order before its envs are built, with the same rows as before.
         """
         ...
 
     def packed(self, arguments: Any) -> Any:
-        """`arguments` as `submit` sends them; nobody's later change reaches them.
+        """Return `arguments` in the form that `submit` sends; later changes don't affect it.
 
         Args:
-            arguments: what goes out of band: (action, extras), (seed, options) or (name, args,
-                kwargs).
+            arguments: out of band: (action, extras), (seed, options) or (name, args, kwargs).
 
-        Raises what makes it impossible to send them: so it is called before anything is sent.
+        Raises if they can't be sent. So callers pack all arguments before they send a request.
         """
         ...
 
     def submit(self, entries: NDArray[np.int64], arguments: Sequence[Any] | None = None) -> None:
-        """Send requests, which their entries name (see `protocol.entries`).
+        """Send requests.
 
         Args:
-            entries: env, number and operation of each.
+            entries: env, number and operation of each request (see `protocol.entries`).
             arguments: packed, one for each: (action, extras) of a step, (seed, options) of a
-                reset, (name, args, kwargs) of a call. None: they lie in the rows.
+                reset, (name, args, kwargs) of a call. None: they are in the rows.
 
         One completion follows for each: `Reported`, `Result`, `Value`, `Raised`, `Failed` or
         `Withdrawn`, with the same entry; or the host's `Died` for all.
@@ -129,88 +129,96 @@ class Host(Protocol):
         ...
 
     def close(self) -> None:
-        """Ask the envs to close, after what they still execute; `Closed` follows."""
+        """Close the envs after their current requests; `Closed` follows."""
         ...
 
     def release(self) -> None:
-        """Give descriptors and memory back, at once; nothing follows. Idempotent."""
+        """Release descriptors and memory immediately; no completion follows. Idempotent."""
         ...
 
 
 @runtime_checkable
 class Killable(Protocol):
-    """A host that can hang, and be ended by force."""
+    """A host that can hang, and that can be killed."""
 
     def executing(self) -> tuple[int, int]:
-        """Entry being executed and since when (monotonic ns); entry 0 if none.
+        """Return the entry being executed and its start (monotonic ns); entry 0 if none.
 
-        The time is 0 while it waits for the trainer to read what has come of the entry so far.
+        The start is 0 while the worker waits for the trainer to read a reply.
         """
         ...
 
     @property
     def traffic(self) -> int:
-        """Changes whenever a part of a reply has been read, or more of a request been written."""
+        """A number that changes whenever a part of a reply is read, or of a request is written."""
         ...
 
     def catch_up(self) -> bool:
-        """Take in what it has told, and write what it is to be told, without blocking; whether
-        there was anything.
+        """Read pending replies and write pending requests, without blocking.
 
-        Called before it is ended by force: the trainer may be the one that is late.
+        Returns True if anything moved. Called before a host is killed, because the trainer may be
+        the one that is late.
         """
         ...
 
     def kill(self, *, dump: bool) -> None:
-        """End it; `Died` follows. With `dump`, have it write its stacks first."""
+        """Kill it; `Died` follows. With `dump`, it writes its stacks first."""
         ...
 
     def destroy(self) -> None:
-        """End it together with what it stands on, when `kill` has not ended it; `Died` follows,
-        also of other hosts that stand on the same.
+        """Kill it and the process that it depends on, if `kill` had no effect.
+
+        `Died` follows, also for other hosts that depend on that process.
         """
         ...
 
 
 @runtime_checkable
 class Polled(Protocol):
-    """A host some of whose results wake nobody."""
+    """A host with results that don't wake the driver."""
 
     def poll(self) -> None:
-        """Append what lies there to the completions, without blocking."""
+        """Append completions of finished requests, without blocking."""
         ...
 
 
 @runtime_checkable
+class SharesThread(Protocol):
+    """A host whose envs make progress only while the driver waits in its event loop."""
+
+    shares_thread: bool
+
+
+@runtime_checkable
 class Executing(Protocol):
-    """A host that executes requests where it is asked to."""
+    """A host that executes requests in the thread of the caller."""
 
     def execute_next(self) -> bool:
-        """Execute one waiting request here and now; False if none waits.
+        """Execute one waiting request; return False if there is none.
 
-        What has come of it is among the completions after `poll`.
+        Its completion is in the queue after `poll`.
         """
         ...
 
     def poll(self) -> None:
-        """See `Polled.poll`."""
+        """Append completions, as of `Polled`."""
         ...
 
 
 @runtime_checkable
 class Membership(Protocol):
-    """A host whose envs come and go, and answer when they can (an env_server).
+    """A host whose envs join and leave (an env_server).
 
-    Its results come unasked, too (`Joined`), and wake the driver by themselves.
+    It also posts results that answer no request (`Joined`), and its results wake the driver.
 
     Attributes:
-        server_id: what a batch calls its envs.
+        server_id: the name of its envs in a batch.
     """
 
     server_id: str
 
     def address(self) -> str:
-        """Where its envs connect to, as ``tcp://host:port``.
+        """Return the address that clients connect to, as ``tcp://host:port``.
 
         Raises:
             RuntimeError: it does not listen yet.
@@ -218,27 +226,27 @@ class Membership(Protocol):
         ...
 
     def members(self) -> Mapping[str, EnvMeta]:
-        """The envs that are here, by the name of their client."""
+        """Return the envs that have joined, by the name of their client."""
         ...
 
     def member_indices(self) -> list[int]:
-        """Indices of the envs that are here, in the order of their names."""
+        """Return the indices of the envs that have joined, in the order of their names."""
         ...
 
     def num_sub_envs(self, index: int) -> int:
-        """Sub-environments of an env that is here."""
+        """Return the number of sub-environments of an env that has joined."""
         ...
 
     def check_step(self, index: int, action: Any, extras: dict[str, Any]) -> None:
-        """Raises `BadAction` if an env can't be sent these; `NO_ACTION` means the row's."""
+        """Raise `BadAction` if an env can't get these; `NO_ACTION` means the action in the row."""
         ...
 
     def check_reset(self, index: int, seed: int | None, options: dict[str, Any]) -> None:
-        """Raises ValueError if an env can't be sent these."""
+        """Raise ValueError if an env can't get these."""
         ...
 
     def missing(self, waited: float) -> float | None:
-        """How long a reset may wait in all for envs that are missing; None if none are.
+        """Return the seconds that a reset may wait for missing envs; None if none is missing.
 
         Args:
             waited: seconds that it has waited already.
@@ -249,36 +257,39 @@ class Membership(Protocol):
         ...
 
     def poll(self) -> None:
-        """See `Polled.poll`."""
+        """Append completions, as of `Polled`."""
         ...
 
     def is_readable(self) -> bool:
-        """Whether anything has come that `tick` would take in."""
+        """Return True if `tick` would read anything."""
         ...
 
     def deadline(self) -> float | None:
-        """When `tick` is due at the latest (monotonic seconds); None if it need not come."""
+        """Return the latest time for the next `tick` (monotonic seconds); None if there is none."""
         ...
 
     def tick(self, now: float) -> None:
-        """Take in what has come; find those that are gone. `now` is monotonic seconds."""
+        """Read what clients sent, and find clients that are gone. `now` is monotonic seconds."""
         ...
 
 
 @dataclass(frozen=True)
 class Wiring:
-    """What a group gives its hosts.
+    """The parts of a group that its hosts use.
 
     Attributes:
-        completions: where a host says what has become of requests.
+        completions: the queue.
         watcher: the driver.
-        arena: shared memory; bell: how workers wake the trainer, and where it lies there.
+        arena: the shared memory.
+        bell, bell_offset: workers wake the trainer by it; its offset in the arena.
+        rings: by host, those of live workers.
         num_hosts: of the group.
         configs: all entries.
-        objection: why an env that comes by itself may not join, if there is a reason.
-        is_idle: whether nothing was asked of a slot and nothing of it waits to be collected.
-        resources: what hosts of one kind share, made by the first of them; ended with
+        objection: returns the reason why an env that joins by itself is refused, or None.
+        is_idle: True if a slot has no request and no result to collect.
+        resources: shared by hosts of one kind, and made by the first of them; released by
             `release(seconds)` after the hosts.
+        shares_thread: other tasks run in the trainer's thread while a procedure waits.
     """
 
     completions: Completions
@@ -286,27 +297,29 @@ class Wiring:
     arena: Arena
     bell: TrainerBell
     bell_offset: int
+    rings: list[Ring | None]
     num_hosts: int
     configs: Sequence[EnvConfig]
     objection: Callable[[EnvMeta], str | None]
     is_idle: Callable[[int], bool]
     resources: dict[object, Shared]
+    shares_thread: bool = False
 
 
 class Shared(Protocol):
-    """What several hosts use, and none of them ends."""
+    """A resource that several hosts share."""
 
     def release(self, seconds: float) -> None:
-        """Let go of it; what it still does may take `seconds`, and is then ended by force."""
+        """End it; kill what is still running after `seconds`."""
         ...
 
     def disown(self) -> None:
-        """Let go of this process's share: it was forked, and the other one goes on using it."""
+        """Drop it in a forked process; the parent continues to use it."""
         ...
 
 
 class HostFactory(Protocol):
-    """How a host is made: its class, for all that the group knows."""
+    """Makes a host, as its class does."""
 
     def __call__(
         self, host_id: int, first_slot: int, order: StartOrder, wiring: Wiring

@@ -1,4 +1,4 @@
-"""Copies values that stay in one process, as if they had travelled."""
+"""Copies values that stay in one process."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ __all__ = ["copied"]
 
 
 def copied(value: Any) -> Any:
-    """`value` with its containers and arrays copied: its maker may change them later.
+    """Copy the containers and arrays of `value`, because their owner may change them later.
 
-    Everything else is left as it is; a tensor must stay the tensor it is.
+    Other objects are not copied; a tensor must stay the same tensor.
     """
     if isinstance(value, np.ndarray):
         return cast("NDArray[Any]", value).copy()

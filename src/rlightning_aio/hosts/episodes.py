@@ -1,9 +1,9 @@
-"""`EpisodeSums`: return and length of the episodes that are under way in one env.
+"""`EpisodeSums`: return and length of the current episodes of one env.
 
-Rule: there is one sum for each agent and sub-environment, over the steps between a reset and an
-end. The sums are kept in the row that carries them to the trainer, where a step limit, which ends
-an episode elsewhere, finds them. A step in which a sub-environment resets itself belongs to no
-episode, and neither does what comes between an end and the next reset.
+There is one sum for each agent and sub-environment, over the steps between a reset and an end. The
+sums are in the row, because the trainer ends episodes at a step limit and needs them. A step in
+which a sub-environment resets itself belongs to no episode, and neither do steps between an end
+and the next reset.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ Which = EllipsisType | NDArray[np.integer[Any]]
 
 
 class EpisodeSums:
-    """See the module.
+    """Adds up rewards and steps in place.
 
     Args:
-        returns: float64, lengths: int64, over: bool; of one shape: agents, then
-            sub-environments, where there are any. They are written in place.
-        autoreset: what sub-environments do after an end; see `EnvMeta`.
+        returns: float64, lengths: int64, over: bool; all of shape `[*agents, *sub_envs]`.
+        autoreset: when sub-environments reset themselves; see `EnvMeta`.
 
     Attributes:
-        returns, lengths: of each episode, the last step included; length 0 where that belongs
-            to no episode.
-        over: whether each has ended and was not reset since.
+        returns, lengths: of each episode, including the last step. If that step belongs to no
+            episode, the length is 0, and the return is that of the previous episode, or 0 if the
+            step was a reset.
+        over: True for each that ended and was not reset since.
     """
 
     def __init__(
@@ -48,15 +48,15 @@ class EpisodeSums:
         self._any_over = False
 
     def begin(self, begun: Which = ...) -> None:
-        """All episodes begin anew; those that `begun` leaves out, when next heard of."""
+        """Begin new episodes; those that `begun` leaves out begin with their next result."""
         self.returns[...] = 0.0
         self.lengths[...] = 0
         self.over[...] = True
         self.over[begun] = False
         self._any_over = bool(self.over.any())
 
-    def look(self) -> None:
-        """Take note of what others have written to the row."""
+    def row_changed(self) -> None:
+        """Read what others wrote into the row."""
         self._any_over = bool(self.over.any())
 
     def step(
@@ -67,10 +67,10 @@ class EpisodeSums:
         Args:
             reward: of each.
             ended: whether each was terminated or truncated in it; None if none was.
-            which: unlike one another.
+            which: distinct indices.
 
         Returns:
-            Which of them have reset themselves in this step; None if none has.
+            A mask of those that reset themselves in this step; None if none did.
         """
         if ended is None and not self._any_over:
             if which is ...:
@@ -86,17 +86,20 @@ class EpisodeSums:
         self, reward: NDArray[np.float64], ended: NDArray[np.bool_] | None, which: Which
     ) -> NDArray[np.bool_] | None:
         over = self.over[which].copy()
-        # A few of many, as a rule, or none.
         chosen = over if which is ... else which[over]
         same_step, next_step = self._autoreset == "same_step", self._autoreset == "next_step"
         some = self._any_over and np.count_nonzero(over) > 0
         if same_step and some:
-            # What is over has begun anew already.
+            # These already began their next episode.
             self.returns[chosen] = self.lengths[chosen] = 0
-        self.returns[which] += reward
+        # An agent that waits for others keeps its return, so that they can be added up.
+        waits = some and self._autoreset == "disabled"
+        self.returns[which] += np.where(over, 0.0, reward) if waits else reward
         self.lengths[which] += 1
         if some and not same_step:
-            self.returns[chosen] = self.lengths[chosen] = 0
+            self.lengths[chosen] = 0
+        if some and next_step:
+            self.returns[chosen] = 0.0
         if ended is None:
             now = np.zeros_like(over) if same_step or next_step else over
         elif same_step:

@@ -1,9 +1,9 @@
-"""What a trainer and a fork server tell each other, and the socket that carries it.
+"""Messages between a trainer and a fork server, and the socket that carries them.
 
-Rule: neither end waits for the other one to read; messages that find no room wait in here. A fork
-server imports this before it knows whether its interpreter has what workers need, so it
-imports nothing but Python's own modules.
-Absent on purpose: what the messages mean; that is `fork_server`'s and `process`'s.
+Rule: neither end waits for the other to read; messages wait here until the socket has room. A fork
+server imports this module before it knows if its interpreter has the packages of a worker, so it
+imports only the standard library.
+Left out on purpose: the effects of the messages (see `fork_server` and `process`).
 """
 
 from __future__ import annotations
@@ -26,33 +26,33 @@ __all__ = [
     "Exited",
     "Fork",
     "Forked",
-    "Hello",
     "Kill",
     "Message",
     "MessageSocket",
+    "Preload",
     "Ready",
     "Received",
 ]
 
 
 @dataclass(frozen=True)
-class Hello:
-    """First message of the trainer: what to import before anything is forked."""
+class Preload:
+    """First message of the trainer: modules to import before the first fork."""
 
     path: list[str] | None
-    preload: tuple[str, ...]
+    modules: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class Ready:
-    """First message of the fork server; `error` says why it can't serve."""
+    """First message of the fork server; `error` is the reason why it can't serve, or None."""
 
     error: str | None
 
 
 @dataclass(frozen=True)
 class Fork:
-    """Fork the worker of `place`; the channel's and the arena's descriptors ride along."""
+    """Fork the worker of `place`; descriptors of channel and arena travel with it."""
 
     place: WorkerPlace
 
@@ -67,7 +67,7 @@ class Forked:
 
 @dataclass(frozen=True)
 class Kill:
-    """Kill worker `host_id`; with `dump`, have it write its stacks to stderr first."""
+    """Kill worker `host_id`; with `dump`, it writes its stacks to stderr first."""
 
     host_id: int
     dump: bool
@@ -75,17 +75,17 @@ class Kill:
 
 @dataclass(frozen=True)
 class Exited:
-    """Worker `host_id` has ended: exit code (negative for a signal), last words."""
+    """Worker `host_id` exited, with a code (negative for a signal) and its last output."""
 
     host_id: int
     exit_code: int
     stderr_tail: str
 
 
-Message: TypeAlias = Hello | Ready | Fork | Forked | Kill | Exited
+Message: TypeAlias = Preload | Ready | Fork | Forked | Kill | Exited
 
 FAILED: Final = b"!"
-"""Begins the one packet of a fork server that can't even import its own code: text follows."""
+"""First byte of the only packet of a fork server that can't import its code; a text follows."""
 _MORE: Final = b"+"
 _LAST: Final = b"."
 _PACKET_BYTES: Final = 1 << 15
@@ -108,11 +108,11 @@ class _Packet(NamedTuple):
 class MessageSocket:
     """One end of the socket between a trainer and its fork server; it never blocks.
 
-    Messages arrive whole and in order, however long they are: each travels in packets that
-    say whether more of it follows.
+    Messages of any length arrive complete and in order. A message travels in packets, each with a
+    mark if more packets follow.
 
     Args:
-        end: of a pair of SOCK_SEQPACKET sockets, which it takes.
+        end: one of a pair of SOCK_SEQPACKET sockets, which it closes.
     """
 
     def __init__(self, end: socket.socket) -> None:
@@ -122,23 +122,23 @@ class MessageSocket:
         self._begun = bytearray()
 
     def fileno(self) -> int:
-        """Its descriptor."""
+        """Return the descriptor."""
         return self._socket.fileno()
 
     @property
     def waiting(self) -> bool:
-        """Whether something waits for room: `flush` when the descriptor is writable."""
+        """True while a message waits for room: call `flush` when the descriptor is writable."""
         return bool(self._waiting)
 
     def send(
         self, message: Message, given: socket.socket | None = None, lent: Sequence[int] = ()
     ) -> None:
-        """Send `message` as soon as there is room; what nobody reads any more is dropped.
+        """Send `message`, now or when there is room; drop it if the other end is gone.
 
         Args:
-            message: any of them.
-            given: rides along, and is closed here then.
-            lent: descriptors that ride along after it, and stay open until they have.
+            message: any message.
+            given: a socket to send along; it is closed afterwards.
+            lent: descriptors to send after it; they must stay open until then.
         """
         data = pickle.dumps(message)
         step = _PACKET_BYTES - 1
@@ -149,7 +149,7 @@ class MessageSocket:
         self.flush()
 
     def flush(self) -> None:
-        """Send what finds room now."""
+        """Send waiting messages as far as there is room."""
         while self._waiting:
             data, given, lent = self._waiting[0]
             try:
@@ -160,7 +160,7 @@ class MessageSocket:
             except OSError as error:
                 if error.errno in _NO_ROOM:
                     return
-                self._drop()  # The other end is gone; `receive` tells.
+                self._drop()  # The other end is gone; `receive` reports that.
                 return
             self._waiting.popleft()
             if given is not None:
@@ -173,10 +173,10 @@ class MessageSocket:
                 given.close()
 
     def receive(self) -> Received | None:
-        """The next message; None if none is there yet.
+        """Return the next message; None if there is none yet.
 
         Raises:
-            EOFError: the other end is gone, and all that it has said was received.
+            EOFError: the other end is gone, and all its messages were received.
         """
         while True:
             try:
@@ -184,7 +184,7 @@ class MessageSocket:
             except BlockingIOError:
                 return None
             except ConnectionResetError:
-                continue  # It died with something of ours unread. What it said comes after this.
+                continue  # It died before it read everything. Its own messages follow.
             for descriptor in descriptors:
                 os.set_inheritable(descriptor, False)
             if not packet:
@@ -198,6 +198,6 @@ class MessageSocket:
                 return Received(message, descriptors)
 
     def close(self) -> None:
-        """Let go of it, and of what waits."""
+        """Close the socket, and drop waiting messages."""
         self._drop()
         self._socket.close()

@@ -1,10 +1,9 @@
-"""The fork server: a small process that forks workers and tells how they ended.
+"""The fork server: a small process that forks workers and reports their exit.
 
-One runs for each combination of interpreter and environment variables. It has the
-simulator's modules imported, so that a worker starts in milliseconds; it keeps the
-last lines that each worker wrote to stderr; it outlives no trainer: when the trainer's
-end of its socket closes, all workers are killed.
-Rule: one thread whenever it forks. Nothing is built here.
+One runs for each combination of interpreter and environment variables. It has imported the modules
+of the simulator, so a worker starts in milliseconds. It keeps the last lines that each worker wrote
+to stderr. When the trainer closes its end of the socket or dies, all workers are killed.
+Rule: it has one thread when it forks. It builds no env.
 """
 
 from __future__ import annotations
@@ -31,9 +30,9 @@ from rlightning_aio.hosts.fork_messages import (
     Exited,
     Fork,
     Forked,
-    Hello,
     Kill,
     MessageSocket,
+    Preload,
     Ready,
 )
 from rlightning_aio.hosts.standard_streams import occupy_standard_streams
@@ -68,28 +67,28 @@ except BaseException:
     fail(traceback.format_exc())
 main(int(sys.argv[2]), int(sys.argv[3]))
 """
-"""Runs `main` from this very package, whatever the interpreter has installed, and of any version.
+"""Runs `main` of this package, even if the interpreter has another version of it installed.
 
-If that fails, the only packet is `FAILED` and why.
+If that fails, the only packet is `FAILED` and the reason.
 """
 
 DUMP_SIGNAL: Final = signal.SIGRTMIN + 7
 _TAIL_BYTES: Final = 8192
 _CHUNK_BYTES: Final = 1 << 16
 _GRACE_SECONDS: Final = 1.2
-"""How long workers may take to notice that the trainer is gone and stop a robot."""
+"""Time for workers to notice that the trainer is gone, and to stop a robot."""
 _DUMP_SECONDS: Final = 0.3
 _ERROR_CHARACTERS: Final = 60_000
 _OUTLET_BYTES: Final = 1 << 20
 _READ_SECONDS: Final = 0.2
-"""A trainer that hasn't read anything for so long reads nothing."""
+"""If the reader of stderr reads nothing for this long, it is considered gone."""
 _STDERR: Final = 2
 
 
 @dataclass
 class _Child:
-    """A worker. Its end of the channel is kept open until it is buried, so it can be told to stop
-    when the trainer is gone.
+    """A worker. Its end of the channel stays open here until its exit is handled, so that it can be
+    shut down when the trainer is gone.
     """
 
     host_id: int
@@ -102,10 +101,10 @@ class _Child:
 
 
 class _Outlet:
-    """Passes on what workers write to stderr, and never blocks.
+    """Forwards the stderr of workers, and never blocks.
 
-    A trainer's stderr may be a pipe that nobody reads. Then output waits here, and once
-    there is too much of it, in the workers' own pipes.
+    The stderr of the trainer may be a pipe without a reader. Then output waits here, and when
+    there is too much of it, in the pipes of the workers.
     """
 
     def __init__(self, poll: select.poll) -> None:
@@ -121,14 +120,14 @@ class _Outlet:
         self.flush()
 
     def empty(self, until: float) -> None:
-        """Write what is left, as long as somebody reads it."""
+        """Write the rest while the reader reads."""
         reader = select.poll()
         reader.register(_STDERR, select.POLLOUT)
         while self._waiting and time.monotonic() < until and reader.poll(_READ_SECONDS * 1000):
             self.flush()
 
     def flush(self) -> None:
-        """Write what can be written now; have the poll tell when more can."""
+        """Write without blocking; poll for more room if necessary."""
         probe = select.poll()
         probe.register(_STDERR, select.POLLOUT)
         while self._waiting:
@@ -140,24 +139,29 @@ class _Outlet:
                 # A pipe that is writable takes this much without blocking.
                 del self._waiting[: os.write(_STDERR, self._waiting[: select.PIPE_BUF])]
             except OSError:
-                self._waiting.clear()  # Nobody can ever read it.
+                self._waiting.clear()  # The reader is gone.
         with contextlib.suppress(KeyError):
             self._poll.unregister(_STDERR)
 
 
 def _die_with_parent() -> None:
-    """Have the kernel kill this process when its parent dies (Linux)."""
+    """Make the kernel kill this process when its parent dies (Linux)."""
     with contextlib.suppress(OSError, AttributeError):
         pr_set_pdeathsig = 1
         ctypes.CDLL(None, use_errno=True).prctl(pr_set_pdeathsig, signal.SIGKILL)
 
 
 def _on_child(signal_number: int, frame: FrameType | None) -> None:
-    """Does nothing: a signal that has a handler reaches the wake-up descriptor."""
+    """Do nothing: a signal with a handler reaches the wake-up descriptor."""
 
 
 class _ForkServer:
-    """Args: the socket to the trainer, and a descriptor of its process (-1 if unknown)."""
+    """Forks workers and handles their exits.
+
+    Args:
+        trainer: the socket.
+        trainer_process: a descriptor of the process (-1 if unknown).
+    """
 
     def __init__(self, trainer: MessageSocket, trainer_process: int) -> None:
         self._trainer = trainer
@@ -167,7 +171,7 @@ class _ForkServer:
         if trainer_process >= 0:
             self._poll.register(trainer_process, select.POLLIN)
         self._outlet = _Outlet(self._poll)
-        # A byte arrives here whenever a child has ended.
+        # A byte arrives here whenever a child exits.
         self._wakeup, wakeup = socket.socketpair()
         self._wakeup.setblocking(False)
         wakeup.setblocking(False)
@@ -177,7 +181,7 @@ class _ForkServer:
         self._poll.register(self._wakeup, select.POLLIN)
 
     def serve(self) -> None:
-        """Fork and bury until the trainer is gone; then see that no worker is left."""
+        """Serve until the trainer is gone; then end all workers."""
         while self._step(self._next_kill()):
             pass
         self._end_all()
@@ -200,7 +204,7 @@ class _ForkServer:
             else:
                 self._attend(descriptor)
         self._kill_due()
-        self._bury()
+        self._handle_exits()
         return True
 
     def _attend(self, descriptor: int) -> None:
@@ -209,9 +213,9 @@ class _ForkServer:
                 self._wakeup.recv(4096)
         elif descriptor == _STDERR:
             self._outlet.flush()
-            self._choose_heard()
+            self._choose_readable()
         else:
-            self._listen(descriptor)
+            self._forward(descriptor)
 
     def _obey(self) -> bool:
         try:
@@ -248,11 +252,11 @@ class _ForkServer:
         os.close(arena)
         os.set_blocking(reader, False)
         self._children[pid] = _Child(order.place.host_id, pid, reader, channel)
-        self._choose_heard()
+        self._choose_readable()
         self._trainer.send(Forked(order.place.host_id, pid))
 
     def _become_worker(self) -> None:
-        """Leave behind, in the child, what belongs to the fork server."""
+        """Release in the child what belongs to the fork server."""
         signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
         for child in self._children.values():
@@ -269,7 +273,7 @@ class _ForkServer:
                 if order.dump:
                     os.kill(child.pid, DUMP_SIGNAL)
                 child.kill_at = time.monotonic() + (_DUMP_SECONDS if order.dump else 0.0)
-        self._choose_heard()
+        self._choose_readable()
 
     def _kill_due(self) -> None:
         now = time.monotonic()
@@ -278,18 +282,18 @@ class _ForkServer:
                 os.kill(child.pid, signal.SIGKILL)
                 child.kill_at = None
 
-    def _choose_heard(self) -> None:
-        """Read from all workers, unless too much waits; from one to be killed in any case."""
+    def _choose_readable(self) -> None:
+        """Read from all workers; if too much output waits, only from those about to be killed."""
         for child in self._children.values():
-            heard = not child.silent and (not self._outlet.full or child.kill_at is not None)
-            if heard:
+            readable = not child.silent and (not self._outlet.full or child.kill_at is not None)
+            if readable:
                 self._poll.register(child.stderr, select.POLLIN)
             else:
                 with contextlib.suppress(KeyError):
                     self._poll.unregister(child.stderr)
 
-    def _listen(self, descriptor: int) -> None:
-        """Pass on what a worker wrote to stderr, and keep its end."""
+    def _forward(self, descriptor: int) -> None:
+        """Forward the stderr of a worker, and keep the end of it."""
         for child in self._children.values():
             if child.stderr == descriptor:
                 self._drain(child)
@@ -301,22 +305,23 @@ class _ForkServer:
             return
         if not data:
             child.silent = True
-            self._choose_heard()
+            self._choose_readable()
             return
         child.tail += data
         del child.tail[:-_TAIL_BYTES]
         was_full = self._outlet.full
         self._outlet.write(data)
         if self._outlet.full != was_full:
-            self._choose_heard()
+            self._choose_readable()
 
-    def _bury(self) -> None:
+    def _handle_exits(self) -> None:
+        """Report the workers that exited."""
         for pid in list(self._children):
             ended, status = os.waitpid(pid, os.WNOHANG)
             if not ended:
                 continue
             child = self._children.pop(pid)
-            # No more than lies there now: a process that it has started may go on writing.
+            # Only what is in the pipe now: a process that it started may continue to write.
             if unread := _unread(child.stderr):
                 self._drain(child, unread)
             with contextlib.suppress(KeyError):
@@ -327,13 +332,13 @@ class _ForkServer:
             os.close(child.channel)
 
     def _end_all(self) -> None:
-        """The trainer is gone: workers see their channel close; kill those that stay."""
+        """Close the channels of all workers, then kill those that still run."""
         self._poll.unregister(self._trainer)
         self._trainer.close()
         if self._trainer_process >= 0:
             self._poll.unregister(self._trainer_process)
         for child in self._children.values():
-            # A child that the trainer has forked may hold the other end of it still.
+            # A process that the trainer forked may still have the other end open.
             with (
                 socket.socket(fileno=os.dup(child.channel)) as channel,
                 contextlib.suppress(OSError),
@@ -349,21 +354,21 @@ class _ForkServer:
     def _wait_for_children(self, until: float) -> None:
         for descriptor, _ in self._poll.poll(max(0.0, until - time.monotonic()) * 1000):
             self._attend(descriptor)
-        self._bury()
+        self._handle_exits()
 
 
 def _unread(pipe: int) -> int:
-    """How many bytes lie in it."""
+    """Return the number of unread bytes."""
     return int.from_bytes(fcntl.ioctl(pipe, termios.FIONREAD, bytes(4)), sys.byteorder)
 
 
 def _run_worker(
     leave: Callable[[], None], parent: int, stderr: int, order: Fork, channel: int, arena: int
 ) -> None:
-    """Everything that a forked child does; never returns."""
+    """Run a worker in a forked child; never returns."""
     code = 1
     try:
-        # Standard output too: the trainer's may be read by a program.
+        # Standard output too: a program may read that of the trainer.
         os.dup2(stderr, 1)
         os.dup2(stderr, 2)
         os.close(stderr)
@@ -373,7 +378,7 @@ def _run_worker(
             os._exit(1)
         faulthandler.enable(all_threads=True)
         faulthandler.register(DUMP_SIGNAL, all_threads=True)
-        # Not above: the fork server speaks before it imports what may fail.
+        # Not at the top: the fork server sends messages before imports that may fail.
         from rlightning_aio.hosts import worker  # noqa: PLC0415
 
         trainer = socket.socket(fileno=channel)
@@ -400,8 +405,8 @@ def _watch_trainer(trainer: MessageSocket, process: int, finished: socket.socket
             os._exit(0)
 
 
-def _preload(trainer: MessageSocket, process: int, modules: tuple[str, ...]) -> str | None:
-    """Import what every worker needs; an error that only one env would meet is left to it."""
+def _import(trainer: MessageSocket, process: int, modules: tuple[str, ...]) -> str | None:
+    """Import the modules of workers; return an error of ours. Envs report those of simulators."""
     finish, finished = socket.socketpair()
     watcher = threading.Thread(
         target=_watch_trainer, args=(trainer, process, finished), daemon=True
@@ -410,7 +415,7 @@ def _preload(trainer: MessageSocket, process: int, modules: tuple[str, ...]) -> 
     error = None
     try:
         importlib.import_module("rlightning_aio.hosts.worker")
-        # Each worker is sent its entry's config, and would import this for itself.
+        # Each worker gets the config of its entry, and would import this itself.
         importlib.import_module("rlightning_aio.config")
         for module in modules:
             with contextlib.suppress(Exception):
@@ -424,9 +429,9 @@ def _preload(trainer: MessageSocket, process: int, modules: tuple[str, ...]) -> 
 
 
 def _process_of(pid: int) -> int:
-    """A descriptor that is readable once process `pid` is dead; -1 where there is no such thing.
+    """Return a descriptor that is readable once process `pid` is dead; -1 if not supported.
 
-    The trainer's sockets would do, but for a trainer that has forked: its child holds them, too.
+    The socket is not enough: if the trainer forked, its child has it open, too.
     """
     try:
         return os.pidfd_open(pid)
@@ -447,24 +452,24 @@ def _first_message(trainer: MessageSocket) -> Message:
 
 
 def main(descriptor: int, trainer_pid: int) -> None:
-    """Serve the trainer, which is at the other end of socket `descriptor`; never returns."""
-    # What the trainer's thread has blocked is inherited, by workers as well: they would miss the
-    # signals that tell of a death, write stacks, or end them.
+    """Serve the trainer at the other end of socket `descriptor`; never returns."""
+    # The mask is inherited from the thread of the trainer. Blocked signals would not report exits,
+    # write stacks, or end workers.
     signal.pthread_sigmask(signal.SIG_SETMASK, ())
     occupy_standard_streams()
     trainer = MessageSocket(socket.socket(fileno=descriptor))
     process = _process_of(trainer_pid)
     try:
-        hello = _first_message(trainer)
+        preload = _first_message(trainer)
     except EOFError:
         os._exit(0)
-    assert isinstance(hello, Hello)
-    if hello.path is not None:
-        sys.path[:] = hello.path
-    # Looking for garbage takes a tenth of the imports' time, finds next to none, and would
-    # touch the memory that workers share with this process.
+    assert isinstance(preload, Preload)
+    if preload.path is not None:
+        sys.path[:] = preload.path
+    # Garbage collection takes a tenth of the import time, finds hardly anything, and would write
+    # to memory that workers share with this process.
     gc.disable()
-    error = _preload(trainer, process, hello.preload)
+    error = _import(trainer, process, preload.modules)
     gc.freeze()
     gc.enable()
     trainer.send(Ready(error))

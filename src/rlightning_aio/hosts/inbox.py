@@ -1,4 +1,4 @@
-"""`Inbox`: what other threads tell the trainer's, and a descriptor that says so."""
+"""`Inbox`: tasks that other threads leave for the thread of the trainer."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ __all__ = ["Inbox"]
 
 
 class Inbox:
-    """Tasks for the trainer's thread.
+    """A queue of tasks with a descriptor.
 
     Attributes:
-        descriptor: readable while there are any; level-triggered.
+        descriptor: readable while there are tasks; level-triggered.
     """
 
     def __init__(self) -> None:
@@ -27,7 +27,7 @@ class Inbox:
         self._is_open = True
 
     def put(self, task: Callable[[], None]) -> None:
-        """Leave a task, on any thread; dropped if nobody takes any more."""
+        """Add a task, from any thread; it is dropped if the inbox is closed."""
         with self._lock:
             if self._is_open:
                 if not self._tasks:
@@ -35,7 +35,7 @@ class Inbox:
                 self._tasks.append(task)
 
     def take(self) -> list[Callable[[], None]]:
-        """All tasks that are there, in the order in which they came."""
+        """Remove and return all tasks, oldest first."""
         with self._lock:
             if not self._tasks:
                 return []
@@ -45,7 +45,7 @@ class Inbox:
             return tasks
 
     def close(self) -> None:
-        """Drop what is there and what will come, and give the descriptor back."""
+        """Drop all tasks, now and later, and close the descriptor."""
         with self._lock:
             if self._is_open:
                 self._is_open = False

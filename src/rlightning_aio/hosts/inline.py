@@ -1,8 +1,8 @@
-"""`InlineHost`: envs in the trainer's own process, with the same rows and rules.
+"""`InlineHost`: envs in the process of the trainer, with the same rows and rules.
 
-Requests wait in a queue; one is executed whenever a driver has nothing ready and asks
-for it (`execute_next`), so sending never blocks here either. An env blocks the process
-while it steps; nothing protects the trainer from an env that crashes.
+Requests wait in a queue, so sending never blocks. A driver that has no result executes the next one
+(`execute_next`). An env blocks the process while it steps, unless its own thread computes the step
+and an event loop waits for it (`_Threads`). An env that crashes ends the trainer.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 from rlightning_aio.hosts.arena import map_shared
 from rlightning_aio.hosts.build_env import built_envs
 from rlightning_aio.hosts.copied import copied
+from rlightning_aio.hosts.inbox import Inbox
 from rlightning_aio.hosts.messages import (
     Attached,
     Built,
@@ -38,19 +39,19 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from rlightning_aio.hosts.base import Wiring
+    from rlightning_aio.hosts.base import Watcher, Wiring
     from rlightning_aio.hosts.messages import AttachOrder, OutOfBand, StartOrder
-    from rlightning_aio.hosts.runner import EnvRunner, Execute
+    from rlightning_aio.hosts.runner import EnvRunner
 
 __all__ = ["InlineHost"]
 
 _Waiting: TypeAlias = "tuple[int, Callable[[], Any]]"
-"""An entry, and what executes it."""
+"""An entry, and the function that executes it."""
 _STEP: Final = int(Operation.STEP)
 
 
 class InlineHost:
-    """See `base.Host`, `Executing` and `Polled`. It has no descriptor and is never watched."""
+    """Runs envs in this process; see `base.Host`, `Executing` and `Polled`."""
 
     def __init__(self, host_id: int, first_slot: int, order: StartOrder, wiring: Wiring) -> None:
         self.host_id = host_id
@@ -58,15 +59,17 @@ class InlineHost:
         self.num_envs = len(order.worker_indices)
         self._order = order
         self._arena = wiring.arena
-        self._tell = wiring.completions.append
+        self._post = wiring.completions.append
         self._runners: list[EnvRunner] = []
         self._queue: deque[_Waiting] = deque()
-        # Entries of results that lie in their rows, and have still to be told.
+        # Entries of results in rows that were not reported yet.
         self._done: list[int] = []
         self._schemas = InfoSchemas(self._announce)
+        self._watcher = wiring.watcher if wiring.shares_thread else None
+        self._threads: _Threads | None = None
 
     def start(self) -> None:
-        """Build the envs here and now."""
+        """Build the envs immediately."""
         try:
             for runner in built_envs(self._order, inline=True):
                 self._runners.append(runner)
@@ -75,91 +78,140 @@ class InlineHost:
             raise
         except BaseException as error:
             index = min(len(self._runners), self.num_envs - 1)
-            self._tell(NotBuilt(self.host_id, index, ErrorText.of(error)))
+            self._post(NotBuilt(self.host_id, index, ErrorText.of(error)))
             return
-        self._tell(Built(self.host_id, started))
+        if self._watcher is not None:
+            self._threads = _Threads(self._runners, self._queue, self._watcher)
+        self._post(Built(self.host_id, started))
 
     def attach(self, order: AttachOrder) -> None:
-        """See `base.Host.attach`."""
         map_part = partial(map_shared, self._arena.descriptor)
-        attach_all(self._runners, order, map_part, self._schemas.announce, self._keep)
-        self._tell(Attached(self.host_id))
+        attach_all(self._runners, order, map_part, self._schemas.announce, self._save)
+        self._post(Attached(self.host_id))
 
     def _announce(self, number: int, schema: InfoSchema) -> None:
-        self._tell(NewSchema(self.host_id, number, schema))
+        self._post(NewSchema(self.host_id, number, schema))
 
-    def _keep(self, index: int, standing: bytes, before: bool) -> None:
-        self._tell(Saved(self.host_id, index, standing, before))
+    def _save(self, index: int, checkpoint: bytes, before: bool) -> None:
+        self._post(Saved(self.host_id, index, checkpoint, before))
 
     def packed(self, arguments: Any) -> Any:
-        """See `base.Host.packed`."""
         return copied(arguments)
 
     def submit(self, entries: NDArray[np.int64], arguments: Sequence[Any] | None = None) -> None:
-        """See `base.Host.submit`."""
         asked = cast("list[int]", entries.tolist())
         for position, entry in enumerate(asked):
-            runner = self._runners[slot_of(entry) - self.first_slot]
+            index = slot_of(entry) - self.first_slot
+            runner = self._runners[index]
             if arguments is not None:
                 execute = partial(runner.execute, op_of(entry), arguments[position])
+            elif op_of(entry) == _STEP and runner.begin_step is not None:
+                try:
+                    execute = runner.begin_step()
+                except BaseException as error:
+                    # Raised later: the other requests of this batch must be sent first.
+                    execute = partial(_reraise, error)
+                else:
+                    if self._threads is not None and index in self._threads.indices:
+                        self._threads.unfinished[index] = entry, execute
+                        continue
             elif op_of(entry) == _STEP:
-                execute = runner.step if runner.begin_step is None else _begun(runner.begin_step)
+                execute = runner.step
             else:
                 execute = runner.reset_from_row
             self._queue.append((entry, execute))
 
     def execute_next(self) -> bool:
-        """See `base.Executing.execute_next`."""
         if not self._queue:
             return False
         entry, execute = self._queue.popleft()
         try:
             outcome = execute()
         except BaseException as error:
-            self.poll()  # What came before is told before.
-            self._tell(Raised(self.host_id, entry, ErrorText.of(error)))
+            self.poll()  # Earlier results come first.
+            self._post(Raised(self.host_id, entry, ErrorText.of(error)))
             if isinstance(error, KeyboardInterrupt):
-                raise  # It was meant for the program; the request that it struck ends all the same.
+                raise  # It is meant for the program, but the request ends, too.
             return True
         if outcome is None and not answers_with_value(op_of(entry)):
             self._done.append(entry)
             return True
         self.poll()
         if answers_with_value(op_of(entry)):
-            self._tell(Value(self.host_id, entry, outcome))
+            self._post(Value(self.host_id, entry, outcome))
         else:
-            self._tell(Result(self.host_id, entry, outcome or {}))
+            self._post(Result(self.host_id, entry, outcome or {}))
         return True
 
     def poll(self) -> None:
-        """See `base.Polled.poll`."""
         if self._done:
-            self._tell(Reported(self.host_id, np.array(self._done, np.int64)))
+            self._post(Reported(self.host_id, np.array(self._done, np.int64)))
             self._done.clear()
 
     def step_now(self) -> OutOfBand | None:
-        """Step env 0 with the action in its row, past the queue, which holds nothing for it."""
+        """Step env 0 with the action in its row; the queue must have no request to it."""
         return self._runners[0].step()
 
     def close(self) -> None:
-        """Close the envs here and now."""
+        """Close the envs immediately."""
         errors = close_all(self._runners)
         self.release()
-        self._tell(Closed(self.host_id, errors))
+        self._post(Closed(self.host_id, errors))
 
     def release(self) -> None:
-        """Drop the envs and what was asked of them."""
+        """Drop the envs and their requests."""
         self._runners.clear()
         self._queue.clear()
+        if self._threads is not None:
+            self._threads.close()
+            self._threads = None
 
 
-def _begun(begin_step: Callable[[], Execute]) -> Execute:
-    """Start a step of a simulator that computes by itself; what will end it."""
-    try:
-        return begin_step()
-    except BaseException as error:
-        # When its result is asked for: of several requests all are to be taken first.
-        return partial(_reraise, error)
+class _Threads:
+    """Steps that envs compute in their own threads; see `base.Source`.
+
+    Such a step joins the queue when the thread is done, so executing the rest of it doesn't wait.
+
+    Args:
+        runners: of the host's envs.
+        queue: of the host.
+        watcher: the driver.
+
+    Attributes:
+        indices: of the envs that report the end of a step.
+        unfinished: running steps, by the index of their env.
+    """
+
+    def __init__(
+        self, runners: Sequence[EnvRunner], queue: deque[_Waiting], watcher: Watcher
+    ) -> None:
+        self.unfinished: dict[int, _Waiting] = {}
+        self._queue, self._watcher = queue, watcher
+        self._inbox = inbox = Inbox()
+        self.indices = {
+            index
+            for index, runner in enumerate(runners)
+            if runner.env.on_stepped(partial(inbox.put, partial(self._ended, index)))
+        }
+        watcher.watch(self)
+
+    def _ended(self, index: int) -> None:
+        self._queue.append(self.unfinished.pop(index))
+
+    def fileno(self) -> int:
+        return self._inbox.descriptor
+
+    def on_readable(self) -> None:
+        for task in self._inbox.take():
+            task()
+
+    def on_writable(self) -> None:
+        """Do nothing: it has nothing to write."""
+
+    def close(self) -> None:
+        """Forget running steps."""
+        self._watcher.unwatch(self)
+        self._inbox.close()
 
 
 def _reraise(error: BaseException) -> OutOfBand | None:

@@ -1,6 +1,6 @@
-"""Gymnasium's tasks that the training process knows, for workers that are asked for one of them.
+"""Gymnasium tasks that are registered in the trainer, for workers that have to make them.
 
-A script registers its envs where it begins, which no worker executes.
+A script registers its tasks when it starts, and workers don't run the script.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ __all__ = ["known_tasks", "register_tasks"]
 
 
 def known_tasks() -> tuple[bytes, ...]:
-    """What is registered in this process, but for what can't be pickled."""
+    """Return all registered tasks that can be pickled."""
     return tuple(_pickled(list(gym.registry.values())))
 
 
@@ -36,7 +36,7 @@ def _pickled(specs: Sequence[EnvSpec]) -> Iterator[bytes]:
 
 
 def register_tasks(tasks: Sequence[bytes]) -> None:
-    """Register those of `known_tasks` that this process lacks, as far as they can be read here."""
+    """Register the tasks of `known_tasks` that this process lacks and can unpickle."""
     for pickled in tasks:
         with contextlib.suppress(Exception):
             for spec in pickle.loads(pickled):

@@ -1,7 +1,7 @@
-"""`Link`: the trainer's end of what it shares with one worker, rings and channel.
+"""`Link`: the trainer's end of the rings and the channel that it shares with one worker.
 
-Requests go into the shared rings, larger things into the channel (a socket pair).
-Absent on purpose: the worker's life, which is `process`'s, and what anything means.
+Requests go into the shared rings, larger data into the channel (a socket pair).
+Left out on purpose: the life of the worker (see `process`), and the effects of messages.
 """
 
 from __future__ import annotations
@@ -9,11 +9,11 @@ from __future__ import annotations
 import pickle
 from typing import TYPE_CHECKING, Any
 
-from rlightning_aio.hosts.arena import map_shared
 from rlightning_aio.hosts.messages import (
     Attached,
     Built,
     ErrorText,
+    Failed,
     NewSchema,
     NotBuilt,
     Raised,
@@ -23,7 +23,7 @@ from rlightning_aio.hosts.messages import (
     Value,
 )
 from rlightning_aio.protocol.frames import BELL, CHUNK_BYTES, Frame, FrameKind, FrameReader, encode
-from rlightning_aio.protocol.rings import TrainerRings, rings_size
+from rlightning_aio.protocol.rings import TrainerRings
 
 if TYPE_CHECKING:
     import socket
@@ -39,43 +39,46 @@ __all__ = ["Link"]
 
 
 class Link:
-    """See the module. It lives as long as its worker; the next one gets another.
+    """The connection to one worker; its replacement gets a new one.
 
     Args:
-        place: the worker's part of the arena.
+        place: the part of the arena that belongs to the worker.
+        memory: that part; it is cleared.
         wiring: of the group.
-        channel: our end, non-blocking.
+        channel: non-blocking end of the trainer.
 
     Attributes:
-        close_errors: what the worker said when it closed; None before.
+        close_errors: what the envs raised when the worker closed; None before.
         traffic: see `base.Killable.traffic`.
     """
 
-    def __init__(self, place: WorkerPlace, wiring: Wiring, channel: socket.socket) -> None:
-        size = rings_size(place.num_envs)
-        memory = map_shared(wiring.arena.descriptor, place.rings_offset, size)
-        memory[:] = bytes(size)
+    def __init__(
+        self, place: WorkerPlace, memory: memoryview, wiring: Wiring, channel: socket.socket
+    ) -> None:
+        memory[:] = bytes(len(memory))
         self._rings = TrainerRings(memory, place.num_envs, wiring.bell, place.host_id)
         self._host_id = place.host_id
         self._completions = wiring.completions
         self._watcher = wiring.watcher
         self._socket: socket.socket | None = channel
         self._frames = FrameReader()
-        self._frames_received = 0
         self._outgoing = bytearray()
         self._frames_outgoing = 0
         self.close_errors: list[tuple[int, ErrorText]] | None = None
         self.traffic = 0
+        self._all_rings = wiring.rings
+        self._all_rings[place.host_id] = self._rings.ring(self.wake)
         self._watcher.watch(self)
 
     def fileno(self) -> int:
-        """The channel."""
+        """Return the descriptor of the channel."""
         assert self._socket is not None
         return self._socket.fileno()
 
     def hang_up(self) -> None:
-        """Close the channel; what was not read is lost."""
+        """Close the channel; unread data is lost."""
         if self._socket is not None:
+            self._all_rings[self._host_id] = None
             self._watcher.unwatch(self)
             self._socket.close()
             self._socket = None
@@ -83,10 +86,9 @@ class Link:
     # -- requests -----------------------------------------------------------------
 
     def submit(self, entries: NDArray[np.int64], arguments: Sequence[bytes] | None) -> None:
-        """See `base.Host.submit`."""
         if arguments is None:
             if self._rings.request(entries):
-                self._write(BELL)
+                self.wake()
             return
         frames = [
             encode(FrameKind.REQUEST, entry, packed)
@@ -95,8 +97,18 @@ class Link:
         self._frames_outgoing += len(frames)
         self._write(b"".join(frames))
 
+    def wake(self) -> None:
+        """Wake the sleeping worker: its ring has requests."""
+        if self._socket is None or self._outgoing:
+            self._write(BELL)
+            return
+        try:
+            self._socket.send(BELL)  # Few enough bytes to be sent whole or not at all.
+        except OSError:
+            self._write(BELL)
+
     def send(self, kind: FrameKind, number: int = 0, payload: bytes = b"") -> None:
-        """Send a frame, as soon as the worker reads."""
+        """Send a frame, now or when the channel has room."""
         self._frames_outgoing += 1
         self._write(encode(kind, number, payload))
 
@@ -119,11 +131,10 @@ class Link:
         except BlockingIOError:
             return 0
         except (BrokenPipeError, ConnectionResetError):
-            # The worker is gone; its end is announced by the fork server.
+            # The worker is gone; the fork server will report its exit.
             return len(data)
 
     def on_writable(self) -> None:
-        """See `base.Source.on_writable`."""
         sent = self._write_some(self._outgoing)
         del self._outgoing[:sent]
         self.traffic += sent
@@ -132,7 +143,7 @@ class Link:
             self._all_written()
 
     def _all_written(self) -> None:
-        # Only now: a worker that is told of a frame expects to find all of it.
+        # Only now: a worker expects a counted frame to be complete.
         while self._frames_outgoing:
             self._frames_outgoing -= 1
             self._rings.count_frame()
@@ -140,22 +151,7 @@ class Link:
     # -- replies ------------------------------------------------------------------
 
     def on_readable(self) -> None:
-        """See `base.Source.on_readable`. Who waits for reports polls for them, of all workers
-        at once.
-        """
-        self.read_channel()
-
-    def poll(self) -> None:
-        """See `base.Polled.poll`."""
-        entries = self._rings.reports()
-        if len(entries):
-            # What was sent before these reports comes before them.
-            if self._rings.frames_from_worker() > self._frames_received:
-                self.read_channel()
-            self._completions.append(Reported(self._host_id, entries))
-
-    def read_channel(self) -> None:
-        """Read all frames there are."""
+        """Read all frames. Reports come by `poll`, from the rings of all workers."""
         while self._socket is not None:
             try:
                 data = self._socket.recv(CHUNK_BYTES)
@@ -164,65 +160,79 @@ class Link:
             except ConnectionResetError:
                 data = b""
             if not data:
-                # The fork server holds the other end until it has buried the worker, and
-                # tells why it died; there is nothing more to hear from here.
+                # The fork server keeps the other end open until it has handled the exit, and it
+                # reports the cause.
                 self.hang_up()
                 return
             self.traffic += len(data)
+            if data == BELL and self._frames.is_empty:
+                return
             for frame in self._frames.feed(data):
-                self._frames_received += 1
+                self._rings.frame_seen()
                 self._receive(frame)
             if len(data) < CHUNK_BYTES:
                 return
 
+    def poll(self) -> None:
+        entries = self._rings.reports()
+        if len(entries):
+            # Frames that were sent before these reports come first.
+            if self._rings.has_frame():
+                self.on_readable()
+            self._completions.append(Reported(self._host_id, entries))
+
     def catch_up(self) -> None:
-        """Write what waits, as far as it can go, and read all that there is."""
+        """Write pending data as far as possible, and read all replies."""
         if self._outgoing:
             self.on_writable()
-        self.read_channel()
+        self.on_readable()
         self.poll()
 
     def _receive(self, frame: Frame) -> None:
         kind, number, payload = frame
-        host_id, tell = self._host_id, self._completions.append
+        host_id, post = self._host_id, self._completions.append
         if kind == FrameKind.RESULT:
-            tell(Result(host_id, number, payload))
+            post(Result(host_id, number, payload))
         elif kind == FrameKind.SAVED:
-            tell(Saved(host_id, number >> 1, payload, bool(number & 1)))
+            post(Saved(host_id, number >> 1, payload, bool(number & 1)))
         elif kind == FrameKind.INFO_SCHEMA:
-            tell(NewSchema(host_id, number, pickle.loads(payload)))
+            post(NewSchema(host_id, number, pickle.loads(payload)))
         elif kind == FrameKind.ERROR:
-            tell(Raised(host_id, number, pickle.loads(payload)))
+            post(Raised(host_id, number, pickle.loads(payload)))
+        elif kind == FrameKind.RESTARTED:
+            cause, packed = pickle.loads(payload)
+            post(Result(host_id, number, packed, restarted=cause))
+        elif kind == FrameKind.FAILED:
+            post(Failed(host_id, number, pickle.loads(payload)))
         elif kind == FrameKind.START_ERROR:
-            tell(NotBuilt(host_id, number, pickle.loads(payload)))
+            post(NotBuilt(host_id, number, pickle.loads(payload)))
         elif kind == FrameKind.ATTACHED:
-            tell(Attached(host_id))
+            post(Attached(host_id))
         elif kind == FrameKind.CLOSED:
             self.close_errors = pickle.loads(payload)
         else:
             self._receive_object(kind, number, payload)
 
     def _receive_object(self, kind: int, number: int, payload: bytes) -> None:
-        """Take in an object of the user's, whose class may be unknown here."""
-        host_id, tell = self._host_id, self._completions.append
+        """Read an object whose class may be unknown here."""
+        host_id, post = self._host_id, self._completions.append
         value: Any
         try:
             value = pickle.loads(payload)
         except KeyboardInterrupt:
             raise
-        except BaseException as error:  # What it is made by may raise anything.
+        except BaseException as error:  # Unpickling may raise anything.
             text = ErrorText.of(error)
             starts = kind == FrameKind.STARTED
-            tell(NotBuilt(host_id, 0, text) if starts else Raised(host_id, number, text))
+            post(NotBuilt(host_id, 0, text) if starts else Raised(host_id, number, text))
             return
-        tell(Built(host_id, value) if kind == FrameKind.STARTED else Value(host_id, number, value))
+        post(Built(host_id, value) if kind == FrameKind.STARTED else Value(host_id, number, value))
 
-    # -- the worker, as the rings show it ---------------------------------------------
+    # -- the state of the worker ------------------------------------------------------
 
     def executing(self) -> tuple[int, int]:
-        """See `base.Killable.executing`."""
         return self._rings.current()
 
     def last_requests(self) -> tuple[int, ...]:
-        """Entries, that first which it may be executing; see `messages.Death`."""
+        """Return entries that it may have been executing, as in `messages.Death`."""
         return (self._rings.current()[0], *self._rings.last_requests())

@@ -1,10 +1,9 @@
-"""What crosses between a trainer and the places where its envs live.
+"""Messages between a trainer and its hosts.
 
-Orders go one way, completions come back: each completion says what has become of one
-request, or of a host, and hosts append them to their group's one queue, in order, whatever
-thread of events they come from. What of a request or a result has no place in a row
-travels *out of band*.
-Absent on purpose: how these travel (see `link`), and what they mean (see `group.core`).
+Orders go to hosts, completions come back. Each completion reports the outcome of one request, or
+an event of a host. Hosts append them in order to the one queue of their group. Data of a request or
+a result that has no place in a row travels *out of band*.
+Left out on purpose: transport (see `link`), and the effects of messages (see `group.intake`).
 """
 
 from __future__ import annotations
@@ -57,12 +56,12 @@ __all__ = [
 ]
 
 NO_ACTION: Final = "the action is in the row"
-"""Travels in place of an action whose extras alone go out of band."""
+"""Sent in place of an action if only its extras travel out of band."""
 RECORD_VIDEO: Final = "rlightning_aio.record_video"
-"""A call of this name is for the runner, not for its env, none of whose methods is called so."""
+"""The name of a call to the runner instead of the env; no method can have this name."""
 OutOfBand: TypeAlias = dict[str, Any]
-"""What of a result has no place in its row. Keys: ``observation``, ``info``, ``extra`` (the
-result's ``_extra``), ``ret`` (all of it)."""
+"""The part of a result that has no place in its row. Keys: ``observation``, ``info``, ``extra``
+(the result's ``_extra``), ``ret`` (the whole result)."""
 
 
 # -- orders -----------------------------------------------------------------------
@@ -70,17 +69,17 @@ result's ``_extra``), ``ret`` (all of it)."""
 
 @dataclass(frozen=True)
 class StartOrder:
-    """What a host is to build; travels by cloudpickle.
+    """The envs that a host must build; travels by cloudpickle.
 
     Attributes:
         config: the entry.
-        env_class: the class itself where it was registered in the trainer by hand;
-            None resolves the entry's backend where the env is built.
-        worker_indices: which envs of the entry.
-        preprocess_fns: one for each of them; None for the default.
-        spins: whether waiting may burn a core for some microseconds.
-        core: the core to stay on; None for any.
-        trainer_pid: the process that gives the order; None where it runs on another machine.
+        env_class: a class that was registered in the trainer; None resolves the backend of the
+            entry where the env is built.
+        worker_indices: of the envs in the entry.
+        preprocess_fns: one for each env; None for the default.
+        spins: waiting may use a core for some microseconds.
+        core: the only core to run on; None for any.
+        trainer_pid: the process that gives the order; None if it runs on another machine.
         tasks: of `known_tasks`.
     """
 
@@ -96,26 +95,26 @@ class StartOrder:
 
 @dataclass(frozen=True)
 class AttachOrder:
-    """Where a host's envs write. What a row consists of, each of them knows by itself.
+    """The rows of the envs of a host. Each env knows the layout of its row.
 
     Attributes:
         slabs: offset in the arena and number of rows of each slab of the group.
-        rows: for each env which slab and which row of it.
-        standings: where envs of a replacement are to stand, see `Saved`; None for one that
-            begins anew. Empty where all do.
+        rows: index of the slab, and the row in it, for each env.
+        checkpoints: of the envs of a replacement (see `Saved`); None for an env that begins a new
+            episode. Empty if all do.
     """
 
     slabs: tuple[tuple[int, int], ...]
     rows: tuple[tuple[int, int], ...]
-    standings: tuple[bytes | None, ...] = ()
+    checkpoints: tuple[bytes | None, ...] = ()
 
 
 @dataclass(frozen=True)
 class WorkerPlace:
-    """Where a worker finds its part of the group's shared memory.
+    """The part of the shared memory that belongs to a worker.
 
     Attributes:
-        host_id: which of the group's `num_hosts` hosts it belongs to.
+        host_id: of its host, one of `num_hosts`.
         first_slot, num_envs: slots of its envs.
         bell_offset, rings_offset: in the arena.
     """
@@ -128,12 +127,12 @@ class WorkerPlace:
     rings_offset: int
 
 
-# -- what comes back --------------------------------------------------------------
+# -- completions ------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class EnvStarted:
-    """What is known of an env once it is built."""
+    """The description of an env that was built."""
 
     meta: EnvMeta
     layout: RowLayout
@@ -143,7 +142,7 @@ class EnvStarted:
 
 @dataclass(frozen=True)
 class ErrorText:
-    """An exception as text: it crosses processes whatever its class is like."""
+    """An exception as text, which any process can read, whatever its class."""
 
     type_name: str
     text: str
@@ -151,12 +150,12 @@ class ErrorText:
 
     @property
     def summary(self) -> str:
-        """The last line of the traceback: its type and, where it has one, its text."""
+        """The last line of the traceback: the type, and the text if there is one."""
         return f"{self.type_name}: {self.text}" if self.text else self.type_name
 
     @classmethod
     def of(cls, error: BaseException) -> ErrorText:
-        """`error` in words, in plain text; nothing about its class is an obstacle."""
+        """Describe `error` in plain text, even if methods of its class raise."""
         kind = type(error)
         name = _plain(_NAME.__get__(kind))
         module = _MODULE.__get__(kind)
@@ -169,7 +168,6 @@ class ErrorText:
         try:
             lines = _plain("".join(traceback.format_exception(error)))
         except BaseException:
-            # As it was noted when it was raised, whatever its class says.
             frames = traceback.format_tb(_TRACEBACK.__get__(error))
             lines = "".join(frames) + f"{name}: {text}\n"
         return cls(name, text, lines)
@@ -178,23 +176,23 @@ class ErrorText:
 _NAME: Final[Any] = vars(type)["__qualname__"]
 _MODULE: Final[Any] = vars(type)["__module__"]
 _TRACEBACK: Final[Any] = vars(BaseException)["__traceback__"]
-"""What a class may have redefined, as Python itself defines it."""
+"""Descriptors of Python itself, because classes may redefine these attributes."""
 
 
 def _plain(text: str) -> str:
-    """`text` as a `str` and nothing else: a subclass may be unknown elsewhere."""
+    """Return `text` as a plain `str`: other processes may lack its subclass."""
     return str.__str__(text)
 
 
 @dataclass(frozen=True)
 class Death:
-    """Why a worker is gone.
+    """The end of a worker.
 
     Attributes:
         cause: one clause, such as "was killed by SIGKILL".
-        exit_code: negative for a signal; None if nobody knows.
-        stderr_tail: the last lines it wrote.
-        requests: entries, those first that it may have been executing; they may be
+        exit_code: negative for a signal; None if unknown.
+        stderr_tail: its last lines on stderr.
+        requests: entries, beginning with those that it may have been executing; they may be
             answered already, or be 0.
     """
 
@@ -205,7 +203,7 @@ class Death:
 
 
 class Built(NamedTuple):
-    """The host's envs are built."""
+    """The envs of the host are built."""
 
     host_id: int
     started: list[EnvStarted]
@@ -220,27 +218,27 @@ class NotBuilt(NamedTuple):
 
 
 class Attached(NamedTuple):
-    """The host's envs have their rows, and can be asked."""
+    """The envs of the host have their rows and accept requests."""
 
     host_id: int
 
 
 class Died(NamedTuple):
-    """The worker is gone, without having been asked to close."""
+    """The worker ended without a request to close."""
 
     host_id: int
     death: Death
 
 
 class Closed(NamedTuple):
-    """The host has closed and is gone; `errors` are those of the envs' `close`, by index."""
+    """The host has closed; `errors` are (index, error) of envs whose `close` raised."""
 
     host_id: int
     errors: list[tuple[int, ErrorText]]
 
 
 class NewSchema(NamedTuple):
-    """The host holds infos in one more way."""
+    """The host will write infos in a new layout."""
 
     host_id: int
     number: int
@@ -248,37 +246,40 @@ class NewSchema(NamedTuple):
 
 
 class Saved(NamedTuple):
-    """An env has given its standing away: its state, and what it shows.
+    """An env sent a checkpoint: its state and its last result.
 
     Attributes:
-        standing: a pickle that none but a worker reads.
-        before: it is from before the request that is being executed, and not from after.
+        checkpoint: a pickle that only workers read.
+        before: it is from before the current request, not from after it.
     """
 
     host_id: int
     env_index: int
-    standing: bytes
+    checkpoint: bytes
     before: bool
 
 
 class Reported(NamedTuple):
-    """These requests to one host are done, and their results lie in the rows."""
+    """Requests to one host are done, and the rows hold their whole results."""
 
     host_id: int
     entries: NDArray[np.int64]
 
 
 class Result(NamedTuple):
-    """A request is done; `out_of_band` (a pickle, or plain) goes with its row.
+    """A request is done; `out_of_band` (a pickle, or an object) completes its row.
 
     Attributes:
-        is_loss: no result of the env's, but the mark that it is gone.
+        is_loss: the result is not from the env, but marks that it is gone.
+        restarted: the reason why the env was rebuilt, if it was: the result is the first of a new
+            episode, and the previous episode is lost.
     """
 
     host_id: int
     entry: int
     out_of_band: bytes | OutOfBand
     is_loss: bool = False
+    restarted: str = ""
 
 
 class Value(NamedTuple):
@@ -298,7 +299,7 @@ class Raised(NamedTuple):
 
 
 class Failed(NamedTuple):
-    """A request has ended in an error that is known as such."""
+    """A request ended in an error of ours, not of the env."""
 
     host_id: int
     entry: int
@@ -306,20 +307,20 @@ class Failed(NamedTuple):
 
 
 class Withdrawn(NamedTuple):
-    """A request will not be answered: its env is away, and the caller was told so."""
+    """A request will not be answered: its env is away, and the caller knows."""
 
     host_id: int
     entry: int
 
 
 class Joined(NamedTuple):
-    """An env has come by itself, with a first result that nobody has asked for.
+    """An env joined by itself, with a first result that answers no request.
 
     Attributes:
         env_index: its index in the host.
-        slab: where the host's envs have their rows from now on; None if that is known.
-        write: puts the result into its row, which may hold one that nobody has collected
-            yet; returns what of it is out of band.
+        slab: the slab of the host from now on; None if it is the same as before.
+        write: writes the result into the row, which may still hold a result that was not
+            collected; returns the part that is out of band.
     """
 
     host_id: int
@@ -335,4 +336,4 @@ Completion: TypeAlias = (
     | Saved | Reported | Result | Value | Raised | Failed | Withdrawn | Joined
 )  # fmt: skip
 Completions: TypeAlias = deque[Completion]
-"""A group's queue: every host appends, the core takes out."""
+"""The queue of a group: hosts append, the core removes."""

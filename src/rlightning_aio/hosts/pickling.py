@@ -1,9 +1,8 @@
-"""Values as bytes between a trainer and the workers that it has forked itself.
+"""Pickles for messages between a trainer and its own workers.
 
-Rule: what either end may hold in a module travels by pickle, which is fast; what may be
-code of the user's (classes and functions of a script, lambdas) by cloudpickle. Both are
-read by `pickle.loads`.
-Absent on purpose: anything from a network; that is never pickled.
+Rule: pickle is fast and suffices for objects of importable modules; cloudpickle is for code of the
+user (classes and functions of a script, lambdas). `pickle.loads` reads both.
+Left out on purpose: data from a network, which is never unpickled.
 """
 
 from __future__ import annotations
@@ -17,18 +16,18 @@ __all__ = ["dumped", "dumped_with_code"]
 
 
 def dumped(value: Any, what: str) -> bytes:
-    """The pickle of `value`; with the code in it only if it can't do without.
+    """Pickle `value`, with code only if necessary.
 
     Args:
-        value: travels to the other end.
-        what: what an error calls it.
+        value: the object to send.
+        what: its name in errors.
 
     Raises:
         TypeError: it can't be pickled.
     """
     try:
         pickled = pickle.dumps(value, pickle.HIGHEST_PROTOCOL)
-        # The other end has a `__main__` of its own, which has none of this one's names.
+        # `__main__` is another module in the receiver.
         return dumped_with_code(value) if b"__main__" in pickled else pickled
     except Exception:
         try:
@@ -38,8 +37,8 @@ def dumped(value: Any, what: str) -> bytes:
 
 
 def dumped_with_code(value: Any) -> bytes:
-    """The pickle of `value`, with functions and classes that the other end can't import.
+    """Pickle `value` with functions and classes that the receiver can't import.
 
-    Raises whatever the value's own pickling raises.
+    Raises what pickling the value raises.
     """
     return cloudpickle.dumps(value)  # pyright: ignore[reportUnknownMemberType]  # No annotations.

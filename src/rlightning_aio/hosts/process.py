@@ -1,8 +1,8 @@
 """`ProcessHost`: the life of a worker process; `ForkServer`: the trainer's handle on its parent.
 
-A worker is watched from two sides, its channel (see `link`) and the fork server that will
-bury it, so that no death goes unnoticed.
-Absent on purpose: any decision about what a death means; that is the supervisor's.
+A worker is watched through its channel (see `link`) and by the fork server, which is its parent, so
+no death goes unnoticed.
+Left out on purpose: decisions about a death, which the supervisor makes.
 """
 
 from __future__ import annotations
@@ -14,15 +14,16 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
+from rlightning_aio.hosts.arena import map_shared
 from rlightning_aio.hosts.fork_messages import (
     Exited,
     Fork,
     Forked,
-    Hello,
     Kill,
     MessageSocket,
+    Preload,
     Ready,
 )
 from rlightning_aio.hosts.fork_server import BOOTSTRAP
@@ -33,7 +34,7 @@ from rlightning_aio.hosts.standard_streams import occupy_standard_streams
 from rlightning_aio.protocol.entries import slot_of
 from rlightning_aio.protocol.frames import FrameKind
 from rlightning_aio.protocol.rings import rings_size
-from rlightning_aio.registry import BACKENDS
+from rlightning_aio.registry import ENVS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -49,6 +50,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ForkServer", "ProcessHost"]
 
+_STDERR: Final = 2
 _ONE_THREAD = dict.fromkeys(
     (
         "OMP_NUM_THREADS",
@@ -73,13 +75,13 @@ class ForkServer:
 
     @classmethod
     def shared(cls, config: EnvConfig, wiring: Wiring) -> ForkServer:
-        """The group's fork server for the interpreter and the environment of an entry."""
+        """Return the fork server of the group for the interpreter and env_vars of an entry."""
         key = (cls, *_surroundings(config))
         fork_server = wiring.resources.get(key)
         if fork_server is None:
             preload: dict[str, None] = {}
             for other in wiring.configs:
-                backend = BACKENDS.get(other.backend)
+                backend = ENVS.described(other.backend)
                 if _surroundings(other) == _surroundings(config) and backend is not None:
                     preload.update(dict.fromkeys(backend.preload))
             env_vars = dict(config.env_vars)
@@ -103,18 +105,22 @@ class ForkServer:
         self._messages: MessageSocket | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._ready = False
-        # Why it ended, as far as that is known better than by its exit code.
+        # The reason of its exit, if that says more than the exit code.
         self._failure: str | None = None
 
     def fileno(self) -> int:
-        """The socket to the fork server."""
+        """Return the descriptor of the socket to the fork server."""
         assert self._messages is not None
         return self._messages.fileno()
 
     def fork(self, host: ProcessHost, channel: socket.socket, arena: Arena, order: Fork) -> None:
-        """Start a worker for `host`; starts the fork server first if it isn't running.
+        """Start a worker for `host`, and first the fork server if it isn't running.
 
-        It takes `channel`, the worker's end.
+        Args:
+            host: of the worker.
+            channel: the worker's end, which is closed here.
+            arena: of the group.
+            order: for the fork server.
         """
         messages = self._messages or self._launch()
         self._hosts[order.place.host_id] = host
@@ -122,16 +128,16 @@ class ForkServer:
         self._watcher.watch_writable(self, messages.waiting)
 
     def on_writable(self) -> None:
-        """Send what waits; a fork server that is importing reads nothing for a while."""
+        """Send waiting messages; a fork server reads nothing while it imports modules."""
         if self._messages is not None:
             self._messages.flush()
             self._watcher.watch_writable(self, self._messages.waiting)
 
     def kill(self, host: ProcessHost, *, dump: bool) -> None:
-        """Kill the worker of `host`, if it is still there."""
+        """Kill the worker of `host`, if it still runs."""
         if not self._ready and self._process is not None:
             self._failure = f"it was killed while it was importing {self._imports}"
-            self._process.kill()  # It hangs in an import, and obeys nobody.
+            self._process.kill()  # It hangs in an import and reads no messages.
         elif self._messages is not None:
             self._messages.send(Kill(host.host_id, dump))
             self._watcher.watch_writable(self, self._messages.waiting)
@@ -158,7 +164,7 @@ class ForkServer:
                 pass_fds=[theirs.fileno()],
                 env={**os.environ, **_ONE_THREAD, **self._env_vars},
                 stdin=subprocess.DEVNULL,
-                # Ctrl-C in the terminal is the trainer's business alone.
+                # Only the trainer should react to Ctrl-C in the terminal.
                 start_new_session=True,
             )
         except BaseException:
@@ -173,18 +179,18 @@ class ForkServer:
             self._end(0.0)
             raise
         path = None if self._interpreter else list(sys.path)
-        messages.send(Hello(path, self._preload))
+        messages.send(Preload(path, self._preload))
         return messages
 
     def on_readable(self) -> None:
-        """Pass on what the fork server tells of its workers."""
+        """Read messages of the fork server, and pass them to the hosts of its workers."""
         try:
             while self._messages is not None and (received := self._messages.receive()) is not None:
-                self._heard(received.message)
+                self._handle(received.message)
         except EOFError:
             self._lost()
 
-    def _heard(self, message: Message) -> None:
+    def _handle(self, message: Message) -> None:
         if isinstance(message, Ready):
             self._ready = message.error is None
             self._failure = message.error
@@ -195,7 +201,7 @@ class ForkServer:
             host.on_exit(message.exit_code, message.stderr_tail)
 
     def _lost(self) -> None:
-        """The fork server is gone, and by the kernel's care so are its workers."""
+        """Handle the exit of the fork server; the kernel killed its workers."""
         hosts = list(self._hosts.values())
         self._hosts.clear()
         exit_code = self._end(0.0)
@@ -210,20 +216,19 @@ class ForkServer:
             host.on_fork_server_lost(why.rstrip())
 
     def release(self, seconds: float) -> None:
-        """Let the fork server go; it ends what workers it still has, within `seconds`."""
+        """End the fork server, which ends its workers within `seconds`."""
         self._end(seconds)
 
     def disown(self) -> None:
-        """See `base.Shared.disown`."""
         if self._messages is not None:
             self._messages.close()
             self._messages = None
         if self._process is not None:
-            self._process.returncode = 0  # Another process's child, of which nobody is to warn.
+            self._process.returncode = 0  # The child of another process, so no warning is due.
             self._process = None
 
     def _end(self, seconds: float) -> int:
-        """See `release`; its exit code, 0 if there was none."""
+        """End it, as `release` does; return its exit code, or 0 if it wasn't running."""
         if self._messages is not None:
             self._watcher.unwatch(self)
             self._messages.close()
@@ -261,6 +266,7 @@ class ProcessHost:
             wiring.bell_offset,
             wiring.arena.append(rings_size(self.num_envs)),
         )
+        self._rings: memoryview | None = None
         self._link: Link | None = None
         self._alive = False
         self._closing = False
@@ -269,17 +275,21 @@ class ProcessHost:
     # -- life ---------------------------------------------------------------------
 
     def start(self) -> None:
-        """Fork a worker (a new one, after a death) and tell it what to build."""
+        """Fork a worker (a new one, after a death) and send it the order to build its envs."""
         self._closing = False
         self._killed = ""
-        occupy_standard_streams()  # A program may have closed them since.
-        ours, theirs = socket.socketpair()
+        ours, theirs = _new_channel()
         try:
             ours.setblocking(False)
-            self._link = Link(self._place, self._wiring, ours)
+            if self._rings is None:
+                size = rings_size(self.num_envs)
+                self._rings = map_shared(
+                    self._wiring.arena.descriptor, self._place.rings_offset, size
+                )
+            self._link = Link(self._place, self._rings, self._wiring, ours)
             self._fork_server.fork(self, theirs, self._wiring.arena, Fork(self._place))
         except BaseException:
-            # Another attempt may follow, when there are descriptors again.
+            # The supervisor may try again, when there are descriptors.
             self.release()
             ours.close()
             theirs.close()
@@ -288,21 +298,17 @@ class ProcessHost:
         self._link.send(FrameKind.START, payload=self._start_payload)
 
     def attach(self, order: AttachOrder) -> None:
-        """See `base.Host.attach`."""
         if self._link is not None:
             self._link.send(FrameKind.ATTACH, payload=pickle.dumps(order))
 
     def kill(self, *, dump: bool) -> None:
-        """See `base.Killable.kill`."""
         self._killed = "did not close in time and was killed" if self._closing else ""
         self._fork_server.kill(self, dump=dump)
 
     def destroy(self) -> None:
-        """See `base.Killable.destroy`."""
         self._fork_server.destroy()
 
     def close(self) -> None:
-        """See `base.Host.close`."""
         self._closing = True
         if self._alive and self._link is not None:
             self._link.send(FrameKind.CLOSE)
@@ -310,72 +316,80 @@ class ProcessHost:
             self._wiring.completions.append(Closed(self.host_id, []))
 
     def release(self) -> None:
-        """See `base.Host.release`."""
+        self._hang_up()
+        self._rings = None
+
+    def _hang_up(self) -> None:
         self._alive = False
         if self._link is not None:
             self._link.hang_up()
             self._link = None
 
     def on_exit(self, exit_code: int, stderr_tail: str) -> None:
-        """The worker has ended; whatever it still said is heard first."""
+        """Handle the exit of the worker; read its pending output first."""
         if self._link is not None:
-            self._link.read_channel()
+            self._link.on_readable()
         by_us = self._killed and exit_code == -signal.SIGKILL
         self._ended(self._killed if by_us else _ending(exit_code), exit_code, stderr_tail)
 
     def on_fork_server_lost(self, why: str) -> None:
-        """The worker ended with its fork server."""
+        """Handle the exit of the fork server, which ended the worker, too."""
         self._ended(f"ended with its fork server: {why}", None, "")
 
     def _ended(self, cause: str, exit_code: int | None, stderr_tail: str) -> None:
-        link, tell = self._link, self._wiring.completions.append
+        link, post = self._link, self._wiring.completions.append
         if link is None:
             return
         link.poll()
         requests = link.last_requests()
-        self.release()
+        self._hang_up()
         self.pid = None
         if not self._closing:
-            tell(Died(self.host_id, Death(cause, exit_code, stderr_tail, requests)))
+            post(Died(self.host_id, Death(cause, exit_code, stderr_tail, requests)))
             return
         errors = link.close_errors
         if errors is None:
             index = slot_of(requests[0]) - self.first_slot if requests[0] else 0
             errors = [(index, ErrorText("WorkerDied", f"its worker {cause}", stderr_tail))]
-        tell(Closed(self.host_id, errors))
+        post(Closed(self.host_id, errors))
 
     # -- requests and replies -----------------------------------------------------
 
     def packed(self, arguments: Any) -> bytes:
-        """See `base.Host.packed`."""
         return dumped(arguments, "it")
 
     def submit(self, entries: NDArray[np.int64], arguments: Sequence[bytes] | None = None) -> None:
-        """See `base.Host.submit`."""
         if self._link is not None:
             self._link.submit(entries, arguments)
 
     def poll(self) -> None:
-        """See `base.Polled.poll`."""
         if self._link is not None:
             self._link.poll()
 
     def executing(self) -> tuple[int, int]:
-        """See `base.Killable.executing`."""
         return (0, 0) if self._link is None else self._link.executing()
 
     @property
     def traffic(self) -> int:
-        """See `base.Killable.traffic`."""
         return 0 if self._link is None else self._link.traffic
 
     def catch_up(self) -> bool:
-        """See `base.Killable.catch_up`."""
-        told, traffic = len(self._wiring.completions), self.traffic
+        posted, traffic = len(self._wiring.completions), self.traffic
         self._fork_server.on_readable()
         if self._link is not None:
             self._link.catch_up()
-        return (len(self._wiring.completions), self.traffic) != (told, traffic)
+        return (len(self._wiring.completions), self.traffic) != (posted, traffic)
+
+
+def _new_channel() -> tuple[socket.socket, socket.socket]:
+    """Make a pair of sockets, neither of which takes the place of a standard stream."""
+    ours, theirs = socket.socketpair()
+    if min(ours.fileno(), theirs.fileno()) > _STDERR:
+        return ours, theirs
+    ours.close()
+    theirs.close()
+    occupy_standard_streams()  # The program has closed some since the group was built.
+    return socket.socketpair()
 
 
 def _ending(exit_code: int) -> str:

@@ -1,9 +1,9 @@
-"""`RayHost`: envs in a Ray actor, on whatever node of the cluster has room for it.
+"""`RayHost`: envs in a Ray actor, on any node of the cluster that has room for it.
 
-One remote call carries a batch of requests, one array for each column, and its reply comes
-back alike. Ray's threads leave what has completed in an `Inbox`, whose descriptor wakes the
-trainer. A node that dies is a worker that dies, and its replacement is another actor.
-Absent on purpose: everything of Ray's own (see `ray`), and what envs do (see `actor`).
+One remote call carries a batch of requests, with one array for each column, and its reply has the
+same form. Threads of Ray put outcomes into an `Inbox`, whose descriptor wakes the trainer. A node
+that dies is a worker that dies, and its replacement is another actor.
+Left out on purpose: calls to Ray (see `ray`), and the execution of requests (see `actor`).
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from rlightning_aio.hosts.messages import (
 )
 from rlightning_aio.hosts.pickling import dumped, dumped_with_code
 from rlightning_aio.hosts.ray import (
-    Connection,
+    RayConnection,
     actor_class,
-    beside,
     call,
+    concurrent,
     ending,
     kill,
     shortage,
@@ -61,11 +61,11 @@ if TYPE_CHECKING:
 __all__ = ["RayHost"]
 
 _ON_THE_WAY_NS: Final = 2_000_000_000
-"""How long a batch and its reply may be on their way, beside what the envs take."""
+"""Time for a batch and its reply to travel, in addition to the time of the envs."""
 
 _OF_ANOTHER_PROCESS: Final[list[_Life]] = []
-"""What a forked process has found in its memory. It keeps it: to let go of what is Ray's would be
-told to the cluster, through sockets in the middle of what the other process says there.
+"""Actors that a forked process inherited. It keeps them, because Ray would report their release to
+the cluster, over sockets that the parent uses.
 """
 
 
@@ -74,13 +74,13 @@ class _Life:
 
     Attributes:
         actor: Ray's handle.
-        inbox: where its replies arrive.
-        has_place: some node has started it.
-        is_built: its envs are.
-        sent: entries of the batches that it has not answered, in the order of execution.
-        began_ns: when it began with the first of them, as far as that can be known here.
-        late: a request that it has told to take too long, and since when that takes.
-        stacks: what all of its threads did then.
+        inbox: for its replies.
+        has_place: a node has started it.
+        is_built: its envs are built.
+        sent: entries of unanswered batches, in the order of execution.
+        began_ns: estimated start of the first of them.
+        late: a request that it reported as late, and the start of that request.
+        stacks: of all its threads when it reported that.
     """
 
     def __init__(self, actor: Any) -> None:
@@ -91,12 +91,12 @@ class _Life:
         self.began_ns = 0
         self.late: tuple[int, int] | None = None
         self.stacks = ""
-        # What calls have left with us, by their number.
+        # Objects to keep until a call returns, by the number of the call.
         self._kept: dict[int, object] = {}
         self._num_calls = 0
 
     def call(self, method: Any, then: Callable[[_Life, Any], None], *arguments: Any) -> None:
-        """Call a method of the actor; `then` gets what comes of it, on the trainer's thread."""
+        """Call a method of the actor; `then` gets the outcome on the thread of the trainer."""
         self._num_calls = number = self._num_calls + 1
         put = self.inbox.put
 
@@ -110,7 +110,7 @@ class _Life:
         then(self, outcome)
 
     def end(self) -> None:
-        """Whatever the actor does, and whatever it has still told, is over."""
+        """Kill the actor, and drop its replies."""
         self.inbox.close()
         self._kept.clear()
         kill(self.actor)
@@ -132,47 +132,48 @@ class RayHost:
         self._actor_class = actor_class(order.config, watched=bool(self._limits))
         self._start_payload = dumped_with_code(order)
         self._wiring = wiring
-        self._tell = wiring.completions.append
+        self._post = wiring.completions.append
         self._pid = os.getpid()
         self._life: _Life | None = None
         self._started: list[EnvStarted] = []
         self._table: RowTable | None = None
         self._closing = False
-        # How far a batch and its reply have come is Ray's own knowledge.
+        # Only Ray knows the progress of a transfer.
         self.traffic = 0
 
     # -- life ---------------------------------------------------------------------
 
     def start(self) -> None:
-        """See `base.Host.start`."""
         self._closing = False
         try:
-            Connection.share(self._config, self._wiring)
+            RayConnection.share(self._config, self._wiring)
             actor = self._actor_class.remote(self.first_slot, self._limits, list(sys.path))
+        except ConnectionError:
+            raise  # As for any worker that can't be started: there is no second attempt.
         except Exception as error:
-            self._tell(Died(self.host_id, Death(f"has no Ray cluster to live in: {error}")))
+            self._post(Died(self.host_id, Death(f"has no Ray cluster to live in: {error}")))
             return
         life = self._life = _Life(actor)
         self._wiring.watcher.watch(self)
         life.call(actor.hello, self._on_placed)
         life.call(actor.build, self._on_built, self._start_payload)
         if self._limits:
-            life.call(beside(actor.watch), self._on_late)
+            life.call(concurrent(actor.watch), self._on_late)
 
     def attach(self, order: AttachOrder) -> None:
-        """See `base.Host.attach`. The actor has rows of its own."""
+        """Map the rows of the trainer; the actor has its own."""
         if self._table is None:
             map_part = partial(map_shared, self._wiring.arena.descriptor)
             places = [(slab, row) for _, slab, row in placed(self._started, order, map_part)]
             self._table = RowTable(self.first_slot, places)
-        elif self._life is not None and any(order.standings):
-            self._life.call(self._life.actor.resume, self._on_resumed, order.standings)
+        elif self._life is not None and any(order.checkpoints):
+            self._life.call(self._life.actor.resume, self._on_resumed, order.checkpoints)
         # A replacement is not built yet.
         if self._life is not None and self._life.is_built:
-            self._tell(Attached(self.host_id))
+            self._post(Attached(self.host_id))
 
     def kill(self, *, dump: bool) -> None:
-        """See `base.Killable.kill`. Its stacks came when it was found to be late."""
+        """Kill the actor; it sent its stacks when it reported a late request."""
         del dump
         if self._life is None:
             return
@@ -184,20 +185,18 @@ class RayHost:
             self._end("was killed", -9)
 
     def destroy(self) -> None:
-        """See `base.Killable.destroy`. What `kill` ends is gone at once, as far as we know it."""
+        """Kill the actor; `kill` always has an effect."""
         self.kill(dump=False)
 
     def close(self) -> None:
-        """See `base.Host.close`."""
         self._closing = True
         if self._life is not None and self._life.has_place:
             self._life.call(self._life.actor.close, self._on_closed)
         else:
             self.release()
-            self._tell(Closed(self.host_id, []))
+            self._post(Closed(self.host_id, []))
 
     def release(self) -> None:
-        """See `base.Host.release`."""
         life, self._life = self._life, None
         if life is None:
             return
@@ -208,7 +207,7 @@ class RayHost:
         life.end()
 
     def _end(self, cause: str, exit_code: int | None = None) -> None:
-        """Be done with the actor, and tell of its death."""
+        """Release the actor, and report its death."""
         life = self._life
         if life is None:
             return
@@ -218,19 +217,17 @@ class RayHost:
         if self._closing:
             index = slot_of(requests[0]) - self.first_slot if requests else 0
             text = ErrorText("WorkerDied", f"its worker {cause}", life.stacks)
-            self._tell(Closed(self.host_id, [(index, text)]))
+            self._post(Closed(self.host_id, [(index, text)]))
         else:
             death = Death(cause, exit_code, life.stacks, tuple(requests))
-            self._tell(Died(self.host_id, death))
+            self._post(Died(self.host_id, death))
 
     # -- requests -----------------------------------------------------------------
 
     def packed(self, arguments: Any) -> bytes:
-        """See `base.Host.packed`."""
         return dumped(arguments, "it")
 
     def submit(self, entries: NDArray[np.int64], arguments: Sequence[bytes] | None = None) -> None:
-        """See `base.Host.submit`."""
         life = self._life
         if life is None:
             return
@@ -242,11 +239,10 @@ class RayHost:
         life.call(life.actor.execute, self._on_reply, Batch(entries, columns, arguments))
 
     def executing(self) -> tuple[int, int]:
-        """See `base.Killable.executing`.
+        """Return the entry being executed and its start, as of `base.Killable`.
 
-        An actor tells by itself when a request takes too long. As long as it tells nothing, its
-        batch is given the time that all of its requests may take: so an actor that was stopped
-        or cut off is found as well.
+        An actor reports a late request itself. Without a report, a batch may take as long as the
+        limits of all its requests together, so an actor that is stopped or cut off is found, too.
         """
         life = self._life
         if life is None or not life.sent:
@@ -263,30 +259,27 @@ class RayHost:
         return entries[-1], since_ns
 
     def catch_up(self) -> bool:
-        """See `base.Killable.catch_up`."""
-        told = len(self._wiring.completions)
+        posted = len(self._wiring.completions)
         self.on_readable()
-        return len(self._wiring.completions) != told
+        return len(self._wiring.completions) != posted
 
     # -- replies ------------------------------------------------------------------
 
     def fileno(self) -> int:
-        """See `base.Source.fileno`."""
         assert self._life is not None
         return self._life.inbox.descriptor
 
     def on_readable(self) -> None:
-        """See `base.Source.on_readable`."""
         life = self._life
         for task in life.inbox.take() if life is not None else ():
-            if self._life is life:  # And not at its end by one of them.
+            if self._life is life:  # A task may end it.
                 task()
 
     def on_writable(self) -> None:
-        """Never asked for: Ray sends by itself."""
+        """Do nothing: Ray sends by itself."""
 
     def _has_returned(self, outcome: Any) -> bool:
-        """Whether a call has returned; otherwise the actor has come to its end."""
+        """Return True if a call returned a value; otherwise handle the end of the actor."""
         if isinstance(outcome, BaseException):
             self._end(*ending(outcome))
             return False
@@ -300,21 +293,21 @@ class RayHost:
         if not self._has_returned(outcome):
             return
         started: Any = _loaded(outcome) if isinstance(outcome, bytes) else outcome
-        if isinstance(started, ErrorText):  # It holds what can't be read here.
+        if isinstance(started, ErrorText):  # It can't be unpickled here.
             started = NotStarted(0, started)
         if isinstance(started, NotStarted):
-            self._tell(NotBuilt(self.host_id, started.env_index, started.error))
+            self._post(NotBuilt(self.host_id, started.env_index, started.error))
             return
         self._started = started
         life.is_built = True
-        self._tell(Built(self.host_id, started))
+        self._post(Built(self.host_id, started))
         if self._table is not None:  # A replacement has its rows already.
-            self._tell(Attached(self.host_id))
+            self._post(Attached(self.host_id))
 
     def _on_resumed(self, life: _Life, outcome: NotStarted | Exception | None) -> None:
         del life
         if self._has_returned(outcome) and isinstance(outcome, NotStarted):
-            self._tell(NotBuilt(self.host_id, outcome.env_index, outcome.error))
+            self._post(NotBuilt(self.host_id, outcome.env_index, outcome.error))
 
     def _on_late(self, life: _Life, outcome: Late | Exception) -> None:
         if self._has_returned(outcome):
@@ -327,47 +320,46 @@ class RayHost:
             assert isinstance(outcome, Reply)
             life.sent.popleft()
             life.began_ns = time.monotonic_ns()
-            for completion in self._taken_in(outcome):
-                self._tell(completion)
+            self._wiring.completions.extend(self._apply(outcome))
 
-    def _taken_in(self, reply: Reply) -> list[Completion]:
-        """Write results into their rows; what has become of the batch."""
+    def _apply(self, reply: Reply) -> list[Completion]:
+        """Write results into their rows, and return the completions of a batch."""
         assert self._table is not None
         host_id = self.host_id
         self._table.put_results(reply.with_rows(), reply.columns, time.monotonic_ns())
-        told: list[Completion] = [NewSchema(host_id, *schema) for schema in reply.schemas]
-        told += [Saved(host_id, *saved) for saved in reply.saved]
+        completions: list[Completion] = [NewSchema(host_id, *schema) for schema in reply.schemas]
+        completions += [Saved(host_id, *saved) for saved in reply.saved]
         if len(reply.done):
-            told.append(Reported(host_id, reply.done))
-        told += [Result(host_id, entry, packed) for entry, packed in reply.beside]
+            completions.append(Reported(host_id, reply.done))
+        completions += [Result(host_id, entry, packed) for entry, packed in reply.partial]
         for entry, packed in reply.values:
             value = _loaded(packed)
-            told.append(
+            completions.append(
                 Raised(host_id, entry, value)
                 if isinstance(value, ErrorText)
                 else Value(host_id, entry, value)
             )
-        told += [Raised(host_id, entry, error) for entry, error in reply.errors]
-        return told
+        completions += [Raised(host_id, entry, error) for entry, error in reply.errors]
+        return completions
 
     def _on_closed(self, life: _Life, outcome: Any) -> None:
         del life
         if self._has_returned(outcome):
             self.release()
-            self._tell(Closed(self.host_id, outcome))
+            self._post(Closed(self.host_id, outcome))
 
 
 def _limits(config: EnvConfig) -> dict[int, float]:
-    """How many seconds an operation may take, where it has a limit."""
+    """Return the time limits in seconds, by operation."""
     limits = {Operation.STEP: config.step_timeout, Operation.RESET: config.reset_timeout}
     return {int(op): limit for op, limit in limits.items() if limit is not None}
 
 
 def _loaded(packed: bytes) -> Any:
-    """An object of the user's, whose class may be unknown here; an `ErrorText` of why not."""
+    """Unpickle an object whose class may be unknown here; return the error as an `ErrorText`."""
     try:
         return pickle.loads(packed)
     except KeyboardInterrupt:
         raise
-    except BaseException as error:  # What it is made by may raise anything.
+    except BaseException as error:  # Unpickling may raise anything.
         return ErrorText.of(error)

@@ -1,8 +1,8 @@
-"""`Camera`: films the episodes of an env where it lives.
+"""`Camera`: films the episodes of an env in its own process.
 
-It renders after each result and hands the frame to an encoder beside it (`VideoFile`), so no
-frame travels. An episode's film begins with what its reset shows, and ends with what its last
-step shows; where an env begins the next episode within that step, with the one before.
+It renders after each result and passes the frame to an encoder (`VideoFile`), so no frame travels.
+A film begins with the frame after the reset and ends with the frame after the last step. If an env
+begins the next episode within that step, the film ends with the frame before it.
 """
 
 from __future__ import annotations
@@ -12,9 +12,11 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import gymnasium as gym
 import numpy as np
 
 from rlightning_aio.envs.tensors import as_numpy
+from rlightning_aio.files import check_folder
 from rlightning_aio.hosts.video_file import VideoFile, find_ffmpeg
 
 if TYPE_CHECKING:
@@ -34,14 +36,14 @@ class Camera:
 
     Raises:
         ImportError: ffmpeg isn't installed where the env lives.
-        OSError: there is no such folder, and it can't be made.
+        OSError: nothing can be written into the folder.
         ValueError: the env renders nothing, or can't be filmed.
     """
 
     def __init__(self, env: BaseEnv, config: VideoConfig) -> None:
         find_ffmpeg()
         _check_renders(env, config.sub_env)
-        Path(config.folder).mkdir(parents=True, exist_ok=True)
+        check_folder(config.folder)
         self._env, self._config = env, config
         self._name = env.env_id
         if env.num_envs > 1:
@@ -52,34 +54,34 @@ class Camera:
         self._off = False
 
     def watch(self, slab: Slab, row: int, autoreset: str, limit: int | None) -> None:
-        """Learn from a row what has happened."""
+        """Read from `row` what each result is."""
         agents = len(slab.layout.agents) or 1
         columns = (slab.is_reset, slab.over, slab.episode_length)
         self._is_reset, self._over, self._length = (
             column[row, ...].reshape(agents, -1)[:, self._config.sub_env] for column in columns
         )
-        self._begins_at_once = autoreset == "same_step"
+        self._resets_itself = autoreset == "same_step"
         self._limit = limit
 
     def see(self) -> None:
-        """A result lies in the row."""
+        """Film the result that was just written into the row."""
         if self._off:
             return
         if self._is_reset.all():
             self._begin()
-        elif self._file is not None or self._begins_at_once:
-            self._go_on()
+        elif self._file is not None or self._resets_itself:
+            self._continue()
 
     def _begin(self) -> None:
-        """Begin the next episode with what is to be seen now."""
+        """Begin the next episode with the current frame."""
         self._finish()
         self._number += 1
         if self._config.wants(self._number):
             self._write()
 
-    def _go_on(self) -> None:
+    def _continue(self) -> None:
         over = bool(self._over.all())
-        if over and self._begins_at_once:
+        if over and self._resets_itself:
             self._begin()
             return
         if self._file is not None:
@@ -107,7 +109,7 @@ class Camera:
                 self._stop(error)
 
     def _stop(self, error: OSError) -> None:
-        """A disk that is full ends the film, not the training."""
+        """Stop filming; a full disk must not end the training."""
         self._off, self._file = True, None
         sys.stderr.write(f"env {self._env.env_id!r} is no longer filmed: {error}\n")
 
@@ -117,22 +119,28 @@ class Camera:
         if array.ndim == 4 and len(array) == 1:  # ManiSkill's, of one sub-environment.
             array = array[0]
         if array.ndim != 3 or array.shape[2] != 3 or array.dtype != np.uint8:
-            shown = type(frame).__name__ if array.ndim != 3 else f"{array.dtype}{array.shape}"
+            found = type(frame).__name__ if array.ndim != 3 else f"{array.dtype}{array.shape}"
             raise ValueError(
-                f"env {self._env.env_id!r} can't be filmed: render() gives {shown}, not a uint8 "
+                f"env {self._env.env_id!r} can't be filmed: render() gives {found}, not a uint8 "
                 "array [height, width, 3]; a simulator of Gymnasium's does with "
                 "env_kwargs: {render_mode: rgb_array}"
             )
         return array
 
     def close(self) -> None:
-        """The episode that is under way stays without its end."""
+        """End the film of the current episode early."""
         file, self._file = self._file, None
         if file is not None:
             file.abandon()
 
 
 def _check_renders(env: BaseEnv, sub_env: int) -> None:
+    inner: Any = getattr(env.env, "unwrapped", env.env)
+    if getattr(inner.__class__, "render", None) is gym.vector.VectorEnv.render:
+        raise ValueError(
+            f"env {env.env_id!r} can't be filmed: a {inner.__class__.__name__} renders nothing; "
+            "film one with num_envs: 1"
+        )
     mode = getattr(env.env, "render_mode", "rgb_array")
     if mode != "rgb_array":
         raise ValueError(
@@ -157,9 +165,9 @@ def _fps(env: BaseEnv) -> float:
 
 
 def _last_number(folder: Path, name: str) -> int:
-    """The highest number of an episode whose film is there; -1 if none is.
+    """Return the highest number of an episode that has a film; -1 if there is none.
 
-    So a replaced worker, and a run that is resumed, go on counting.
+    So a replaced worker and a resumed run continue the numbers.
     """
     pattern = re.compile(rf"{re.escape(name)}-episode-(\d+)\.mp4")
     found = (pattern.fullmatch(path.name) for path in folder.glob("*.mp4"))

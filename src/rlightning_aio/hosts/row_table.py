@@ -1,8 +1,8 @@
-"""`RowTable`: the rows of a host's envs where trainer and envs share no memory.
+"""`RowTable`: copies rows between a trainer and envs that share no memory with it.
 
-Both sides have a table of the same envs, each over slabs of its own. What a request or a
-result consists of crosses as a few columns, one array for each, whatever the number of envs.
-Rule: both sides find out from the entries alone which columns travel and in which order.
+Both sides have a table of the same envs over their own slabs. Requests and results travel as a few
+columns, one array each, however many envs there are.
+Rule: the entries alone determine the columns and their order.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rlightning_aio.protocol.columns import leaf_of
-from rlightning_aio.protocol.entries import OP_BITS, OP_MASK, SLOT_MASK, Operation
+from rlightning_aio.protocol.entries import OP_MASK, Operation, slots_of
 from rlightning_aio.protocol.info import NO_INFO, PICKLED
 
 if TYPE_CHECKING:
@@ -25,16 +25,16 @@ if TYPE_CHECKING:
 __all__ = ["Columns", "RowTable"]
 
 Columns = list["NDArray[Any]"]
-"""One array for each column, the rows on its first axis; for each slab in turn."""
+"""One array `[rows, ...]` for each column, slab by slab."""
 
 
 class RowTable:
-    """See the module.
+    """Reads and writes the rows of one host.
 
     Args:
         first_slot: slot of the env of index 0.
-        places: slab and row of each env, by index; both sides give an env the same position
-            among the slabs, in the order in which they first occur.
+        places: slab and row of each env, by index. On both sides the slabs must first occur in
+            the same order.
     """
 
     def __init__(self, first_slot: int, places: Sequence[tuple[Slab, int]]) -> None:
@@ -47,11 +47,11 @@ class RowTable:
         self._outputs = [_outputs(slab) for slab in self._slabs]
 
     def requests(self, entries: NDArray[np.int64], *, seeds: bool) -> Columns:
-        """Copies of what the rows hold for the requests of `entries`; takes the seeds away.
+        """Copy the inputs of requests from the rows, and remove the seeds there.
 
         Args:
             entries: of the requests.
-            seeds: those of resets lie in the rows.
+            seeds: the rows hold the seeds of resets.
         """
         columns: Columns = []
         for k, rows, ops in self._parts(entries):
@@ -63,7 +63,7 @@ class RowTable:
         return columns
 
     def put_requests(self, entries: NDArray[np.int64], columns: Columns, *, seeds: bool) -> None:
-        """Write what `requests` has read on the other side."""
+        """Write the columns that `requests` returned on the other side."""
         values = iter(columns)
         for k, rows, ops in self._parts(entries):
             if len(stepped := rows[ops == Operation.STEP]):
@@ -73,11 +73,11 @@ class RowTable:
                 self._slabs[k].seed[reset] = next(values)
 
     def results(self, entries: NDArray[np.int64], info_width: int) -> Columns:
-        """Copies of the results that the rows of `entries` hold.
+        """Copy results from the rows.
 
         Args:
-            entries: of requests that have ended in a result.
-            info_width: bytes of a row that infos use, at the most.
+            entries: of requests that ended in a result.
+            info_width: the most bytes of a row that infos use.
         """
         columns: Columns = []
         for k, rows, _ in self._parts(entries):
@@ -88,21 +88,21 @@ class RowTable:
         return columns
 
     def put_results(self, entries: NDArray[np.int64], columns: Columns, done_ns: int) -> None:
-        """Write what `results` has read on the other side, ready at `done_ns` (monotonic)."""
+        """Write the columns that `results` returned on the other side at `done_ns` (monotonic)."""
         values = iter(columns)
         for k, rows, _ in self._parts(entries):
             for column in self._outputs[k]:
                 column[rows] = next(values)
             info = next(values)
             self._slabs[k].info[rows, : info.shape[1]] = info
-            # The clock of another machine says nothing here.
+            # Clocks of different machines can't be compared.
             self._slabs[k].done_ns[rows] = done_ns
 
     def _parts(
         self, entries: NDArray[np.int64]
     ) -> Iterator[tuple[int, NDArray[np.intp], NDArray[np.int64]]]:
-        """Which slabs are concerned, with the rows and the operations of each."""
-        indices = ((entries >> OP_BITS) & SLOT_MASK) - self._first_slot
+        """Yield each slab that `entries` concern, with their rows and operations."""
+        indices = slots_of(entries) - self._first_slot
         ops = entries & OP_MASK
         if len(self._slabs) == 1:
             if len(indices):
@@ -115,7 +115,7 @@ class RowTable:
 
 
 def _outputs(slab: Slab) -> Columns:
-    """What a result writes to its row, but for the info; its mark is the last."""
+    """Return the columns of a result except the info; the last one is its mark."""
     observation = (
         []
         if slab.observation is None

@@ -1,9 +1,9 @@
-"""`RowWriter`: how a result becomes a row, in a worker, an inline host and an env_server.
+"""`RowWriter`: writes results into rows, in a worker, an inline host and an env_server.
 
-Rule: a row says what it is. Beside observation, reward and ends it tells whether it is a
-reset, whether the episode is over, and the episode's return and length so far. What has no
-place in the row (a nested info, an observation without a fixed size) is returned, to be
-sent out of band; None means that the row holds all of it.
+A row holds observation, reward and ends, and also whether it is a reset, whether the episode is
+over, and the episode's return and length so far. Data without a place in the row (a nested info,
+an observation without a fixed size) is returned, to be sent out of band; None means that the row
+holds all of the result.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ __all__ = ["RowWriter", "infos_out_of_band"]
 
 
 def infos_out_of_band(schema: InfoSchema) -> int:
-    """In place of `announce`: no info is packed into the row."""
+    """Stand in for `announce`, so that no info is packed into the row."""
     del schema
     return PICKLED
 
@@ -38,20 +38,19 @@ class RowWriter:
     """Writes the results of one env.
 
     Args:
-        slab, row: where.
+        slab, row: where the results go.
         env_id: named in errors.
-        autoreset: what sub-environments do after an end; see `EnvMeta`.
-        announce: tells the trainer of a new way in which infos lie in the row.
-        turns: if results come from some of the sub-environments at a time, how many there
-            are in all; 0 otherwise.
-        copies: what is returned stays in this process, and must be nobody else's.
+        autoreset: when sub-environments reset themselves; see `EnvMeta`.
+        announce: sends a new schema of infos to the trainer, and returns its number.
+        partial_of: the number of sub-environments, if a result is of some of them only; else 0.
+        copies: data out of band stays in this process, so it must be copied.
 
     Attributes:
-        write_observation: into the row; None where observations don't travel there.
-        write_info: into the row; returns its mark (see `protocol.info`).
-        read_info: what it wrote last, given that mark.
-        out_of_band: what was last returned as such.
-        shows_some: results come from some of the sub-environments at a time.
+        write_observation: writes into the row; None if observations travel out of band.
+        write_info: writes into the row and returns the mark (see `protocol.info`).
+        read_info: reads the last info from the row, given its mark.
+        out_of_band: the last data out of band.
+        partial_results: a result is of some of the sub-environments only.
     """
 
     def __init__(
@@ -62,7 +61,7 @@ class RowWriter:
         env_id: str,
         autoreset: Autoreset,
         announce: Callable[[InfoSchema], int],
-        turns: int = 0,
+        partial_of: int = 0,
         copies: bool = False,
     ) -> None:
         self._slab = slab
@@ -78,42 +77,41 @@ class RowWriter:
         infos = InfoWriter(memoryview(slab.info[row]), announce)
         self.write_info, self.read_info = infos.write, infos.read
         self.out_of_band: OutOfBand = {}
-        # With an ellipsis an entry of a plain column is a view, too.
+        # With an ellipsis, an element of a plain column is a view, too.
         self._reward, self._flags = slab.reward[row, ...], slab.flags[row, ...]
         self._terminated, self._truncated = slab.terminated[row, ...], slab.truncated[row, ...]
         self._is_reset = slab.is_reset[row, ...]
-        self._turns = turns
-        self.shows_some = turns > 0
-        self._sums = _sums(slab, row, autoreset, turns)
+        self.partial_results = partial_of > 0
+        self._sums = _sums(slab, row, autoreset, partial_of)
 
     def begin_episode(self, info: Mapping[str, Any]) -> None:
-        """Say that the row is a reset: no reward, no end, nothing summed up."""
+        """Mark the row as a reset: no reward, no end, sums of 0."""
         self._reward[...] = 0.0
         self._flags[...] = False
         self._is_reset[...] = True
-        if self._turns:
-            # The others' first observations are still to come, as results of steps.
+        if self.partial_results:
+            # The first observations of the others will come as results of steps.
             self._sums.begin(begun=np.asarray(info["env_id"]))
             self._show_sums(np.asarray(info["env_id"]))
         else:
             self._sums.begin()
 
-    def look(self) -> None:
-        """Take note of what was written to the row past this."""
-        self._sums.look()
+    def row_changed(self) -> None:
+        """Read what others wrote into the row."""
+        self._sums.row_changed()
 
     def write_ends(
         self, reward: Any, terminated: Any, truncated: Any, info: Mapping[str, Any]
     ) -> None:
-        """Write reward and ends of a step, which fit the row, and add it to its episodes."""
+        """Write reward and ends, in the shape of the row, and add the step to the sums."""
         self._reward[...] = reward
         self._terminated[...] = terminated
         self._truncated[...] = truncated
         ended = None
         if terminated is not False or truncated is not False:
             ended = self._terminated | self._truncated
-            ended = ended if ended.any() else None
-        if self._turns:
+            ended = ended if np.count_nonzero(ended) else None
+        if self.partial_results:
             which = np.asarray(info["env_id"])
             reset = self._sums.step(self._reward, ended, which)
             self._show_sums(which)
@@ -122,7 +120,7 @@ class RowWriter:
         self._is_reset[...] = False if reset is None else self._of_all_agents(reset)
 
     def _of_all_agents(self, reset: Any) -> Any:
-        """A sub-environment resets itself for all of its agents."""
+        """Combine the agents: a sub-environment resets itself for all of them."""
         return reset.all(axis=0) if self._slab.layout.agents else reset
 
     def _show_sums(self, which: Any) -> None:
@@ -132,13 +130,13 @@ class RowWriter:
         slab.over[row] = sums.over[which]
 
     def checked_ends(self, reward: Any, terminated: Any, truncated: Any) -> tuple[Any, Any, Any]:
-        """Reward and ends in the shape of the row, from whatever holds them (tensors, dicts by
-        agent, an axis of one too many).
+        """Return reward and ends in the shape of the row.
 
-        Those that a result leaves out (0.0 and False, no agent at all) hold for all.
+        They may be tensors, dicts by agent, or have an extra axis of length one. Values that a
+        result leaves out (0.0 and False, a dict without agents) apply to all.
 
         Raises:
-            ValueError: a shape that doesn't fit.
+            ValueError: a shape doesn't fit.
         """
         return (
             self._checked("reward", reward),
@@ -164,10 +162,10 @@ class RowWriter:
         return array
 
     def number(self, what: str, value: Any) -> float:
-        """The one number that `value` holds, an array of shape (1,) say.
+        """Return the one number in `value`, such as an array of shape (1,).
 
         Raises:
-            ValueError: it holds none, or several.
+            ValueError: it holds no number, or several.
         """
         try:
             return float(self._checked(what, value))
@@ -177,15 +175,15 @@ class RowWriter:
             ) from None
 
     def write_times(self, done_ns: int, busy_ns: int) -> None:
-        """Write when the result was ready (monotonic), and what it took the env, in ns."""
+        """Write when the result was ready (monotonic) and how long the env took, in ns."""
         self._slab.times[self._row] = done_ns, busy_ns
 
     def write_data(
         self, observation: Any, info: dict[str, Any], extra: dict[str, Any] | None = None
     ) -> OutOfBand | None:
-        """Write an observation and an info; what of them is out of band."""
+        """Write an observation and an info, and return the part that is out of band."""
         if self._slab.layout.observations_out_of_band:
-            return self.kept(self.handed_over(observation, info))
+            return self.keep(self.hand_over(observation, info))
         out_of_band: OutOfBand = {}
         if self.write_observation is None:
             out_of_band["observation"] = observation
@@ -196,25 +194,28 @@ class RowWriter:
             out_of_band["info"] = as_numpy(info)
         if extra:
             out_of_band["extra"] = extra
-        return self.kept(out_of_band) if out_of_band else None
+        return self.keep(out_of_band) if out_of_band else None
 
-    def handed_over(self, observation: Any, info: dict[str, Any]) -> OutOfBand:
-        """What the row would only copy."""
+    def hand_over(self, observation: Any, info: dict[str, Any]) -> OutOfBand:
+        """Return observation and info for the trainer to use without a copy."""
         space = self._slab.layout.observation_space
         observation = fitted_tree(space, observation, "observation")
         self.out_of_band = {"observation": observation, "info": info}
         return self.out_of_band
 
-    def kept(self, out_of_band: OutOfBand) -> OutOfBand:
-        """`out_of_band` as the trainer may keep it; pickling copies what leaves the process."""
+    def keep(self, out_of_band: OutOfBand) -> OutOfBand:
+        """Return `out_of_band` for the trainer to keep; pickling copies it for other processes."""
         self.out_of_band = copied(out_of_band) if self._copies else out_of_band
         return self.out_of_band
 
 
-def _sums(slab: Slab, row: int, autoreset: Autoreset, turns: int) -> EpisodeSums:
-    if turns:
+def _sums(slab: Slab, row: int, autoreset: Autoreset, partial_of: int) -> EpisodeSums:
+    if partial_of:
         return EpisodeSums(
-            np.zeros(turns), np.zeros(turns, np.int64), np.zeros(turns, np.bool_), autoreset
+            np.zeros(partial_of),
+            np.zeros(partial_of, np.int64),
+            np.zeros(partial_of, np.bool_),
+            autoreset,
         )
     return EpisodeSums(
         slab.episode_return[row, ...],

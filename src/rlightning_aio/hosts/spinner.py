@@ -1,10 +1,9 @@
-"""`Spinner`: wait for a moment without sleeping, where that has paid lately.
+"""`Spinner`: waits briefly without sleeping, if recent waits were short.
 
-Putting a process to sleep and waking it takes tens of microseconds and a system call on
-the other side; a reply often comes sooner. So a process that expects one soon looks for it
-a while first. It yields its core in every turn, and leaves off when others want the core
-(a sleeper is woken before them, one that yields queues behind them) or when replies
-have been taking longer than a spin may last.
+A sleep and a wake-up take tens of microseconds and a system call on the other side; a reply often
+comes sooner. So a process first polls for a while. It yields its core in each turn. It stops when
+other processes want the core (a sleeper is woken before them, but one that yields queues behind
+them), or when recent replies took longer than a spin may last.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["Spinner"]
 
 _LIMIT_SECONDS: Final = 400e-6
-# A yield that nobody took takes half a microsecond.
+# A yield takes half a microsecond if no other process wants the core.
 _YIELD_SECONDS: Final = 10e-6
 _SKIPPED_AFTER_CONTENTION: Final = 8
 # One long pause (a policy update) says little about the next wait.
@@ -37,7 +36,7 @@ class Spinner:
         self._began = 0.0
 
     def spin(self, ready: Callable[[], bool]) -> bool:
-        """Whether `ready` came true within a spin; if not, sleep and call `slept` after."""
+        """Spin until `ready` returns True; if this returns False, sleep and then call `slept`."""
         if not self._enabled:
             return False
         clock = time.monotonic
@@ -53,7 +52,7 @@ class Spinner:
                 return False
             os.sched_yield()
             before, now = now, clock()
-            # The one we wait for may have had the core meanwhile: then it was no loss.
+            # If the awaited process had the core, yielding was right.
             if now - before > _YIELD_SECONDS and not ready():
                 self._skip = _SKIPPED_AFTER_CONTENTION
                 return False
@@ -61,7 +60,7 @@ class Spinner:
         return True
 
     def slept(self) -> None:
-        """What was waited for has come, after a sleep."""
+        """Record that the wait ended after a sleep."""
         if self._enabled:
             self._note(time.monotonic() - self._began)
 

@@ -1,7 +1,6 @@
-"""Keeps descriptors 0, 1 and 2 taken in a program that was started without its streams.
+"""Keeps descriptors 0, 1 and 2 open in a program that was started without its streams.
 
-Otherwise, whatever is opened next would get one of them, and all that goes to stderr would be
-written into it.
+Otherwise the next file would get one of them, and output to stderr would be written into it.
 """
 
 from __future__ import annotations
@@ -17,9 +16,9 @@ _STDERR: Final = 2
 
 
 def occupy_standard_streams() -> None:
-    """Have /dev/null in place of those that are closed, here and in what this process starts.
+    """Open /dev/null in place of closed streams, here and in child processes.
 
-    Call it before opening what must not land there.
+    Call it before opening a file that must not get one of these descriptors.
     """
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= _STDERR:
         os.set_inheritable(descriptor, True)
@@ -27,10 +26,10 @@ def occupy_standard_streams() -> None:
 
 
 def stdout_set_aside() -> TextIO:
-    """Have descriptor 1 lead to stderr from now on, here and in what this process starts.
+    """Redirect descriptor 1 to stderr, here and in child processes.
 
-    Whoever prints, an env, a library written in C or a process that either starts, can then spoil
-    no result. Returns the stream that leads where stdout has led until now.
+    Then an env, a C library or a child process that prints can't corrupt output to stdout. Returns
+    a stream to the original stdout.
     """
     occupy_standard_streams()
     before = sys.stdout

@@ -1,8 +1,8 @@
-"""`VideoFile`: frames of one episode become one MP4 file.
+"""`VideoFile`: writes the frames of one episode to one MP4 file.
 
-Rule: only a file that has all frames of its episode has the name that was asked for. Until then,
-and if its process dies, it is called ``….partial.mp4``; ffmpeg, a process of its own, ends such a
-file properly when its input ends, so what there is can be played.
+Rule: only a complete file has the requested name. Until then, and if its process dies, it is called
+``….partial.mp4``. A separate ffmpeg process closes such a file properly when its input ends, so it
+can be played.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
+from rlightning_aio.files import check_regular, check_writable, finish_file
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -21,11 +23,11 @@ if TYPE_CHECKING:
 __all__ = ["VideoFile", "find_ffmpeg"]
 
 _NICE: Final = 10
-"""Who steps comes before who encodes."""
+"""Stepping has priority over encoding."""
 
 
 def find_ffmpeg() -> str:
-    """The program that encodes.
+    """Return the path of ffmpeg.
 
     Raises:
         ImportError: it isn't installed.
@@ -40,16 +42,16 @@ def find_ffmpeg() -> str:
 
 
 class VideoFile:
-    """One file that is being written.
+    """An MP4 file that is being written.
 
     Args:
-        path: what it is to be called, ``<folder>/<name>.mp4``.
-        frame: the first one, ``[height, width, 3]`` uint8; all others have its shape.
-        fps: frames to a second when it is played.
+        path: of the complete file, ``<folder>/<name>.mp4``.
+        frame: the first frame, ``[height, width, 3]`` uint8; all others have its shape.
+        fps: frames per second when it is played.
 
     Raises:
         ImportError: ffmpeg isn't installed.
-        OSError: it can't be started.
+        OSError: it can't be started, or the file can't be written.
     """
 
     def __init__(self, path: Path, frame: NDArray[np.uint8], fps: float) -> None:
@@ -57,17 +59,19 @@ class VideoFile:
         self._partial = path.with_suffix(".partial.mp4")
         self._shape = frame.shape
         height, width, _ = frame.shape
-        # The ffmpeg of a worker that has died may still be at work on it.
+        check_writable(path)
+        # The ffmpeg of a dead worker may still write to it.
+        check_regular(self._partial)
         self._partial.unlink(missing_ok=True)
-        # In a session of its own, as Ctrl-C would reach it, too.
+        # In its own session, because Ctrl-C would reach it, too.
         self._ffmpeg = subprocess.Popen(
             [
                 *(find_ffmpeg(), "-loglevel", "error"),
                 *("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"),
                 *("-r", str(fps), "-i", "-", "-an"),
-                # What most players take: chroma by the half, so sizes must be even.
+                # Most players need halved chroma, so sizes must be even.
                 *("-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p"),
-                # By itself it would take all cores, which others step on.
+                # Without a limit it would use all cores, which envs need.
                 *("-c:v", "libx264", "-preset", "veryfast", "-threads", "1", str(self._partial)),
             ],
             stdin=subprocess.PIPE,
@@ -82,8 +86,8 @@ class VideoFile:
         """Add a frame.
 
         Raises:
-            ValueError: it has another shape than the first one.
-            OSError: ffmpeg has ended, as on a full disk; the message has what it said.
+            ValueError: its shape differs from that of the first frame.
+            OSError: ffmpeg has ended, as on a full disk; the message includes its output.
         """
         if frame.shape != self._shape:
             raise ValueError(f"a frame has shape {frame.shape}, the ones before {self._shape}")
@@ -95,16 +99,16 @@ class VideoFile:
             raise
 
     def finish(self) -> None:
-        """The episode is over: the file gets its name.
+        """Close the file and give it its name: the episode is over.
 
         Raises:
             OSError: the file couldn't be written.
         """
         self._end()
-        self._partial.replace(self._path)
+        finish_file(self._partial, self._path)
 
     def abandon(self) -> None:
-        """No more frames will come; what there is stays, marked as partial."""
+        """Close the file early; it keeps its partial name."""
         self._end()
 
     def _end(self) -> None:

@@ -1,8 +1,8 @@
-"""The other end of a process host: a plain blocking loop around a few envs.
+"""The worker process of a process host: a plain blocking loop around a few envs.
 
-Rule: one thread, no asyncio; requests are executed in the order in which they were
-sent, and every request gets exactly one reply with its own entry. When there is
-nothing to do the worker spins for a moment (see `spinner`), then sleeps on its channel.
+Rule: one thread, no asyncio. Requests are executed in the order of sending, and every
+request gets exactly one reply with its own entry. An idle worker spins for a moment (see
+`spinner`), then sleeps on its channel.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ import socket
 import sys
 import time
 import traceback
-from typing import TYPE_CHECKING, ClassVar, NoReturn
+from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 
+from rlightning_aio.envs.results import is_awaitable
 from rlightning_aio.hosts.arena import make_private, map_shared
 from rlightning_aio.hosts.build_env import built_envs
 from rlightning_aio.hosts.messages import ErrorText
 from rlightning_aio.hosts.pickling import dumped, dumped_with_code
 from rlightning_aio.hosts.runner import attach_all, close_all
 from rlightning_aio.hosts.spinner import Spinner
-from rlightning_aio.protocol.bell import WorkerBell, bell_size
 from rlightning_aio.protocol.entries import (
     OP_BITS,
     OP_MASK,
@@ -34,6 +34,7 @@ from rlightning_aio.protocol.entries import (
     op_of,
     slot_of,
 )
+from rlightning_aio.protocol.exchange import WorkerBell, bell_size
 from rlightning_aio.protocol.frames import BELL, CHUNK_BYTES, Frame, FrameKind, FrameReader, encode
 from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
 from rlightning_aio.protocol.rings import WorkerRings, rings_size
@@ -41,8 +42,9 @@ from rlightning_aio.protocol.rings import WorkerRings, rings_size
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from rlightning_aio.hosts.env_steps import Execute
     from rlightning_aio.hosts.messages import AttachOrder, OutOfBand, StartOrder, WorkerPlace
-    from rlightning_aio.hosts.runner import EnvRunner, Execute
+    from rlightning_aio.hosts.runner import EnvRunner
 
 __all__ = ["Worker", "main"]
 
@@ -50,18 +52,18 @@ _STEP = int(Operation.STEP)
 
 
 class TrainerGone(Exception):
-    """The channel has closed from the other side."""
+    """The trainer closed the channel, or died."""
 
 
 class Worker:
-    """Serves the envs of one worker until told to close, or until the trainer is gone.
+    """Serves the envs of one worker until it gets `CLOSE` or the trainer is gone.
 
     Args:
         channel: blocking stream socket to the trainer.
         arena: descriptor of the group's shared memory.
-        rings: this worker's.
+        rings: of this worker.
         first_slot: slot of its first env in the group.
-        shared: the shared memory that it has mapped so far.
+        shared: memory that is mapped already.
     """
 
     def __init__(
@@ -84,45 +86,82 @@ class Worker:
         self._spinner = Spinner(enabled=False)
         self._attached = False
         self._closing = False
+        self._awaits = False
+        self._submit: Callable[[int, Any], None]
+        self._order: StartOrder
         self._shared = list(shared)
         self._is_child = False
 
     def serve(self) -> None:
-        """Run until told to close; envs are closed on every way out."""
+        """Serve until it gets `CLOSE` or the trainer is gone; close the envs in any case."""
         try:
             while not self._attached and not self._closing:
                 self._receive(0)
+            if self._awaits and not self._closing:
+                self._serve_awaitable()
             while not self._closing:
                 self.run_requests()
                 self._wait()
         except TrainerGone as gone:
-            for index, runner in enumerate(self._runners):
-                self._begin_with(index)
-                with contextlib.suppress(Exception):
-                    runner.env.on_disconnect()
+            self._disconnect()
             if not isinstance(gone.__cause__, BrokenPipeError | ConnectionResetError | None):
                 raise
         finally:
             if not self._closing:
                 self._close_envs()
 
+    def _disconnect(self) -> None:
+        """Bring the envs to a safe state: the trainer is gone."""
+        for index, runner in enumerate(self._runners):
+            self._begin_with(index)
+            with contextlib.suppress(Exception):
+                runner.env.on_disconnect()
+
+    def _serve_awaitable(self) -> None:
+        """Serve envs whose `reset` and `step` are coroutine functions concurrently."""
+        # Not at the top: no other worker needs asyncio.
+        from rlightning_aio.hosts.awaiting import Awaiting  # noqa: PLC0415
+
+        rings, ring, send = self._rings, self._ring, self._send
+        awaiting = Awaiting(
+            self._order,
+            self._first_slot,
+            self._runners,
+            lambda entry: rings.report(entry, ring),
+            send,
+            (lambda entry: rings.begin(entry, time.monotonic_ns())) if self._timed else None,
+        )
+        self._submit = awaiting.submit
+        errors = awaiting.serve(self._channel, self._take_requests, self._disconnect)
+        send(FrameKind.CLOSED, payload=pickle.dumps(errors))
+
+    def _take_requests(self) -> bool:
+        """Read requests and begin to execute them; return False to close."""
+        rings = self._rings
+        while not self._closing:
+            self._receive(socket.MSG_DONTWAIT)
+            for request in rings.requests():
+                self._submit(request, None)
+            # From now on the trainer sends a wake-up for each request, even if envs are busy.
+            if rings.fall_asleep() and not self._closing:
+                return True
+        return False
+
     def run_requests(self) -> None:
-        """Execute what the ring holds; frames in between, as they come."""
+        """Execute the requests in the ring, and frames as they arrive."""
         rings = self._rings
         while not self._closing:
             if rings.has_frame():
-                self._receive(socket.MSG_DONTWAIT)
-            elif not rings.serve(self._run, self._ring):
+                self._receive_some()
+            elif not rings.serve(self._run, self._ring, self._receive_some):
                 break
         rings.idle()
 
     def _run(self, request: int) -> bool:
-        """Execute one request of the ring; True if its row holds all of the reply."""
-        if self._rings.has_frame():
-            self._receive(socket.MSG_DONTWAIT)
+        """Execute one request of the ring; return True if its row holds the whole reply."""
         if self._closing:
             return False
-        # `slot_of` and `op_of`, spelt out: they would be felt in every step.
+        # `slot_of` and `op_of` inline: calls would slow down every step.
         index = ((request >> OP_BITS) & SLOT_MASK) - self._first_slot
         if self._timed:
             self._rings.begin(request, time.monotonic_ns())
@@ -146,7 +185,7 @@ class Worker:
         self._write(BELL)
 
     def _wait(self) -> None:
-        """Return when there may be something to do."""
+        """Return when there may be a request."""
         if self._closing or self._spinner.spin(self._rings.has_news):
             return
         if self._rings.fall_asleep():
@@ -154,12 +193,16 @@ class Worker:
             self._rings.wake_up()
             self._spinner.slept()
 
+    def _receive_some(self) -> None:
+        """Execute the frames that the channel holds."""
+        self._receive(socket.MSG_DONTWAIT)
+
     def _receive(self, flags: int) -> None:
         try:
             data = self._channel.recv(CHUNK_BYTES, flags)
         except BlockingIOError:
             return
-        except ConnectionResetError:  # It died with something of ours unread.
+        except ConnectionResetError:  # It died before it read everything.
             data = b""
         if not data:
             raise TrainerGone
@@ -175,9 +218,9 @@ class Worker:
             self._rings.idle()
 
     def become_child(self) -> None:
-        """Keep nothing of the trainer's, in a process that an env has forked.
+        """Release the channel and the shared memory in a process that an env forked.
 
-        It goes on in the env's code. If it comes back from there, it ends.
+        It continues in the code of the env. It ends if that code returns.
         """
         self._is_child = True
         self._channel.close()
@@ -185,13 +228,13 @@ class Worker:
             make_private(memory)
 
     def _begin(self, request: int) -> None:
-        """Say what is being worked on, should that be the last thing it does."""
+        """Publish the current request, in case the worker dies in it."""
         if self._is_child:
             _end_child()
         self._rings.begin(request, time.monotonic_ns())
 
     def _begin_with(self, index: int) -> None:
-        """Say which env is being built or closed."""
+        """Publish which env is being built or closed."""
         self._begin(entry(0, self._first_slot + index, 0))
 
     def _start(self, frame: Frame) -> None:
@@ -205,9 +248,11 @@ class Worker:
             self._spinner = Spinner(enabled=order.spins)
             config = order.config
             self._timed = (config.step_timeout or config.reset_timeout) is not None
+            self._order = order
             for runner in built_envs(order):
                 self._runners.append(runner)
                 self._begin_with(len(self._runners) % len(order.worker_indices))
+            self._awaits = any(is_awaitable(runner.env) for runner in self._runners)
             started = dumped_with_code([runner.started() for runner in self._runners])
         except BaseException as error:
             index = len(self._runners)
@@ -215,16 +260,16 @@ class Worker:
                 index = min(index, len(order.worker_indices) - 1)
             self._send(FrameKind.START_ERROR, index, pickle.dumps(ErrorText.of(error)))
             return
-        # What was built stays: sparing the collector from walking it saves time and pages.
+        # These objects stay. Without them the garbage collector saves time and copied pages.
         gc.collect()
         gc.freeze()
         self._send(FrameKind.STARTED, payload=started)
 
     def _attach(self, frame: Frame) -> None:
-        """Map the slabs; the arena's descriptor was inherited for this."""
+        """Map the slabs from the inherited descriptor of the arena."""
         order: AttachOrder = pickle.loads(frame.payload)
         announce = self._schemas.announce
-        attach_all(self._runners, order, self._map_part, announce, self._send_standing)
+        attach_all(self._runners, order, self._map_part, announce, self._send_checkpoint)
         self._steps = [runner.step for runner in self._runners]
         os.close(self._arena)
         self._attached = True
@@ -241,10 +286,13 @@ class Worker:
         self._begin(request)
         try:
             arguments = pickle.loads(frame.payload)
+            if self._awaits:
+                self._submit(request, arguments)
+                return
             index = slot_of(request) - self._first_slot
             runner = self._runners[index]
             outcome = runner.execute(op, arguments)
-            self._steps[index] = runner.step  # It may be filmed from now on.
+            self._steps[index] = runner.step  # A call may start or stop filming.
             if answers_with_value(op):
                 self._send(FrameKind.VALUE, request, dumped(outcome, "what it returned"))
             elif outcome is None:
@@ -259,6 +307,8 @@ class Worker:
     def _close(self, frame: Frame) -> None:
         del frame
         self._closing = True
+        if self._awaits and self._attached:
+            return  # The event loop closes them.
         errors = self._close_envs()
         self._send(FrameKind.CLOSED, payload=pickle.dumps(errors))
 
@@ -283,12 +333,13 @@ class Worker:
             if sent < len(data):
                 self._write_rest(memoryview(data)[sent:])
         except BaseException as error:
-            # A part may be out, which nothing can follow; and no env has raised this.
+            # No frame can follow a partial one, and this is not an error of an env.
             raise TrainerGone from error
 
     def _write_rest(self, rest: memoryview) -> None:
-        """Write what the channel had no room for. The trainer may take its time to read it, which
-        is not the env's.
+        """Write data that the channel had no room for.
+
+        This waits for the trainer, so it doesn't count as time of the env.
         """
         paused_ns = time.monotonic_ns()
         since_ns = self._rings.pause()
@@ -310,15 +361,15 @@ class Worker:
     def _send_error(self, request: int, error: BaseException) -> None:
         self._send(FrameKind.ERROR, request, pickle.dumps(ErrorText.of(error)))
 
-    def _send_standing(self, index: int, standing: bytes, before: bool) -> None:
-        self._send(FrameKind.SAVED, index << 1 | before, standing)
+    def _send_checkpoint(self, index: int, checkpoint: bytes, before: bool) -> None:
+        self._send(FrameKind.SAVED, index << 1 | before, checkpoint)
 
     def _send_schema(self, number: int, schema: InfoSchema) -> None:
         self._send(FrameKind.INFO_SCHEMA, number, pickle.dumps(schema))
 
 
 def _end_child() -> NoReturn:
-    """End a process that an env has forked; what it raised is shown, and nobody is answered."""
+    """End a process that an env forked; print its error, and send no reply."""
     error = sys.exception()
     code = 1
     if isinstance(error, SystemExit) and (error.code is None or isinstance(error.code, int)):
@@ -337,7 +388,7 @@ def _end_child() -> NoReturn:
 
 
 def main(channel: socket.socket, arena: int, place: WorkerPlace) -> None:
-    """Run a worker in this process; returns when it has closed."""
+    """Run a worker in this process until it has closed."""
     bell_memory = map_shared(arena, place.bell_offset, bell_size(place.num_hosts))
     bell = WorkerBell(bell_memory, place.num_hosts, place.host_id)
     rings_memory = map_shared(arena, place.rings_offset, rings_size(place.num_envs))

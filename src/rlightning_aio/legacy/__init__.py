@@ -1,12 +1,12 @@
-"""Programs written for RLightning, on this runtime.
+"""Runs programs that were written for RLightning.
 
 ``python -m rlightning_aio.legacy script.py …`` runs a script; `install` does the same for a
-program that calls it before it imports ``rlightning``. Where RLightning is not installed, its names
-for envs and groups are found here; where it is, its own builder makes groups of ours, and they hand
-out its own `EnvRet` and `BatchedData`. docs/rlightning.md says what differs from rlightning_aio's
-own interface, which is what new programs should use.
+program that calls it before it imports ``rlightning``. Where RLightning is not installed, this
+package provides its names for envs and groups. Where it is installed, its own builder makes our
+groups, which return its own `EnvRet` and `BatchedData`. docs/rlightning.md lists the differences
+from rlightning_aio's own interface, which new programs should use.
 
-Rule: whatever RLightning does another way is settled in this package, and nowhere else.
+Rule: every difference in RLightning's behaviour is handled in this package and in no other.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ __all__ = ["install"]
 
 
 def install() -> None:
-    """Have ``import rlightning`` bring groups of rlightning_aio, in this process and in workers.
+    """Make ``import rlightning`` use groups of rlightning_aio, in this process and in workers.
 
-    Call it before anything imports names from RLightning: what was imported before stays as it
-    was. Idempotent.
+    Call it before anything imports names from RLightning: names that were imported earlier keep
+    their old values. Idempotent.
     """
     if not names_in_use().own:
         return

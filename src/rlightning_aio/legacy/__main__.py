@@ -1,4 +1,4 @@
-"""``python -m rlightning_aio.legacy script.py …``: runs a script written for RLightning."""
+"""``python -m rlightning_aio.legacy script.py …`` runs a script written for RLightning."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def main() -> None:
     script = sys.argv[0]
     if not Path(script).is_file():
         sys.exit(f"{script}: no such file")
-    # In place of the current directory, which `-m` has put there.
+    # It replaces the current directory, which `-m` has put there.
     sys.path[0] = str(Path(script).resolve().parent)
     install()
     # `__file__` is absolute in a script that Python runs itself.

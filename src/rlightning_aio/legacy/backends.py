@@ -1,4 +1,4 @@
-"""RLightning's built-in envs, over rlightning_aio's own backends."""
+"""RLightning's built-in envs, on rlightning_aio's own backends."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ class _SimulatedEnv(BaseEnv):
         preprocess_fn: Callable[[Any], Any] | None = default_env_preprocess_fn,
         **kwargs: Any,
     ) -> None:
-        del kwargs  # Accepted so that subclasses may pass on what they were given.
+        del kwargs  # Accepted so that subclasses can pass on all their arguments.
         super().__init__(config, worker_index, preprocess_fn)
         arguments = self._arguments()
-        # `init_params` are all of ManiSkill's own arguments, these two among them.
+        # `init_params` are all of ManiSkill's own arguments, including these two.
         task = arguments.pop("id", config.task)
         num_envs = arguments.pop("num_envs", config.num_envs)
         native = EnvConfig(
@@ -65,7 +65,7 @@ class _SimulatedEnv(BaseEnv):
         self.action_space: Any = self.native.get_action_space()
 
     def _arguments(self) -> dict[str, Any]:
-        """What the simulator is made with: ``env_kwargs``, and ``init_params`` over them."""
+        """Return the simulator's arguments: ``env_kwargs``, updated by ``init_params``."""
         sections = (self.config.env_kwargs, self.config.get("init_params"))
         return {
             name: value
@@ -83,7 +83,7 @@ class _SimulatedEnv(BaseEnv):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None, **kwargs: Any
     ) -> EnvRet:
-        del kwargs  # RLightning's takes what others understand.
+        del kwargs  # RLightning's envs accept each other's arguments.
         result = self.native.reset(seed=seed, options=options)
         return EnvRet(self.env_id, result.observation, info=result.info)
 
@@ -113,7 +113,7 @@ class _SimulatedEnv(BaseEnv):
 
 
 class _GymnasiumEnv(_SimulatedEnv):
-    """One that is made from its task alone, and steps as Gymnasium does."""
+    """A Gymnasium env that is made from its task alone."""
 
     def _arguments(self) -> dict[str, Any]:
         return {}
@@ -126,10 +126,10 @@ class _GymnasiumEnv(_SimulatedEnv):
         return EnvRet(self.env_id, *self.env.step(np.asarray(self._preprocess_fn(policy_resp))))
 
     def offload(self) -> None:
-        """It holds no device memory."""
+        """Do nothing: it holds no device memory."""
 
     def reload(self) -> None:
-        """It has freed none."""
+        """Do nothing: it has freed no memory."""
 
 
 class MujocoEnv(_GymnasiumEnv):
@@ -145,7 +145,7 @@ class ALEEnv(_GymnasiumEnv):
 
 
 class ManiskillEnv(_SimulatedEnv):
-    """ManiSkill's tasks, whose observations are the task's own."""
+    """ManiSkill's tasks, with the observations of the task itself."""
 
     backend = "maniskill"
 
@@ -168,6 +168,6 @@ class PiperEnv(_SimulatedEnv):
     backend = "piper"
 
 
-_ALL: Final = (MujocoEnv, ALEEnv, ManiskillEnv, IsaacEnv, IsaacMarlEnv, PiperEnv)
-for _kind in _ALL:
+_BUILT_IN: Final = (MujocoEnv, ALEEnv, ManiskillEnv, IsaacEnv, IsaacMarlEnv, PiperEnv)
+for _kind in _BUILT_IN:
     ENVS.provide(_kind.backend, _kind)

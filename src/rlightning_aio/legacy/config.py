@@ -1,4 +1,4 @@
-"""RLightning's configs: mutable, open to fields of anybody's, and read like dicts."""
+"""RLightning's configs: mutable, open to extra fields, and readable like dicts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _CONTROL_MODES: Final = {
     "_gripper_pd_joint_pos_interpolate_by_planner",
     "widowx": "arm_pd_ee_target_delta_pose_align2_gripper_pd_joint_pos",
 }
-"""Of ManiSkill, by the robot that `policy_setup` names."""
+"""ManiSkill's control modes, by the robot that `policy_setup` names."""
 
 
 class Config(BaseModel):
@@ -43,26 +43,26 @@ class Config(BaseModel):
         return getattr(self, name)
 
     def get(self, name: str, default: Any = None) -> Any:
-        """The field of that name, or `default`."""
+        """Return the field `name`, or `default`."""
         return getattr(self, name, default)
 
     @classmethod
     def load_yaml(cls, file_path: str | os.PathLike[str] | None = None) -> Self:
-        """Read a YAML file; without one, all defaults."""
+        """Read a YAML file; without one, return all defaults."""
         text = "{}" if file_path is None else Path(file_path).read_text(encoding="utf-8")
         return cls.from_dict(yaml.safe_load(text))
 
     @classmethod
     def from_omegaconf(cls, om_cfg: Any) -> Self:
-        """Of an OmegaConf node, resolved."""
+        """Make a config of an OmegaConf node, which is resolved first."""
         return cls.from_dict(cast("dict[str, Any]", OmegaConf.to_container(om_cfg, resolve=True)))
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
-        """Of a mapping.
+        """Make a config of a mapping.
 
         Raises:
-            ValueError: with a line for each field that is wrong.
+            ValueError: fields are wrong; the message has a line for each.
         """
         try:
             return cls.model_validate(data)
@@ -71,22 +71,22 @@ class Config(BaseModel):
                 f"\n  field '{'.'.join(map(str, fault['loc']))}': {fault['msg']}"
                 for fault in error.errors()
             )
-            raise ValueError(f"{cls.__name__} can't be made of this:{faults}") from error
+            raise ValueError(f"{cls.__name__} has wrong fields:{faults}") from error
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain dicts all the way down."""
+        """Return the config as nested plain dicts."""
         return self.model_dump()
 
     def to_yaml(self) -> str:
-        """`to_dict` as YAML."""
+        """Return `to_dict` as YAML."""
         return yaml.safe_dump(self.to_dict(), sort_keys=False)
 
 
 class EnvConfig(Config):
     """One entry of ``env:``, which makes ``num_workers`` envs of one kind.
 
-    Fields that RLightning has no use for, and rlightning_aio's own `EnvConfig` has (``placement``,
-    ``envs_per_process``, ``step_timeout``, …), mean here what they mean there.
+    Fields of rlightning_aio's own `EnvConfig` (``placement``, ``envs_per_process``,
+    ``step_timeout``, …) are accepted and have the same meaning.
     """
 
     name: str

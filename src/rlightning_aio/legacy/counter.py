@@ -1,4 +1,4 @@
-"""What RLightning's group counts: steps of episodes, and steps in a second."""
+"""Counters of RLightning's group: steps per episode and steps per second."""
 
 from __future__ import annotations
 
@@ -26,50 +26,52 @@ class EnvStepCounter:
         self._steps = dict.fromkeys(env_ids, -1)
 
     def reset(self, env_id: str) -> None:
-        """Begin an env's count anew; the observation of its reset is a step to 0."""
+        """Set an env's count to -1; the result of its reset then counts it up to 0."""
         self._steps[env_id] = -1
 
     def reset_all(self) -> None:
-        """`reset` each."""
+        """Set every env's count to -1."""
         self._steps = dict.fromkeys(self._steps, -1)
 
     def step(self, env_id: str) -> None:
         """Count one result of an env.
 
         Raises:
-            ValueError: it has reached its limit already.
+            ValueError: the env has reached its limit already.
         """
         if self.is_reached_max_steps(env_id):
-            raise ValueError(f"env {env_id} has made its {self._limits[env_id]} steps; reset it")
+            raise ValueError(
+                f"env {env_id} has reached its limit of {self._limits[env_id]} steps; reset it"
+            )
         self._steps[env_id] += 1
 
     def step_all(self) -> None:
-        """`step` each."""
+        """Count one result of every env."""
         for env_id in self._steps:
             self.step(env_id)
 
     def get_steps(self, env_id: str) -> int:
-        """The count of an env."""
+        """Return the count of an env."""
         return self._steps[env_id]
 
     def __getitem__(self, env_id: str) -> int:
         return self._steps[env_id]
 
     def get_max_steps(self, env_id: str) -> int:
-        """The limit of an env."""
+        """Return the limit of an env."""
         return self._limits[env_id]
 
     def is_reached_max_steps(self, env_id: str) -> bool:
-        """Whether an env has come to its limit."""
+        """Return True if an env has reached its limit."""
         return self._steps[env_id] == self._limits[env_id]
 
     def get_truncations(self, env_ids: Sequence[str]) -> list[bool]:
-        """`is_reached_max_steps` of each."""
+        """Return `is_reached_max_steps` of each env."""
         return [self.is_reached_max_steps(env_id) for env_id in env_ids]
 
 
 class ThroughputTracker:
-    """Steps in a second by name, each over a span of at least `log_interval_s` seconds."""
+    """Steps per second by name, measured over at least `log_interval_s` seconds."""
 
     def __init__(self, log_interval_s: float = 5.0) -> None:
         self._span = log_interval_s
@@ -77,7 +79,7 @@ class ThroughputTracker:
         self._rates: dict[str, float] = {}
 
     def record(self, name: str, count: int, step: int | None = None) -> None:
-        """Count so many steps more."""
+        """Add `count` steps to `name`."""
         del step
         if count <= 0:
             return
@@ -92,5 +94,5 @@ class ThroughputTracker:
     record_async = record
 
     def get_stats(self) -> dict[str, float]:
-        """The last rate of each name."""
+        """Return the latest rate of each name."""
         return dict(self._rates)

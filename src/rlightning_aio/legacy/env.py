@@ -1,4 +1,4 @@
-"""RLightning's `BaseEnv`, and what it steps with by default."""
+"""RLightning's `BaseEnv` and its default preprocess function."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ __all__ = ["BaseEnv", "default_env_preprocess_fn"]
 
 
 def default_env_preprocess_fn(policy_resp: PolicyResponse) -> Any:
-    """The action as the policy gave it."""
+    """Return the action of the response, unchanged."""
     return policy_resp.action
 
 
 class BaseEnv(abc.ABC):
-    """One env of RLightning's kind. Subclasses set ``self.env`` and define `reset` and `step`.
+    """An env of RLightning's kind. Subclasses set ``self.env`` and define `reset` and `step`.
 
     Attributes:
         config: a deep copy of the entry.
         env_id: ``<uuid>-<worker_index>``.
         env: the simulator.
         num_envs, max_episode_steps: the entry's.
-        timing_raw: what `profiler.timer_wrap` measured.
+        timing_raw: the durations that `profiler.timer_wrap` measured.
     """
 
     def __init__(
@@ -55,30 +55,30 @@ class BaseEnv(abc.ABC):
 
     @abc.abstractmethod
     def reset(self, *args: Any, **kwargs: Any) -> Any:
-        """Start a new episode with whatever the group's `reset` was given; an `EnvRet`."""
+        """Start an episode with the arguments of the group's `reset`. Return an `EnvRet`."""
 
     @abc.abstractmethod
     def step(self, policy_resp: Any) -> Any:
-        """Advance by one step; an `EnvRet`."""
+        """Advance by one step. Return an `EnvRet`."""
 
     def get_env_id(self) -> str:
-        """Its id."""
+        """Return the env's id."""
         return self.env_id
 
     def get_observation_space(self) -> gym.Space[Any]:
-        """The simulator's; override it where observations are something else."""
+        """Return the simulator's space; override it if observations differ."""
         return self.env.observation_space
 
     def get_action_space(self) -> gym.Space[Any]:
-        """The simulator's."""
+        """Return the simulator's space."""
         return self.env.action_space
 
     def get_max_episode_steps(self) -> int | None:
-        """The step limit that `EnvGroup.auto_reset` takes."""
+        """Return the step limit for `EnvGroup.auto_reset`."""
         return self.max_episode_steps
 
     def get_metadata(self) -> EnvMeta:
-        """Id, spaces and number of sub-environments."""
+        """Return the id, the spaces and the number of sub-environments."""
         return EnvMeta(
             env_id=self.env_id,
             action_space=self.get_action_space(),
@@ -87,18 +87,18 @@ class BaseEnv(abc.ABC):
         )
 
     def init(self) -> Any:
-        """Called by `EnvGroup.init`, which returns what this does."""
+        """Return the metadata; `EnvGroup.init` calls it and returns the values."""
         return self.get_metadata()
 
     def step_async(self, policy_resp_list: Any) -> None:
-        """For a server of remote envs alone."""
+        """Raise an error: only a server of remote envs has it."""
         raise NotImplementedError("step_async() belongs to RemoteEnvServer")
 
     def collect_async(self) -> Any:
-        """For a server of remote envs alone."""
+        """Raise an error: only a server of remote envs has it."""
         raise NotImplementedError("collect_async() belongs to RemoteEnvServer")
 
-    # -- what a group calls: reset and step, with the hooks around them
+    # -- reset and step with the hooks around them, which a group calls
 
     def _reset(self, *args: Any, **kwargs: Any) -> Any:
         return self._post_step_hook(self.reset(*args, **kwargs))
@@ -121,7 +121,7 @@ class BaseEnv(abc.ABC):
             self._episode_env_infos[name].append(value)
 
     def get_env_stats(self, reset: bool = False) -> dict[str, list[float]]:
-        """Sum and count of each metric in ``info["episode_info"]`` since the last `reset`."""
+        """Return sum and count of each metric in ``info["episode_info"]`` since `reset`."""
         stats: dict[str, list[float]] = {}
         for name, values in self._episode_env_infos.items():
             flat = [np.asarray(value.cpu() if hasattr(value, "cpu") else value) for value in values]
@@ -131,16 +131,16 @@ class BaseEnv(abc.ABC):
         return stats
 
     def print_timing_summary(self, reset: bool = False) -> None:
-        """Log what `profiler.timer_wrap` measured."""
+        """Log the durations that `profiler.timer_wrap` measured."""
         for name, stats in self.timing_raw.items():
             logging.getLogger(__name__).debug("env %s, %s: %s", self.env_id, name, stats)
         if reset:
             self.timing_raw = {}
 
-    # -- what a subclass may define
+    # -- methods that a subclass may define
 
     def is_finish(self) -> bool:
-        """Whether `RemoteEnvClient.run` should end; asked after every step."""
+        """Return True to end `RemoteEnvClient.run`; called after every step."""
         return False
 
     def close(self) -> None:
@@ -150,13 +150,13 @@ class BaseEnv(abc.ABC):
         """Free device memory."""
 
     def reload(self) -> None:
-        """Take the memory again."""
+        """Allocate the memory again."""
 
     def apply_evaluate_cfg(self) -> None:
-        """Take on ``config.evaluate_cfg``."""
+        """Apply ``config.evaluate_cfg``."""
 
     def restore_evaluate_cfg(self) -> None:
-        """Drop what `apply_evaluate_cfg` took on."""
+        """Undo `apply_evaluate_cfg`."""
 
     def finish_rollout(self) -> None:
-        """Called after each `EnvGroup.get_env_stats`."""
+        """Finish a rollout; `EnvGroup.get_env_stats` calls it."""

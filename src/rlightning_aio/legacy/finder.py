@@ -1,7 +1,7 @@
-"""`import rlightning` where RLightning is not installed: its modules, with our names in them.
+"""Provides RLightning's modules, with our objects in them, where RLightning is not installed.
 
-Rule: a table of paths and names; what RLightning has beyond it raises an ImportError that says
-so. Modules are made when they are first imported.
+Rule: a table of paths and names. A name of RLightning's that is not in it raises an ImportError
+that explains this. Modules are made when they are first imported.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ ALIASED: Final[dict[str, dict[str, tuple[str, ...]]]] = {
         "tensors": ("to_device", "to_numpy"),
     },
 }
-"""Modules of RLightning, and what each of them has from which module of ours."""
+"""For each module of RLightning: our modules, and the names taken from each."""
 
 _ABSENT: Final = {
     "rlightning.utils.builders": (
@@ -92,15 +92,15 @@ _ABSENT: Final = {
     ),
     "rlightning.env": ("LiberoEnv",),
 }  # fmt: skip
-"""Names that a program may well ask for, and that are RLightning's alone."""
+"""Names that programs often import and that only RLightning itself has."""
 
 
 def _refusal(name: str) -> ImportError:
-    # Without the name of a module: `from rlightning import engine` would swallow it.
+    # Without the module's name, which would make `from rlightning import engine` ignore it.
     return ModuleNotFoundError(
-        f"{name} is RLightning's own and not installed here: rlightning_aio.legacy has its names "
-        "for envs and groups, and none of its engines, buffers and policies; install RLightning "
-        "itself, and its builder gets groups of rlightning_aio all the same"
+        f"{name} belongs to RLightning, which is not installed: rlightning_aio.legacy has its "
+        "names for envs and groups, but not its engines, buffers and policies; install "
+        "RLightning, and its builder still makes groups of rlightning_aio"
     )
 
 
@@ -122,7 +122,7 @@ class _Finder:
 
     def exec_module(self, module: ModuleType) -> None:
         if module.__name__ == "rlightning":
-            # What an entry's backend names is registered wherever RLightning was imported.
+            # Register the built-in envs in every process that imports RLightning.
             importlib.import_module(f"{_HERE}.backends")
             module.__dict__["__version__"] = importlib.import_module("rlightning_aio").__version__
         homes = ALIASED[module.__name__]
@@ -142,7 +142,7 @@ def _getter(module: ModuleType, origin: dict[str, str]) -> Callable[[str], Any]:
             return importlib.import_module(f"{path}.{name}")
         if name in _ABSENT.get(path, ()):
             raise _refusal(f"{path}.{name}")
-        # An AttributeError, which those who look for something take for a no.
+        # `hasattr` and `getattr` with a default expect an AttributeError.
         raise AttributeError(f"{path} has no {name!r} in rlightning_aio.legacy")
 
     return get
@@ -152,11 +152,11 @@ _finder: Final[Any] = _Finder()
 
 
 def is_ours(spec: ModuleSpec | None) -> bool:
-    """Whether a module comes from here."""
+    """Return True if this finder provides the module."""
     return spec is not None and spec.loader is _finder
 
 
 def install_finder() -> None:
-    """Have ``import rlightning`` find the modules of `ALIASED`."""
+    """Make ``import rlightning`` find the modules of `ALIASED`."""
     if _finder not in sys.meta_path:
         sys.meta_path.append(_finder)

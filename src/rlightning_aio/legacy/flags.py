@@ -1,4 +1,4 @@
-"""`InternalFlag`: what RLightning's launcher and shell scripts say by environment variables."""
+"""`InternalFlag`: the environment variables of RLightning's launcher and shell scripts."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _NAMES = ("DEBUG", "VERBOSE", "REMOTE_TRAIN", "REMOTE_EVAL", "REMOTE_STORAGE", "
 
 
 class _Flags(type):
-    """Attributes that are read anew from ``RLIGHTNING_<name>``, which is 1 or 0."""
+    """Attributes that are read from ``RLIGHTNING_<name>`` (1 or 0) at each access."""
 
     def __getattr__(cls, name: str) -> bool:
         if name not in _NAMES:
@@ -21,11 +21,11 @@ class _Flags(type):
 class InternalFlag(metaclass=_Flags):
     """RLightning's flags: ``InternalFlag.DEBUG`` and so on.
 
-    ``REMOTE_STORAGE`` has envs return arrays in place of tensors. ``REMOTE_ENV`` changes nothing
-    here: envs always live in processes of their own.
+    With ``REMOTE_STORAGE``, envs return arrays instead of tensors. ``REMOTE_ENV`` has no effect:
+    envs always live in worker processes.
     """
 
     @classmethod
     def get_env_vars(cls) -> dict[str, str]:
-        """The variables as they stand."""
+        """Return the variables with their present values."""
         return {f"RLIGHTNING_{name}": str(int(getattr(cls, name))) for name in _NAMES}

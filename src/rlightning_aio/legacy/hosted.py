@@ -1,7 +1,7 @@
-"""RLightning's envs in our workers: made there, called there, and their results sent back.
+"""Runs RLightning's envs in our workers and sends their results back.
 
-Rule: what an env returns reaches the program as it was. A result that says no more than a row
-holds travels in its row; any other is pickled whole.
+Rule: a program gets exactly what its env returned. A result travels in its row if the row can hold
+all of it, and is pickled otherwise.
 """
 
 from __future__ import annotations
@@ -35,26 +35,26 @@ if TYPE_CHECKING:
 __all__ = ["ARGUMENTS", "ActionForm", "EnvMaker", "HostedEnv", "restored"]
 
 ARGUMENTS: Final = "rlightning"
-"""Key of a reset's options that holds the arguments which RLightning's `reset` was given."""
+"""Key in a reset's options for the arguments of RLightning's `reset`."""
 WHOLE: Final = "rlightning"
-"""Key of a result's ``_extra`` that holds all of it."""
+"""Key in a result's ``_extra`` for the pickled result."""
 
 _MADE_ID: Final = re.compile(r"[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}-")
 _ANYTHING: Final = gym.spaces.Text(1)
-"""A space whose values travel pickled, whatever they are."""
+"""A space for any values, which travel pickled."""
 
 
 @dataclasses.dataclass
 class EnvMaker:
-    """Makes one of RLightning's envs where it is called; travels to a worker as bytes, which are
-    read there only after ``import rlightning`` works.
+    """Makes an env of RLightning's. It travels to a worker as bytes, which are unpickled only once
+    ``import rlightning`` works there.
 
     Attributes:
         kind: the env's class.
         config: the entry, an `EnvConfig` of RLightning's.
-        worker_index: the env's place in its group.
-        preprocess_fn: or None.
-        env_id: for an env that has one which `BaseEnv` has made: it stays after a restart.
+        worker_index: the env's position in its group.
+        preprocess_fn: the preprocess function, or None.
+        env_id: the id that `BaseEnv` made, to be kept after a restart.
     """
 
     kind: Any
@@ -64,7 +64,7 @@ class EnvMaker:
     env_id: str
 
     def __call__(self) -> HostedEnv:
-        """The env, as one of ours."""
+        """Make the env and wrap it as one of ours."""
         env = self.kind(
             self.config, worker_index=self.worker_index, preprocess_fn=self.preprocess_fn
         )
@@ -78,7 +78,7 @@ class EnvMaker:
 
 
 class _PackedMaker:
-    """An `EnvMaker` on its way."""
+    """A pickled `EnvMaker`."""
 
     def __init__(self, packed: bytes) -> None:
         self._packed = packed
@@ -89,10 +89,10 @@ class _PackedMaker:
 
 
 class HostedEnv(BaseEnv):
-    """One of RLightning's envs as one of ours.
+    """An env of RLightning's as one of ours.
 
-    Actions that fit the action space travel in the row, and may be of any other kind: a whole
-    `PolicyResponse`, where there is more to it than an action.
+    Actions that fit the action space travel in the row. Any other is sent as a whole
+    `PolicyResponse`.
     """
 
     transforms_actions = True
@@ -118,7 +118,7 @@ class HostedEnv(BaseEnv):
 
     @property
     def _is_bare(self) -> bool:
-        """Whether nothing of the program's stands between a step and Gymnasium's env."""
+        """Return True if a step calls Gymnasium's env without any code of the program."""
         names = self._names
         if names.own:
             return False
@@ -145,17 +145,17 @@ class HostedEnv(BaseEnv):
     def reset(
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> EnvRet:
-        del seed  # RLightning's arguments come in `options`, all of them.
+        del seed  # `options` contains all of RLightning's arguments.
         args, kwargs = (options or {}).get(ARGUMENTS, ((), {}))
-        return self._told(self.env._reset(*args, **kwargs))  # noqa: SLF001
+        return self._as_ours(self.env._reset(*args, **kwargs))  # noqa: SLF001
 
     def step(self, policy_resp: PolicyResponse) -> EnvRet:
         given = policy_resp.action
         if not isinstance(given, self._names.PolicyResponse):
             given = self._names.PolicyResponse(env_id=self.env.env_id, action=given)
-        return self._told(self.env._step(given))  # noqa: SLF001
+        return self._as_ours(self.env._step(given))  # noqa: SLF001
 
-    def _told(self, ret: Any) -> EnvRet:
+    def _as_ours(self, ret: Any) -> EnvRet:
         if self._fits_row(ret):
             return EnvRet.model_construct(
                 env_id=self.env_id,
@@ -168,7 +168,7 @@ class HostedEnv(BaseEnv):
         return EnvRet(env_id=self.env_id, observation=self._blank, _extra={WHOLE: ret})
 
     def _fits_row(self, ret: Any) -> bool:
-        """Whether the row gives back this very result: arrays and numbers of its kinds."""
+        """Return True if the row can hold all of the result, with the same dtypes."""
         return (
             self._leaves is not None
             and type(ret) is self._names.EnvRet
@@ -180,19 +180,19 @@ class HostedEnv(BaseEnv):
             and _parts_in_row(ret.observation, self._leaves)
         )
 
-    # -- everything else
+    # -- other calls
 
     def action_form(self) -> ActionForm:
-        """What to send for a response."""
+        """Return the form in which responses are sent to this env."""
         return ActionForm(leaves(self._action_space), self._is_bare)
 
     def look(self, name: str) -> tuple[bool, Any]:
-        """Whether attribute `name` of RLightning's env is a method; its value if it is none."""
+        """Return (True, None) if RLightning's env has a method `name`, else (False, its value)."""
         value = getattr(self.env, name)
         return (True, None) if callable(value) else (False, value)
 
     def of_env(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """What method `name` of RLightning's env returns."""
+        """Call method `name` of RLightning's env and return its value."""
         return getattr(self.env, name)(*args, **kwargs)
 
     def close(self) -> None:
@@ -201,19 +201,19 @@ class HostedEnv(BaseEnv):
 
 @dataclasses.dataclass(frozen=True)
 class ActionForm:
-    """In what form responses are sent to an env.
+    """The form in which responses are sent to an env.
 
     Attributes:
-        leaves: of the action space; None where its values have no place in a row.
-        action_only: nothing but the action matters there, and only its numbers.
+        leaves: the leaves of the action space; None if its values don't fit a row.
+        action_only: the env uses nothing but the numbers of the action.
     """
 
     leaves: tuple[Leaf, ...] | None
     action_only: bool
 
     def of(self, response: Any, names: Names) -> Any:
-        """What stands for `response` as an action of ours: an array that a row gives back as it
-        is, or the response itself.
+        """Return `response` as an action of ours: an array that fits the row exactly, or else
+        the response itself.
         """
         data: dict[str, Any] = response.__dict__
         action: Any = data.get("action")
@@ -229,7 +229,7 @@ class ActionForm:
 
 
 def _on_cpu(response: Any) -> Any:
-    """`response`, or a copy of it without tensors of a device that another process has not."""
+    """Return `response`, or a copy of it with its tensors on the CPU."""
     data: dict[str, Any] = response.__dict__
     if not holds_tensor(data):
         return response
@@ -240,7 +240,7 @@ def _on_cpu(response: Any) -> Any:
 
 
 def _space_of(read: Callable[[], Any]) -> gym.Space[Any]:
-    """What an env says its space is, if it says so already."""
+    """Return an env's space, or None if it does not have one yet."""
     try:
         space = read()
     except Exception:  # noqa: BLE001  # It may well make its simulator later, in `init`.
@@ -249,7 +249,7 @@ def _space_of(read: Callable[[], Any]) -> gym.Space[Any]:
 
 
 def _parts_in_row(value: Any, space_leaves: tuple[Leaf, ...]) -> bool:
-    """Whether `value` consists of arrays that a row of these leaves gives back as they are."""
+    """Return True if `value` consists of arrays that fit a row of these leaves exactly."""
     arrays = list(_arrays(value))
     if len(arrays) != len(space_leaves):
         return False
@@ -261,7 +261,7 @@ def _parts_in_row(value: Any, space_leaves: tuple[Leaf, ...]) -> bool:
 
 
 def _arrays(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], Any]]:
-    """What is in the dicts and tuples of `value`, in the order of a space's leaves."""
+    """Return the leaves of `value`, in the order of a space's leaves."""
     if type(value) is dict:
         parts = cast("dict[Any, Any]", value)
         for key in parts:
@@ -274,13 +274,13 @@ def _arrays(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any,
 
 
 def restored(names: Names, part: ResultColumns, row: int, env_id: str) -> Any:
-    """RLightning's result, of one of ours that a worker or client has sent.
+    """Return RLightning's result for one of ours that a worker or client has sent.
 
     Args:
-        names: whose `EnvRet` it is to be.
-        part: columns of ours.
-        row: the one that becomes a value.
-        env_id: RLightning's.
+        names: the names in use, with the class `EnvRet`.
+        part: columns of our results.
+        row: the position of the result in them.
+        env_id: RLightning's id.
     """
     extra: dict[str, Any] = part.out_of_band_of(row).get("extra") or {}
     ret = extra.get(WHOLE)
@@ -296,6 +296,6 @@ def restored(names: Names, part: ResultColumns, row: int, env_id: str) -> Any:
             part.sent_ns_of(row),
         )
     if part.restarted is not None and part.restarted[row] and dataclasses.is_dataclass(ret):
-        told = {**cast("Any", ret).info, **part.reported_info_of(row)}
-        return dataclasses.replace(cast("Any", ret), last_truncated=True, info=told)
+        info = {**cast("Any", ret).info, **part.reported_info_of(row)}
+        return dataclasses.replace(cast("Any", ret), last_truncated=True, info=info)
     return ret

@@ -1,4 +1,4 @@
-"""RLightning's `launch`, for programs that need its configs and none of its cluster."""
+"""RLightning's `launch`, for programs that need its configs and not its cluster."""
 
 from __future__ import annotations
 

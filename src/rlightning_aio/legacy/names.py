@@ -1,6 +1,6 @@
-"""Whose names a program uses: RLightning's own where it is installed, or ours for them.
+"""Chooses the names that a program uses: RLightning's own if it is installed, or ours.
 
-Rule: nobody else in this package asks whether RLightning is installed.
+Rule: no other module of this package asks if RLightning is installed.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ _ROOT: Final = "rlightning"
 
 @dataclass(frozen=True)
 class Names:
-    """What a group needs of RLightning.
+    """The names of RLightning that a group needs.
 
     Attributes:
         EnvRet, PolicyResponse, BatchedData, EnvConfig: classes.
-        ENVS: its registry.
-        default_env_preprocess_fn: what RLightning steps with by default.
-        own: these are RLightning's own.
+        ENVS: the registry of envs.
+        default_env_preprocess_fn: the default preprocess function.
+        own: True if these are RLightning's own.
     """
 
     EnvRet: Any
@@ -39,14 +39,14 @@ class Names:
 
 
 def is_rlightning_installed() -> bool:
-    """Whether Python finds RLightning itself; imports nothing of it."""
+    """Return True if Python finds RLightning itself; imports nothing of it."""
     loaded = sys.modules.get(_ROOT)
     if loaded is not None:
         return not is_ours(loaded.__spec__)
     for finder in sys.meta_path:
         find = getattr(finder, "find_spec", None)
         spec = None if find is None else find(_ROOT, None)
-        # A folder without __init__.py is anybody's.
+        # A folder without __init__.py may be any folder of that name.
         if spec is not None and spec.loader is not None and spec.origin is not None:
             return not is_ours(spec)
     return False
@@ -54,7 +54,7 @@ def is_rlightning_installed() -> bool:
 
 @cache
 def names_in_use() -> Names:
-    """RLightning's names; afterwards ``import rlightning`` finds them in any case."""
+    """Return RLightning's names; from then on, ``import rlightning`` finds them."""
     own = is_rlightning_installed()
     if not own:
         install_finder()

@@ -1,4 +1,4 @@
-"""RLightning's configs as entries of ours."""
+"""Turns RLightning's configs into entries of ours."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.legacy.hosted import EnvMaker
 from rlightning_aio.legacy.names import names_in_use
-from rlightning_aio.registry import BACKENDS
+from rlightning_aio.registry import ENVS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -24,11 +24,11 @@ _PASSED_ON: Final = (
     "on_worker_death", "snapshot_every", "max_restarts", "imports", "interpreter", "env_vars",
     "cpu_affinity",
 )  # fmt: skip
-"""Fields of our entries that RLightning's have no word for: they may have them beside their own."""
+"""Fields of our entries that RLightning lacks and that its entries may have here, too."""
 
 
 def listed_configs(env_cfgs: Any) -> list[Any]:
-    """RLightning's configs, of one or a list of them, or of mappings."""
+    """Return a list of RLightning's configs, made from one or several configs or mappings."""
     kind = names_in_use().EnvConfig
     return [
         kind.from_dict(dict(cast("Mapping[str, Any]", one))) if isinstance(one, Mapping) else one
@@ -37,23 +37,23 @@ def listed_configs(env_cfgs: Any) -> list[Any]:
 
 
 def repeated(value: Any, count: int) -> list[Any]:
-    """`value` if it is a list, else a list of it, so many times."""
+    """Return `value` if it is a list, else a list that repeats it."""
     return cast("list[Any]", value) if isinstance(value, list) else [value] * count
 
 
 def define_env_instance_cfgs(env_cfg: Any, num_workers: int = 1) -> list[Any]:
-    """So many times one copy of a config."""
+    """Return a list that repeats one copy of a config."""
     return [copy.deepcopy(env_cfg)] * num_workers
 
 
 class Plan:
-    """What a group of RLightning's configs, one for each env, is made of.
+    """The entries and ids for a group of RLightning's configs, one for each env.
 
     Attributes:
-        entries: of our group: local envs, then env_servers.
-        local, servers: the configs of either.
-        ids: RLightning's, of the local envs and the servers.
-        core_ids: ours, in the same order.
+        entries: the entries of our group: local envs, then env_servers.
+        local, servers: the configs of each kind.
+        ids: RLightning's ids of the local envs and the servers.
+        core_ids: our ids, in the same order.
     """
 
     def __init__(self, configs: Sequence[Any], preprocess_fns: Sequence[Any]) -> None:
@@ -83,7 +83,7 @@ class Plan:
 
     def _local_entry(self, replicas: list[EnvMaker]) -> EnvConfig:
         config = replicas[0].config
-        backend = BACKENDS.get(config.backend)
+        backend = ENVS.described(config.backend)
         fields = _passed_on(config)
         if fields.get("placement") != "inline":
             if backend is None or not backend.cpu_bound:
@@ -108,7 +108,7 @@ class Plan:
         return EnvConfig(name=name, backend=_SERVER, env_kwargs=arguments, **fields)
 
     def _name(self, wanted: str) -> str:
-        """An entry's name, made unique: RLightning's may be shared."""
+        """Return the entry's name, made unique, because RLightning's entries may share one."""
         name = next(name for name in _variants(wanted) if name not in self._taken)
         self._taken.add(name)
         return name

@@ -1,4 +1,4 @@
-"""RLightning's timers, which envs put around their methods."""
+"""RLightning's timers for the methods of envs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["get_logger", "log_metric", "record_timing", "timer", "timer_wrap"]
 
 
 def get_logger(name: str) -> logging.Logger:
-    """Python's own logger of that name."""
+    """Return Python's own logger with this name."""
     return logging.getLogger(name)
 
 
@@ -25,7 +25,7 @@ def log_metric(
     step: int | None = None,
     prefix: str | None = None,
 ) -> None:
-    """Log each metric of `payload` as a line."""
+    """Log a line for each metric of `payload`."""
     for name, value in payload.items():
         label = f"{prefix}/{name}" if prefix else name
         logging.getLogger("rlightning").log(level, "%s: %s (step %s)", label, value, step)
@@ -47,7 +47,7 @@ def record_timing(
 def timer(
     name: str, timing_raw: dict[str, dict[str, Any]], level: str = "info", enable: bool = True
 ) -> Generator[None]:
-    """Record how long the block takes."""
+    """Record the duration of the block."""
     began = time.perf_counter()
     yield
     if enable:
@@ -57,7 +57,7 @@ def timer(
 def timer_wrap(
     name: str | None = None, level: str = "info", log_to_metric: bool = False, enable: bool = True
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Method decorator: records how long each call takes in the object's ``timing_raw``."""
+    """Decorate a method to record each call's duration in the object's ``timing_raw``."""
 
     def decorate(method: Callable[..., Any]) -> Callable[..., Any]:
         label = name or method.__name__

@@ -1,4 +1,4 @@
-"""RLightning's registries: names of classes that configs refer to."""
+"""RLightning's registries of classes that configs name."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class Registry:
     """Classes by name.
 
     Attributes:
-        name: of the registry.
-        module_dict: the classes, by name; whoever assigns to it registers.
+        name: the name of the registry.
+        module_dict: the classes by name; assigning to it registers a class.
     """
 
     def __init__(self, name: str) -> None:
@@ -38,7 +38,7 @@ class Registry:
         return f"Registry(name={self.name}, items={list(self.module_dict)})"
 
     def get(self, key: str) -> Any:
-        """The class of that name.
+        """Return the class registered as `key`.
 
         Raises:
             KeyError: there is none.
@@ -48,18 +48,18 @@ class Registry:
         return self.module_dict[key]
 
     def provide(self, name: str, value: Any) -> None:
-        """Have `value` stand for `name` until a program registers one of its own."""
+        """Use `value` for `name` until a program registers a class of that name."""
         self.module_dict[name] = self._provided[name] = value
 
     def is_provided(self, name: str) -> bool:
-        """Whether `name` stands for what was provided."""
+        """Return True if `name` stands for the provided value."""
         return name in self._provided and self.module_dict.get(name) is self._provided[name]
 
     def register(self, name: str | None = None) -> Callable[[T], T]:
-        """Class decorator: makes the class known as `name`, or by its own name.
+        """Return a class decorator that registers the class as `name`, or by its own name.
 
         Raises:
-            KeyError: a program has registered one of that name already.
+            KeyError: a program has registered a class of that name already.
         """
 
         def remember(kind: T) -> T:
@@ -80,6 +80,6 @@ ENGINE = Registry("engine")
 
 
 def load_modules_from_config(config: Any) -> None:
-    """Import the modules that a config lists as ``imports``: they register what they define."""
+    """Import the modules in a config's ``imports``, which register their classes."""
     for module in config.get("imports", None) or ():
         importlib.import_module(module)

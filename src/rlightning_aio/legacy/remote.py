@@ -1,6 +1,6 @@
-"""RLightning's two ends of a network, over our own wire format: nothing is unpickled.
+"""RLightning's client and server of remote envs, over our own wire format, without pickle.
 
-Both ends must be ours: a client that runs RLightning's own code speaks another language.
+Both ends must run this code: RLightning's own client uses another format.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ if TYPE_CHECKING:
 __all__ = ["RemoteEnvClient", "RemoteEnvServer"]
 
 _ANY_ACTION: Final = gym.spaces.Box(-np.inf, np.inf, (), np.float32)
-"""Announced by an env without an action space, whose actions may be anything in any case."""
+"""Announced by an env without an action space."""
 
 
 class _DialledEnv(HostedEnv):
-    """An env that a client lends: its results are told in our own terms."""
+    """A client's env, with results in our own form."""
 
     def __init__(self, env: Any) -> None:
         super().__init__(env)
         self.num_envs = env.num_envs
         self._first: EnvRet | None = None
         if env.get_observation_space() is None:
-            # A robot's env need not know what its cameras give before they have given it.
+            # A robot's env may know its space only after its cameras have sent something.
             self._first = self.reset()
             self._observation_space = _space_around(self._first.observation)
         if env.get_action_space() is None:
@@ -55,13 +55,13 @@ class _DialledEnv(HostedEnv):
         first, self._first = self._first, None
         if first is not None and not given:
             return first
-        return self._told(self.env._reset(**given))  # noqa: SLF001
+        return self._as_ours(self.env._reset(**given))  # noqa: SLF001
 
     def step(self, policy_resp: PolicyResponse) -> EnvRet:
         data = {"action": policy_resp.action, **policy_resp.extras}
-        return self._told(self.env._step(self._names.PolicyResponse(self.env.env_id, **data)))  # noqa: SLF001
+        return self._as_ours(self.env._step(self._names.PolicyResponse(self.env.env_id, **data)))  # noqa: SLF001
 
-    def _told(self, ret: Any) -> EnvRet:
+    def _as_ours(self, ret: Any) -> EnvRet:
         return EnvRet(
             env_id=self.env_id,
             observation=as_numpy(ret.observation),
@@ -81,11 +81,11 @@ class _DialledEnv(HostedEnv):
             stop()
 
     def close(self) -> None:
-        """RLightning's client leaves its env open: it may serve again."""
+        """Do nothing: RLightning's client leaves its env open, to serve again."""
 
 
 def _space_around(observation: Any) -> gym.Space[Any]:
-    """A space of observations like this one, without bounds."""
+    """Return an unbounded space for observations like this one."""
     if isinstance(observation, dict):
         parts = cast("Mapping[str, Any]", observation).items()
         return gym.spaces.Dict({key: _space_around(part) for key, part in parts})
@@ -101,14 +101,14 @@ def _space_around(observation: Any) -> gym.Space[Any]:
 
 
 class RemoteEnvClient:
-    """Lends an env of RLightning's kind to an env_server; may do so more than once.
+    """Serves an env of RLightning's kind to an env_server, once or more often.
 
     Args:
         env: stepped on the caller's thread.
         hostname, port: of the env_server.
 
     Attributes:
-        zmq_identity: the name that the server knows it by; None before `connect`.
+        zmq_identity: its name on the server; None before `connect`.
     """
 
     def __init__(self, env: Any, hostname: str, port: int) -> None:
@@ -120,7 +120,7 @@ class RemoteEnvClient:
         self._client: OurClient | None = None
 
     def connect(self) -> None:
-        """Dial in, and wait until the server has let it in; the env is reset then."""
+        """Connect, and wait until the server has accepted the client and the env is reset."""
         if self._client is None:
             self._client = OurClient(
                 _DialledEnv(self.env), self.hostname, self.port, name=self._name
@@ -129,7 +129,7 @@ class RemoteEnvClient:
         self._client.connect()
 
     def run(self) -> None:
-        """Serve until ``env.is_finish()`` says so after a reply; the connection is closed then."""
+        """Serve until ``env.is_finish()`` is true after a reply; then close the connection."""
         self.connect()
         client = self._client
         assert client is not None
@@ -146,7 +146,7 @@ class RemoteEnvClient:
 
 
 class RemoteEnvServer(BaseEnv):
-    """An env_server by itself, without a group around it."""
+    """An env_server on its own, without a group."""
 
     max_envs = 32
 
@@ -157,48 +157,48 @@ class RemoteEnvServer(BaseEnv):
         preprocess_fn: Any = None,
         **kwargs: Any,
     ) -> None:
-        del kwargs  # Accepted so that subclasses may pass on what they were given.
+        del kwargs  # Accepted so that subclasses can pass on all their arguments.
         super().__init__(config, worker_index, preprocess_fn)
         self._group: EnvGroup | None = None
 
     @property
     def _listening(self) -> EnvGroup:
         if self._group is None:
-            raise RuntimeError("this env_server does not listen yet; call init() first")
+            raise RuntimeError("this env_server is not listening yet; call init() first")
         return self._group
 
     def init(self) -> None:
-        """Listen."""
+        """Start listening."""
         self._group = EnvGroup([self.config])
         self.env_id = self._group.env_ids[0]
 
     def get_address_port(self) -> tuple[str, int]:
-        """Where clients connect to."""
+        """Return the host and port for clients."""
         return self._listening.env_servers[0].get_address_port()
 
     def reset(self, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Wait for clients, and for the first result of each that has come."""
+        """Wait for clients, and return the first result of each."""
         batch, _ = self._listening.reset(*args, **kwargs)
         return batch.values()
 
     def step(self, policy_resp: Any) -> Any:
-        raise NotImplementedError("an env_server answers when it can; use step_async")
+        raise NotImplementedError("an env_server has no synchronous step; use step_async")
 
     def step_async(self, policy_resp_list: Sequence[Any]) -> None:
-        """Have the clients that these responses are for step."""
+        """Send each response to its client."""
         responses = list(policy_resp_list)
         batch = names_in_use().BatchedData([self.env_id] * len(responses), responses)
         self._listening.step_async(batch)
 
     def collect_async(self, timeout: float | None = None) -> tuple[Any, ...]:
-        """Results that have come; the first is waited for, so many seconds at most."""
+        """Return results; wait for the first, at most `timeout` seconds."""
         return self._listening.results_within(timeout)
 
     def get_observation_space(self) -> Any:
-        """Its clients' envs have spaces, and it has none."""
+        """Return None: only its clients' envs have spaces."""
 
     def get_action_space(self) -> Any:
-        """Its clients' envs have spaces, and it has none."""
+        """Return None: only its clients' envs have spaces."""
 
     def close(self) -> None:
         group, self._group = self._group, None

@@ -1,7 +1,7 @@
-"""The sections of a whole experiment's config, as far as their fields and defaults go.
+"""The sections of an experiment's config: fields and defaults only.
 
-A program that loads its experiment's file to get at ``env:`` reads the others as well. What
-acts on them (engines, policies, buffers) is RLightning's own.
+A program that loads its experiment's file for ``env:`` reads the other sections, too. The engines,
+policies and buffers that use them are RLightning's own.
 """
 
 from __future__ import annotations
@@ -181,7 +181,7 @@ class MainConfig(Config):
 
 
 def validate_config_for_placement(config: MainConfig) -> MainConfig:
-    """`config`, whose policies share weights where they share their devices."""
+    """Return `config`, with weights shared between policies that share their devices."""
     if config.cluster is not None and config.cluster.is_colocated:
         config.policy.weight_buffer.buffer_strategy = "None"
     return config

@@ -1,4 +1,4 @@
-"""What RLightning's programs use of its layer over Ray, where nothing is Ray's."""
+"""The names of RLightning's layer over Ray, without Ray."""
 
 from __future__ import annotations
 
@@ -11,33 +11,33 @@ __all__ = ["GlobalResourceManager", "RayActorMixin", "TaskSubmitter", "resolve_o
 
 
 class TaskSubmitter:
-    """Calls methods, of envs in workers and of plain objects alike."""
+    """Calls methods of envs and of any other objects."""
 
     def __init__(self, max_pending_tasks_each_worker: int = 1) -> None:
         if max_pending_tasks_each_worker < 0:
-            raise ValueError("max_pending_tasks_each_worker is a number from 0 up")
+            raise ValueError("max_pending_tasks_each_worker must be 0 or more")
         self.max_pending_tasks = max_pending_tasks_each_worker
 
     def submit(
         self, method: Callable[..., Any], *args: Any, _block: bool = False, **kwargs: Any
     ) -> Any:
-        """What `method` returns; there is nothing to wait for any more, whatever `_block` says."""
+        """Call `method` and return its value; `_block` has no effect."""
         del _block
         return method(*args, **kwargs)
 
 
 def resolve_object(obj: Any) -> Any:
-    """`obj` itself: no value here is a reference to one elsewhere."""
+    """Return `obj`: values are never references here."""
     return obj
 
 
 class RayActorMixin:
-    """For classes that Ray may run elsewhere; without it they run here."""
+    """A base class for Ray actors, which does nothing without Ray."""
 
 
 class GlobalResourceManager:
-    """Where RLightning keeps who runs on which node; here is one node."""
+    """RLightning's table of nodes, which does nothing without Ray."""
 
     @classmethod
     def reset(cls) -> None:
-        """There is nothing to forget."""
+        """Do nothing."""

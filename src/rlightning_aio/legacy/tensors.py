@@ -1,4 +1,4 @@
-"""Arrays and tensors as RLightning moves them: torch where it is installed, NumPy without it."""
+"""Moves arrays and tensors as RLightning does, with torch if it is installed."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _torch() -> Any:
 
 
 def _mapped(function: Callable[[Any], Any], data: Any) -> Any:
-    """`data` with `function` applied to all that is in its containers."""
+    """Return `data` with `function` applied to all values in its containers."""
     if isinstance(data, dict):
         entries = cast("dict[Any, Any]", data).items()
         return {key: _mapped(function, value) for key, value in entries}
@@ -36,10 +36,10 @@ def _mapped(function: Callable[[Any], Any], data: Any) -> Any:
 
 
 def to_device(data: Any, device: Any) -> Any:
-    """`data` with its tensors, and its arrays as tensors, on a device of torch's.
+    """Return `data` with its tensors and arrays as tensors on a torch device.
 
-    Without torch, arrays stay what they are, and only ``cpu`` is there. An array of uint16 is one
-    of bfloat16, which NumPy has not.
+    Without torch, arrays stay arrays, and the device must be ``cpu``. An array of uint16 is taken
+    for bfloat16, which NumPy lacks.
     """
     torch = _torch()
     if torch is None:
@@ -52,7 +52,7 @@ def to_device(data: Any, device: Any) -> Any:
             array = cast("np.ndarray[Any, Any]", value)
             if array.dtype.kind not in "biufc":
                 return array
-            # Torch takes no array that is read-only, or that runs backwards.
+            # Torch takes no array that is read-only or has negative strides.
             writable = np.require(array, requirements=("C", "W")).reshape(array.shape)
             tensor = torch.from_numpy(writable)
             tensor = tensor.view(torch.bfloat16) if array.dtype == np.uint16 else tensor
@@ -64,7 +64,7 @@ def to_device(data: Any, device: Any) -> Any:
 
 
 def to_numpy(data: Any) -> Any:
-    """`data` with its tensors as arrays on the CPU; bfloat16 becomes uint16, bit for bit."""
+    """Return `data` with its tensors as arrays; bfloat16 becomes uint16, bit for bit."""
 
     def converted(value: Any) -> Any:
         if is_tensor(value) and str(value.dtype) == "torch.bfloat16":
@@ -75,7 +75,7 @@ def to_numpy(data: Any) -> Any:
 
 
 def on_cpu(data: Any) -> Any:
-    """`data` with its tensors on the CPU, where another process can take them."""
+    """Return `data` with its tensors on the CPU, from where they can be pickled."""
     if not holds_tensor(data):
         return data
     return _mapped(lambda value: value.detach().cpu() if is_tensor(value) else value, data)

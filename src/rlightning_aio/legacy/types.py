@@ -1,4 +1,4 @@
-"""RLightning's values: what its envs return, what its policies answer, and batches of both.
+"""RLightning's values: results of envs, responses of policies, and batches of both.
 
 Rule: names, fields, defaults and order are RLightning's; programs build these by position.
 """
@@ -40,15 +40,15 @@ def _seconds_since(sent_ns: Any, now_ns: int | None) -> float:
 
 @dataclasses.dataclass
 class EnvRet:
-    """What an env returns of a reset or a step.
+    """The result of a reset or a step.
 
     Attributes:
-        env_id: the env it came from.
-        observation: after the reset or step.
-        last_reward, last_terminated, last_truncated: of the step that led here.
-        info: what the env says beside.
-        _extra: free for extensions; `to_dict` has its entries among the fields.
-        ts_env_sent_ns: when the env sent it, in ns since the epoch.
+        env_id: the id of the env.
+        observation: the observation after the reset or step.
+        last_reward, last_terminated, last_truncated: reward and end of the step.
+        info: the env's info.
+        _extra: free for extensions; `to_dict` includes its items.
+        ts_env_sent_ns: the time when the env sent it, in ns since the epoch.
     """
 
     env_id: str
@@ -62,12 +62,12 @@ class EnvRet:
 
     @classmethod
     def fields(cls) -> tuple[str, ...]:
-        """Names of what it holds, without id, extras and time."""
+        """Return the names of its data fields: all but id, extras and time."""
         return tuple(f.name for f in dataclasses.fields(cls) if f.name not in _NOT_DATA)
 
     @classmethod
     def get_defaults(cls) -> dict[str, Any]:
-        """Defaults of those `fields` that have a plain one."""
+        """Return the defaults of those `fields` that have a plain one."""
         return {
             f.name: f.default
             for f in dataclasses.fields(cls)
@@ -75,37 +75,37 @@ class EnvRet:
         }
 
     def mark_env_sent(self) -> Self:
-        """Note that it is sent now."""
+        """Record the present time as the time of sending."""
         self.ts_env_sent_ns = time.time_ns()
         return self
 
     def compute_sent_latency(self, now_ns: int | None = None) -> float:
-        """Seconds since it was sent; 0.0 where that is not known."""
+        """Return the seconds since it was sent, or 0.0 if that is unknown."""
         return _seconds_since(self.ts_env_sent_ns, now_ns)
 
     def to_dict(self) -> dict[str, Any]:
-        """The `fields`, and what is in ``_extra``.
+        """Return the data fields together with the items of ``_extra``.
 
         Raises:
-            KeyError: something in ``_extra`` has the name of a field.
+            KeyError: an item of ``_extra`` has the name of a field.
         """
         result = {name: getattr(self, name) for name in self.fields()}
         for name, value in self._extra.items():
             if name in result:
-                raise KeyError(f"{name!r} is in _extra, and is the name of a field")
+                raise KeyError(f"{name!r} is both in _extra and the name of a field")
             result[name] = value
         return result
 
     def cpu(self) -> Self:
-        """A copy whose arrays and tensors are tensors on the CPU; without torch, arrays."""
+        """Return a copy with arrays and tensors as CPU tensors; without torch, as arrays."""
         return self._converted(lambda value: to_device(value, "cpu"))
 
     def cuda(self, device: int | str | None = None) -> Self:
-        """A copy whose arrays and tensors are tensors on a CUDA device."""
+        """Return a copy with arrays and tensors as tensors on a CUDA device."""
         return self._converted(lambda value: to_device(value, "cuda" if device is None else device))
 
     def numpy(self) -> Self:
-        """A copy whose tensors are arrays."""
+        """Return a copy with tensors as arrays."""
         return self._converted(to_numpy)
 
     def _converted(self, convert: Callable[[Any], Any]) -> Self:
@@ -118,13 +118,13 @@ class EnvRet:
 
 @dataclasses.dataclass
 class MultiAgentEnvRet(EnvRet):
-    """What a multi-agent env returns: rewards and ends are dicts by agent."""
+    """The result of a multi-agent env: rewards and ends are dicts by agent."""
 
     __hash__ = EnvRet.__hash__
 
 
 class PolicyResponse(SimpleNamespace):
-    """What a policy answers for one env: whatever it attaches, seldom without an ``action``."""
+    """A policy's response for one env: any attributes, usually with an ``action``."""
 
     env_id: str
 
@@ -137,19 +137,19 @@ class PolicyResponse(SimpleNamespace):
         return set(vars(self)) - {"env_id", "ts_policy_sent_ns"}
 
     def to_dict(self) -> dict[str, Any]:
-        """What the policy attached."""
+        """Return all attributes that the policy attached."""
         return {name: getattr(self, name) for name in self._fields}
 
     def cpu(self) -> Self:
-        """Make its arrays and tensors tensors on the CPU; without torch, they stay arrays."""
+        """Convert arrays and tensors to CPU tensors; without torch, keep arrays."""
         return self._convert(lambda value: to_device(value, "cpu"))
 
     def cuda(self, device: int | str | None = None) -> Self:
-        """Make its arrays and tensors tensors on a CUDA device."""
+        """Convert arrays and tensors to tensors on a CUDA device."""
         return self._convert(lambda value: to_device(value, "cuda" if device is None else device))
 
     def numpy(self) -> Self:
-        """Make its tensors arrays."""
+        """Convert tensors to arrays."""
         return self._convert(to_numpy)
 
     def _convert(self, convert: Callable[[Any], Any]) -> Self:
@@ -158,12 +158,12 @@ class PolicyResponse(SimpleNamespace):
         return self
 
     def mark_policy_sent(self) -> Self:
-        """Note that it is sent now."""
+        """Record the present time as the time of sending."""
         self.ts_policy_sent_ns = time.time_ns()
         return self
 
     def compute_sent_latency(self, now_ns: int | None = None) -> float:
-        """Seconds since it was sent; 0.0 where that is not known."""
+        """Return the seconds since it was sent, or 0.0 if that is unknown."""
         return _seconds_since(getattr(self, "ts_policy_sent_ns", None), now_ns)
 
     def __reduce__(self) -> Any:
@@ -173,27 +173,27 @@ class PolicyResponse(SimpleNamespace):
     def make_example(
         action_space: gym.Space[Any], env_id: str | None = None, **data: Any
     ) -> PolicyResponse:
-        """A response with a random action."""
+        """Return a response with a random action."""
         return PolicyResponse(env_id or "", action=action_space.sample(), **data)
 
 
 class MultiAgentPolicyResponse(PolicyResponse):
-    """What a policy answers for a multi-agent env: ``action`` is a dict by agent."""
+    """A policy's response for a multi-agent env: ``action`` is a dict by agent."""
 
     @staticmethod
     def make_example(  # pyright: ignore[reportIncompatibleMethodOverride]  # As RLightning's.
         action_spaces: Mapping[str, gym.Space[Any]], env_id: str | None = None, **data: Any
     ) -> MultiAgentPolicyResponse:
-        """A response with a random action for each agent."""
+        """Return a response with a random action for each agent."""
         action = {agent: space.sample() for agent, space in action_spaces.items()}
         return MultiAgentPolicyResponse(env_id or "", action=action, **data)
 
 
 class BatchedData:
-    """Ids and what belongs to them, in order; an id may come more than once.
+    """Ids with a value for each, in order; an id may occur more than once.
 
     Attributes:
-        is_future: something in it is still to be computed elsewhere; nothing here ever is.
+        is_future: always False, because no value is a Ray reference.
     """
 
     is_future = False
@@ -205,15 +205,15 @@ class BatchedData:
         self._data = tuple(data)
 
     def ids(self) -> tuple[Any, ...]:
-        """The ids, in order."""
+        """Return the ids, in order."""
         return self._ids
 
     def values(self) -> tuple[Any, ...]:
-        """The values, in order."""
+        """Return the values, in order."""
         return self._data
 
     def items(self) -> Iterator[tuple[Any, Any]]:
-        """Pairs of id and value, in order."""
+        """Return an iterator over pairs of id and value, in order."""
         return zip(self._ids, self._data, strict=True)
 
     def __iter__(self) -> Iterator[tuple[Any, Any]]:
@@ -223,7 +223,7 @@ class BatchedData:
         return len(self._ids)
 
     def __getitem__(self, id_: Any) -> Any:
-        """The value of `id_`; of the first, if it comes more than once.
+        """Return the value of `id_`: the first one, if it occurs more than once.
 
         Raises:
             ValueError: the batch has no such id.
@@ -232,13 +232,13 @@ class BatchedData:
 
     @staticmethod
     def from_dict(data_dict: Mapping[Any, Any]) -> BatchedData:
-        """A batch of the mapping's items, in its order."""
+        """Return a batch of the mapping's items, in its order."""
         return BatchedData(list(data_dict), list(data_dict.values()))
 
 
 @dataclasses.dataclass
 class EnvMeta:
-    """What is known of an env."""
+    """The metadata of an env."""
 
     env_id: str | None = None
     action_space: gym.Space[Any] | None = None

@@ -1,8 +1,8 @@
-"""Whether a value lies within the bounds of its space.
+"""Checks values against the bounds of their space.
 
-Rule: nothing here refuses or raises. Simulators declare bounds that their own observations don't
-keep to; structure, shapes and dtypes are what `columns` checks, and what doesn't have those of
-its space is passed over. So are tensors, which may be on another device.
+Rule: nothing here raises, because some simulators violate the bounds that they declare. `columns`
+checks structure, shapes and dtypes; values that don't match these are skipped here. So are tensors,
+which may be on another device.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _NUMBERS = (np.ndarray, np.generic, int, float)
 
 
 def out_of_bounds(space: gym.Space[Any], value: Any, what: str) -> str | None:
-    """What of `value` its space excludes, in words; None if nothing."""
+    """Describe the first number of `value` outside the bounds of `space`; None without any."""
     return next(_faults(space, value, what, ()), None)
 
 
@@ -43,7 +43,7 @@ def _faults(
         if array.shape != space.shape or array.dtype.kind not in "biuf":
             return
         low, high = (np.broadcast_to(bound, array.shape) for bound in bounds)
-        # Written so that NaN lies outside.
+        # In this form NaN is outside.
         outside = ~((array >= low) & (array <= high))
         if outside.any():
             name = Leaf(path, (), array.dtype).name
@@ -52,7 +52,7 @@ def _faults(
 
 
 def _bounds(space: gym.Space[Any]) -> tuple[Any, Any] | None:
-    # Gymnasium's spaces are generic over dtypes that nobody states.
+    # Gymnasium's spaces are generic over dtypes, which aren't known here.
     spaces: Any = gym.spaces
     known = cast("Any", space)
     if isinstance(space, spaces.Box):

@@ -1,10 +1,9 @@
-"""Spaces as columns: which spaces fit in fixed-size memory, and how values get in and out.
+"""Spaces as columns: memory of fixed size for values, and functions that write and read them.
 
-A tree has the shape of its space: an array for Box, Discrete, MultiBinary and
-MultiDiscrete, a dict for Dict, a tuple for Tuple. Every array of a tree carries rows
-on its first axis.
-Absent on purpose: Text, Sequence, Graph and other spaces without a fixed size; they
-travel pickled.
+A tree has the structure of its space: an array for Box, Discrete, MultiBinary and MultiDiscrete, a
+dict for Dict, a tuple for Tuple. The first axis of each array is that of rows.
+Absent on purpose: Text, Sequence, Graph and other spaces without a fixed size; their values are
+pickled.
 """
 
 from __future__ import annotations
@@ -33,12 +32,14 @@ __all__ = [
     "fitted_tree",
     "gather",
     "index",
+    "is_array",
     "is_dict",
     "is_tuple",
     "leaf_of",
     "leaves",
     "mapped",
     "out_of_range",
+    "paired",
     "row_reader",
     "row_writer",
     "stacked",
@@ -48,14 +49,14 @@ Tree: TypeAlias = Any
 """An array, or a dict or tuple of trees."""
 _Node: TypeAlias = "NDArray[Any] | dict[str, Tree] | tuple[Tree, ...]"
 Rows: TypeAlias = "slice | NDArray[np.intp]"
-"""Which rows: a slice for a contiguous range, else an index array."""
+"""A selection of rows: a slice for a contiguous range, else an index array."""
 
 _FIXED = (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete)
 
 
 @dataclass(frozen=True, slots=True)
 class Leaf:
-    """One array of a tree: its place, and the shape and dtype of one row."""
+    """One array of a tree: its path, and the shape and dtype of one row."""
 
     path: tuple[str | int, ...]
     shape: tuple[int, ...]
@@ -63,12 +64,12 @@ class Leaf:
 
     @property
     def name(self) -> str:
-        """The place as a person would write it; empty for a space of one array."""
+        """The path in Python's notation; empty for a space of one array."""
         return "".join(f"[{key!r}]" for key in self.path)
 
 
 def leaves(space: gym.Space[Any]) -> tuple[Leaf, ...] | None:
-    """The arrays that a value of `space` consists of, or None if it has no fixed size."""
+    """Arrays of a value of `space`, or None if it has no fixed size."""
     found = list(_walk(space, ()))
     return None if None in found else tuple(leaf for leaf in found if leaf is not None)
 
@@ -80,29 +81,29 @@ def _walk(space: gym.Space[Any], path: tuple[str | int, ...]) -> Iterator[Leaf |
     elif is_tuple(space):
         for position, inner in enumerate(space.spaces):
             yield from _walk(inner, (*path, position))
-    elif _is_array(space) and space.dtype != object:
+    elif is_array(space) and space.dtype != object:
         yield Leaf(path, space.shape, space.dtype)
     else:
         yield None
 
 
 def is_dict(space: object) -> TypeGuard[spaces.Dict[Any]]:
-    """Whether `space` is a Dict; an `isinstance` would lose what its parts are."""
+    """Return True for a Dict; unlike `isinstance`, this keeps the types of its parts."""
     return isinstance(space, spaces.Dict)
 
 
 def is_tuple(space: object) -> TypeGuard[spaces.Tuple[Any]]:
-    """Whether `space` is a Tuple; an `isinstance` would lose what its parts are."""
+    """Return True for a Tuple; unlike `isinstance`, this keeps the types of its parts."""
     return isinstance(space, spaces.Tuple)
 
 
-def _is_array(space: gym.Space[Any]) -> TypeGuard[spaces.Box[Any]]:
-    """Whether values of `space` are arrays of one shape and dtype, as a Box's are."""
+def is_array(space: gym.Space[Any]) -> TypeGuard[spaces.Box[Any]]:
+    """Return True if all values of `space` are arrays with the same shape and dtype."""
     return isinstance(space, _FIXED)
 
 
 def assemble(space: gym.Space[Any], arrays: Iterator[NDArray[Any]]) -> Tree:
-    """Arrange `arrays`, given in the order of `leaves`, in the shape of `space`."""
+    """Arrange `arrays`, given in the order of `leaves`, in the structure of `space`."""
     if is_dict(space):
         return {key: assemble(inner, arrays) for key, inner in space.spaces.items()}
     if is_tuple(space):
@@ -111,7 +112,7 @@ def assemble(space: gym.Space[Any], arrays: Iterator[NDArray[Any]]) -> Tree:
 
 
 def leaf_of(space_leaves: Sequence[Leaf], tree: Tree) -> Iterator[tuple[Leaf, NDArray[Any]]]:
-    """Each leaf with its array of `tree`."""
+    """Yield each leaf with its array in `tree`."""
     for leaf in space_leaves:
         array = tree
         for key in leaf.path:
@@ -120,7 +121,7 @@ def leaf_of(space_leaves: Sequence[Leaf], tree: Tree) -> Iterator[tuple[Leaf, ND
 
 
 def mapped(function: Callable[[NDArray[Any]], Any], tree: _Node) -> Tree:
-    """`tree` with `function` applied to each array."""
+    """Apply `function` to each array of `tree`."""
     if isinstance(tree, dict):
         return {key: mapped(function, inner) for key, inner in tree.items()}
     if isinstance(tree, tuple):
@@ -128,15 +129,24 @@ def mapped(function: Callable[[NDArray[Any]], Any], tree: _Node) -> Tree:
     return function(tree)
 
 
+def paired(function: Callable[[Any, Any], Any], one: _Node, other: Any) -> Tree:
+    """Apply `function` to each array of the tree `one`, and to what `other` has in its place."""
+    if isinstance(one, dict):
+        return {key: paired(function, inner, other[key]) for key, inner in one.items()}
+    if isinstance(one, tuple):
+        return tuple(paired(function, inner, other[k]) for k, inner in enumerate(one))
+    return function(one, other)
+
+
 def gather(tree: _Node, rows: Rows) -> Any:
-    """A fresh copy of `rows` of each array."""
+    """Copy `rows` of each array."""
     if isinstance(tree, np.ndarray):
         return tree[rows].copy() if isinstance(rows, slice) else tree.take(rows, axis=0)
     return mapped(lambda array: gather(array, rows), tree)
 
 
 def stacked(trees: Sequence[_Node]) -> Tree:
-    """Trees of one structure along a new first axis; a single one is not copied."""
+    """Stack trees with the same structure along a new first axis; a single one is not copied."""
     first = trees[0]
     if isinstance(first, dict):
         return {key: stacked([cast("Any", tree)[key] for tree in trees]) for key in first}
@@ -146,30 +156,30 @@ def stacked(trees: Sequence[_Node]) -> Tree:
 
 
 def index(tree: _Node, position: int) -> Tree:
-    """Row `position` of each array: a view, or a NumPy scalar where a row is one number."""
+    """Row `position` of each array: a view, or a NumPy scalar if a row is one number."""
     return tree[position] if isinstance(tree, np.ndarray) else mapped(lambda a: a[position], tree)
 
 
 class Misfit(ValueError):
-    """A value doesn't fit the space it was declared for."""
+    """A value doesn't fit its declared space."""
 
 
 def as_array(value: Any) -> NDArray[Any]:
-    """`value` as NumPy; tensors come from their device to the CPU."""
+    """Convert `value` to NumPy; tensors are copied to the CPU."""
     if type(value) is np.ndarray:
         return value
     return array_of_tensor(value) if hasattr(value, "detach") else np.asarray(value)
 
 
 def array_of_tensor(tensor: Any) -> NDArray[Any]:
-    """A torch tensor as an array on the CPU, of float32 if it is of bfloat16, which NumPy lacks."""
-    # A view may be marked as conjugated or negated instead of being so, which NumPy can't show.
+    """Convert a torch tensor to an array on the CPU; bfloat16, unknown to NumPy, to float32."""
+    # Conjugated and negated views are only marked as such, which NumPy can't represent.
     tensor = tensor.detach().cpu().resolve_conj().resolve_neg()
     return (tensor.float() if str(tensor.dtype) == "torch.bfloat16" else tensor).numpy()
 
 
 def out_of_range(array: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[np.bool_] | None:
-    """Where numbers of `array` don't fit the integer `dtype`; None if nowhere."""
+    """Mask of the numbers of `array` that don't fit the integer `dtype`; None if all fit."""
     if dtype.kind not in "iu" or not array.size or np.can_cast(array.dtype, dtype):
         return None
     limits = np.iinfo(dtype)
@@ -179,10 +189,10 @@ def out_of_range(array: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[np.bool_]
 
 
 def fitted(value: Any, leaf: Leaf, what: str) -> NDArray[Any]:
-    """`value` as an array that may be copied into one row of `leaf`.
+    """Convert `value` to an array that can be copied into one row of `leaf`.
 
     Raises:
-        Misfit: it has another shape, another kind of dtype, or numbers that are out of range.
+        Misfit: it has another shape, another kind of dtype, or numbers out of range.
     """
     array = np.asarray(value)
     if array.shape != leaf.shape or not np.can_cast(array.dtype, leaf.dtype, "same_kind"):
@@ -202,10 +212,10 @@ def fitted(value: Any, leaf: Leaf, what: str) -> NDArray[Any]:
 def fitted_tree(
     space: gym.Space[Any], value: Any, what: str, path: tuple[str | int, ...] = ()
 ) -> Tree:
-    """`value` as arrays of the shapes and dtypes of `space`; those that have them, uncopied.
+    """Convert `value` to arrays with the shapes and dtypes of `space`, without needless copies.
 
     Raises:
-        Misfit: as the function that `row_writer` makes.
+        Misfit: see `row_writer`.
     """
     if type(value) is np.ndarray and value.shape == space.shape and value.dtype == space.dtype:
         return value
@@ -219,7 +229,7 @@ def fitted_tree(
             fitted_tree(inner, part, what, (*path, position))
             for position, (inner, part) in enumerate(zip(space.spaces, value, strict=True))
         )
-    assert _is_array(space)
+    assert is_array(space)
     return fitted(value, Leaf(path, space.shape, space.dtype), what).astype(space.dtype)
 
 
@@ -242,13 +252,13 @@ def _misplaced(what: str, path: tuple[str | int, ...], expected: str, value: Any
 def row_writer(
     space: gym.Space[Any], tree: Tree, row: int, what: str, path: tuple[str | int, ...] = ()
 ) -> Callable[[Any], None]:
-    """A function that copies one value of `space` into `row` of `tree`.
+    """Make a function that copies a value of `space` into `row` of `tree`.
 
-    Floats may be narrowed (float64 into float32), as Gymnasium's vector environments do.
+    Floats may be narrowed (float64 to float32), as in Gymnasium's vector environments.
 
     Raises (from the function):
-        Misfit: the value has another shape, structure, or kind of dtype, or numbers that are
-            out of its range; the row may hold a part of it.
+        Misfit: the value has another shape, structure or kind of dtype, or numbers out of range;
+            a part of it may have been written.
     """
     if is_dict(space):
         return _dict_writer(space, tree, row, what, path)
@@ -307,10 +317,7 @@ def _tuple_writer(
 
 
 def row_reader(space: gym.Space[Any], tree: Tree, row: int) -> Callable[[], Any]:
-    """A function that returns a copy of the value in `row`, as an env expects it.
-
-    The caller owns the value: nothing that is written to the row later changes it.
-    """
+    """Make a function that returns the value in `row` in the form that envs expect: a copy."""
     if is_dict(space):
         readers = {k: row_reader(inner, tree[k], row) for k, inner in space.spaces.items()}
         return lambda: {key: reader() for key, reader in readers.items()}

@@ -1,9 +1,9 @@
-"""Frames: what travels in the channel between a host and its local worker.
+"""Frames: messages in the channel between a host and its local worker.
 
-A frame is a 16-byte header (payload length, kind, an entry or another number) and a
-payload. A *bell* is a frame without a payload that only wakes the other side. The payload
-is a pickle: both ends are the same user's own processes on the same machine, connected by
-an anonymous socket pair. Nothing here ever meets a network (see `net` for that).
+A frame is a 16-byte header (payload length, kind, an entry or another number) and a payload. A
+*bell* is a frame without payload that only wakes the other side. Payloads are pickles, because both
+ends are processes of the same user on the same machine, connected by an anonymous socket pair.
+Frames never cross a network (see `net` for that).
 """
 
 from __future__ import annotations
@@ -18,22 +18,24 @@ HEADER: Final = struct.Struct("<IIq")
 
 
 class FrameKind(IntEnum):
-    """What a frame is; the comment names its sender, its number and its payload."""
+    """The kind of a frame. The comments name sender, number and payload."""
 
     BELL = 0  # both
     START = 1  # trainer: what to build
-    STARTED = 2  # worker: what each env is like
-    START_ERROR = 3  # worker; the env's index: why it could not be built
+    STARTED = 2  # worker: metadata of each env
+    START_ERROR = 3  # worker; index of the env: the error of building it
     ATTACH = 4  # trainer: layouts of the slabs, and the rows of the envs
     ATTACHED = 5  # worker
-    REQUEST = 6  # trainer; its entry: arguments out of band
-    RESULT = 7  # worker; the request's entry: its part out of band
-    VALUE = 8  # worker; the request's entry: what a call returned
+    REQUEST = 6  # trainer; the entry: arguments out of band
+    RESULT = 7  # worker; the request's entry: the part out of band
+    VALUE = 8  # worker; the request's entry: the value of a call
     ERROR = 9  # worker; the request's entry: an exception as text
-    INFO_SCHEMA = 10  # worker; its number: a new way in which rows hold infos
+    INFO_SCHEMA = 10  # worker; the schema's number: a new schema of infos
     CLOSE = 11  # trainer
     CLOSED = 12  # worker: errors of close(), by env
-    SAVED = 13  # worker; index of an env, and whether from before its request: where it stands
+    SAVED = 13  # worker; index of an env, and a flag for "before its request": its checkpoint
+    RESTARTED = 14  # worker; the request's entry: why its env was rebuilt, and as for RESULT
+    FAILED = 15  # worker; the request's entry: an error of this package
 
 
 class Frame(NamedTuple):
@@ -45,26 +47,29 @@ class Frame(NamedTuple):
 
 
 def encode(kind: FrameKind, number: int = 0, payload: bytes = b"") -> bytes:
-    """The bytes of one frame."""
+    """Encode one frame."""
     return HEADER.pack(len(payload), kind, number) + payload
 
 
 BELL: Final = encode(FrameKind.BELL)
 CHUNK_BYTES: Final = 1 << 16
-"""Bytes of a channel to read at a time; the C library maps fresh memory for much more than that."""
+"""Bytes to read from a channel in one call; for much larger reads the C library maps memory."""
 
 
 class FrameReader:
-    """Cuts a byte stream into frames; bells are dropped."""
+    """Cuts a byte stream into frames; bells are dropped.
+
+    Attributes:
+        is_empty: True if no incomplete frame is buffered.
+    """
 
     def __init__(self) -> None:
         self._buffer = bytearray()
+        self.is_empty = True
 
     def feed(self, data: bytes) -> list[Frame]:
-        """Add `data`; the frames that are complete now, in order."""
+        """Add `data`, and return the frames that are complete now, in order."""
         frames: list[Frame] = []
-        if data == BELL and not self._buffer:
-            return frames
         self._buffer += data
         buffer, size, start = self._buffer, HEADER.size, 0
         while len(buffer) - start >= size:
@@ -77,4 +82,5 @@ class FrameReader:
             if kind != FrameKind.BELL:
                 frames.append(Frame(kind, number, payload))
         del buffer[:start]
+        self.is_empty = not buffer
         return frames

@@ -1,9 +1,8 @@
 """Small info dicts in shared memory: written without pickling, decoded only when read.
 
-Most envs report the same few numbers under the same keys at every step. The worker
-announces such a shape once, as a schema, and from then on packs only the values into
-the row. An info that fits no schema (nested, strings, too large) travels pickled.
-Types survive: a NumPy scalar comes back as the NumPy scalar it was.
+Most envs report a few numbers under the same keys in each step. The worker announces these keys and
+types once, as a schema, and then packs only the values into the row. An info that fits no schema
+(nested, strings, too large) is pickled. Types are preserved, also those of NumPy scalars.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Container
+    from collections.abc import Callable, Mapping
 
     from numpy.typing import NDArray
 
@@ -32,14 +31,14 @@ __all__ = [
 ]
 
 INFO_BYTES: Final = 512
-"""Of a row; with sub-environments at least."""
+"""Space for infos in a row; the minimum for rows with sub-environments."""
 INFO_BYTES_OF_SUB_ENV: Final = 128
 NO_INFO: Final = 0
 PICKLED: Final = 255
-"""Row marks: 0 no info, 1 to 254 the number of a schema, 255 the info is out of band."""
+"""Marks of rows: 0 without an info, 1 to 254 for a schema, 255 for an info out of band."""
 
 _AS_OBJECTS: Final = np.bool_
-"""A kind of number of which Gymnasium makes no typed array."""
+"""Gymnasium stores numbers of this type in arrays of objects."""
 _MAX_SCHEMAS: Final = 254
 
 _SCALARS: Final[dict[type, str]] = {
@@ -54,24 +53,30 @@ _SCALARS: Final[dict[type, str]] = {
 }
 
 
-def is_mask(key: str, info: Container[str]) -> bool:
-    """Whether a vector environment tells by `key` which sub-environments have another one."""
-    return key.startswith("_") and key[1:] in info
+def is_mask(key: Any, info: Mapping[Any, Any]) -> bool:
+    """Return True if the value of `key` is a mask: of sub-environments that have another key.
+
+    A mask is an array of bools under the name of the other key, prefixed with an underscore.
+    """
+    if not isinstance(key, str) or not key.startswith("_") or key[1:] not in info:
+        return False
+    value: Any = info.get(key)
+    return type(value) is np.ndarray and value.dtype == np.bool_ and value.ndim > 0
 
 
-def has_mask(key: str, info: Container[str]) -> bool:
-    """Whether `key` needs none made: it has one among the infos, or is one."""
-    return f"_{key}" in info or is_mask(key, info)
+def has_mask(key: Any, info: Mapping[Any, Any]) -> bool:
+    """Return True if `key` has a mask in `info`, or is one."""
+    return is_mask(f"_{key}", info) or is_mask(key, info)
 
 
 @dataclass(frozen=True)
 class InfoSchema:
-    """How a row holds infos of one shape.
+    """Keys and types of an info, and its layout in a row.
 
     Attributes:
-        keys: the dict's keys, in order.
+        keys: of the dict, in order.
         types: the exact type of each value.
-        arrays: for each value shape and dtype if it is an array, else None.
+        arrays: shape and dtype of each value that is an array, else None.
         format: `struct` format of all values.
     """
 
@@ -82,7 +87,7 @@ class InfoSchema:
 
     @classmethod
     def of(cls, info: dict[str, Any]) -> InfoSchema | None:
-        """The schema of `info`, or None if it can't travel in a row."""
+        """Make the schema of `info`, or None if it can't be stored in a row."""
         arrays: list[tuple[tuple[int, ...], str] | None] = []
         codes = "="
         kinds = tuple(map(type, info.values()))
@@ -101,12 +106,12 @@ class InfoSchema:
 
     @cached_property
     def size(self) -> int:
-        """Bytes of a row that it uses."""
+        """Size in bytes in a row."""
         return struct.calcsize(self.format)
 
     @cached_property
     def _dtype(self) -> np.dtype[Any]:
-        """The bytes of a row as a structured array knows them."""
+        """The layout as the dtype of a structured array."""
         return np.dtype(
             [
                 (key, _SCALARS[kind]) if array is None else (key, array[1], array[0])
@@ -116,25 +121,42 @@ class InfoSchema:
 
     @cached_property
     def is_typed(self) -> bool:
-        """Whether Gymnasium makes typed arrays of all values, one column for each key."""
+        """True if Gymnasium makes one typed column for each key."""
         return (
             _AS_OBJECTS not in self.types
             and "final_obs" not in self.keys
             and not any(array is not None and 0 in array[0] for array in self.arrays)
+            and self.keys_but_masks.isdisjoint(f"_{key}" for key in self.keys)
         )
 
     @cached_property
+    def masks(self) -> frozenset[str]:
+        """Keys that are masks of others; see `is_mask`."""
+        # An info with these keys and types, without values.
+        info = {
+            key: None if array is None else np.empty(array[0], array[1])
+            for key, array in zip(self.keys, self.arrays, strict=True)
+        }
+        return frozenset(key for key in self.keys if is_mask(key, info))
+
+    @cached_property
+    def keys_but_masks(self) -> frozenset[str]:
+        """Keys that are not masks."""
+        return frozenset(self.keys) - self.masks
+
+    @cached_property
     def without_mask(self) -> tuple[str, ...]:
-        """Keys that are no mask, and have none among the others."""
-        return tuple(key for key in self.keys if not has_mask(key, self.keys))
+        """Keys that are not masks and have no mask."""
+        masks = self.masks
+        return tuple(key for key in self.keys if key not in masks and f"_{key}" not in masks)
 
     def fields(self, rows: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
-        """What ``rows [n, bytes]`` hold, one column for each key; views of a copy."""
+        """Decode ``rows [n, bytes]`` to one column for each key, which are views of a copy."""
         values = np.ascontiguousarray(rows[:, : self.size]).view(self._dtype)[:, 0]
         return {key: values[key] for key in self.keys}
 
     def decode(self, row: bytes | memoryview) -> dict[str, Any]:
-        """The info that `row` holds; arrays are fresh and writable."""
+        """Decode the info in `row`; its arrays are new and writable."""
         values = struct.unpack_from(self.format, row)
         return {
             key: _restored(value, value_type, array)
@@ -144,10 +166,10 @@ class InfoSchema:
         }
 
     def decode_all(self, rows: NDArray[np.uint8]) -> list[dict[str, Any]]:
-        """The infos that ``rows [n, bytes]`` hold."""
+        """Decode the infos in ``rows [n, bytes]``."""
         if any(self.arrays):
             return [self.decode(memoryview(row)) for row in rows]
-        # Elements of an array are NumPy's scalars, those of its list are Python's.
+        # `list` yields NumPy scalars, `tolist` those of Python.
         columns = [
             column.tolist() if kind in (float, int, bool) else list(column)
             for kind, column in zip(self.types, self.fields(rows).values(), strict=True)
@@ -166,9 +188,9 @@ class InfoWriter:
     """The worker's side for one env: packs infos into its row.
 
     Args:
-        row: the row's info bytes, writable.
-        announce: tells the trainer of a new schema; returns its number, or `PICKLED` if
-            the worker has announced too many.
+        row: the writable info bytes of the row.
+        announce: sends a new schema to the trainer; returns its number, or `PICKLED` if the worker
+            has announced too many.
     """
 
     def __init__(self, row: memoryview, announce: Callable[[InfoSchema], int]) -> None:
@@ -182,7 +204,7 @@ class InfoWriter:
         self._pack: Callable[..., None] = struct.Struct("").pack_into
 
     def write(self, info: dict[str, Any]) -> int:
-        """Put `info` into the row; the mark that says how, `PICKLED` if it can't be."""
+        """Write `info` to the row. Return its mark, `PICKLED` if it wasn't written."""
         if not info:
             return NO_INFO
         if [*info] != self._keys or [*map(type, info.values())] != self._types:
@@ -193,12 +215,12 @@ class InfoWriter:
             if self._arrays:
                 return self._write_arrays(info)
             self._pack(self._row, 0, *info.values())
-        except struct.error:  # An int beyond 64 bits.
+        except struct.error:  # An int of more than 64 bits.
             return PICKLED
         return self._number
 
     def read(self, mark: int) -> dict[str, Any]:
-        """The info that was written last, with its mark; empty if it isn't in the row."""
+        """Decode the info that was written last, with its mark; empty if it isn't in the row."""
         if mark in (NO_INFO, PICKLED) or self._schema is None:
             return {}
         return self._schema.decode(self._row)
@@ -208,7 +230,7 @@ class InfoWriter:
         for position, shape, dtype in self._arrays:
             array = values[position]
             if array.shape != shape or array.dtype != dtype:
-                self._keys = []  # Another schema; take it up at the next write.
+                self._keys = []  # The next write adopts the new schema.
                 return PICKLED
             values[position] = array.tobytes()
         self._pack(self._row, 0, *values)
@@ -232,14 +254,14 @@ class InfoWriter:
 
 
 class InfoSchemas:
-    """The schemas that one worker has announced, numbered from 1 (its own side of them)."""
+    """The worker's side: numbers its schemas from 1, and sends new ones."""
 
     def __init__(self, send: Callable[[int, InfoSchema], None]) -> None:
         self._numbers: dict[InfoSchema, int] = {}
         self._send = send
 
     def announce(self, schema: InfoSchema) -> int:
-        """The number of `schema`; sent to the trainer when it is new."""
+        """Return the number of `schema`; send it to the trainer if it is new."""
         number = self._numbers.get(schema)
         if number is None:
             if len(self._numbers) >= _MAX_SCHEMAS:

@@ -1,14 +1,13 @@
 """Two rings of numbered entries in memory shared by a trainer and one worker.
 
-The trainer appends requests and reads reports; the worker reads requests and appends
-reports. A worker that has nothing to do sleeps on its channel and is woken there by a few
-bytes, which the trainer sends only when the worker has said that it sleeps. How a worker
-wakes the trainer is told in `bell`.
+The trainer appends requests and reads reports; the worker reads requests and appends reports. A
+worker without requests marks itself as asleep and waits for its channel, where the trainer wakes
+it with a few bytes. `exchange` describes how workers wake the trainer.
 
-Invariant: every word has one writer. A writer publishes (entry first, then the counter)
-and fences before it looks whether the other side sleeps; a sleeper says so and fences
-before it looks at the counter a last time. So one of the two always sees the other, and
-no wake-up is lost (Dekker's rule).
+Invariant: each word has one writer. A writer publishes (entry first, then the counter) and fences
+before it checks whether the other side sleeps; a sleeper publishes that it sleeps and fences
+before it checks the counter once more. So one of the two always sees the other, and no wake-up is
+lost (Dekker's rule).
 """
 
 from __future__ import annotations
@@ -17,11 +16,17 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from rlightning_aio.protocol.bell import (
+from rlightning_aio.protocol.exchange import (
     ARMED,
     AT_LAST,
+    FRAMES_TO_TRAINER,
     IN_ORDER,
     LINE,
+    REQUESTS_SENT,
+    SEEN,
+    SENT,
+    WORKER_ASLEEP,
+    Ring,
     new_fence,
 )
 
@@ -30,27 +35,24 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from rlightning_aio.protocol.bell import TrainerBell, WorkerBell
+    from rlightning_aio.protocol.exchange import TrainerBell, WorkerBell
 
 __all__ = ["TrainerRings", "WorkerRings", "rings_size"]
 
-# Words, each on a cache line of its own: false sharing would cost both sides.
-_REQUESTS_SENT: Final = 0 * LINE
-_WORKER_ASLEEP: Final = 1 * LINE
+# Words that `exchange` doesn't use.
 _FRAMES_TO_WORKER: Final = 2 * LINE
-_FRAMES_TO_TRAINER: Final = 3 * LINE
 _CURRENT: Final = 4 * LINE
 _CURRENT_SINCE_NS: Final = 4 * LINE + 1
 _WORDS: Final = 5 * LINE
 
 
 def _capacity(num_envs: int) -> int:
-    # One request of an env may be in flight, so no more entries than envs are unread.
+    # Each env has at most one request in flight, so unread entries are at most as many as envs.
     return 1 << num_envs.bit_length()
 
 
 def rings_size(num_envs: int) -> int:
-    """Bytes that the words and both rings of a worker with so many envs take."""
+    """Size in bytes of the words and both rings of a worker with `num_envs` envs."""
     return 8 * (_WORDS + 2 * _capacity(num_envs))
 
 
@@ -64,70 +66,70 @@ class TrainerRings:
     """The trainer's side: appends requests, reads reports.
 
     Args:
-        buffer: the rings' memory, zeroed.
+        buffer: the memory of the rings, zeroed.
         num_envs: of the worker.
-        bell: of the group; index: which of its counters is the worker's.
+        bell: of the group; index: of the worker's counter in it.
     """
 
     def __init__(self, buffer: memoryview, num_envs: int, bell: TrainerBell, index: int) -> None:
         self._words, requests, reports = _split(buffer, num_envs)
         self._requests: NDArray[np.int64] = np.frombuffer(requests, np.int64)
         self._reports: NDArray[np.int64] = np.frombuffer(reports, np.int64)
+        self._own = memoryview(bytearray(16)).cast("q")
         self._capacity = _capacity(num_envs)
         self._mask = self._capacity - 1
         self._fence = new_fence()
         self._bell = bell
         self._index = index
-        self._sent = 0
-        self._read = 0
         self._frames_sent = 0
         bell.restart(index)
 
+    def ring(self, wake: Callable[[], None]) -> Ring:
+        """The rings as buffers, for `exchange`."""
+        return Ring(self._words, self._requests, self._reports, self._own, wake)
+
     def request(self, entries: NDArray[np.int64]) -> bool:
         """Append `entries` in order; True if the worker sleeps and must be rung."""
-        count = len(entries)
-        start = self._sent & self._mask
+        count, sent = len(entries), self._own[SENT]
+        start = sent & self._mask
         room = self._capacity - start
         if count <= room:
             self._requests[start : start + count] = entries
         else:
             self._requests[start:] = entries[:room]
             self._requests[: count - room] = entries[room:]
-        self._sent += count
         if not IN_ORDER:
             self._fence()
-        self._words[_REQUESTS_SENT] = self._sent
+        self._words[REQUESTS_SENT] = self._own[SENT] = sent + count
         return self.worker_sleeps()
 
     def last_requests(self) -> tuple[int, ...]:
-        """The entries that were sent last, oldest first; all unanswered ones are among them."""
-        start = self._sent & self._mask
+        """Entries sent last, oldest first, including all unanswered ones."""
+        sent = self._own[SENT]
+        start = sent & self._mask
         ring = self._requests.tolist()
-        return tuple((ring[start:] + ring[:start])[-self._sent :] if self._sent else ())
+        return tuple((ring[start:] + ring[:start])[-sent:] if sent else ())
 
     def worker_sleeps(self) -> bool:
-        """Whether the worker must be rung to see what was just published."""
+        """Return True if the worker must be rung to see a new entry or frame."""
         self._fence()
-        return self._words[_WORKER_ASLEEP] != 0
+        return self._words[WORKER_ASLEEP] != 0
 
     def count_frame(self) -> bool:
-        """Tell the worker that one more frame lies in the channel; True if it must be rung.
-
-        Call it after the frame was handed to the channel.
-        """
+        """Count a frame that was written to the channel; True if the worker must be rung."""
         self._frames_sent += 1
         self._words[_FRAMES_TO_WORKER] = self._frames_sent
         return self.worker_sleeps()
 
     def reports(self) -> NDArray[np.int64]:
-        """Read all reports there are, in order."""
-        sent = self._bell.count(self._index)
-        count = sent - self._read
+        """Read all unread reports, in order."""
+        before = self._bell.read[self._index]
+        count = self._bell.counters[self._index] - before
         if not count:
             return self._reports[:0]
         if not IN_ORDER:
             self._fence()
-        start = self._read & self._mask
+        start = before & self._mask
         room = self._capacity - start
         if count <= room:
             found = self._reports[start : start + count].copy()
@@ -135,25 +137,28 @@ class TrainerRings:
             found = np.concatenate((self._reports[start:], self._reports[: count - room]))
         if not IN_ORDER:
             self._fence()
-        self._read = sent
         self._bell.took(self._index, count)
         return found
 
-    def frames_from_worker(self) -> int:
-        """Frames that the worker has sent so far, bells excluded."""
-        return self._words[_FRAMES_TO_TRAINER]
+    def has_frame(self) -> bool:
+        """Return True if the worker has sent a frame that `frame_seen` has not counted."""
+        return self._words[FRAMES_TO_TRAINER] > self._own[SEEN]
+
+    def frame_seen(self) -> None:
+        """Count a frame that was read from the channel."""
+        self._own[SEEN] += 1
 
     def current(self) -> tuple[int, int]:
-        """The entry that the worker is executing (0 if none), and since when.
+        """Entry that the worker is executing (0 if none), and its start time.
 
         The time is in ns of the monotonic clock, which all processes share; 0 while the worker
-        waits for the trainer to read what has come of the entry so far.
+        waits for the trainer to read earlier output of the entry.
         """
         return self._words[_CURRENT], self._words[_CURRENT_SINCE_NS]
 
 
 class WorkerRings:
-    """The worker's side: reads requests, appends reports, says when it sleeps."""
+    """The worker's side: reads requests, appends reports, publishes when it sleeps."""
 
     def __init__(self, buffer: memoryview, num_envs: int, bell: WorkerBell) -> None:
         self._words, self._requests, self._reports = _split(buffer, num_envs)
@@ -166,8 +171,8 @@ class WorkerRings:
         self._frames_seen = 0
 
     def requests(self) -> list[int]:
-        """Read all entries that wait, in order."""
-        sent = self._words[_REQUESTS_SENT]
+        """Read all waiting entries, in order."""
+        sent = self._words[REQUESTS_SENT]
         if sent == self._read:
             return []
         if not IN_ORDER:
@@ -180,7 +185,7 @@ class WorkerRings:
         return found if end <= len(ring) else found + ring[: end - len(ring)].tolist()
 
     def has_frame(self) -> bool:
-        """Whether a frame lies in the channel that `frame_seen` has not counted."""
+        """Return True if the channel has a frame that `frame_seen` has not counted."""
         return self._words[_FRAMES_TO_WORKER] != self._frames_seen
 
     def frame_seen(self) -> None:
@@ -188,44 +193,53 @@ class WorkerRings:
         self._frames_seen += 1
 
     def begin(self, current: int, now_ns: int) -> None:
-        """Say which entry is being executed."""
+        """Publish the entry whose execution begins."""
         self._words[_CURRENT_SINCE_NS] = now_ns
         self._words[_CURRENT] = current
 
     def pause(self) -> int:
-        """Say that what is being executed waits for the trainer; what `resume` takes."""
+        """Publish that execution waits for the trainer. Return the argument of `resume`."""
         since_ns = self._words[_CURRENT_SINCE_NS]
         self._words[_CURRENT_SINCE_NS] = 0
         return since_ns
 
     def resume(self, since_ns: int) -> None:
-        """Say that it goes on, and since when it would have been executed without the wait."""
+        """Publish that execution continues, with a start time that excludes the wait."""
         self._words[_CURRENT_SINCE_NS] = since_ns
 
     def idle(self) -> None:
-        """Say that nothing is being executed."""
+        """Publish that nothing is being executed."""
         self._words[_CURRENT] = 0
 
-    def serve(self, execute: Callable[[int], bool], ring: Callable[[], object]) -> bool:
-        """Read the entries that wait and execute them in order; False if there were none.
+    def serve(
+        self,
+        execute: Callable[[int], bool],
+        ring: Callable[[], object],
+        receive: Callable[[], object],
+    ) -> bool:
+        """Read waiting entries and execute them in order; False if there were none.
 
         Args:
-            execute: takes an entry; returns whether it is done and to be reported here.
+            execute: executes an entry; returns True if it must be reported here.
             ring: wakes the trainer; called when the group's bell is due.
+            receive: reads frames; called before an entry if the channel has one.
         """
         requests = self.requests()
         if not requests:
             return False
         reports, mask, bell, words = self._reports, self._mask, self._bell, self._bell.words
         own = bell.own
+        from_trainer = self._words
         for request in requests:
+            if from_trainer[_FRAMES_TO_WORKER] != self._frames_seen:
+                receive()
             if not execute(request):
                 continue
             reports[self._sent & mask] = request
             self._sent = sent = self._sent + 1
             if not IN_ORDER:
                 self._fence()
-            # `WorkerBell.publish`, spelt out: it would be felt in every step.
+            # `WorkerBell.publish`, inlined because a call would slow each step.
             words[own] = sent
             armed = words[ARMED]
             if armed != bell.settled and not armed & AT_LAST and bell.is_due():
@@ -235,7 +249,7 @@ class WorkerRings:
         return True
 
     def report(self, request: int, ring: Callable[[], object]) -> None:
-        """Report an entry that came in a frame and whose reply is all in its row; see `serve`."""
+        """Report an entry that came in a frame and whose reply is in its row; see `serve`."""
         self._reports[self._sent & self._mask] = request
         self._sent += 1
         if not IN_ORDER:
@@ -245,24 +259,24 @@ class WorkerRings:
             ring()
 
     def count_frame(self) -> None:
-        """Say that one more frame was handed to the channel."""
+        """Count a frame that was written to the channel."""
         self._frames_sent += 1
-        self._words[_FRAMES_TO_TRAINER] = self._frames_sent
+        self._words[FRAMES_TO_TRAINER] = self._frames_sent
 
     def has_news(self) -> bool:
-        """Whether an entry or a frame waits."""
+        """Return True if an entry or a frame waits."""
         words = self._words
-        return words[_REQUESTS_SENT] != self._read or words[_FRAMES_TO_WORKER] != self._frames_seen
+        return words[REQUESTS_SENT] != self._read or words[_FRAMES_TO_WORKER] != self._frames_seen
 
     def fall_asleep(self) -> bool:
-        """Say that this worker sleeps; False if something came meanwhile."""
-        self._words[_WORKER_ASLEEP] = 1
+        """Publish that this worker sleeps; False if an entry or a frame has just come."""
+        self._words[WORKER_ASLEEP] = 1
         self._fence()
         if self.has_news():
-            self._words[_WORKER_ASLEEP] = 0
+            self._words[WORKER_ASLEEP] = 0
             return False
         return True
 
     def wake_up(self) -> None:
-        """Say that this worker is awake."""
-        self._words[_WORKER_ASLEEP] = 0
+        """Publish that this worker is awake."""
+        self._words[WORKER_ASLEEP] = 0

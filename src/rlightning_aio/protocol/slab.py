@@ -1,15 +1,14 @@
 """The slab: one block of shared memory with a row for each env of the same layout.
 
-A row holds what one request and its reply consist of: action and seed on the way in,
-observation, reward, flags, info and times on the way out. Columns are stored one after
-the other, so that many rows are read or written with one copy each.
-Invariant: the trainer writes a row only while the env has no request in flight; the
-worker writes it only while it has one.
+A row holds a request (action, seed) and its reply (observation, reward, flags, info, times).
+Columns are contiguous, so one copy for each column reads or writes any number of rows.
+Invariant: the trainer writes a row only while the env has no request in flight; the worker writes
+it only while the env has one.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import prod
 from typing import TYPE_CHECKING, Any, Final
 
@@ -37,25 +36,26 @@ __all__ = [
 
 NO_SEED: Final = -1
 AS_RESTORED: Final = -2
-"""In place of a seed: no new episode; the env shows where it was put back to."""
+"""In place of a seed: don't begin an episode; return the restored state."""
 TERMINATED: Final = 0
 TRUNCATED: Final = 1
 IS_RESET: Final = 2
 OVER: Final = 3
-"""Places of the flags in their column."""
+"""Positions of the flags in their column."""
 _ALIGNMENT: Final = 64
 
 
 @dataclass(frozen=True)
 class RowLayout:
-    """What a row consists of. Envs with equal `key` share a slab and stack into one batch.
+    """The layout of a row. Envs with equal `key` share a slab and stack into one batch.
 
     Attributes:
-        observation_space, action_space: as the env reports them.
+        observation_space, action_space: of the env.
         head: shape of reward and flags: ``()``, ``(num_envs,)``, and with agents
             ``(num_agents, ...)``.
         agents: agent names of a multi-agent env.
-        observations_out_of_band: observations are handed over as they are (inline placement).
+        observations_out_of_band: observations are passed as objects (inline placement).
+        key: equal for layouts with interchangeable rows and stackable observations.
     """
 
     observation_space: gym.Space[Any]
@@ -63,28 +63,23 @@ class RowLayout:
     head: tuple[int, ...]
     agents: tuple[str, ...]
     observations_out_of_band: bool = False
+    key: tuple[object, ...] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        # Where the env is built; the key travels with the layout.
+        observations, actions = leaves(self.observation_space), self.action_leaves
+        key = (observations, self.observations_out_of_band, actions, self.head, self.agents)
+        object.__setattr__(self, "key", key)
 
     @property
     def observation_leaves(self) -> tuple[Leaf, ...] | None:
-        """Arrays of an observation, or None if observations don't travel in the row."""
+        """Arrays of an observation, or None if observations are not in the row."""
         return None if self.observations_out_of_band else leaves(self.observation_space)
 
     @property
     def action_leaves(self) -> tuple[Leaf, ...] | None:
-        """Arrays of an action, or None if actions travel pickled."""
+        """Arrays of an action, or None if actions are pickled."""
         return leaves(self.action_space)
-
-    @property
-    def key(self) -> tuple[object, ...]:
-        """Equal for layouts whose rows are interchangeable, and whose observations stack."""
-        observations = leaves(self.observation_space)
-        return (
-            observations,
-            self.observations_out_of_band,
-            self.action_leaves,
-            self.head,
-            self.agents,
-        )
 
     def _arrays(self) -> Iterator[tuple[tuple[int, ...], np.dtype[Any]]]:
         for leaf in (*(self.observation_leaves or ()), *(self.action_leaves or ())):
@@ -99,16 +94,16 @@ class RowLayout:
         yield (max(INFO_BYTES, prod(self.head) * INFO_BYTES_OF_SUB_ENV),), np.dtype(np.uint8)
 
     def size(self, rows: int) -> int:
-        """Bytes of a slab with `rows` rows."""
+        """Size in bytes of a slab with `rows` rows."""
         return sum(_aligned(rows * prod(shape) * dtype.itemsize) for shape, dtype in self._arrays())
 
     def arrays(self, buffer: memoryview, rows: int) -> Iterator[NDArray[Any]]:
-        """The columns over `buffer`, in a fixed order."""
+        """Yield the columns over `buffer`, in a fixed order."""
         offset = 0
         for shape, dtype in self._arrays():
             count = rows * prod(shape)
-            # A dtype that was pickled is not the one that arrays have, only equal to it;
-            # made anew it is, and can be compared by identity (see `columns.row_writer`).
+            # A pickled dtype equals those of arrays but isn't identical to them; a new one is, as
+            # the comparison by identity in `columns.row_writer` needs.
             own = np.dtype(dtype.str)
             yield np.frombuffer(buffer, own, count, offset).reshape(rows, *shape)
             offset += _aligned(count * dtype.itemsize)
@@ -122,22 +117,21 @@ class Slab:
     """Columns over one block of memory; both sides map the same block.
 
     Attributes:
-        observation, action: trees of ``[rows, ...]``; None where they travel pickled.
+        observation, action: trees of ``[rows, ...]``; None if they are pickled.
         action_columns: the arrays of `action`, each with its leaf.
         reward: ``[rows, *head]`` float64.
         flags: ``[rows, *head, 4]`` bool; terminated, truncated, is_reset and over are its
             columns. ``is_reset``: no transition ends here. ``over``: the episode has ended,
             here or before, and nothing has reset it since.
         episode_return: ``[rows, *head]`` float64, episode_length: ``[rows, *head]`` int64;
-            of the episode that is under way or ends here, this step included; length 0 where
-            the step belongs to none.
+            of the episode in progress or ending here, including this step; length 0 if the step
+            belongs to no episode.
         info_mark: ``[rows]`` uint8, see `info`; info: ``[rows, bytes]`` uint8.
-        seed: ``[rows]`` int64, of the reset that was sent, plus 1; 0 for none (see
-            `AS_RESTORED`).
-        times: ``[rows, 2]`` int64; its halves are done_ns, the monotonic time at which the
-            reply was ready, and busy_ns, the time that the env itself took.
-        sent_ns: ``[rows]`` int64, ns since the epoch by the env's own clock, where that is
-            another than the trainer's; beside the block of memory, and None elsewhere.
+        seed: ``[rows]`` int64, seed of the reset plus 1, or 0 for none (see `AS_RESTORED`).
+        times: ``[rows, 2]`` int64; its columns are done_ns, the monotonic time at which the
+            reply was ready, and busy_ns, the time that the env took.
+        sent_ns: ``[rows]`` int64, ns since the epoch by the env's clock if that differs from the
+            trainer's, else None; not in the block of memory.
     """
 
     def __init__(self, layout: RowLayout, buffer: memoryview, rows: int) -> None:
@@ -166,14 +160,14 @@ class Slab:
         self.sent_ns: NDArray[np.int64] | None = None
 
     def take_as_restored(self, row: int) -> bool:
-        """Whether `AS_RESTORED` was sent to `row`; it is good for one reset alone."""
+        """Return True if `AS_RESTORED` was sent to `row`, and clear it."""
         asked = bool(self.seed[row] == AS_RESTORED + 1)
         if asked:
             self.seed[row] = 0
         return asked
 
     def take_seed(self, row: int) -> int | None:
-        """The seed of the reset that was sent to `row`; it is good for that one alone."""
+        """Return the seed of the reset that was sent to `row`, and clear it."""
         seed = int(self.seed[row])
         self.seed[row] = 0
         return seed - 1 if seed else None

@@ -1,9 +1,8 @@
-"""`RemoteEnvClient`: an env of this machine, stepped by a trainer on another.
+"""`RemoteEnvClient`: an env of this machine that a trainer on another machine steps.
 
-Rule: a plain blocking loop on the caller's thread. The env is reset, stepped and stopped
-by that thread alone; what is said to the server, and when, is `client_session`'s affair;
-whether the connection lives is ZMQ's, whose own thread goes on while the env steps.
-Absent on purpose: threads, and anything that unpickles.
+Rule: a plain blocking loop on the caller's thread, which alone resets, steps and stops the env.
+`client_session` decides which messages to send and when. ZMQ's own thread keeps the connection
+alive while the env steps. Deliberately left out: threads, and anything that unpickles.
 """
 
 from __future__ import annotations
@@ -37,12 +36,16 @@ from rlightning_aio.protocol.net.client_session import (
     ResetRequest,
     StepRequest,
 )
+from rlightning_aio.protocol.net.limited_log import LOG
 from rlightning_aio.protocol.net.payload import Outcome
-from rlightning_aio.protocol.net.server_session import PATIENCE
 from rlightning_aio.protocol.net.space_description import UnsupportedSpace
-from rlightning_aio.protocol.net.wire import MAX_FRAME_BYTES, MAX_NAME_LENGTH
+from rlightning_aio.protocol.net.wire import (
+    MAX_FRAME_BYTES,
+    MAX_NAME_LENGTH,
+    PINGS_PER_HEARTBEAT,
+)
 from rlightning_aio.remote.keys import read_client_keys
-from rlightning_aio.remote.parts import receive_parts, send_parts
+from rlightning_aio.remote.zmq_messages import next_frame, receive_parts, send_parts
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -53,13 +56,11 @@ if TYPE_CHECKING:
 __all__ = ["RemoteEnvClient"]
 
 _RECONNECT_MS: Final = (100, 5000)
-"""From one attempt to connect to the next: at first, and at most; doubled in between."""
+"""Time between two attempts to connect: at first, and at most. Each attempt doubles it."""
 _HANDSHAKE_MS: Final = 5000
 _REDIAL_SECONDS: Final = (1.0, 8.0)
-"""ZMQ gives up for good after a handshake that failed; then it is told to try again."""
+"""Pauses before another attempt after a failed handshake, after which ZMQ itself gives up."""
 _LINGER_MS: Final = 500
-
-_log = logging.getLogger(__name__)
 
 _Socket = zmq.Socket[bytes]
 ENDING: Final = "end of an interrupted client's sockets"
@@ -69,24 +70,24 @@ ENDING: Final = "end of an interrupted client's sockets"
 class RemoteEnvClient:
     """Lends one env to the env_server of a trainer's group.
 
-    It dials in, and dials again with growing pauses whenever the server is gone; each time
-    it is let in, the env is reset and a new session begins. Whenever a session ends and the env
-    didn't end it, ``env.on_disconnect()`` is called, so that a robot stops.
+    It dials in, and dials again with growing pauses whenever the server is gone. Each time the
+    server lets it in, the env is reset and a new session begins. When a session ends and the env
+    did not end it, the client calls ``env.on_disconnect()``, so that a robot stops.
 
     Args:
-        env: newly built; the client owns it from now on, initialises it and closes it.
+        env: newly built. The client owns it, initialises it and closes it.
         hostname: of the server.
         port: of the server.
         keys: directory of the client's keys, see ``rlightning-aio keygen``; None connects
             without, which a server with keys refuses.
         name: unique at the server; by default this machine's name and the process id.
-        heartbeat: seconds within which a dead server is found; the server's own setting
-            takes over once it has answered.
+        heartbeat: seconds within which a dead server is found, until the server has answered;
+            then the server's own setting applies.
 
     Attributes:
-        name: as given, or made.
-        num_steps: steps that the env has taken for trainers.
-        num_sessions: how often it was let in.
+        name: of the client.
+        num_steps: steps that trainers have requested.
+        num_sessions: sessions so far.
 
     Raises:
         ConfigError: the name is too long, the env's spaces can't be announced, or the keys
@@ -127,8 +128,9 @@ class RemoteEnvClient:
         self._bare_step = env.bare_step()
         self._env_step = step_of(env)
         self._input = input_of(env)
-        self._todo: StepRequest | ResetRequest | None = None
+        self._request: StepRequest | ResetRequest | None = None
         self._trouble = ""
+        self._logged_state = Phase.AWAY.value
         self._redial_at: float | None = None
         self._redial_pause = _REDIAL_SECONDS[0]
         self._context: zmq.Context[_Socket] | None = None
@@ -147,14 +149,14 @@ class RemoteEnvClient:
         return f"{phase} ({trouble})"
 
     def connect(self, timeout: float | None = None) -> None:
-        """Dial in and wait until the server has let this client in.
+        """Dial in and wait until the server lets this client in.
 
         Args:
-            timeout: seconds; None waits as long as it takes.
+            timeout: seconds; None waits without limit.
 
         Raises:
-            TimeoutError: nobody let it in; the message has the last known reason.
-            ClientRefused: the server will never let it in as it is.
+            TimeoutError: no server let it in; the message has the last known reason.
+            ClientRefused: the server will never let this client in.
         """
         if self._closed:
             raise RuntimeError("this client is closed")
@@ -166,26 +168,25 @@ class RemoteEnvClient:
                 raise TimeoutError(
                     f"{self._address} did not let {self.name!r} in within {timeout} s: {self.state}"
                 )
-            self._turn(end)
+            self._wait(end)
 
     def run(self) -> None:
-        """Serve until ``env.is_finish()`` is true; connects first if necessary.
+        """Serve until ``env.is_finish()`` is true; connect first if necessary.
 
-        ``is_finish`` is called after every reset, step and `on_disconnect`, among others.
+        ``is_finish`` is called at least after every reset, step and `on_disconnect`.
 
         Raises:
             ClientRefused: the server will never let this client in.
-            Exception: whatever the env raises in the reset that opens a session, in
-                ``is_finish``, or in ``on_disconnect``. Errors of steps and later resets go to
-                the trainer instead.
+            Exception: an error of the env in the reset that opens a session, in ``is_finish``
+                or in ``on_disconnect``. Errors of steps and later resets go to the trainer.
         """
         try:
             self.connect()
             while not self._env.is_finish():
-                if self._todo is None:
-                    self._turn(None)
+                if self._request is None:
+                    self._wait(None)
                 else:
-                    request, self._todo = self._todo, None
+                    request, self._request = self._request, None
                     self._execute(request)
         except BaseException as error:
             self._leave(f"{type(error).__name__}: {error}")
@@ -216,7 +217,7 @@ class RemoteEnvClient:
     ) -> None:
         self.close()
 
-    # The connection
+    # -- connection -----------------------------------------------------------------
 
     def _dial(self) -> None:
         context = zmq.Context[_Socket]()
@@ -228,24 +229,23 @@ class RemoteEnvClient:
             self._poller.register(self._monitor, zmq.POLLIN)
             self._poller.register(self._dealer, zmq.POLLIN)
             self._dealer.connect(self._address)
-            # Invariant: there is a context as soon as all of it is there, and not before.
+            # Invariant: if there is a context, there are its sockets and the poller.
             self._context = context
         except BaseException:
             self._context = None
-            # The end of a context waits until all its sockets are closed, of which one may be
-            # half made and in the hands of the error that is on its way.
+            # Ending a context waits for its sockets, and the traceback may still hold one.
             Thread(target=context.destroy, args=(0,), name=ENDING, daemon=True).start()
             raise
 
     def _set_options(self, dealer: _Socket) -> None:
-        # A message for a connection that is no more must not wait for the next one.
+        # A message must not wait for the next connection when this one is gone.
         dealer.set(zmq.IMMEDIATE, 1)
         dealer.set(zmq.MAXMSGSIZE, MAX_FRAME_BYTES)
         dealer.set(zmq.RECONNECT_IVL, _RECONNECT_MS[0])
         dealer.set(zmq.RECONNECT_IVL_MAX, _RECONNECT_MS[1])
         dealer.set(zmq.HANDSHAKE_IVL, _HANDSHAKE_MS)
-        dealer.set(zmq.HEARTBEAT_IVL, max(1, int(1000 * self._heartbeat / PATIENCE)))
-        dealer.set(zmq.HEARTBEAT_TIMEOUT, max(2, int(2000 * self._heartbeat / PATIENCE)))
+        dealer.set(zmq.HEARTBEAT_IVL, max(1, int(1000 * self._heartbeat / PINGS_PER_HEARTBEAT)))
+        dealer.set(zmq.HEARTBEAT_TIMEOUT, max(2, int(2000 * self._heartbeat / PINGS_PER_HEARTBEAT)))
         if self._keys is not None:
             dealer.set(zmq.CURVE_SERVERKEY, self._keys.server)
             dealer.set(zmq.CURVE_PUBLICKEY, self._keys.public)
@@ -253,26 +253,39 @@ class RemoteEnvClient:
         if "[" in self._address:
             dealer.set(zmq.IPV6, 1)
 
-    def _turn(self, until: float | None) -> None:
-        """Wait for something to happen, at most `until`, and take it in."""
+    def _wait(self, until: float | None) -> None:
+        """Wait for messages and events, at most `until`, and process them."""
         due = _earliest(_earliest(until, self._session.deadline()), self._redial_at)
         wait_ms = None if due is None else ceil(1000 * max(0.0, due - time.monotonic()))
         for source, _ in self._poller.poll(wait_ms):
-            if source is self._dealer:
-                first = self._dealer.recv(zmq.NOBLOCK, copy=False)
+            if source is self._monitor:
+                self._read_event()
+            elif (first := next_frame(self._dealer)) is not None:
                 parts = receive_parts(self._dealer, first)
-                self._obey(self._session.receive(parts, time.monotonic()))
-            else:
-                self._watch()
+                self._apply(self._session.receive(parts, time.monotonic()))
         if due is not None and time.monotonic() >= due:
-            self._obey(self._session.tick(time.monotonic()))
+            self._apply(self._session.tick(time.monotonic()))
             if self._redial_at is not None and time.monotonic() >= self._redial_at:
                 self._redial()
         self._flush()
+        self._log_state()
 
-    def _watch(self) -> None:
-        """Take in what has become of the connection."""
-        event, now = recv_monitor_message(self._monitor)["event"], time.monotonic()
+    def _log_state(self) -> None:
+        """Log the state of the connection if it has changed."""
+        state = self.state
+        if state != self._logged_state:
+            self._logged_state = state
+            in_trouble = state != self._session.phase.value
+            level = logging.WARNING if in_trouble else logging.INFO
+            LOG.log(level, "%s: %s", self.name, state)
+
+    def _read_event(self) -> None:
+        """Process one event of the connection."""
+        try:
+            event = recv_monitor_message(self._monitor, zmq.NOBLOCK)["event"]
+        except zmq.Again:
+            return
+        now = time.monotonic()
         if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
             self._trouble = ""
             self._redial_at, self._redial_pause = None, _REDIAL_SECONDS[0]
@@ -281,13 +294,15 @@ class RemoteEnvClient:
             self._session.disconnected(now)
             self._redial_at = now + _REDIAL_SECONDS[1]
         elif event == zmq.EVENT_CONNECT_RETRIED and not self._trouble:
-            self._trouble = f"nobody answers at {self._address}"
+            self._trouble = f"no server answers at {self._address}"
         elif event in _REFUSED_HANDSHAKES:
-            self._trouble = _REFUSED_HANDSHAKES[event]
+            # Handshakes that fail for one reason may end with it or without any.
+            if not self._trouble or event != zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL:
+                self._trouble = _REFUSED_HANDSHAKES[event]
             self._redial_at = now + self._redial_pause
 
     def _redial(self) -> None:
-        """Connect anew, in place of a connection that ZMQ may or may not be working on."""
+        """Connect again, in place of a connection that ZMQ may or may not be working on."""
         with contextlib.suppress(zmq.ZMQError):
             self._dealer.disconnect(self._address)
         self._dealer.connect(self._address)
@@ -301,7 +316,7 @@ class RemoteEnvClient:
             try:
                 send_parts(self._dealer, parts)
             except zmq.Again:
-                # No connection, or a full one; what is lost is asked for again.
+                # No connection, or a full one; lost messages are repeated.
                 continue
 
     def _leave(self, reason: str) -> None:
@@ -309,17 +324,17 @@ class RemoteEnvClient:
         if self._context is not None:
             self._flush()
 
-    # The env
+    # -- env ------------------------------------------------------------------------
 
-    def _obey(self, event: Event | None) -> None:
+    def _apply(self, event: Event | None) -> None:
         if isinstance(event, Refused):
             raise ClientRefused(f"{self._address} refused the client {self.name!r}: {event.text}")
         if isinstance(event, Ended):
-            self._todo = None
-            _log.warning("%s: session over: %s", self.name, event.cause)
+            self._request = None
+            LOG.warning("%s: session over: %s", self.name, event.cause)
             self._env.on_disconnect()
         elif event is not None:
-            self._todo = event
+            self._request = event
 
     def _execute(self, request: StepRequest | ResetRequest) -> None:
         if request.number == 0:
@@ -331,8 +346,8 @@ class RemoteEnvClient:
                 self._reset(request)
             else:
                 self._step(request)
-        except Exception as error:  # noqa: BLE001  # Whatever it is, the trainer learns of it.
-            self._session.fail(request.number, *_in_words(error))
+        except Exception as error:  # noqa: BLE001  # Any error of the env goes to the trainer.
+            self._session.fail(request.number, *_texts_of(error))
             self._flush()
 
     def _reset(self, request: ResetRequest) -> None:
@@ -366,8 +381,8 @@ def _earliest(one: float | None, other: float | None) -> float | None:
     return min(one, other)
 
 
-def _in_words(error: Exception) -> tuple[str, str, str]:
-    """Type, text and traceback of `error`; a broken ``__str__`` is no obstacle."""
+def _texts_of(error: Exception) -> tuple[str, str, str]:
+    """Return type, text and traceback of `error`, even if its ``__str__`` raises."""
     kind = type(error)
     name = f"{kind.__module__}.{kind.__qualname__}".removeprefix("builtins.")
     try:

@@ -1,18 +1,21 @@
 """The CURVE keys of an env_server and its clients: making them and reading them.
 
-Rule: key files are ZeroMQ's certificates, so that its tools read them; a key is 40
-characters of Z85. ``make_keys(directory, names)`` lays out one directory for each machine, so that
-setting up a client is copying one of them: ``server/`` has the server's secret and, in
-``clients/``, the public key of every client that may come in; ``<name>/`` has one
-client's secret and the server's public key. Deleting a file in ``server/clients/``, or
-writing another key into it, shuts that client out.
+Rule: key files are ZeroMQ's certificates, so ZeroMQ's tools read them; a key has 40 characters of
+Z85. ``make_keys(directory, names)`` makes one directory for each machine, so setting up a client
+means copying one of them. ``server/`` has the server's secret key and, in ``clients/``, the public
+key of every client that may connect; ``<name>/`` has one client's secret key and the server's
+public key. Deleting a file in ``server/clients/``, or writing another key into it, shuts that
+client out.
 """
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import logging
 import os
 import re
+import shutil
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -20,9 +23,10 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import zmq
 
 from rlightning_aio.errors import ConfigError
+from rlightning_aio.files import write_file
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Generator, Sequence
 
 __all__ = [
     "AllowedKeys",
@@ -54,14 +58,14 @@ class KeyPair(NamedTuple):
 
 
 class ServerKeys(NamedTuple):
-    """What a server needs: its own secret, Z85 text, and where its clients' keys lie."""
+    """A server's own secret key, as Z85 text, and the directory of its clients' keys."""
 
     secret: bytes
     clients: Path
 
 
 class ClientKeys(NamedTuple):
-    """What a client needs to prove itself, and to know its server; Z85 text."""
+    """A client's own keys and its server's public key; Z85 text."""
 
     public: bytes
     secret: bytes
@@ -80,7 +84,7 @@ def make_keys(directory: str | os.PathLike[str], names: Sequence[str]) -> list[P
 
     Raises:
         ConfigError: a name can't be a file's, or has keys already, and nothing was written; or
-            the directory can't be written into.
+            the directory can't be written into, and the client of the failure has no keys.
     """
     top = Path(directory)
     for name in names:
@@ -104,53 +108,70 @@ def make_keys(directory: str | os.PathLike[str], names: Sequence[str]) -> list[P
 def _write_keys(top: Path, names: Sequence[str]) -> None:
     allowed = top / _SERVER / _ALLOWED
     allowed.mkdir(parents=True, exist_ok=True)
-    server = top / _SERVER / (_SERVER + _SECRET_SUFFIX)
-    if not server.exists():
-        _write_pair(top / _SERVER, _SERVER)
-    server_keys = read_keys(server)
-    for name in names:
-        (top / name).mkdir()
-        keys = _write_pair(top / name, _CLIENT)
-        (top / name / (_SERVER + _PUBLIC_SUFFIX)).write_text(_render(KeyPair(server_keys.public)))
-        (allowed / (name + _PUBLIC_SUFFIX)).write_text(_render(KeyPair(keys.public)))
+    with _locked(allowed):
+        server = top / _SERVER / (_SERVER + _SECRET_SUFFIX)
+        if not server.exists():
+            _write_pair(top / _SERVER, _SERVER)
+        server_keys = KeyPair(read_keys(server).public)
+        for name in names:
+            (top / name).mkdir()
+            try:
+                keys = _write_pair(top / name, _CLIENT)
+                write_file(top / name / (_SERVER + _PUBLIC_SUFFIX), _render(server_keys))
+                # Last: from now on the client may come in.
+                write_file(allowed / (name + _PUBLIC_SUFFIX), _render(keys))
+            except BaseException:
+                shutil.rmtree(top / name)
+                raise
+
+
+@contextlib.contextmanager
+def _locked(directory: Path) -> Generator[None]:
+    """Have others who make keys here wait, so that the server gets one secret only."""
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def _write_pair(directory: Path, name: str) -> KeyPair:
+    """Make keys and write both files; the public half is returned."""
     public, secret = zmq.curve_keypair()
-    keys = KeyPair(public, secret)
+    write_file(directory / (name + _PUBLIC_SUFFIX), _render(KeyPair(public)))
+    # After the other one: where there is a secret, the pair is complete.
     path = directory / (name + _SECRET_SUFFIX)
-    with os.fdopen(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "w") as file:
-        file.write(_render(keys))
-    (directory / (name + _PUBLIC_SUFFIX)).write_text(_render(KeyPair(public)))
-    return keys
+    write_file(path, _render(KeyPair(public, secret)), mode=0o600)
+    return KeyPair(public)
 
 
 def read_client_keys(directory: str | os.PathLike[str]) -> ClientKeys:
-    """The keys in a client's directory, as `make_keys` lays it out.
+    """Return the keys in a client's directory, which `make_keys` made.
 
     Raises:
-        ConfigError: a file is missing or is no key; the message names it.
+        ConfigError: a file is missing or holds no key; the message names it.
     """
-    public, secret = _read_secret(Path(directory) / (_CLIENT + _SECRET_SUFFIX))
+    public, secret = _read_secret_keys(Path(directory) / (_CLIENT + _SECRET_SUFFIX))
     return ClientKeys(
         public, secret, read_keys(Path(directory) / (_SERVER + _PUBLIC_SUFFIX)).public
     )
 
 
 def read_server_keys(directory: str | os.PathLike[str]) -> ServerKeys:
-    """The keys in a server's directory, as `make_keys` lays it out.
+    """Return the keys in a server's directory, which `make_keys` made.
 
     Raises:
-        ConfigError: a file is missing or is no key; the message names it.
+        ConfigError: a file is missing or holds no key; the message names it.
     """
-    _, secret = _read_secret(Path(directory) / (_SERVER + _SECRET_SUFFIX))
+    _, secret = _read_secret_keys(Path(directory) / (_SERVER + _SECRET_SUFFIX))
     clients = Path(directory) / _ALLOWED
     if not clients.is_dir():
         raise ConfigError(f"{clients} is not a directory; the public keys of clients belong there")
     return ServerKeys(secret, clients)
 
 
-def _read_secret(path: Path) -> tuple[bytes, bytes]:
+def _read_secret_keys(path: Path) -> tuple[bytes, bytes]:
     keys = read_keys(path)
     if keys.secret is None:
         raise ConfigError(f"{path} has no line secret-key; `rlightning-aio keygen` makes keys")
@@ -158,10 +179,10 @@ def _read_secret(path: Path) -> tuple[bytes, bytes]:
 
 
 def read_keys(path: Path) -> KeyPair:
-    """The keys in one file.
+    """Return the keys in one file.
 
     Raises:
-        ConfigError: it can't be read, or is no key; the message names it.
+        ConfigError: it can't be read, or holds no key; the message names it.
     """
     try:
         text = path.read_text()
@@ -177,7 +198,7 @@ def read_keys(path: Path) -> KeyPair:
 
 
 class _Stamp(NamedTuple):
-    """What changes when a file does, however it was written."""
+    """Properties of a file; at least one changes when it is written."""
 
     modified_ns: int
     size: int
@@ -189,10 +210,10 @@ _TICK_NS: Final = 1_000_000_000
 
 
 class AllowedKeys:
-    """Whose keys lie in a directory, as it is now.
+    """The owners of the keys that are now in a directory.
 
-    Each question looks at the stamps of all files (some microseconds for each), and reads
-    those anew that have changed. A file that holds no key is left out with one warning.
+    `owner` compares the stamps of all files (a few microseconds for each), and reads files that
+    have changed. A file that holds no key is skipped with one warning.
 
     Args:
         directory: of public keys, ``<name>.key`` each.
@@ -209,14 +230,14 @@ class AllowedKeys:
         self._is_unreadable = False
 
     def owner(self, key: bytes) -> str | None:
-        """The name of the client whose public key, as Z85 text, is `key`; None if nobody's."""
+        """Return the name of the client with the public key `key` (Z85 text); None if unknown."""
         stamps = self._stamps()
         if stamps != {name: stamp for name, (stamp, _) in self._read.items()}:
             self._refresh(stamps)
         return self._owners.get(key)
 
-    def knew(self, key: bytes) -> bool:
-        """Whether `key` was somebody's when the files were looked at last."""
+    def is_known(self, key: bytes) -> bool:
+        """Return True if `key` was a client's when the files were read last."""
         return key in self._owners
 
     def _stamps(self) -> dict[str, _Stamp]:
@@ -231,10 +252,10 @@ class AllowedKeys:
                             continue  # Deleted since it was listed, or a link to nowhere.
                         stamps[file.name] = _Stamp(said.st_mtime_ns, said.st_size, said.st_ino)
         except OSError as error:
-            # A list that can't be read allows nobody.
+            # A directory that can't be read admits no client.
             if not self._is_unreadable:
                 self._is_unreadable = True
-                _log.warning("can't read %s: %s; no client gets in", self.directory, error)
+                _log.warning("can't read %s: %s; no client is let in", self.directory, error)
             return {}
         self._is_unreadable = False
         return stamps
@@ -246,7 +267,7 @@ class AllowedKeys:
             if known is not None and known[0] == stamp:
                 read[name] = known
                 continue
-            # What is written within the same tick of the file system's clock leaves no trace.
+            # A second write within one tick of the file system's clock does not change the stamp.
             is_settled = time.time_ns() - stamp.modified_ns > _TICK_NS
             read[name] = stamp if is_settled else _UNSETTLED, self._key_in(name)
         self._read = read
@@ -258,26 +279,26 @@ class AllowedKeys:
         }
 
     def _key_in(self, name: str) -> bytes | None:
-        """The key in the file `name`; None, with a warning, if there is none."""
+        """Return the key in the file `name`; None, with a warning, if there is none."""
         path = self.directory / name
         try:
             if not name.isprintable():
-                raise ConfigError(f"{str(path)!a} has a name that can't be a client's")
+                raise ConfigError(f"{str(path)!a} has a name that can't name a client")
             if not path.is_file():
-                raise ConfigError(f"{path} is no file")
+                raise ConfigError(f"{path} is not a file")
             key = read_keys(path).public
         except ConfigError as error:
             if name not in self._faulty:
                 self._faulty.add(name)
-                _log.warning("%s; its client stays out", error)
+                _log.warning("%s; its client is not let in", error)
             return None
         self._faulty.discard(name)
         return key
 
 
-def _render(keys: KeyPair) -> str:
+def _render(keys: KeyPair) -> bytes:
     lines = ["# A key of rlightning-aio.", "curve", f'    public-key = "{keys.public.decode()}"']
     if keys.secret is not None:
         lines[0] = "# A key of rlightning-aio. SECRET: leave no copy where others can read it."
         lines.append(f'    secret-key = "{keys.secret.decode()}"')
-    return "\n".join([*lines, ""])
+    return "\n".join([*lines, ""]).encode()

@@ -1,7 +1,7 @@
 """Gymnasium's vector interface: a group of envs as a `gymnasium.vector.VectorEnv`.
 
-It takes the place of `gymnasium.vector.AsyncVectorEnv`: the same arguments, the same results to the
-bit, the same errors where Gymnasium's users catch them. docs/gymnasium.md tells what differs.
+It replaces `gymnasium.vector.AsyncVectorEnv`: the same arguments, bit-identical results, and the
+errors that users of Gymnasium catch. docs/gymnasium.md lists the differences.
 """
 
 from __future__ import annotations

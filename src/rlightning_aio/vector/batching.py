@@ -1,4 +1,4 @@
-"""Observations and infos of some envs as Gymnasium batches those of all."""
+"""Observations and infos in the layout of Gymnasium's batches."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from rlightning_aio.protocol.columns import is_dict, is_tuple
+from rlightning_aio.protocol.columns import is_dict, is_tuple, paired
 
 if TYPE_CHECKING:
     import gymnasium as gym
     from numpy.typing import NDArray
 
-__all__ = ["batched", "merged", "spread"]
+__all__ = ["batched", "merged", "replaced", "spread"]
 
 
 def batched(space: gym.Space[Any], observations: Any) -> Any:
-    """What doesn't stack as the tuples that Gymnasium makes of it."""
+    """Convert lists of observations that can't be stacked to tuples, as Gymnasium does."""
     if is_dict(space):
         return {key: batched(part, observations[key]) for key, part in space.spaces.items()}
     if is_tuple(space):
@@ -26,8 +26,20 @@ def batched(space: gym.Space[Any], observations: Any) -> Any:
     return observations
 
 
+def replaced(columns: Any, others: Any, chosen: NDArray[np.intp]) -> Any:
+    """Copy `columns`, with the rows `chosen` taken from `others`."""
+
+    def mixed(column: Any, other: Any) -> Any:
+        copy = column.copy()
+        for k in chosen.tolist():
+            copy[k] = other[k]
+        return copy
+
+    return paired(mixed, columns, others)
+
+
 def merged(before: Any, now: Any, chosen: NDArray[np.intp], count: int) -> Any:
-    """Observations of all envs, some of which are new."""
+    """Observations of all `count` envs: those of `before`, with `now` in the rows `chosen`."""
     if isinstance(now, dict):
         parts = cast("dict[str, Any]", now)
         known: dict[str, Any] = before or {}
@@ -49,7 +61,7 @@ def merged(before: Any, now: Any, chosen: NDArray[np.intp], count: int) -> Any:
 
 
 def spread(infos: dict[str, Any], chosen: NDArray[np.intp], count: int) -> dict[str, Any]:
-    """Columns of some envs as those of all."""
+    """Expand infos of the envs `chosen` to columns for all `count` envs."""
     columns: dict[str, Any] = {}
     for key, column in infos.items():
         if isinstance(column, dict):

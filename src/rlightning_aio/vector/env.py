@@ -1,10 +1,12 @@
-"""`VectorEnv`: a group of envs behind Gymnasium's vector interface; see the package."""
+"""`VectorEnv`: a group of envs behind Gymnasium's vector interface."""
 
 from __future__ import annotations
 
 import copy as copying
+import math
 import multiprocessing
 import warnings
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import gymnasium as gym
@@ -14,12 +16,16 @@ from gymnasium.vector import AutoresetMode, utils
 
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.envs.sub_envs import adapted
-from rlightning_aio.group.auto_reset import as_int
+from rlightning_aio.errors import ConfigError, EnvFault
+from rlightning_aio.group.continuity import as_int
 from rlightning_aio.protocol.columns import leaves
 from rlightning_aio.sync import EnvGroup, build_env_group
 from rlightning_aio.types import PolicyResponse
 from rlightning_aio.vector.batching import batched, merged, spread
+from rlightning_aio.vector.deaths import Deaths, Stepped
 from rlightning_aio.vector.leftovers import drop_outstanding
+from rlightning_aio.vector.proxies import SubEnvProxy
+from rlightning_aio.vector.reset_arguments import checked_mask, seeds_of_envs
 from rlightning_aio.vector.rows import rows_of
 from rlightning_aio.vector.spaces import adopted_spaces
 
@@ -32,8 +38,6 @@ if TYPE_CHECKING:
 
 __all__ = ["VectorEnv", "per_worker"]
 
-_NO_LIMIT: Final = 1 << 61
-"""Step limits are the envs' own business here."""
 _NOT_TO_BE_CALLED: Final = ("reset", "step", "close")
 
 
@@ -41,30 +45,29 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
     """Envs in worker processes behind Gymnasium's vector interface.
 
     Args:
-        env_fns: one callable for each env, or for each of several vector environments of the same
-            size whose `autoreset_mode` is this one's. They run in the workers, and
-            only there; lambdas and functions of ``__main__`` will do.
+        env_fns: one callable for each env, or for each of several vector environments with the
+            same size and this `autoreset_mode`. They are called only in the workers; lambdas and
+            functions of ``__main__`` are allowed.
         shared_memory: accepted and ignored.
-        copy: observations are the caller's own. False saves a copy, but writing to them changes
-            what a later masked reset shows of envs that it doesn't reset.
+        copy: return observations that the caller owns. False saves a copy, but writing to them
+            changes what a later masked reset returns for envs that it doesn't reset.
         context: accepted and ignored.
         daemon: accepted and ignored.
         worker: must be None; there is no worker function to replace.
         observation_mode: ``same``, ``different`` (equal shapes and dtypes), or a pair of the
             batched and the single observation space.
-        autoreset_mode: what an env does after the end of its episode.
-        max_concurrency: maximum number of workers, each of which executes one env at a time; None
-            for one per core that this process may use.
+        autoreset_mode: when an env is reset after the end of its episode.
+        max_concurrency: maximum number of workers, each executing one env at a time; None for one
+            per core that this process may use.
         entry: further fields of `EnvConfig` (``step_timeout``, ``on_worker_death``, …).
 
     Attributes:
-        group: the `EnvGroup` that does the work; its envs, one for each callable, are called
-            ``env-0``, ``env-1``, …
+        group: the `EnvGroup` that runs the envs ``env-0``, ``env-1``, …, one for each callable.
 
     Raises:
         ConfigError: a callable can't be sent to a worker, or `entry` is wrong.
         StartFailed: a callable raised, or didn't return an env.
-        RuntimeError: the envs' spaces, or their numbers, don't go together.
+        RuntimeError: spaces or numbers of envs don't match.
     """
 
     def __init__(
@@ -80,7 +83,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         max_concurrency: int | None = None,
         **entry: Any,
     ) -> None:
-        # Annotated here: Gymnasium leaves open what its spaces hold.
+        # Annotated here because Gymnasium doesn't say what its spaces hold.
         self.observation_space: gym.Space[Any]
         self.action_space: gym.Space[Any]
         self.single_observation_space: gym.Space[Any]
@@ -104,18 +107,17 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         self.group: EnvGroup = build_env_group(
             {"name": "env", "num_workers": len(makers), "make_env": makers, **entry},
             mixed_actions=True,
-            zero_copy=copy,
         )
         metas = self.group.init()
         self.closed = False
         try:
-            self._adopt(metas)
+            self._adopt(metas, resumes=entry.get("on_worker_death") == "resume")
         except BaseException:
             self.close()
             raise
 
-    def _adopt(self, metas: list[EnvMeta]) -> None:
-        """Take the spaces and the metadata of the envs for the whole."""
+    def _adopt(self, metas: list[EnvMeta], *, resumes: bool) -> None:
+        """Set the attributes that come from the envs: spaces, metadata, render mode."""
         self._rows = rows_of(self.group, metas)
         self.num_envs = self._rows.num_envs
         (
@@ -130,12 +132,20 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
             setattr(self, name, value)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         self._fits_rows = leaves(self.single_action_space) is not None
+        self._deaths = Deaths(self.group, self._rows, self.autoreset_mode, self._collect)
         self._observations: Any = None
-        # Results of all envs, in order, which actions can answer.
+        # The last results of all envs, in order; actions respond to them.
         self._answerable = BatchedData(self.group.env_ids, [None] * len(metas))
         reset_themselves = metas[0].num_envs > 1
+        if resumes and reset_themselves and self.autoreset_mode == AutoresetMode.NEXT_STEP:
+            raise ConfigError(
+                "on_worker_death='resume' may resume envs that are stepped together at a step "
+                "where some of them need a reset; make separate envs (vectorization_mode='async'), "
+                "or use AutoresetMode.SAME_STEP"
+            )
         if self.autoreset_mode == AutoresetMode.NEXT_STEP and not reset_themselves:
-            self.group.auto_reset(max_episode_steps=_NO_LIMIT).__enter__()
+            # No step limit: the envs have their own.
+            self.group.auto_reset(math.inf).__enter__()
 
     # -- resets -----------------------------------------------------------------------
 
@@ -148,15 +158,16 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         """Reset all envs, or those of a mask, and wait for them.
 
         Args:
-            seed: env k gets ``seed + k``; or one for each, None for none.
-            options: passed to each env, without ``reset_mask``: a bool array ``[num_envs]``
-                that tells which envs are reset. The others show the observation they had.
+            seed: env k gets ``seed + k``; or a sequence with one seed or None for each env.
+            options: passed to each env, without ``reset_mask``: a bool array ``[num_envs]`` that
+                selects the envs to reset. The others return their last observation again.
 
-        Returns observations and infos, batched.
+        Returns batched observations and infos.
 
         Raises:
-            EnvRaised, WorkerDied, EnvHung: an env failed; nothing is left to be collected.
-            AlreadyPendingCallError, ClosedEnvironmentError: it is no time for it.
+            EnvRaised, WorkerDied, EnvHung: an env failed; nothing is left to collect.
+            AlreadyPendingCallError: another call is pending.
+            ClosedEnvironmentError: the vector env is closed.
         """
         self.reset_async(seed, options)
         return self.reset_wait()
@@ -166,53 +177,28 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> None:
-        """Send resets, which `reset_wait` waits for; see `reset`."""
+        """Send resets without waiting; `reset_wait` returns their results."""
         self._begin("reset_async")
-        seeds = self._seeds(seed)
+        seeds = seeds_of_envs(seed, self.num_envs)
         mask = None
         if options is not None and "reset_mask" in options:
             options = dict(options)
-            mask = self._checked_mask(options.pop("reset_mask"))
-            # Envs that are stepped together share a row, which is about to be written.
-            self._observations = copying.deepcopy(self._observations)
+            mask = checked_mask(options.pop("reset_mask"), self.num_envs)
         which = range(self.num_envs) if mask is None else np.flatnonzero(mask).tolist()
-        self._late = True  # One that can't be sent leaves those before it.
+        self._late = True  # A reset that can't be sent leaves those before it outstanding.
         self._rows.send_resets(seeds, [options] * self.num_envs, which)
         self._pending, self._arguments, self._late = "reset", mask, False
 
-    def _seeds(self, seed: int | Sequence[int | None] | None) -> list[Any]:
-        if seed is None or isinstance(seed, int | np.integer):
-            return [None if seed is None else seed + k for k in range(self.num_envs)]
-        if len(seed) != self.num_envs:
-            raise ValueError(f"{len(seed)} seeds for num_envs={self.num_envs}; give one for each")
-        return list(seed)
-
-    def _checked_mask(self, mask: Any) -> NDArray[np.bool_]:
-        # The words are Gymnasium's, which its own tests look for.
-        what = "`options['reset_mask']` must"
-        if not isinstance(mask, np.ndarray):
-            raise TypeError(f"{what} be a numpy array, got {type(mask)}")
-        array = cast("NDArray[Any]", mask)
-        if array.shape != (self.num_envs,):
-            raise ValueError(f"{what} have shape `({self.num_envs},)`, got {array.shape}")
-        if array.dtype != np.bool_:
-            raise TypeError(f"{what} have `dtype=np.bool_`, got {array.dtype}")
-        if not array.any():
-            raise ValueError(
-                f"{what} contain a boolean array with at least one True value, got "
-                f"reset_mask={array}"
-            )
-        return array
-
     def reset_wait(self, timeout: float | None = None) -> tuple[Any, dict[str, Any]]:
-        """Wait for `reset_async`, `timeout` seconds at most.
+        """Wait for `reset_async`, at most `timeout` seconds.
 
         Raises:
-            TimeoutError: the envs reset all the same; late results are dropped.
-            NoAsyncCallError: nothing was sent.
+            TimeoutError: the resets continue; their results will be dropped.
+            NoAsyncCallError: no reset was sent.
         """
         batch = self._finish("reset", timeout, self._collect)
         mask = self._arguments
+        self._deaths.note_reset(... if mask is None else mask)
         if mask is None or mask.all():
             return self._observed(self._rows.observation(batch)), self._rows.infos(batch)
         chosen = np.flatnonzero(mask)
@@ -228,48 +214,61 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         Args:
             actions: ``[num_envs, ...]``, an element of `action_space`; cast to its dtype.
 
-        Returns observations, rewards (float64), terminations, truncations (bool) and infos,
-        batched.
+        Returns batched observations, rewards (float64), terminations, truncations (bool) and
+        infos.
 
         Raises:
-            ValueError, TypeError: the actions are not as many as envs, or don't fit.
-            EnvRaised, WorkerDied, EnvHung: an env failed; nothing is left to be collected.
-            AlreadyPendingCallError, ClosedEnvironmentError: it is no time for it.
+            ValueError, TypeError: the number of actions is wrong, or they don't fit the space.
+            EnvRaised, WorkerDied, EnvHung: an env failed; nothing is left to collect.
+            AlreadyPendingCallError: another call is pending.
+            ClosedEnvironmentError: the vector env is closed.
         """
         self._begin("step_async")
-        self._late = True  # Ctrl-C leaves what was sent.
-        self._answerable, _ = self.group.step(self._batch(actions))
+        self._late = True  # Ctrl-C would leave steps outstanding.
+        responses = self._batch(actions)
+        if self._deaths.unfinished:
+            self._deaths.send(responses)
+            self._answerable = self._deaths.collect(None)
+        else:
+            self._answerable, _ = self.group.step(responses)
         self._late = False
         return self._stepped(self._answerable)
 
     def step_async(self, actions: Any) -> None:
-        """Send steps, which `step_wait` waits for; see `step`."""
+        """Send steps without waiting; `step_wait` returns their results."""
         self._begin("step_async")
-        self._late = True  # Ctrl-C leaves what was sent.
-        self.group.step_async(self._batch(actions))
+        self._late = True  # As in `step`.
+        send = self._deaths.send if self._deaths.unfinished else self.group.step_async
+        send(self._batch(actions))
         self._pending, self._late = "step", False
 
     def step_wait(
         self, timeout: float | None = None
     ) -> tuple[Any, NDArray[Any], NDArray[Any], NDArray[Any], Any]:
-        """Wait for `step_async`, `timeout` seconds at most.
+        """Wait for `step_async`, at most `timeout` seconds.
 
         Raises:
-            TimeoutError: the envs step all the same; late results are dropped.
-            NoAsyncCallError: nothing was sent.
+            TimeoutError: the steps continue; their results will be dropped.
+            NoAsyncCallError: no step was sent.
         """
-        return self._stepped(self._finish("step", timeout, self._collect))
+        collect = self._deaths.collect if self._deaths.unfinished else self._collect
+        return self._stepped(self._finish("step", timeout, collect))
 
     def _batch(self, actions: Any) -> BatchedData:
-        trees = isinstance(self.single_action_space, gym.spaces.Dict | gym.spaces.Tuple)
-        if self._fits_rows and not (trees and isinstance(actions, dict | tuple)):
+        is_tree = isinstance(actions, dict | tuple) and isinstance(
+            self.single_action_space, gym.spaces.Dict | gym.spaces.Tuple
+        )
+        if self._fits_rows and not is_tree:
             actions = np.asarray(actions)
             if not actions.ndim:
                 raise TypeError(
                     f"there must be as many actions as envs, {self.num_envs}, not a scalar"
                 )
         if self._fits_rows:
-            return self._answerable.respond(action=self._rows.actions(actions))
+            columns = self._rows.actions(actions)
+            if self._deaths.unfinished:
+                columns = self._deaths.with_valid(columns)
+            return self._answerable.respond(action=columns)
         env_ids = self.group.env_ids
         each = list(utils.iterate(self.action_space, actions))
         pairs = zip(env_ids, each, strict=True)
@@ -277,18 +276,22 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
 
     def _stepped(self, batch: BatchedData) -> tuple[Any, Any, Any, Any, Any]:
         rows = self._rows
-        return (
-            self._observed(rows.observation(batch)),
+        stepped = Stepped(
+            rows.observation(batch),
             rows.flat(batch.reward),
             rows.flat(batch.terminated),
             rows.flat(batch.truncated),
             rows.infos(batch),
         )
+        if self._deaths.concern(batch):
+            stepped = self._deaths.settle(batch, stepped, self._observations)
+        self._deaths.note_step(stepped)
+        return (self._observed(stepped.observations), *stepped[1:])
 
     # -- both -------------------------------------------------------------------------
 
     def _begin(self, what: str) -> None:
-        """Make sure that something may be sent."""
+        """Check that requests may be sent, and drop those that an earlier call has left."""
         self._check_running()
         if self._pending is not None:
             raise AlreadyPendingCallError(
@@ -313,11 +316,13 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         self._pending = None
 
     def _finish(self, what: str, timeout: float | None, collect: Callable[..., Any]) -> Any:
-        """What `collect` returns of the calls that were sent."""
+        """Collect the pending requests by `collect`, within `timeout` seconds."""
         self._check_sent(what)
-        self._late = True  # Unless all goes well.
+        self._late = True  # Until all are collected.
         try:
             found = collect(deadline=_seconds(timeout))
+        except EnvFault:
+            raise  # Before the next clause, as an env may have raised `TimeoutError`.
         except TimeoutError as error:
             raise multiprocessing.TimeoutError(
                 f"the envs have not answered {what}_async within {timeout} s; late results are "
@@ -326,48 +331,69 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         self._late = False
         return found
 
-    def _collect(self, deadline: float | None) -> BatchedData:
+    def _collect(self, deadline: float | None = None) -> BatchedData:
         batch, _ = self.group.collect_async(wait_all=True, ordered=True, deadline=deadline)
         return batch
 
     def _observed(self, observations: Any) -> Any:
-        """Observations as Gymnasium batches them; the last ones are kept, for masks.
-
-        With `copy` they are views of the rows still, of which the caller gets the one copy.
-        """
-        self._observations = batched(self.single_observation_space, observations)
-        return copying.deepcopy(self._observations) if self.copy else self._observations
+        """Batch observations as Gymnasium does, and keep the columns for masks and deaths."""
+        self._observations = observations
+        if type(observations) is np.ndarray and not observations.dtype.hasobject:
+            return observations.copy() if self.copy else observations
+        result = batched(self.single_observation_space, observations)
+        return copying.deepcopy(result) if self.copy else result
 
     # -- methods and attributes -------------------------------------------------------
 
     def call(self, name: str, /, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Call method `name` of every env, found through its wrappers, or get an attribute."""
+        """Call method `name` of each env, found through its wrappers, or get an attribute."""
         self.call_async(name, *args, **kwargs)
         return self.call_wait()
 
     def call_async(self, name: str, /, *args: Any, **kwargs: Any) -> None:
-        """Send calls, which `call_wait` waits for; see `call`."""
+        """Send calls without waiting; `call_wait` returns their values."""
         self._begin("call_async")
-        if name in _NOT_TO_BE_CALLED:
-            raise ValueError(f"call {name}() of the vector env itself, not of its envs")
+        _check_name(name)
         self._rows.call(name, args, kwargs)
         self._pending = "call"
 
     def call_wait(self, timeout: float | None = None) -> tuple[Any, ...]:
-        """Wait for `call_async`, `timeout` seconds at most; one value for each env.
+        """Wait for `call_async`, at most `timeout` seconds, and return one value for each env.
 
         Raises:
-            TimeoutError: the methods run all the same; late results are dropped.
-            NoAsyncCallError: nothing was sent.
+            TimeoutError: the calls continue; their values will be dropped.
+            NoAsyncCallError: no call was sent.
         """
         return tuple(self._rows.values(self._finish("call", timeout, self.group.collect_calls)))
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
-        """Attribute `name` of every env, found through its wrappers."""
+        """Attribute `name` of each env, found through its wrappers."""
         return self.call(name)
 
+    @property
+    def envs(self) -> list[Any]:
+        """A proxy of each env; it fetches attributes when they are read."""
+        return [
+            SubEnvProxy(partial(self._look_up, place), partial(self._call_one, place))
+            for place in range(self.num_envs)
+        ]
+
+    def _call_one(self, place: int, name: str, /, *args: Any, **kwargs: Any) -> Any:
+        _check_name(name)
+        return self._of_one(place, partial(self._rows.call, name, args, kwargs, [place]))
+
+    def _look_up(self, place: int, name: str) -> tuple[bool, Any]:
+        return self._of_one(place, partial(self._rows.look_up, name, place))
+
+    def _of_one(self, place: int, send: Callable[[], None]) -> Any:
+        self._begin("call_async")
+        send()
+        self._pending = "call"
+        (value,) = self._rows.values(self._finish("call", None, self.group.collect_calls), [place])
+        return value
+
     def set_attr(self, name: str, values: Any) -> None:
-        """Set attribute `name` of every env: one value for each (a list or a tuple), or one."""
+        """Set attribute `name` of each env: a list or tuple has one value for each env."""
         self._check_running()
         single = not isinstance(values, list | tuple)
         each = [values] * self.num_envs if single else list(cast("list[Any]", values))
@@ -377,13 +403,13 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
                 "one that is not a list or tuple"
             )
         self._begin("set_attr")
-        self._late = True  # A value that can't be sent leaves the calls before it.
+        self._late = True  # A value that can't be sent leaves the calls before it outstanding.
         self._rows.set_attr(name, each)
         self._pending = "call"
         self._finish("call", None, self.group.collect_calls)
 
     def render(self) -> tuple[Any, ...]:
-        """One frame of each env, as it renders it."""
+        """Return one rendered frame of each env."""
         return self.call("render")
 
     @property
@@ -393,7 +419,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
 
     @property
     def np_random_seed(self) -> Any:
-        """Seeds of these generators: a tuple."""
+        """Seeds of the envs' random generators: a tuple."""
         return self.get_attr("np_random_seed")
 
     # -- the end ----------------------------------------------------------------------
@@ -402,8 +428,8 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         """Close the envs and end their workers.
 
         Args:
-            timeout: accepted; workers that don't end are ended by force after 1.5 s.
-            terminate: likewise.
+            timeout: accepted and ignored; workers that don't end within 1.5 s are killed.
+            terminate: accepted and ignored.
         """
         del timeout, terminate
         if self._pending is not None:
@@ -413,12 +439,15 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
                 stacklevel=3,
             )
         self.group.close()
-        # They are views of shared memory, which ends with its last one.
-        self._observations, self._answerable = None, BatchedData([], [])
+
+
+def _check_name(name: str) -> None:
+    if name in _NOT_TO_BE_CALLED:
+        raise ValueError(f"call {name}() of the vector env itself, not of its envs")
 
 
 def per_worker(max_concurrency: Any, num_envs: int) -> int:
-    """How many envs share a worker where there are `max_concurrency` workers at most."""
+    """Number of envs that share a worker if there are at most `max_concurrency` workers."""
     count = as_int(max_concurrency)
     if count is None or count < 1:
         raise ValueError(f"max_concurrency must be an int above 0 or None, not {max_concurrency!r}")
@@ -426,5 +455,5 @@ def per_worker(max_concurrency: Any, num_envs: int) -> int:
 
 
 def _seconds(timeout: float | None) -> float | None:
-    """A deadline; 0 asks only for what is there."""
+    """Convert a timeout to a deadline; 0 collects only what has arrived."""
     return timeout if timeout is None else max(timeout, 1e-9)

@@ -1,4 +1,4 @@
-"""What a call that failed or timed out has left in the workers."""
+"""Outstanding requests of a call that failed or timed out."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["drop_outstanding"]
 
 
 def drop_outstanding(group: EnvGroup) -> None:
-    """Wait until no env has anything to do, and forget what comes of it, faults included."""
+    """Wait until no env is busy, and discard all results and faults."""
     for collect in (group.collect_async, group.collect_calls):
         while True:
             try:

@@ -1,15 +1,16 @@
-"""`VectorEnv`s of registered tasks, and which tasks are stepped together."""
+"""`VectorEnv`s of registered tasks, and the choice of tasks whose envs are stepped together."""
 
 from __future__ import annotations
 
 import copy
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from gymnasium.vector import AutoresetMode
 
 from rlightning_aio.envs.gymnasium import spec_of
 from rlightning_aio.envs.mujoco_tasks import is_batched
 from rlightning_aio.envs.of_spec import BatchOf, OneOf, VectorOf
+from rlightning_aio.errors import ConfigError
 from rlightning_aio.registry import PLACEMENTS
 from rlightning_aio.sharing import num_batches, num_cores
 from rlightning_aio.vector.env import VectorEnv, per_worker
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 __all__ = ["imports_of", "make_vec", "steps_together", "together", "vector_entry_point"]
 
 Mode = Literal["async", "vector_entry_point"]
+BATCH_OPTIONS: Final = ("num_threads", "randomize")
+"""Options of envs that are stepped together, in addition to those of the task."""
 
 
 def make_vec(
@@ -34,31 +37,32 @@ def make_vec(
     wrappers: Sequence[Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]]] = (),
     **kwargs: Any,
 ) -> VectorEnv:
-    """A `VectorEnv` of so many envs of one task; see `gymnasium.make_vec`.
+    """Make a `VectorEnv` of `num_envs` envs of one task; see `gymnasium.make_vec`.
 
     Args:
         id: a registered name, ``module:name``, or a spec.
-        num_envs: how many.
-        vectorization_mode: None has the envs of a task that `mujoco_batch` knows stepped
-            together, with the same results, as many in each worker and in this process
-            (``placement: split``), and those of any other separately. ``async``: separately,
-            whatever the task. ``vector_entry_point``: each worker has the task's own vector
-            environment, whose seeds and infos may differ from separate envs'.
+        num_envs: the number of envs.
+        vectorization_mode: None steps the envs of a task that `mujoco_batch` supports together,
+            with the same results, in threads of this process, and makes workers only if an
+            argument needs them; envs of any other task are separate. ``async``: always separate
+            envs. ``vector_entry_point``: each worker has the task's own vector environment, whose
+            seeds and infos may differ from those of separate envs.
         vector_kwargs: further arguments of `VectorEnv`.
-        wrappers: put around each env, the first innermost; envs with any are separate.
-        kwargs: of `gymnasium.make`, or of the task's vector environment. Gymnasium's checker,
-            which stays in the path of every step, is left out unless
-            ``disable_env_checker=False`` is among them; envs with it are separate.
+        wrappers: applied to each env, the first innermost; envs with wrappers are separate.
+        kwargs: of `gymnasium.make`, or of the task's vector environment; for envs that are stepped
+            together also `BATCH_OPTIONS`. ``disable_env_checker`` is True by default, because
+            Gymnasium's checker slows every step; envs with the checker are separate.
 
     Raises:
-        ValueError: the task has no vector environment, or it takes no wrappers; or the mode is
-            none of these.
+        ConfigError: `BATCH_OPTIONS` are wrong, or the envs aren't stepped together.
+        ValueError: the task has no vector environment, or the mode allows no wrappers or is
+            unknown.
     """
     mode = getattr(vectorization_mode, "value", vectorization_mode)
     spec = copy.deepcopy(spec_of(id) if isinstance(id, str) else id)
     given = {**imports_of(spec), **(vector_kwargs or {})}
-    one = OneOf(spec, {"disable_env_checker": True, **kwargs}, tuple(wrappers))
-    makers: list[Callable[[], Any]] = [one] * num_envs
+    of_one = {"disable_env_checker": True, **kwargs}
+    makers: list[Callable[[], Any]] = [OneOf(spec, of_one, tuple(wrappers))] * num_envs
     if mode == "vector_entry_point":
         if spec.vector_entry_point is None or wrappers:
             reason = "takes no wrappers of single envs" if wrappers else "has no such entry point"
@@ -73,7 +77,7 @@ def make_vec(
         )
     elif mode is None and not wrappers and steps_together(spec, kwargs):
         autoreset = AutoresetMode(given.get("autoreset_mode", AutoresetMode.NEXT_STEP))
-        makers, given = together(one, num_envs, autoreset, given)
+        makers, given = together(spec, of_one, num_envs, autoreset, given)
     env = VectorEnv(makers, **given)
     env.spec = copy.deepcopy(spec)
     env.spec.kwargs.update(kwargs)
@@ -84,10 +88,10 @@ def vector_entry_point(
     id: str | EnvSpec,  # noqa: A002
     **vector_kwargs: Any,
 ) -> Callable[..., VectorEnv]:
-    """What `gymnasium.register` takes as ``vector_entry_point``, to serve task `id` from here.
+    """Make a ``vector_entry_point`` for `gymnasium.register`: it makes a `VectorEnv` of task `id`.
 
-    `gymnasium.make_vec(..., vectorization_mode="vector_entry_point")`, and whoever calls it
-    (RLlib, say), gets a `VectorEnv` with `vector_kwargs` then.
+    `gymnasium.make_vec(..., vectorization_mode="vector_entry_point")` then returns a `VectorEnv`
+    with `vector_kwargs`, also to libraries that call it, such as RLlib.
     """
 
     def make(num_envs: int, **kwargs: Any) -> VectorEnv:
@@ -97,45 +101,58 @@ def vector_entry_point(
 
 
 def steps_together(spec: EnvSpec, kwargs: Mapping[str, Any]) -> bool:
-    """Whether nobody notices, but by the speed, that envs of a task are stepped together.
+    """Return True if stepping the envs of a task together changes nothing but the speed.
 
     Args:
         spec: of the task.
-        kwargs: of `gymnasium.make`. Gymnasium's checker and a window for each env are of single
-            envs.
+        kwargs: of `gymnasium.make`. Gymnasium's checker and windows need separate envs.
     """
     single = kwargs.get("render_mode", spec.kwargs.get("render_mode")) == "human"
     return is_batched(spec) and kwargs.get("disable_env_checker", True) and not single
 
 
 def together(
-    one: OneOf, num_envs: int, mode: AutoresetMode, arguments: dict[str, Any]
+    spec: EnvSpec,
+    kwargs: Mapping[str, Any],
+    num_envs: int,
+    mode: AutoresetMode,
+    arguments: dict[str, Any],
 ) -> tuple[list[Callable[[], Any]], dict[str, Any]]:
-    """What makes envs of a task that are stepped together, and where they live.
+    """Return callables that make batches of envs stepped together, and the fields of their entry.
 
-    Whoever steps them waits for all, and their simulator is one that does not crash: so one
-    share lives in this process, unless an argument asks for what only workers can do.
+    MuJoCo steps them in threads of this process and doesn't crash, so there are workers only if
+    an argument needs them.
 
     Args:
-        one: makes one of them.
-        num_envs: in all.
-        mode: what each does after its episode's end.
-        arguments: as of `_laid_out`.
+        spec: of the task.
+        kwargs: of `gymnasium.make`, and `BATCH_OPTIONS`.
+        num_envs: the total number of envs.
+        mode: when an env is reset after the end of its episode.
+        arguments: see `_laid_out`.
     """
-    count, given = _laid_out(num_envs, arguments)
-    if not given.keys() & {"placement", *PLACEMENTS["split"].refuses}:
-        given["placement"] = "split"
-    return [one if count == num_envs else BatchOf(one, num_envs // count, mode)] * count, given
+    options = {name: kwargs[name] for name in BATCH_OPTIONS if name in kwargs}
+    one = OneOf(spec, {name: kwargs[name] for name in kwargs if name not in options})
+    if arguments.keys() & {"placement", "max_concurrency", *PLACEMENTS["inline"].refuses}:
+        count, given = _laid_out(num_envs, arguments)
+    else:
+        count, given = 1, {**arguments, "placement": "inline"}
+    if count == num_envs:
+        if options.get("randomize"):
+            raise ConfigError(
+                "randomize needs envs that are stepped together: several in each batch"
+            )
+        return [one] * count, given
+    options.setdefault("num_threads", max(1, num_cores() // count))
+    return [BatchOf(one, num_envs // count, mode, **options)] * count, given
 
 
 def _laid_out(num_envs: int, arguments: dict[str, Any]) -> tuple[int, dict[str, Any]]:
-    """In how many batches envs are laid over workers, and how an entry says that.
+    """Return the number of batches, and the fields of an entry that spread them over workers.
 
     Args:
-        num_envs: in all.
-        arguments: of `VectorEnv`, or fields of the entry. Those that say how many workers there
-            are, or how many envs share one, are about the envs; those that are returned are
-            about batches.
+        num_envs: the total number of envs.
+        arguments: of `VectorEnv`, or fields of the entry. ``max_concurrency`` and
+            ``envs_per_process`` count envs; the returned ``envs_per_process`` counts batches.
     """
     rest = {
         name: value
@@ -153,7 +170,7 @@ def _laid_out(num_envs: int, arguments: dict[str, Any]) -> tuple[int, dict[str, 
 
 
 def imports_of(spec: EnvSpec) -> dict[str, Any]:
-    """What an entry of the task has to say of it."""
-    # Known before the first env is made, it need not tell every time that its assets are old.
+    """Fields that an entry of the task needs."""
+    # Imported before the first env is made, mujoco doesn't warn each time that assets are old.
     is_mujoco = str(spec.entry_point).startswith("gymnasium.envs.mujoco")
     return {"imports": ("mujoco",)} if is_mujoco else {}

@@ -1,7 +1,8 @@
-"""How one row of envs lies in the results of a group, for the interfaces that show such a row.
+"""The layout of a vector env's envs in the results of its group.
 
-`Singles` has an env in each result, `Batches` as many sub-environments in each. What is
-``[num_envs, ...]`` to a user is ``[results, each, ...]`` to the group: a view, either way.
+`Singles` has one env in each result; `Batches` has several sub-environments in each, the same
+number everywhere. A user's ``[num_envs, ...]`` is a view of the group's ``[results, each, ...]``.
+An env's place is its position among `num_envs`.
 """
 
 from __future__ import annotations
@@ -10,13 +11,10 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from rlightning_aio.batch.data import (
-    reported_info_list,
-    reported_infos,
-    reported_sub_env_infos,
-)
+from rlightning_aio.batch.contents import reported_info_list, reported_infos, reported_sub_env_infos
 from rlightning_aio.batch.infos import listed
 from rlightning_aio.envs.sub_envs import SEEDS
+from rlightning_aio.envs.wrappers import name_of
 from rlightning_aio.protocol.columns import leaves, mapped
 
 if TYPE_CHECKING:
@@ -34,14 +32,14 @@ Options = dict[str, Any]
 
 
 class Singles:
-    """An env in each result.
+    """One env in each result.
 
     Args:
-        group: initialised.
-        metas: of its envs.
+        group: an initialised group.
+        metas: of the group's envs.
 
     Attributes:
-        num_envs: of the row.
+        num_envs: the number of envs that the user sees.
         spaces: observation and action space of each env.
     """
 
@@ -55,11 +53,11 @@ class Singles:
     # -- results ------------------------------------------------------------------------
 
     def observation(self, batch: BatchedData) -> Any:
-        """Observations, as the columns that they are."""
+        """Observations as columns ``[num_envs, ...]``."""
         return batch.observation
 
     def flat(self, column: NDArray[Any]) -> NDArray[Any]:
-        """A column of rewards or ends, ``[num_envs]``."""
+        """Reshape a column of rewards or flags to ``[num_envs]``."""
         return column
 
     def infos(self, batch: BatchedData) -> dict[str, Any]:
@@ -71,24 +69,48 @@ class Singles:
         return reported_info_list(batch)
 
     def of_mask(self, batch: BatchedData, mask: NDArray[np.bool_]) -> tuple[Any, dict[str, Any]]:
-        """Observations and infos of the envs of `mask` alone, for whose reset `batch` answers."""
+        """Observations and infos of the envs in `mask` only, from the results of their reset."""
         del mask
         return self.observation(batch), self.infos(batch)
+
+    # -- results of lost workers ----------------------------------------------------------
+
+    def whole(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Mask of the results with all their envs in `mask`."""
+        return mask
+
+    def places(self, results: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Mask of the envs in `results`, which is a mask of results."""
+        return results
+
+    def lost(self, restarted: NDArray[np.bool_], due: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Mask of the envs that have lost an episode.
+
+        Args:
+            restarted: mask of the envs whose worker was replaced.
+            due: mask of the envs whose next step is a reset anyway.
+        """
+        return restarted & ~due
+
+    def with_valid(self, actions: Any, ignored: NDArray[np.bool_]) -> Any:
+        """Replace ignored actions that would be executed by valid ones of the same batch."""
+        del ignored
+        return actions
 
     # -- requests -----------------------------------------------------------------------
 
     def actions(self, actions: Any) -> Any:
-        """Actions ``[num_envs, ...]`` as the group takes them.
+        """Reshape actions ``[num_envs, ...]`` for the group.
 
         Raises:
-            ValueError, TypeError: they are not as many.
+            ValueError, TypeError: the number of actions is wrong.
         """
         return actions
 
     def send_resets(
         self, seeds: Sequence[int | None], options: Sequence[Options | None], chosen: Sequence[int]
     ) -> None:
-        """Reset the envs at the places `chosen`, in order, each with its seed and its options."""
+        """Reset the envs at the places `chosen`, in order, each with its own seed and options."""
         env_ids = self._group.env_ids
         if all(options[k] is options[chosen[0]] for k in chosen):
             given = {env_ids[k]: int(seed) for k in chosen if (seed := seeds[k]) is not None}
@@ -100,24 +122,28 @@ class Singles:
         return None
 
     def call(self, name: str, args: Any, kwargs: Any, chosen: Sequence[int] | None = None) -> None:
-        """Call a method of all envs, or of those at the places `chosen`."""
+        """Send a call of a method to all envs, or to those at the places `chosen`."""
         env_ids = self._group.env_ids
         ids = None if chosen is None else [env_ids[k] for k in chosen]
         self._group.call_async("call_wrapped", name, *args, env_ids=ids, **kwargs)
 
+    def look_up(self, name: str, place: int) -> None:
+        """Ask an env for attribute `name`, or whether it is a method."""
+        self._group.call_async("look_up", name, env_ids=[self._group.env_ids[place]])
+
     def values(self, collected: list[Any], chosen: Sequence[int] | None = None) -> list[Any]:
-        """Values of the calls, one for each env that was called."""
+        """Order the values of calls: one for each env that was called."""
         del chosen
         return collected
 
     def are_wrapped(self, wrapper_class: type[Any], chosen: Sequence[int]) -> list[bool]:
-        """Whether a wrapper is among those of the envs at the places `chosen`."""
+        """Ask the envs at the places `chosen` whether they have a wrapper."""
         env_ids = [self._group.env_ids[k] for k in chosen]
-        self._group.call_async("is_wrapped", wrapper_class, env_ids=env_ids)
+        self._group.call_async("is_wrapped", name_of(wrapper_class), env_ids=env_ids)
         return self._group.collect_calls()
 
     def set_attr(self, name: str, each: Sequence[Any]) -> None:
-        """Send values of an attribute, one for each env."""
+        """Send each env its own value of an attribute."""
         for env_id, value in zip(self._group.env_ids, each, strict=True):
             self._group.call_async(
                 "call_wrapped", "set_wrapper_attr", name, value, env_ids=[env_id]
@@ -130,10 +156,10 @@ class Singles:
 
 
 class Batches(Singles):
-    """As many sub-environments in each result.
+    """The same number of sub-environments in each result.
 
     Raises:
-        RuntimeError: they are not as many everywhere, or have no fixed size.
+        RuntimeError: the numbers differ, or values of a space have no fixed size.
     """
 
     def __init__(self, group: EnvGroup, metas: Sequence[EnvMeta]) -> None:
@@ -180,6 +206,25 @@ class Batches(Singles):
             mapped(lambda column: column[wanted], self.observation(batch)),
             _picked(self.infos(batch), wanted),
         )
+
+    def whole(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        return np.logical_and.reduce(mask.reshape(-1, self._each), axis=1)
+
+    def places(self, results: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        return results.repeat(self._each)
+
+    def lost(self, restarted: NDArray[np.bool_], due: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        lost = restarted & ~due
+        if self._takes_masks:
+            return lost
+        # A batch without masks is reset as a whole, so envs that were due lose their step too.
+        return lost.reshape(-1, self._each).any(axis=1).repeat(self._each)
+
+    def with_valid(self, actions: Any, ignored: NDArray[np.bool_]) -> Any:
+        by_batch = ignored.reshape(-1, self._each)
+        # The first that isn't ignored, if any.
+        first = np.asarray(by_batch.argmin(axis=1))
+        return mapped(lambda column: _with_valid(column, by_batch, first), actions)
 
     def actions(self, actions: Any) -> Any:
         return mapped(self._folded, actions)
@@ -228,7 +273,7 @@ class Batches(Singles):
         return self._group.reset_async(None, given or None, [env_id])
 
     def _by_batch(self, chosen: Sequence[int]) -> Iterator[tuple[int, list[int]]]:
-        """Each batch that has some of the places `chosen`, and which these are of its own."""
+        """Group the places `chosen` by batch, as positions inside each batch."""
         found: dict[int, list[int]] = {}
         for k in chosen:
             found.setdefault(k // self._each, []).append(k % self._each)
@@ -242,6 +287,11 @@ class Batches(Singles):
             env_ids = [self._group.env_ids[batch]]
             self._group.call_async("call_sub_envs", name, args, kwargs, which, env_ids=env_ids)
 
+    def look_up(self, name: str, place: int) -> None:
+        batch, own = divmod(place, self._each)
+        env_ids = [self._group.env_ids[batch]]
+        self._group.call_async("look_up_sub_env", own, name, env_ids=env_ids)
+
     def values(self, collected: list[Any], chosen: Sequence[int] | None = None) -> list[Any]:
         if chosen is None:
             return [value for values in collected for value in values]
@@ -250,9 +300,9 @@ class Batches(Singles):
         return [next(of_batch[k // self._each]) for k in chosen]
 
     def are_wrapped(self, wrapper_class: type[Any], chosen: Sequence[int]) -> list[bool]:
-        self._group.call_async("sub_envs_wrapped", wrapper_class)
-        told = self._group.collect_calls()
-        return [told[k // self._each] for k in chosen]
+        self._group.call_async("sub_envs_wrapped", name_of(wrapper_class))
+        wrapped = self._group.collect_calls()
+        return [wrapped[k // self._each] for k in chosen]
 
     def set_attr(self, name: str, each: Sequence[Any]) -> None:
         for k, env_id in enumerate(self._group.env_ids):
@@ -275,7 +325,7 @@ class Batches(Singles):
 
 
 def rows_of(group: EnvGroup, metas: Sequence[EnvMeta]) -> Singles:
-    """How the envs of a group make one row."""
+    """The layout of a group's envs: `Batches` if any has sub-environments, else `Singles`."""
     several = any(meta.num_envs > 1 for meta in metas)
     return Batches(group, metas) if several else Singles(group, metas)
 
@@ -284,8 +334,17 @@ def _flat(column: NDArray[Any]) -> NDArray[Any]:
     return column.reshape(-1, *column.shape[2:])
 
 
+def _with_valid(
+    column: NDArray[Any], ignored: NDArray[np.bool_], first: NDArray[np.intp]
+) -> NDArray[Any]:
+    column = column.copy()
+    for batch, place in np.argwhere(ignored).tolist():
+        column[batch, place] = column[batch, first[batch]]
+    return column
+
+
 def _picked(infos: dict[str, Any], wanted: NDArray[np.bool_]) -> dict[str, Any]:
-    """Columns of some alone."""
+    """Select the rows `wanted` of each column."""
     return {
         key: _picked(cast("dict[str, Any]", column), wanted)
         if isinstance(column, dict)

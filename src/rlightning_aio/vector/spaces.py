@@ -1,4 +1,4 @@
-"""The spaces of many envs as those of a vector environment."""
+"""The single and batched spaces of a vector environment, from those of its envs."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def adopted_spaces(
 
     Raises:
         ValueError: there is no such mode.
-        RuntimeError: the spaces don't go together.
+        RuntimeError: the spaces can't be batched.
     """
     observations, actions = zip(*spaces, strict=True)
     single, batched = _observed(list(observations), mode)
@@ -59,7 +59,7 @@ def _observed(
     if mode == "same":
         return spaces[0], utils.batch_space(spaces[0], len(spaces))
     if mode == "different":
-        # Its stubs know it in part.
+        # Gymnasium's annotations are incomplete.
         return spaces[0], cast("Any", utils).batch_differing_spaces(spaces)
     raise ValueError(
         "Invalid `observation_mode`, expected: 'same' or 'different' or tuple of single "

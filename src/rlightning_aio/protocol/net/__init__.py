@@ -1,6 +1,6 @@
-"""What an env_server and its clients say to each other, without any I/O.
+"""The protocol between an env_server and its clients, without I/O.
 
-Messages and arrays become frames (`wire`, `payload`), spaces become plain data
-(`space_description`), and what was asked, executed and lost is settled by two state
-machines (`server_session`, `client_session`). Rule: nothing here is ever pickled.
+Messages and arrays become frames (`wire`, `payload`), and spaces become plain data
+(`space_description`). Two state machines (`server_session` with its parts, `client_session`) track
+requests, answers and losses. Rule: nothing here is ever pickled.
 """

@@ -1,44 +1,44 @@
-"""A client's end of env_server, without I/O: being let in, and doing each thing once.
+"""`ClientSession`: a client's end of env_server, without I/O.
 
-Rule: a request is executed at most once; a repeated one gets the reply it got before, an
-older one is refused. Messages and what happens to the connection come in, messages pile
-up to be taken out, and time is an argument.
-Absent on purpose: sockets, keys, and the env itself.
+Rule: a request is executed at most once. A repeated request gets the earlier reply again, an older
+one is refused. Messages and changes of the connection come in, messages are queued, and time is an
+argument. Deliberately left out: sockets, keys, and the env itself.
 """
 
 from __future__ import annotations
 
-import logging
 from collections import deque
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING, Any, Final, cast
 
+from rlightning_aio.protocol.net.limited_log import LOG, LimitedLog
 from rlightning_aio.protocol.net.payload import Outcome, Packed, ResultLayout, SpaceLayout
-from rlightning_aio.protocol.net.server_session import PATIENCE, random_token
 from rlightning_aio.protocol.net.space_description import describe
 from rlightning_aio.protocol.net.texts import in_one_line
 from rlightning_aio.protocol.net.wire import (
+    PINGS_PER_HEARTBEAT,
     STALE_REQUEST,
     VERSION,
     Bye,
+    ClientHello,
+    ClientResult,
     Failure,
     FromServer,
     Gone,
-    Hello,
     Part,
     Ping,
     Pong,
     Reader,
     Refusal,
     Reset,
-    Result,
     Step,
     Untransferable,
     Welcome,
     WireError,
     Writer,
     portable,
+    random_token,
 )
 
 if TYPE_CHECKING:
@@ -50,22 +50,19 @@ if TYPE_CHECKING:
 
 __all__ = ["ClientSession", "Ended", "Phase", "Refused", "ResetRequest", "StepRequest"]
 
-_SECONDS_BETWEEN_WARNINGS: Final = 10.0
 _SECONDS_BETWEEN_HELLOS: Final = (0.5, 8.0)
-"""At first, and at most after refusals; doubled from one to the next."""
+"""The first pause, and the longest; each refusal doubles it."""
 
 _MAX_TEXT: Final = 50_000
 _LATEST_NS: Final = 2**63 - 1
 
-_log = logging.getLogger(__name__)
-
 
 class Phase(Enum):
-    """How a client stands with its server."""
+    """State of a client's connection to its server."""
 
     AWAY = "not connected"
     GREETING = "asking to be let in"
-    RESUMING = "reconnected, asking whether the session goes on"
+    RESUMING = "reconnected, asking whether the session continues"
     SERVING = "serving"
 
 
@@ -89,14 +86,14 @@ class ResetRequest:
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """The session is over, and with it the trainer's hold on the env; another may follow."""
+    """The session has ended, and with it the trainer's control of the env; another may follow."""
 
     cause: str
 
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """The server will not let this client in, now or later."""
+    """The server will never admit this client."""
 
     code: str
     text: str
@@ -109,18 +106,18 @@ class ClientSession:
     """All sessions of one client, one after the other.
 
     Args:
-        meta: of the env, as it reports it.
+        meta: of the env.
         name: of the client, unique at its server.
-        heartbeat: seconds within which a dead server is found, until the server says its own.
-        free_actions: the env takes actions that need not fit its action space.
-        reads_extras: something reads what the policy attaches beside the action.
+        heartbeat: seconds within which a dead server is found, until the server sends its own.
+        free_actions: the env accepts actions that do not fit its action space.
+        reads_extras: the env reads columns that the policy attaches to the action.
         new_token: makes nonces.
 
     Attributes:
-        phase: how things stand.
-        outbox: messages to be sent, oldest first; the sender takes them out.
-        malformed: messages dropped because they were none.
-        refusal: why the server said no last, until it says yes.
+        phase: state of the connection.
+        outbox: messages that wait to be sent, oldest first; the sender removes them.
+        num_malformed: messages that were dropped as malformed.
+        refusal: reason of the server's last refusal, until it admits the client.
 
     Raises:
         UnsupportedSpace: a space can't be announced.
@@ -138,13 +135,13 @@ class ClientSession:
     ) -> None:
         self.phase = Phase.AWAY
         self.outbox: deque[list[bytes]] = deque()
-        self.malformed = 0
+        self.num_malformed = 0
         self.refusal: str | None = None
         self._name = name
         self._heartbeat = heartbeat
         self._new_token = new_token
         self._free_actions = free_actions
-        self._hello = Hello(
+        self._hello = ClientHello(
             version=VERSION,
             name=name,
             nonce=0,
@@ -157,7 +154,7 @@ class ClientSession:
             free_actions=free_actions,
             reads_extras=reads_extras,
         )
-        # Neither is None, or it couldn't have been described.
+        # Neither is None, because `describe` accepted them.
         observation_space = cast("gym.Space[Any]", meta.observation_space)
         action_space = cast("gym.Space[Any]", meta.action_space)
         self._results = ResultLayout(observation_space, meta.num_envs, meta.agents)
@@ -171,33 +168,33 @@ class ClientSession:
         self._give_up_at: float | None = None
         self._pause = _SECONDS_BETWEEN_HELLOS[0]
         self._lost_keys: set[str] = set()
-        self._warned_at: float | None = None
+        self._log = LimitedLog(name)
 
     # The connection
 
     def connected(self, now: float) -> None:
-        """A connection to the server stands."""
+        """Record that a connection to the server is open."""
         self._give_up_at = None
         self._pause = _SECONDS_BETWEEN_HELLOS[0]
         if self._session is None:
-            self._greet_at(now)
+            self._say_hello_at(now)
         else:
             self.phase = Phase.RESUMING
         self._ask(now)
 
     def disconnected(self, now: float) -> None:
-        """The connection broke; it may come back."""
+        """Record that the connection broke; it may come back."""
         if self.phase is not Phase.AWAY:
             self.phase, self._ask_at = Phase.AWAY, None
             if self._session is not None:
-                self._give_up_at = now + 2 * self._heartbeat / PATIENCE
+                self._give_up_at = now + 2 * self._heartbeat / PINGS_PER_HEARTBEAT
 
-    def _greet_at(self, when: float) -> None:
+    def _say_hello_at(self, when: float) -> None:
         self.phase, self._ask_at = Phase.GREETING, when
         self._hello.nonce = self._new_token()
 
     def _ask(self, now: float) -> None:
-        """Say what must be heard, and when to say it again: it may get lost."""
+        """Send a hello or a ping, and set the time to repeat it: it may get lost."""
         if self.phase is Phase.GREETING:
             self._send(self._hello)
         elif self._session is not None:
@@ -206,32 +203,32 @@ class ClientSession:
         self._ask_at = now + (self._heartbeat if serving else self._pause)
 
     def deadline(self) -> float | None:
-        """When `tick` is due (monotonic seconds); None if never."""
+        """Return the time at which `tick` is due (monotonic seconds); None if never."""
         return self._ask_at if self._give_up_at is None else self._give_up_at
 
     def tick(self, now: float) -> Ended | None:
-        """Ask again, or give the server up, if it is time to."""
+        """Repeat a hello or ping, or give the server up, if that is due."""
         if self._give_up_at is not None and now >= self._give_up_at:
             return self._end("the connection to the server broke and did not come back")
         if self._ask_at is not None and now >= self._ask_at:
             self._ask(now)
         return None
 
-    # What arrives
+    # Messages
 
     def receive(self, parts: Sequence[Part], now: float) -> Event | None:
-        """Take in one message; never raises for what it holds.
+        """Read one message. No content makes it raise.
 
         Returns:
-            What to do: a `StepRequest` or `ResetRequest` must be answered before the next
-            message is received.
+            The event to act on. A `StepRequest` or `ResetRequest` must be answered before the
+            next message is received.
         """
         try:
             message, frames = self._reader.read(parts)
             if isinstance(message, Welcome | Refusal):
                 return self._on_answer(message, now)
             if message.session != self._session:
-                self._on_stranger(message)
+                self._on_other_session(message)
                 return None
             return self._on_message(message, frames, now)
         except WireError as error:
@@ -245,13 +242,13 @@ class ClientSession:
         now: float,
     ) -> Event | None:
         if isinstance(message, Gone):
-            self._greet_at(now)
+            self._say_hello_at(now)
             return self._end(f"the server ended the session: {in_one_line(message.text)}")
         if isinstance(message, Bye):
-            # Not at once: a server that closes would only be asked in vain.
-            self._greet_at(now + self._pause)
+            # A server that closes answers no hello, so wait.
+            self._say_hello_at(now + self._pause)
             return self._end(f"the server closed: {in_one_line(message.reason)}")
-        # A server that has forgotten this session, and whose word of it got lost, is silent.
+        # A server may have forgotten this session while its `gone` got lost; then it is silent.
         self.phase, self._ask_at = Phase.SERVING, now + self._heartbeat
         if isinstance(message, Step | Reset):
             return self._on_request(message, frames, now)
@@ -299,7 +296,7 @@ class ClientSession:
 
     def _on_welcome(self, welcome: Welcome, now: float) -> Event | None:
         if welcome.session == self._session:
-            # The server is still waiting for the first result, or was when it said so.
+            # The server waits for the first result, or waited when it sent this.
             if self._number == 0:
                 self.outbox.append(self._reply)
             return None
@@ -319,13 +316,12 @@ class ClientSession:
         if not refusal.retry:
             self._ask_at = None
             return Refused(in_one_line(refusal.code), text)
-        _log.info("%s: refused for now: %s", self._name, text)
         self._pause = min(2 * self._pause, _SECONDS_BETWEEN_HELLOS[1])
         self._ask_at = now + self._pause
         return None
 
-    def _on_stranger(self, message: Step | Reset | Ping | Pong | Gone | Bye) -> None:
-        # The server keeps a session that this client has given up, or never knew of.
+    def _on_other_session(self, message: Step | Reset | Ping | Pong | Gone | Bye) -> None:
+        # The server has a session that this client has given up or never had.
         if not isinstance(message, Gone | Bye | Pong):
             self._send(Bye(session=message.session, reason="this client holds no such session"))
 
@@ -335,18 +331,17 @@ class ClientSession:
         return Ended(cause)
 
     def _complain(self, text: str, now: float) -> None:
-        self.malformed += 1
-        if self._warned_at is None or now - self._warned_at >= _SECONDS_BETWEEN_WARNINGS:
-            self._warned_at = now
-            _log.warning(
-                "%s dropped a message (%d so far): %s",
-                self._name, self.malformed, in_one_line(text),
-            )  # fmt: skip
+        self.num_malformed += 1
+        self._log.warn(
+            "malformed",
+            in_one_line(f"dropped a message ({self.num_malformed} so far): {text}"),
+            now,
+        )
 
-    # What the env did
+    # Answers
 
     def finish(self, number: int, ret: EnvRet | MultiAgentEnvRet, busy_ns: int = 0) -> None:
-        """Answer request `number` with `ret`; see `answer`."""
+        """Answer request `number` with what `reset` or `step` of a `BaseEnv` returned."""
         outcome = Outcome(ret.observation, ret.last_reward, ret.last_terminated, ret.last_truncated)
         # The contract gives this field its name.
         extra = ret._extra  # pyright: ignore[reportPrivateUsage]
@@ -362,16 +357,18 @@ class ClientSession:
         busy_ns: int,
         sent_ns: int,
     ) -> None:
-        """Answer request `number` with what the env took `busy_ns` to make, until `sent_ns`.
+        """Answer request `number` with the parts of a result.
 
-        What of `info` and `extra` can't travel is left out; one warning names each such key.
+        The env produced `outcome` in `busy_ns`, at `sent_ns` (since the epoch).
+
+        Values of `info` and `extra` that cannot be sent are left out; one warning names each key.
 
         Raises:
             Misfit: the outcome doesn't fit the announced spaces; nothing was sent.
         """
         if self._session is None:
             return
-        result = Result(
+        result = ClientResult(
             session=self._session, number=number, busy_ns=busy_ns, sent_ns=sent_ns,
             info=info, extra=extra,
         )  # fmt: skip
@@ -380,7 +377,7 @@ class ClientSession:
         result.reward, result.terminated, result.truncated = header[1:]
         self._answer(number, self._written(result, packed.frames))
 
-    def _written(self, result: Result, frames: list[bytes]) -> list[bytes]:
+    def _written(self, result: ClientResult, frames: list[bytes]) -> list[bytes]:
         try:
             return self._writer.write(result, [*frames])
         except Untransferable:
@@ -395,21 +392,21 @@ class ClientSession:
             parts = self._writer.write(result, [*frames])
         if new := sorted({*lost} - self._lost_keys):
             self._lost_keys.update(new)
-            _log.warning(
-                "%s: of the env's info, %s can't travel and is left out",
+            LOG.warning(
+                "%s: %s of the env's info can't be sent and is left out",
                 self._name, ", ".join(new),
             )  # fmt: skip
         return parts
 
     def fail(self, number: int, exception_type: str, text: str, traceback: str) -> None:
-        """Answer request `number` with the exception that it raised."""
+        """Answer request `number` with the exception that the env raised."""
         if self._session is not None:
             failure = Failure(
                 session=self._session,
                 number=number,
-                exception_type=_sayable(exception_type),
-                text=_sayable(text),
-                traceback=_sayable(traceback),
+                exception_type=_encodable(exception_type),
+                text=_encodable(text),
+                traceback=_encodable(traceback),
             )
             self._answer(number, self._writer.write(failure))
 
@@ -418,7 +415,7 @@ class ClientSession:
         self.outbox.append(parts)
 
     def leave(self, reason: str) -> None:
-        """Say goodbye, if there is anyone to say it to."""
+        """Send a goodbye if there is a session."""
         if self._session is not None:
             self._send(Bye(session=self._session, reason=reason))
         self._session = self._ask_at = None
@@ -428,8 +425,8 @@ class ClientSession:
         self.outbox.append(self._writer.write(message))
 
 
-def _sayable(text: str) -> str:
-    """`text` without what UTF-8 can't say, and no longer than anyone will read."""
+def _encodable(text: str) -> str:
+    """Return `text` without characters that UTF-8 cannot encode, cut to a readable length."""
     if len(text) > 2 * _MAX_TEXT:
         text = f"{text[:_MAX_TEXT]}\n…\n{text[-_MAX_TEXT:]}"
     return text.encode(errors="replace").decode()

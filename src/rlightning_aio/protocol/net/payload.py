@@ -1,9 +1,9 @@
 """Observations, actions, rewards and flags as raw array frames, by their spaces.
 
-Rule: both ends derive the same order of frames from the same announced spaces, so a
-frame carries bytes alone; a frame of another size is refused before anything is made of
-it, and a value of another shape before anything is sent.
-Absent on purpose: Text in frames (strings travel in the header), and messages (`wire`).
+Rule: both ends derive the same order of frames from the announced spaces, so a frame has no
+description. A frame of another size is refused before it is used, and a value of another shape
+before anything is sent. Deliberately left out: Text in frames (strings travel in the header), and
+messages (`wire`).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ MAX_HEAD = 1 << 20
 
 
 class Packed(NamedTuple):
-    """What values consist of on the wire: frames, and strings that travel in the header."""
+    """Encoded values: frames, and strings that travel in the header."""
 
     frames: list[bytes]
     texts: list[str]
@@ -42,14 +42,14 @@ class _Arriving(NamedTuple):
 
 
 class SpaceLayout:
-    """How the values of one space travel: one frame for each array, in the space's order.
+    """The encoding of one space's values: one frame for each array, in the space's order.
 
     Args:
         space: made of Box, Discrete, MultiBinary, MultiDiscrete, Dict, Tuple and Text.
         what: what messages call a value, such as ``"observation"``.
 
     Attributes:
-        num_frames, num_texts: what one value consists of.
+        num_frames, num_texts: of one value.
         num_bytes: of all its frames.
     """
 
@@ -69,10 +69,10 @@ class SpaceLayout:
         self._node.pack(value, packed)
 
     def unpack(self, frames: Sequence[Part], texts: Sequence[str]) -> Any:
-        """The value that `frames` begins with; its arrays are read-only views of them.
+        """Return the value at the start of `frames`; its arrays are read-only views of them.
 
         Raises:
-            WireError: frames are missing or of another size, or a text doesn't belong.
+            WireError: frames are missing or have another size, or a text is not in its space.
         """
         if len(frames) < self.num_frames or len(texts) != self.num_texts:
             raise WireError(
@@ -151,7 +151,7 @@ class _Text(_Node):
 
 
 class _Parts(_Node):
-    """What Dict and Tuple share: values one after the other."""
+    """The common part of Dict and Tuple: values one after the other."""
 
     def __init__(self, nodes: dict[Any, _Node], what: str) -> None:
         self._nodes = nodes
@@ -216,7 +216,7 @@ class Outcome(NamedTuple):
 
 
 class ResultLayout:
-    """How results travel: an observation, then rewards and flags.
+    """The encoding of results: an observation, then rewards and flags.
 
     A single env's reward and flags are numbers in the header. Those of several
     sub-environments or agents are three frames, float64, bool and bool, of shape `head`.
@@ -240,7 +240,7 @@ class ResultLayout:
             raise WireError(f"{prod(self.head)} rewards in one result; {MAX_HEAD} are allowed")
 
     def pack(self, outcome: Outcome, packed: Packed) -> Outcome:
-        """Append `outcome` to `packed`; returns what belongs in the header.
+        """Append `outcome` to `packed`; return the part that belongs in the header.
 
         Raises:
             Misfit: it doesn't fit the layout.
@@ -266,7 +266,7 @@ class ResultLayout:
     def unpack(
         self, frames: Sequence[Part], texts: Sequence[str], header: tuple[Any, Any, Any]
     ) -> Outcome:
-        """The outcome that `frames` begins with; `header` is what `pack` gave for it.
+        """Return the outcome at the start of `frames`; `header` is the part that `pack` returned.
 
         Raises:
             WireError: it doesn't fit the layout.
@@ -286,7 +286,7 @@ class ResultLayout:
         return dict(zip(self._agents, column, strict=True)) if self._agents else column
 
     def cut_short(self, observation: Any) -> Outcome:
-        """An outcome that only says: truncated at `observation`."""
+        """Return an outcome that is truncated at `observation`."""
         if not self.head:
             return Outcome(observation, 0.0, False, True)
         reward, flags = np.zeros(self.head), np.zeros(self.head, bool)

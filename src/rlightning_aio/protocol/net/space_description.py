@@ -1,9 +1,8 @@
-"""Gymnasium spaces as plain data, both ways: what a client announces of its env.
+"""Gymnasium spaces as plain data, in both directions: a client announces its spaces this way.
 
-Rule: a description is made of dicts, lists, strings, numbers and booleans alone, so that
-JSON or msgpack can carry it and any language can write one; a space is built from it only
-after its size is known to be harmless.
-Absent on purpose: Sequence, Graph, OneOf and spaces of one's own, which have no fixed
+Rule: a description contains only dicts, lists, strings, numbers and booleans, so JSON and msgpack
+can carry it and any language can write one. A space is built from it only after its size has been
+checked. Deliberately left out: Sequence, Graph, OneOf and user-defined spaces, which have no fixed
 form on the wire.
 """
 
@@ -37,18 +36,18 @@ Description = dict[str, Any]
 
 
 class UnsupportedSpace(ValueError):
-    """A space that an env client can't have; the message names the place in the space."""
+    """An env client can't have such a space; the message has the position in the space."""
 
 
 def describe(space: gym.Space[Any] | None, what: str) -> Description:
-    """The description of `space`.
+    """Return the description of `space`.
 
     Args:
-        space: of an env, as it reports it.
-        what: what the message calls it.
+        space: of an env.
+        what: name of the space in messages.
 
     Raises:
-        UnsupportedSpace: it, or a space within, is none of those that can travel.
+        UnsupportedSpace: it is a space without a form on the wire, or contains one.
     """
     if is_dict(space):
         return _describe_dict(space, what)
@@ -117,37 +116,37 @@ def _dtype_name(space: gym.Space[Any], what: str) -> str:
 
 
 def _bounds(array: NDArray[Any]) -> Any:
-    """`array` as nested lists, without the leading axes along which it is constant."""
+    """Return `array` as nested lists, without leading axes along which it is constant."""
     if not array.size:
         return 0
-    # An axis along which it is a view of one value costs nothing to look at.
+    # An axis with stride 0 repeats one value, so one element of it is enough.
     array = array[tuple(slice(0, 1 if stride == 0 else None) for stride in array.strides)]
     if (array == array.flat[0]).all():
-        return _number_said(array.flat[0].item())
+        return _plain_number(array.flat[0].item())
     while array.ndim > 1 and (array == array[:1]).all():
         array = array[0]
-    return _said(array.tolist())
+    return _plain(array.tolist())
 
 
-def _said(value: Any) -> Any:
+def _plain(value: Any) -> Any:
     if isinstance(value, list):
-        return [_said(inner) for inner in cast("list[Any]", value)]
-    return _number_said(value)
+        return [_plain(inner) for inner in cast("list[Any]", value)]
+    return _plain_number(value)
 
 
-def _number_said(value: float) -> float | str:
+def _plain_number(value: float) -> float | str:
     # JSON has no infinities.
     return str(value) if isinstance(value, float) and math.isinf(value) else value
 
 
 def space_from(description: Any) -> gym.Space[Any]:
-    """The space that `description` describes.
+    """Return the space that `description` describes.
 
     Raises:
-        WireError: it describes none, or one whose values exceed `MAX_FRAME_BYTES`.
+        WireError: it is invalid, or values of the space exceed `MAX_FRAME_BYTES`.
     """
     try:
-        # What Gymnasium warns of, and what the trainer does about warnings, is not at issue.
+        # Gymnasium's warnings do not matter here, even if the trainer turns them into errors.
         with (
             np.errstate(over="raise", invalid="raise", under="ignore", divide="ignore"),
             warnings.catch_warnings(),
@@ -156,15 +155,15 @@ def space_from(description: Any) -> gym.Space[Any]:
             return _Builder().build(description, _MAX_DEPTH)
     except WireError:
         raise
-    # Gymnasium checks its arguments with assertions and with errors of NumPy's.
+    # Gymnasium checks its arguments with assertions and by NumPy's errors.
     except (AssertionError, ArithmeticError, LookupError, TypeError, ValueError) as error:
         raise WireError(f"a space description is not a valid space: {error}") from None
 
 
 class _Builder:
-    """Builds one space out of a description that nobody vouches for.
+    """Builds one space from an untrusted description.
 
-    Invariant: what a space takes in memory is subtracted before it is built.
+    Invariant: the memory of a space is subtracted from the limit before the space is built.
     """
 
     def __init__(self) -> None:
@@ -199,7 +198,7 @@ class _Builder:
         dtype = _dtype(fields)
         shape = self._shape(fields["shape"], dtype)
         low, high = (_bound_array(fields[bound], shape, dtype) for bound in ("low", "high"))
-        return _SaidBox(low, high, shape, dtype)
+        return _CompactBox(low, high, shape, dtype)
 
     def _discrete(self, fields: Description, depth: int) -> gym.Space[Any]:
         del depth
@@ -278,11 +277,11 @@ def _int(value: Any) -> int:
     return value
 
 
-class _SaidBox(spaces.Box[Any]):
-    """A Box whose bounds take no more memory than the numbers that were said of them.
+class _CompactBox(spaces.Box[Any]):
+    """A Box whose bounds take only the memory of the numbers in its description.
 
-    What a peer announces in a few bytes would otherwise cost as many times its size as its
-    bounds have axes of one value: they are read-only views.
+    Its bounds are read-only views. Otherwise a description of a few bytes could announce bounds
+    that take gigabytes.
 
     Args:
         low, high: arrays that broadcast to `shape`.
@@ -307,7 +306,7 @@ class _SaidBox(spaces.Box[Any]):
 
 def _bound_array(value: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
     bound = np.array(_numbers(value, len(shape)), dtype.type)
-    np.broadcast_to(bound, shape)  # Raises if it can't be.
+    np.broadcast_to(bound, shape)  # Raises if the shapes don't fit.
     return bound
 
 

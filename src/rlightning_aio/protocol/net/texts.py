@@ -1,8 +1,7 @@
-"""Texts of the other end as people may be shown them: in logs, errors and terminals.
+"""Texts from the network in a form that is safe to show in logs, errors and terminals.
 
-Rule: what a peer says reaches nobody's terminal as it came. Characters that can't be printed
-(escapes, and what reorders a line) stand there as Python writes them, and what is too long
-loses its middle.
+Rule: no text of a peer reaches a terminal unchanged. Characters that can't be printed (escapes, and
+those that reorder a line) become Python's escapes, and a text that is too long loses its middle.
 """
 
 from __future__ import annotations
@@ -16,12 +15,12 @@ _LINES: Final = 100_000
 
 
 def in_one_line(text: str) -> str:
-    """`text` without control characters and line ends, some 1,000 characters at most."""
+    """Return `text` without control characters and line ends, at most about 1,000 characters."""
     return _printable(text, "", _ONE_LINE, " … ")
 
 
 def in_lines(text: str) -> str:
-    """The same for a traceback: its lines stay, and 100,000 characters."""
+    """Return a traceback without control characters, with its lines, at most 100,000 characters."""
     return _printable(text, "\n\t", _LINES, "\n…\n")
 
 
@@ -33,8 +32,8 @@ def _printable(text: str, kept: str, most: int, gap: str) -> str:
     text = _cut(text, most, gap)
     if text.isprintable():
         return text
-    shown = (
+    printable = (
         char if char.isprintable() or char in kept else char.encode("unicode_escape").decode()
         for char in text
     )
-    return _cut("".join(shown), most, gap)
+    return _cut("".join(printable), most, gap)

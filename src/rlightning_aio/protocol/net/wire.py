@@ -1,14 +1,14 @@
 """The messages between a trainer and the env clients that dial in, as bytes.
 
 Rule: a message is one msgpack header and any number of raw array frames; what arrives
-is checked for size, type and shape before it is believed, and whatever is wrong with it
-raises `WireError` and nothing else. docs/wire-format.md is this file for people.
-Absent on purpose: I/O, pickle, and every notion of who said what before (see
-`server_session` and `client_session`).
+is checked for size, type and shape before it is used, and any fault raises `WireError` and nothing
+else. docs/wire-format.md describes the format for people. Deliberately left out: I/O, pickle, and
+everything about earlier messages (see `server_session` and `client_session`).
 """
 
 from __future__ import annotations
 
+import secrets
 from math import prod
 from typing import TYPE_CHECKING, Annotated, Any, Final, Generic, TypeAlias, TypeVar, cast
 
@@ -33,22 +33,23 @@ __all__ = [
     "MAX_NAME_LENGTH",
     "MAX_NESTING",
     "MAX_PARTS",
+    "PINGS_PER_HEARTBEAT",
     "STALE_REQUEST",
     "VERSION",
     "ArrayForm",
     "Bye",
+    "ClientHello",
+    "ClientResult",
     "Failure",
     "FromClient",
     "FromServer",
     "Gone",
-    "Hello",
     "Part",
     "Ping",
     "Pong",
     "Reader",
     "Refusal",
     "Reset",
-    "Result",
     "Step",
     "Untransferable",
     "Welcome",
@@ -56,32 +57,37 @@ __all__ = [
     "Writer",
     "nests_too_deep",
     "portable",
+    "random_token",
 ]
 
 VERSION: Final = 1
 MAX_HEADER_BYTES: Final = 4 << 20
 MAX_HELLO_BYTES: Final = 256 << 10
-"""The header of a hello: to understand it costs some 50 ms at most."""
+"""Size of a hello's header; reading one takes 50 ms at most."""
 MAX_FRAME_BYTES: Final = 64 << 20
 MAX_BYTES_IN_ALL: Final = 1 << 30
-"""What all clients of a server may need for one result and one action each."""
+"""Memory for one result and one action of each client of a server, all clients together."""
 MAX_PARTS: Final = 1024
 """Header and frames of one message."""
 MAX_NAME_LENGTH: Final = 128
 MAX_NESTING: Final = 32
-"""Of maps and arrays in a value: to pass one on takes several calls within calls for each level."""
+"""Levels of maps and arrays in a value. Each level costs several nested calls."""
+PINGS_PER_HEARTBEAT: Final = 8
+"""Pings to a silent peer within the heartbeat limit. A broken connection is given up after the time
+of two pings.
+"""
 STALE_REQUEST: Final = "StaleRequest"
-"""What a client calls a request that is older than one it has executed."""
+"""Exception type of the answer to a request that is older than the last one."""
 
 DTYPES: Final[Mapping[str, np.dtype[Any]]] = {
-    # By its name: made otherwise it equals that of other arrays, and is not the same.
+    # From the name: a dtype that is made otherwise equals that of arrays, and is not identical.
     name: np.dtype(np.dtype(name).newbyteorder("<").str)
     for name in (
         "bool", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64",
         "float16", "float32", "float64",
     )
 }  # fmt: skip
-"""What arrays may consist of; little-endian on the wire."""
+"""Dtypes of arrays; little-endian on the wire."""
 
 _ARRAY_EXTENSION: Final = 1
 _MAX_AXES: Final = 32
@@ -92,14 +98,19 @@ Name = Annotated[str, Meta(min_length=1, max_length=MAX_NAME_LENGTH)]
 
 
 class WireError(ValueError):
-    """What arrived is not a message that this format allows."""
+    """The format does not allow a message that arrived."""
 
 
 class Untransferable(ValueError):
-    """What was to be sent can't be said in this format."""
+    """The format has no form for a value that should be sent."""
 
 
-class Hello(Struct, tag="hello", tag_field="type", kw_only=True):
+def random_token() -> int:
+    """Return a random number that cannot be guessed."""
+    return secrets.randbits(63)
+
+
+class ClientHello(Struct, tag="hello", tag_field="type", kw_only=True):
     """Client: I own an env, let me in. Answered by `Welcome` or `Refusal` of the same nonce."""
 
     version: Count
@@ -111,11 +122,11 @@ class Hello(Struct, tag="hello", tag_field="type", kw_only=True):
     agents: Annotated[list[Name], Meta(max_length=256)] = []
     max_episode_steps: Annotated[int, Meta(ge=1, le=2**63 - 1)] | None = None
     autoreset: Autoreset = "disabled"
-    """What sub-environments do after an episode's end; see `EnvMeta`."""
+    """Behaviour of sub-environments after an episode's end; see `EnvMeta`."""
     free_actions: bool = False
-    """Actions need not fit the action space: the client transforms them."""
+    """Actions may not fit the action space: the client transforms them."""
     reads_extras: bool = False
-    """Something at the client reads what the policy attaches beside the action."""
+    """The client reads columns that the policy attaches to the action."""
     previous: Count = 0
     """The session that this client held before, which ends now; 0 for none."""
 
@@ -130,7 +141,7 @@ class Welcome(Struct, tag="welcome", tag_field="type", kw_only=True):
 
 
 class Refusal(Struct, tag="refusal", tag_field="type", kw_only=True):
-    """Server: you are not in. ``retry`` tells whether asking again later may help."""
+    """Server: you are not in. ``retry`` is true if the same hello may succeed later."""
 
     nonce: Count
     code: str
@@ -157,15 +168,15 @@ class Reset(Struct, tag="reset", tag_field="type", kw_only=True, omit_defaults=T
     options: dict[str, Any] | None = None
 
 
-class Result(Struct, tag="result", tag_field="type", kw_only=True, omit_defaults=True):
-    """Client: what request ``number`` gave. The observation is in frames."""
+class ClientResult(Struct, tag="result", tag_field="type", kw_only=True, omit_defaults=True):
+    """Client: the result of request ``number``. The observation is in frames."""
 
     session: Count
     number: Count
     busy_ns: Count = 0
-    """How long the env took."""
+    """Duration of the env's call."""
     sent_ns: Count = 0
-    """When the env produced it, in ns since the epoch by the client's clock; 0: unknown."""
+    """Time of the result, in ns since the epoch by the client's clock; 0: unknown."""
     reward: float | None = None
     terminated: bool | None = None
     truncated: bool | None = None
@@ -185,7 +196,7 @@ class Failure(Struct, tag="error", tag_field="type", kw_only=True):
 
 
 class Ping(Struct, tag="ping", tag_field="type", kw_only=True):
-    """Either side: are you there? See docs/wire-format.md for what ``number`` says."""
+    """Either side: are you there? See docs/wire-format.md for the meaning of ``number``."""
 
     session: Count
     number: Count = 0
@@ -212,22 +223,22 @@ class Bye(Struct, tag="bye", tag_field="type", kw_only=True):
     reason: str = ""
 
 
-FromClient: TypeAlias = Hello | Result | Failure | Ping | Pong | Bye
+FromClient: TypeAlias = ClientHello | ClientResult | Failure | Ping | Pong | Bye
 FromServer: TypeAlias = Welcome | Refusal | Step | Reset | Ping | Pong | Gone | Bye
 Message = TypeVar("Message")
 
 _OPEN_FIELDS: Final[Mapping[type[Struct], tuple[str, ...]]] = {
     Step: ("extras",),
     Reset: ("options",),
-    Result: ("info", "extra"),
+    ClientResult: ("info", "extra"),
 }
-"""What of a message an env or a policy has made."""
+"""Fields whose contents an env or a policy has made."""
 
 _FLAT: Final = frozenset({type(None), bool, int, float, str, bytes})
 
 
 def nests_too_deep(value: Any, levels: int = MAX_NESTING) -> bool:
-    """Whether more than `levels` maps and arrays lie in one another in `value`."""
+    """Return True if `value` has more than `levels` levels of maps and arrays."""
     if isinstance(value, dict):
         parts = cast("dict[Any, Any]", value).values()
     elif isinstance(value, list | tuple):
@@ -240,7 +251,7 @@ def nests_too_deep(value: Any, levels: int = MAX_NESTING) -> bool:
 
 
 class ArrayForm:
-    """What a frame must be to hold an array of one dtype and shape."""
+    """The form of a frame that holds an array of one dtype and shape."""
 
     def __init__(self, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
         self.dtype = dtype
@@ -261,7 +272,7 @@ class ArrayForm:
         if not self.size:
             return np.zeros(self.shape, self.dtype)
         array = np.frombuffer(part, self.dtype).reshape(self.shape)
-        # Any other byte would make a bool that equals neither True nor False.
+        # A bool with any other byte equals neither True nor False.
         if self._is_bool and array.view(np.uint8).max() > 1:
             raise WireError("a frame of bools holds bytes other than 0 and 1")
         return array
@@ -278,10 +289,10 @@ class Reader(Generic[Message]):
         self._named: set[int] = set()
 
     def read(self, parts: Sequence[Part]) -> tuple[Message, Sequence[Part]]:
-        """The message that `parts` is, and its frames.
+        """Return the message in `parts`, and its frames.
 
         Raises:
-            WireError: it isn't one.
+            WireError: they are no valid message.
         """
         if not 1 <= len(parts) <= MAX_PARTS:
             raise WireError(f"a message has {len(parts)} parts; 1 to {MAX_PARTS} are allowed")
@@ -303,7 +314,7 @@ class Reader(Generic[Message]):
             raise WireError(f"a header uses the unknown extension {code}")
         dtype_name, shape, position = self._reference.decode(data)
         dtype = DTYPES.get(dtype_name)
-        # Each frame may be named once, or a small message could unfold to any size.
+        # Each frame may be named once; otherwise a small message could expand to any size.
         is_there = position < len(self._frames) and position not in self._named
         if dtype is None or not is_there or len(shape) > _MAX_AXES:
             raise WireError(f"a header names an array {dtype_name!r}{shape} that is not there")
@@ -319,7 +330,7 @@ class Writer:
         self._frames: list[bytes] = []
 
     def write(self, message: Struct, frames: list[bytes] | None = None) -> list[bytes]:
-        """The parts of `message`: its header, then `frames`, then arrays within the header.
+        """Return the parts of `message`: header, `frames`, and arrays within the header.
 
         Raises:
             Untransferable: a value has no form in this format, is too large or nested too deep.
@@ -361,9 +372,9 @@ class Writer:
 
 
 def _check_open(name: str, values: dict[Any, Any] | None) -> None:
-    """Raises `Untransferable` if the reader of a field would refuse `values`."""
+    """Raise `Untransferable` if the reader of a field would refuse `values`."""
     for key in values or ():
-        # Encoded it could be; but it would make the whole message malformed.
+        # It could be encoded, but the reader would refuse the whole message.
         if not isinstance(key, str):
             raise Untransferable(f"{name} has the key {key!r}; keys must be strings")
     if nests_too_deep(values):
@@ -371,13 +382,13 @@ def _check_open(name: str, values: dict[Any, Any] | None) -> None:
 
 
 def portable(values: Mapping[str, Any], lost: list[str]) -> dict[str, Any]:
-    """The part of `values` that can travel; the paths of what can't are appended to `lost`."""
+    """Return the values that can be sent; append the paths of the others to `lost`."""
     kept = _portable(dict(values), "", lost, Writer(), depth=0)
     return cast("dict[str, Any]", kept)
 
 
 class _Lost:
-    """Stands for a value that can't travel."""
+    """Stands for a value that cannot be sent."""
 
 
 class _Value(Struct):
@@ -387,7 +398,7 @@ class _Value(Struct):
 def _portable(value: Any, path: str, lost: list[str], writer: Writer, depth: int) -> Any:
     if isinstance(value, dict) and depth < MAX_NESTING:
         kept: dict[Any, Any] = {}
-        # Readers want strings at the top, and take numbers below.
+        # Readers require strings at the top level, and accept numbers below.
         kinds = str | int if depth else str
         for key, inner in cast("dict[Any, Any]", value).items():
             place = f"{path}.{key}" if path else str(key)

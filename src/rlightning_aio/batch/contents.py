@@ -1,0 +1,132 @@
+"""Contents of a batch that only this library reads: its parts, its slots, the requests it answers.
+
+These functions use private attributes of `BatchedData`. They are no methods, to keep them from
+users.
+"""
+
+# pyright: reportPrivateUsage=false
+
+from __future__ import annotations
+
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rlightning_aio.batch.infos import joined_infos, sub_env_infos_of_rows
+from rlightning_aio.batch.parts import (
+    column_of_parts,
+    infos_of_parts,
+    reported_infos_of_parts,
+    rows_in_order,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from rlightning_aio.batch.columns import ResultColumns
+    from rlightning_aio.batch.data import BatchedData, Origin
+    from rlightning_aio.batch.names import EnvNames
+    from rlightning_aio.batch.sent import Sources
+
+__all__ = [
+    "columns_of_responses",
+    "ended_episodes",
+    "has_ended",
+    "names_of",
+    "origin_of",
+    "parts_of",
+    "plain_columns",
+    "reported_info_list",
+    "reported_infos",
+    "reported_sub_env_infos",
+    "slots_of",
+    "sources_of",
+]
+
+
+def reported_infos(batch: BatchedData) -> dict[str, Any]:
+    """`BatchedData.infos` of a batch of results, without the sums of episodes."""
+    return infos_of_parts(batch._parts, episodes=False)
+
+
+def reported_sub_env_infos(batch: BatchedData, num_envs: int) -> dict[str, Any]:
+    """`reported_infos` over all sub-environments, of envs with `num_envs` each.
+
+    The batch must be in the order of the group.
+    """
+    parts = batch._parts
+    if len(parts) == 1:
+        return sub_env_infos_of_rows(parts[0], num_envs)
+    return joined_infos(reported_info_list(batch), num_envs)
+
+
+def reported_info_list(batch: BatchedData) -> list[dict[str, Any]]:
+    """`BatchedData.info` of a batch of results, without the sums of episodes."""
+    return reported_infos_of_parts(batch._parts)
+
+
+def parts_of(batch: BatchedData) -> Sequence[ResultColumns]:
+    """The columns of a batch of results; empty for any other batch."""
+    return batch._parts
+
+
+def plain_columns(batch: BatchedData) -> ResultColumns | None:
+    """The columns of a batch whose properties of the same names equal them; None for others."""
+    if len(batch._parts) != 1:
+        return None
+    part = batch._parts[0]
+    unlike = part.positions is not None or part.whole_results or part.agents
+    return None if unlike or part.observation is None or not len(part.slots) else part
+
+
+def has_ended(batch: BatchedData) -> NDArray[np.bool_]:
+    """Mask of rows whose episode has ended and was not reset since; shaped like `is_reset`."""
+    if not batch._parts:
+        return np.zeros(0, np.bool_)
+    if len(batch._parts) == 1:
+        return batch._parts[0].has_ended
+    return column_of_parts(batch._parts, attrgetter("has_ended"))
+
+
+def ended_episodes(
+    batch: BatchedData, rows: Sequence[int]
+) -> list[tuple[dict[str, Any], dict[str, Any]]]:
+    """Sums of the episodes that ended in `rows`, and the infos that the envs reported there.
+
+    The sums are ``r`` and ``l``: numbers, or arrays ``[num_envs]``. Rewards of agents are added.
+    They are empty where the group counted no episode.
+    """
+    places = rows_in_order(batch._parts)
+    chosen = [places[row] for row in rows]
+    return [(part.episode_of_all(row), part.reported_info_of(row)) for part, row in chosen]
+
+
+def slots_of(batch: BatchedData, group: object) -> NDArray[np.intp] | None:
+    """Slots of the envs, each once, if the batch was made by `group`."""
+    origin = batch._origin
+    if origin is None or origin.group is not group or origin.repeats:
+        return None
+    return origin.slots
+
+
+def origin_of(batch: BatchedData) -> Origin | None:
+    """Group and slots of a batch; None for plain values."""
+    return batch._origin
+
+
+def sources_of(batch: BatchedData) -> Sources | None:
+    """Requests that the results of `batch` answer; None for any other batch."""
+    return batch._sources
+
+
+def names_of(batch: BatchedData) -> EnvNames | None:
+    """Names of the envs of the group when it returned the batch; None for plain values."""
+    return None if batch._origin is None else batch._origin.names
+
+
+def columns_of_responses(batch: BatchedData) -> Mapping[str, Any] | None:
+    """Columns of a batch made by `BatchedData.respond`; None for any other batch."""
+    return batch._columns

@@ -1,0 +1,149 @@
+"""Columns of a whole batch of results, made from its parts.
+
+A part (`ResultColumns`) holds the rows of envs with the same layout. If there are several, each
+knows the positions of its rows in the batch; a single part has the rows in order.
+"""
+
+from __future__ import annotations
+
+from itertools import repeat
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from rlightning_aio.batch.infos import info_list_of_rows, infos_of_rows, vector_infos
+from rlightning_aio.batch.stacking import differing, stacked_values
+from rlightning_aio.protocol.columns import is_dict, is_tuple, leaves
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+
+    import gymnasium as gym
+    from numpy.typing import NDArray
+
+    from rlightning_aio.batch.columns import ResultColumns
+
+__all__ = [
+    "column_of_parts",
+    "infos_of_parts",
+    "observations_of_parts",
+    "reported_infos_of_parts",
+    "rows_in_order",
+    "shapes",
+    "taken_parts",
+]
+
+
+def rows_in_order(parts: Sequence[ResultColumns]) -> list[tuple[ResultColumns, int]]:
+    """Part and row for each position in the batch."""
+    if len(parts) == 1:
+        return list(zip(repeat(parts[0]), range(len(parts[0].slots)), strict=False))
+    places: list[Any] = [None] * _size(parts)
+    for part in parts:
+        for row, position in enumerate(cast("NDArray[np.intp]", part.positions).tolist()):
+            places[position] = (part, row)
+    return places
+
+
+def _size(parts: Sequence[ResultColumns]) -> int:
+    return sum(len(part.slots) for part in parts)
+
+
+def column_of_parts(
+    parts: Sequence[ResultColumns], column: Callable[[ResultColumns], Any]
+) -> NDArray[Any]:
+    """Join `column` of each part, in the order of the batch.
+
+    Raises:
+        ValueError: the columns have different shapes.
+    """
+    if parts[0].positions is None:
+        return column(parts[0])
+    found = [(part, column(part)) for part in parts]
+    if len({array.shape[1:] for _, array in found}) > 1:
+        raise differing()
+    first = found[0][1]
+    whole = np.empty((_size(parts), *first.shape[1:]), first.dtype)
+    for part, array in found:
+        whole[part.positions] = array
+    return whole
+
+
+def observations_of_parts(parts: Sequence[ResultColumns]) -> Any:
+    """Stack the observations of all rows, in the order of the batch; for those that have no column.
+
+    Raises:
+        ValueError: the envs have different observation spaces.
+    """
+    if len(parts) > 1 or parts[0].whole_results:
+        return stacked_values([part.observation_of(row) for part, row in rows_in_order(parts)])
+    part = parts[0]
+    values = [part.observation_of(row) for row in range(len(part))]
+    return _stacked_in_space(part.observation_space, values)
+
+
+def _stacked_in_space(space: gym.Space[Any] | None, values: list[Any]) -> Any:
+    """Stack values of `space` to columns; values without fixed size stay lists."""
+    if space is not None and is_dict(space):
+        parts = space.spaces.items()
+        return {key: _stacked_in_space(own, [value[key] for value in values]) for key, own in parts}
+    if space is not None and is_tuple(space):
+        return tuple(
+            _stacked_in_space(own, [value[k] for value in values])
+            for k, own in enumerate(space.spaces)
+        )
+    return values if space is not None and leaves(space) is None else stacked_values(values)
+
+
+def infos_of_parts(parts: Sequence[ResultColumns], *, episodes: bool) -> dict[str, Any]:
+    """Infos of all rows as columns, with the sums of episodes if `episodes` is True."""
+    if len(parts) == 1 and parts[0].positions is None:
+        return infos_of_rows(parts[0], episodes=episodes)
+    if episodes:
+        return vector_infos([part.info_of(row) for part, row in rows_in_order(parts)])
+    return vector_infos(reported_infos_of_parts(parts))
+
+
+def reported_infos_of_parts(parts: Sequence[ResultColumns]) -> list[dict[str, Any]]:
+    """One info for each row, as the env reported it."""
+    if len(parts) == 1 and parts[0].positions is None:
+        return info_list_of_rows(parts[0])
+    return [part.reported_info_of(row) for part, row in rows_in_order(parts)]
+
+
+def taken_parts(parts: Sequence[ResultColumns], chosen: Sequence[int]) -> list[ResultColumns]:
+    """Copy the rows at the positions `chosen`, as parts of a new batch in that order."""
+    rows_of: dict[int, list[int]] = {}
+    positions: dict[int, list[int]] = {}
+    places = rows_in_order(parts)
+    for position, k in enumerate(chosen):
+        part, row = places[k]
+        rows_of.setdefault(id(part), []).append(row)
+        positions.setdefault(id(part), []).append(position)
+    taken = [
+        part.subset(rows_of[id(part)], positions[id(part)]) for part in parts if id(part) in rows_of
+    ]
+    if len(taken) == 1:
+        taken[0].positions = None
+    return taken
+
+
+def shapes(responses: Mapping[str, Any], parts: Sequence[ResultColumns]) -> Iterator[str]:
+    """Describe columns of responses and parts of results: ``name: dtype[shape]``."""
+    for name, column in responses.items():
+        yield f"{name}: {_shape(column)}"
+    for part in parts:
+        observation = "…" if part.observation is None else _shape(part.observation)
+        yield f"observation: {observation}, reward: {_shape(part.reward)}"
+
+
+def _shape(tree: Any) -> str:
+    """Dtypes and shapes of the arrays of a column."""
+    if isinstance(tree, dict):
+        items = cast("dict[str, Any]", tree).items()
+        return f"{{{', '.join(f'{key}: {_shape(part)}' for key, part in items)}}}"
+    if isinstance(tree, tuple):
+        return f"({', '.join(map(_shape, cast('tuple[Any, ...]', tree)))})"
+    if hasattr(tree, "shape"):
+        return f"{str(tree.dtype).removeprefix('torch.')}{list(tree.shape)}"
+    return f"list[{len(tree)}]"

@@ -1,0 +1,186 @@
+"""The options of ``eval`` that make a queue of episodes."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+
+import typer
+
+from rlightning_aio.errors import ConfigError
+from rlightning_aio.evaluation import EpisodeSpec, EpisodeVideo
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rlightning_aio.config import EnvConfig
+
+__all__ = [
+    "EpisodesFile",
+    "MaxAttempts",
+    "QueueOptions",
+    "Seeds",
+    "Tasks",
+    "VideoEpisodes",
+    "VideoFailed",
+]
+
+EpisodesFile: TypeAlias = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="Play the episodes in this file, each once: JSON lines with task, seed, options, "
+        "entry.",
+    ),
+]
+Tasks: TypeAlias = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="TASK,…",
+        help="Play these tasks with each of --seeds, on any free env.",
+        show_default="those of the config",
+    ),
+]
+Seeds: TypeAlias = Annotated[
+    str | None,
+    typer.Option(metavar="FIRST:END|SEED,…", help="Play each task once with each of these seeds."),
+]
+MaxAttempts: TypeAlias = Annotated[
+    int,
+    typer.Option(
+        min=1, help="An episode of a queue has failed once it was lost with its worker this often."
+    ),
+]
+VideoFailed: TypeAlias = Annotated[
+    bool,
+    typer.Option("--video-failed", help="Of a queue, keep only films of episodes without success."),
+]
+VideoEpisodes: TypeAlias = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--video-episode",
+        metavar="TASK:SEED",
+        help="Of a queue, film this episode; may be repeated.",
+        show_default="all",
+    ),
+]
+
+
+@dataclass(frozen=True, slots=True)
+class QueueOptions:
+    """What the options ask for, as given."""
+
+    episodes_file: Path | None
+    tasks: Sequence[str] | None
+    seeds: str | None
+    max_attempts: int
+    video: Path | None
+    video_every: int | None
+    video_failed: bool
+    video_episodes: Sequence[str] | None
+
+    @property
+    def wanted(self) -> bool:
+        """True if the options make a queue.
+
+        Raises:
+            ConfigError: an option lacks another one.
+        """
+        if self.episodes_file is not None or self.seeds is not None:
+            return True
+        if self.tasks:
+            raise ConfigError("--tasks needs the seeds of their episodes: add --seeds 0:50")
+        if self.video_failed or self.video_episodes:
+            raise ConfigError(
+                "--video-failed and --video-episode choose episodes of a queue; add --seeds or "
+                "--episodes-file"
+            )
+        return False
+
+    def specs(self, configs: Sequence[EnvConfig]) -> list[EpisodeSpec]:
+        """Return the episodes in the order in which they begin.
+
+        Raises:
+            ConfigError: an option or the file is wrong.
+        """
+        if self.episodes_file is None:
+            seeds = _seeds(self.seeds or "")
+            names = [name for given in self.tasks or () for name in given.split(",") if name]
+            if names:
+                return [EpisodeSpec(name, seed) for name in names for seed in seeds]
+            return [
+                EpisodeSpec("", seed, entry=config.name) for config in configs for seed in seeds
+            ]
+        if self.tasks or self.seeds is not None:
+            raise ConfigError("--episodes-file names the episodes; leave --tasks and --seeds out")
+        return _in_file(self.episodes_file)
+
+    def films(self, specs: Sequence[EpisodeSpec]) -> EpisodeVideo | None:
+        """Return the episodes to film.
+
+        Raises:
+            ConfigError: an option lacks --video, or names no episode.
+        """
+        chosen = set(self.video_episodes or ())
+        if self.video is None:
+            if chosen or self.video_failed or self.video_every:
+                raise ConfigError(
+                    "--video-episode, --video-failed and --video-every choose what to film; add "
+                    "--video FOLDER for the files"
+                )
+            return None
+        for name in chosen - {_name(spec) for spec in specs}:
+            raise ConfigError(f"--video-episode {name}: is not in the queue; give TASK:SEED")
+        every = {_place(spec) for spec in specs[:: self.video_every or 1]}
+        return EpisodeVideo(
+            self.video,
+            lambda spec: (_place(spec) in every) and (not chosen or _name(spec) in chosen),
+            failed_only=self.video_failed,
+        )
+
+
+def _name(spec: EpisodeSpec) -> str:
+    return f"{spec.task}:{spec.seed}"
+
+
+def _place(spec: EpisodeSpec) -> Any:
+    """Return what identifies an episode before its entry is known."""
+    return spec.key[1:]
+
+
+def _seeds(text: str) -> list[int]:
+    first, colon, end = text.partition(":")
+    try:
+        seeds = list(range(int(first or 0), int(end))) if colon else list(map(int, text.split(",")))
+    except ValueError:
+        seeds = []
+    if not seeds or min(seeds) < 0:
+        raise ConfigError(f"--seeds {text!r}: should look like 0:50 or 1,2,5")
+    return seeds
+
+
+def _in_file(path: Path) -> list[EpisodeSpec]:
+    try:
+        lines = path.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"--episodes-file {path}: can't be read: {error}") from None
+    specs: list[EpisodeSpec] = []
+    for number, line in enumerate(lines, 1):
+        if not line.strip():
+            continue
+        try:
+            fields: dict[str, Any] = {"task": "", **json.loads(line)}
+            spec = EpisodeSpec(**fields)
+        except (ValueError, TypeError) as error:
+            raise ConfigError(
+                f"--episodes-file {path}, line {number}: {error}; a line should look like "
+                '{"task": "reach-v3", "seed": 0}, with options and entry if needed'
+            ) from None
+        if type(spec.seed) is not int or spec.seed < 0:
+            raise ConfigError(f"--episodes-file {path}, line {number}: seed should be an int >= 0")
+        specs.append(spec)
+    if not specs:
+        raise ConfigError(f"--episodes-file {path}: has no episodes")
+    return specs

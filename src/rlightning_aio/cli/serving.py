@@ -1,0 +1,66 @@
+"""``rlightning-aio serve``: the envs of a config as an OpenEnv server."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+import rlightning_aio
+from rlightning_aio.cli.options import Config, Overrides
+from rlightning_aio.cli.terminal import INTERRUPTED, counted, interruptible, out
+from rlightning_aio.config import check_installed, load_config
+from rlightning_aio.errors import ConfigError
+
+if TYPE_CHECKING:
+    from rlightning_aio.config import EnvConfig
+
+__all__ = ["serve"]
+
+_MAX_PORT: Final = 65535
+
+
+def serve(
+    config: Config,
+    overrides: Overrides = None,
+    *,
+    port: Annotated[int, typer.Option(min=0, max=_MAX_PORT, help="0 picks a free one.")] = 8000,
+    host: Annotated[str, typer.Option(help="Address to listen at.")] = "127.0.0.1",
+) -> None:
+    """Serve the envs of a config with one entry as sessions of an OpenEnv server.
+
+    OpenEnv's clients connect to it, as many at once as the entry has envs (num_workers).
+    It ends with Ctrl-C.
+
+    For example:
+
+        rlightning-aio serve configs/cartpole.yaml --port 8000
+    """
+    configs = load_config(config, overrides or ())
+    if len(configs) != 1 or configs[0].num_envs != 1 or configs[0].backend == "env_server":
+        raise ConfigError(
+            f"{config}: a server has the envs of one entry, without sub-environments and not an "
+            "env_server's; serve other entries at other ports"
+        )
+    check_installed(configs)
+    try:
+        with interruptible():
+            rlightning_aio.run(_serve(configs[0], host, port))
+    except KeyboardInterrupt:
+        raise typer.Exit(INTERRUPTED) from None
+
+
+async def _serve(config: EnvConfig, host: str, port: int) -> None:
+    # Not at the top: it needs an extra.
+    try:
+        from rlightning_aio.serving import OpenEnvServer  # noqa: PLC0415
+    except ImportError as error:
+        raise ConfigError(f"{error}: pip install 'rlightning-aio[openenv]'") from error
+    async with (
+        rlightning_aio.build_env_group(config) as group,
+        OpenEnvServer(group, config.name, host, port) as server,
+    ):
+        sessions = counted(len(group), "session")
+        out().print(f"{config.name}: {sessions} at {server.url}", soft_wrap=True, markup=False)
+        await asyncio.Event().wait()

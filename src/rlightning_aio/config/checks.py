@@ -1,0 +1,240 @@
+"""Checks that compare fields of entries, or look for what they name (modules, programs)."""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+import sys
+from dataclasses import dataclass
+from importlib.machinery import PathFinder
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from rlightning_aio.config.entry import CALLABLE, MADE_BY_GYMNASIUM, EnvConfig
+from rlightning_aio.config.problems import Problems
+from rlightning_aio.registry import ENVS, placement_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
+__all__ = ["Entry", "check_entry", "check_imports", "check_installed", "check_names"]
+
+
+@dataclass(slots=True)
+class Entry:
+    """One entry while it is checked.
+
+    Attributes:
+        place: its name in messages.
+        config: its fields. Those that are wrong have their defaults, so that later checks can
+            read the others.
+        faulty: the fields that are wrong.
+    """
+
+    place: str
+    config: EnvConfig
+    faulty: set[str]
+
+
+def check_installed(configs: Iterable[EnvConfig]) -> None:
+    """Look for the simulators of entries that run on this Python, importing none of them.
+
+    Raises:
+        ConfigError: one is missing; the message has the command that installs it.
+    """
+    problems = Problems("simulator not installed")
+    for index, config in enumerate(configs):
+        backend = ENVS.described(config.backend)
+        if backend is None or not runs_here(config) or ENVS.registered(config.backend):
+            continue
+        if backend.installed_version() is None:
+            problems.add(
+                f"envs.{index} ({config.name!r}), backend",
+                f"{backend.name!r} needs {backend.distribution}: {backend.install_command}",
+            )
+    problems.raise_any()
+
+
+def runs_here(config: EnvConfig) -> bool:
+    """Return True if the entry's workers see the modules that this process sees."""
+    return config.interpreter is None and placement_of(config.backend, config.placement).local
+
+
+def check_entry(entry: Entry, problems: Problems) -> None:
+    """Compare the fields of one entry with each other and with what its placement supports."""
+    for name, check in _CHECKS.items():
+        if {name, *_COMPARED_WITH.get(name, ())} & entry.faulty:
+            continue
+        if (text := check(entry.config)) is not None:
+            problems.add(f"{entry.place}, {name}", text)
+    for name, why in _refused(entry.config).items():
+        if name not in entry.faulty:
+            problems.add(f"{entry.place}, {name}", why)
+
+
+def _refused(config: EnvConfig) -> dict[str, str]:
+    """Return the reason for each field that has no meaning where the entry's envs live."""
+    refuses = placement_of(config.backend, config.placement).refuses
+    placed = f"placement {config.placement!r}"
+    where = f"backend {config.backend!r}" if "placement" in refuses else placed
+    return {
+        name: f"has no meaning with {where}: {why}"
+        for name, why in refuses.items()
+        if name in config.model_fields_set and not _is_neutral(config, name)
+    }
+
+
+def _is_neutral(config: EnvConfig, name: str) -> bool:
+    """Return True if a field is set to a default that asks for nothing: none, empty, off, or 1."""
+    default = EnvConfig.model_fields[name].get_default(call_default_factory=True, validated_data={})
+    return (not default or default == 1) and getattr(config, name) == default
+
+
+def _check_backend(config: EnvConfig) -> str | None:
+    # Imported modules register backends, and another Python has backends of its own.
+    if config.imports or not runs_here(config) or ENVS.knows(config.backend):
+        return None
+    return ENVS.unknown(config.backend)
+
+
+def _check_task(config: EnvConfig) -> str | None:
+    if config.make_env is not None and config.backend == CALLABLE:
+        return f"make_env makes the envs; leave {config.task!r} out" if config.task else None
+    if config.backend == CALLABLE and not all(config.task.partition(":")):
+        return f"should look like module:function (or give make_env), got {config.task!r}"
+    return None if config.task or config.backend == "env_server" else "is required"
+
+
+def _check_make_env(config: EnvConfig) -> str | None:
+    makers = config.make_env
+    if makers is None:
+        return None
+    if config.backend != CALLABLE:
+        return f"replaces backend {config.backend!r}; leave one of them out"
+    count = len(cast("tuple[Any, ...]", makers)) if isinstance(makers, tuple) else None
+    if count not in (None, config.num_workers):
+        return f"has {count} callables for num_workers: {config.num_workers}"
+    return None
+
+
+def _check_num_envs(config: EnvConfig) -> str | None:
+    backend = None if ENVS.registered(config.backend) else ENVS.described(config.backend)
+    if config.num_envs == 1 or backend is None or backend.vectorized:
+        return None
+    return f"backend {backend.name!r} makes single envs; use num_workers: {config.num_envs}"
+
+
+def _check_interpreter(config: EnvConfig) -> str | None:
+    path = config.interpreter
+    if path is None or shutil.which(path) is not None:
+        return None
+    if Path(path).is_dir():
+        return f"{path!r} is a directory; name the program in it, such as {path}/bin/python"
+    reason = "is not executable" if Path(path).exists() else "doesn't exist"
+    return f"{path!r} {reason}"
+
+
+def _check_min_results(config: EnvConfig) -> str | None:
+    if config.min_results is None or config.backend == "env_server":
+        return None
+    if config.min_results <= config.num_workers:
+        return None
+    return f"is {config.min_results}, more than num_workers: {config.num_workers}"
+
+
+def _check_snapshot_every(config: EnvConfig) -> str | None:
+    resumes = config.on_worker_death == "resume"
+    if "snapshot_every" in placement_of(config.backend, config.placement).refuses:
+        return "has no meaning here, and on_worker_death: resume needs it" if resumes else None
+    if resumes and ENVS.is_hardware(config.backend):
+        return f"on_worker_death: resume can't restore what backend {config.backend!r} moves"
+    if resumes and config.snapshot_every is None:
+        return "is required with on_worker_death: resume; at most this many steps are lost"
+    if config.snapshot_every is not None and not resumes:
+        return "has no meaning without on_worker_death: resume"
+    return None
+
+
+def _check_video(config: EnvConfig) -> str | None:
+    video = config.video
+    if video is None:
+        return None
+    if above := [k for k in video.envs if k >= config.num_workers]:
+        return f"there is no env {above[0]}; num_workers: {config.num_workers} count from 0"
+    if 1 < config.num_envs <= video.sub_env:
+        return f"no sub-environment {video.sub_env}; num_envs: {config.num_envs} count from 0"
+    mode = config.env_kwargs.get("render_mode")
+    if config.backend in MADE_BY_GYMNASIUM and mode != "rgb_array":
+        return f"needs env_kwargs: {{render_mode: rgb_array}}, got {mode!r}"
+    return None
+
+
+_COMPARED_WITH = {
+    "task": ("make_env",),
+    "make_env": ("num_workers",),
+    "min_results": ("num_workers",),
+    "snapshot_every": ("on_worker_death",),
+    "video": ("num_workers", "num_envs", "env_kwargs"),
+}
+"""Other fields that a check reads; it is left out if one of them is wrong."""
+_CHECKS: dict[str, Callable[[EnvConfig], str | None]] = {
+    "backend": _check_backend,
+    "task": _check_task,
+    "make_env": _check_make_env,
+    "num_envs": _check_num_envs,
+    "interpreter": _check_interpreter,
+    "min_results": _check_min_results,
+    "snapshot_every": _check_snapshot_every,
+    "video": _check_video,
+}
+
+
+def check_names(entries: Sequence[Entry], problems: Problems) -> None:
+    """Refuse entries that share a name."""
+    first: dict[str, Entry] = {}
+    for entry in entries:
+        if "name" in entry.faulty:
+            continue
+        owner = first.setdefault(entry.config.name, entry)
+        if owner is not entry:
+            first_place = owner.place.partition(" ")[0]
+            problems.add(
+                f"{entry.place}, name",
+                f"is also the name of {first_place}; env ids begin with it, so names must differ",
+            )
+
+
+def check_imports(entries: Sequence[Entry], shared: tuple[str, ...], problems: Problems) -> None:
+    """Look for the modules of ``imports``: `shared` by the file, and the entries' own."""
+    here = [entry for entry in entries if runs_here(entry.config)]
+    for module in shared if here else ():
+        if not _is_importable(module):
+            problems.add("imports", _not_importable(module))
+    for entry in here:
+        for module in entry.config.imports:
+            if module not in shared and not _is_importable(module):
+                problems.add(f"{entry.place}, imports", _not_importable(module))
+
+
+def _not_importable(module: str) -> str:
+    return f"no module {module!r} on this Python's path"
+
+
+def _is_importable(module: str) -> bool:
+    """Return True if a module can be found, without running any part of it.
+
+    `importlib.util.find_spec` would import the packages that contain a submodule.
+    """
+    if module in sys.modules:
+        return True
+    top, *below = module.split(".")
+    if not all(part.isidentifier() for part in (top, *below)):
+        return False
+    spec = sys.modules[top].__spec__ if top in sys.modules else importlib.util.find_spec(top)
+    path = top
+    for part in below:
+        if spec is None or spec.submodule_search_locations is None:
+            return False
+        path = f"{path}.{part}"
+        spec = PathFinder.find_spec(path, list(spec.submodule_search_locations))
+    return spec is not None

@@ -1,0 +1,211 @@
+"""Reads a configuration: a file or a Python value with entries, and what its entries share."""
+
+from __future__ import annotations
+
+import difflib
+import itertools
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from pydantic import ValidationError
+
+from rlightning_aio.config.checks import Entry, check_entry, check_imports, check_names
+from rlightning_aio.config.entry import EnvConfig, with_backend
+from rlightning_aio.config.problems import Problems, as_text, unknown_field
+from rlightning_aio.config.yaml_files import TOP_LEVEL, imports_above, plain, read_yaml, sections
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
+
+__all__ = ["load_config", "parse_configs"]
+
+_TYPO = 0.8
+"""Similarity above which another section of a file counts as a misspelt name."""
+
+
+def load_config(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> list[EnvConfig]:
+    """Read a YAML file with ``envs:`` (or ``env:``) and, optionally, ``imports:``.
+
+    Args:
+        path: the file. Other sections, such as those of a whole experiment, are ignored; entries
+            may refer to them (``${train.seed}``).
+        overrides: ``key=value`` each, applied in order; keys are dotted from the top of the
+            file (``envs.0.num_workers=8``), values are YAML. They can change other sections, too.
+
+    Returns:
+        The entries in order. Each entry's ``imports`` begin with those of the file.
+
+    Raises:
+        ConfigError: the file can't be read, an override fits nothing, or the content is wrong.
+            The message lists every problem.
+    """
+    source = os.fspath(path)
+    return _parse(read_yaml(source, overrides), source)
+
+
+def parse_configs(env_cfgs: object) -> list[EnvConfig]:
+    """Check entries that were written in Python.
+
+    Args:
+        env_cfgs: an `EnvConfig`, a plain mapping of its fields, or an OmegaConf node of them; a
+            list of these; or a mapping with ``envs:`` (or ``env:``) and ``imports:`` as in
+            a file. A node that is part of a document gets that document's ``imports``.
+
+    Raises:
+        ConfigError: something is wrong; the message lists every problem.
+    """
+    return _parse(env_cfgs, "environment configuration")
+
+
+def _parse(env_cfgs: object, source: str) -> list[EnvConfig]:
+    problems = Problems(source)
+    listed, imports = _split(env_cfgs, source, problems)
+    imports = _shared_imports(imports, problems)
+    entries: list[Entry] = []
+    for place, given in listed:
+        shared = (*imports, *_shared_imports(imports_above(given, source), problems))
+        entry = _read_entry(plain(given, source), place, problems)
+        if entry is not None:
+            entry.config = _with_imports(entry.config, shared)
+            entries.append(entry)
+            check_entry(entry, problems)
+    check_names(entries, problems)
+    check_imports(entries, imports, problems)
+    problems.raise_any()
+    return [entry.config for entry in entries]
+
+
+def _split(env_cfgs: object, source: str, problems: Problems) -> tuple[list[tuple[str, Any]], Any]:
+    """Return the entries, each with its place, and the imports they share."""
+    if isinstance(env_cfgs, EnvConfig):
+        return [("envs.0", env_cfgs)], ()
+    if callable(env_cfgs):
+        return [("envs.0", _entry_of([env_cfgs]))], ()
+    document = sections(env_cfgs, source)
+    if not isinstance(document, Mapping):
+        if isinstance(document, list | tuple):
+            document = _entries_of_callables(cast("Sequence[Any]", document))
+        return _listed(document, "envs", problems), imports_above(env_cfgs, source)
+    fields = cast("Mapping[Any, Any]", document)
+    if not {"env", "envs"} & fields.keys():
+        if {"name", "backend"} & fields.keys():
+            return [("envs.0", env_cfgs)], ()
+        closeness = 0.0  # No key is known, so report each of them.
+    else:
+        closeness = _TYPO
+    for name in fields:
+        if name not in TOP_LEVEL and difflib.get_close_matches(
+            str(name), TOP_LEVEL, cutoff=closeness
+        ):
+            problems.add(str(name), unknown_field(name, TOP_LEVEL))
+    key = "envs" if "envs" in fields or "env" not in fields else "env"
+    if {"env", "envs"} <= fields.keys():
+        problems.add("env", "means the same as envs, which is given, too; keep one of them")
+    listed = _listed(plain(fields.get(key, ()), source), key, problems)
+    return listed, plain(fields.get("imports", ()), source)
+
+
+def _listed(entries: object, key: str, problems: Problems) -> list[tuple[str, Any]]:
+    text = as_text(entries)
+    if isinstance(entries, Mapping):
+        entry = cast("Mapping[Any, Any]", entries)
+        if {"name", "backend"} & entry.keys():
+            return [(key, entry)]
+    if not isinstance(entries, list | tuple):
+        hint = "; load_config reads files" if isinstance(entries, str | Path) else ""
+        problems.add(key, f"should be a list of entries, got {text}{hint}")
+        return []
+    if not entries:
+        problems.add(key, "no entries; give at least one, with name, backend and task")
+    found = cast("Sequence[Any]", entries)
+    return [(f"{key}.{index}", entry) for index, entry in enumerate(found)]
+
+
+def _entries_of_callables(listed: Sequence[Any]) -> list[Any]:
+    """Return `listed`, with one entry in place of callables that follow one another."""
+    entries: list[Any] = []
+    for are_callable, group in itertools.groupby(listed, callable):
+        values = list(group)
+        entries += [_entry_of(values)] if are_callable else values
+    return entries
+
+
+def _entry_of(makers: list[Any]) -> dict[str, Any]:
+    same = all(maker is makers[0] for maker in makers)
+    return {
+        "name": "env",
+        "make_env": makers[0] if same else tuple(makers),
+        "num_workers": len(makers),
+    }
+
+
+def _shared_imports(imports: object, problems: Problems) -> tuple[str, ...]:
+    text = as_text(imports)
+    modules = cast("Sequence[Any]", imports) if isinstance(imports, list | tuple) else (None,)
+    if all(isinstance(module, str) for module in modules):
+        return tuple(modules)
+    problems.add("imports", f"should be a list of module names, got {text}")
+    return ()
+
+
+def _with_imports(config: EnvConfig, shared: tuple[str, ...]) -> EnvConfig:
+    if not shared:
+        return config
+    return config.model_copy(update={"imports": tuple(dict.fromkeys((*shared, *config.imports)))})
+
+
+def _read_entry(entry: object, place: str, problems: Problems) -> Entry | None:
+    if isinstance(entry, EnvConfig):
+        return Entry(f"{place} ({entry.name!r})", entry, set())
+    if not isinstance(entry, Mapping):
+        problems.add(place, f"should be a mapping of fields, got {as_text(entry)}")
+        return None
+    given = cast("Mapping[Any, Any]", entry)
+    if isinstance(name := given.get("name"), str) and name:
+        place = f"{place} ({name!r})"
+    known = EnvConfig.model_fields
+    for unknown in (k for k in given if k not in known):
+        problems.add(f"{place}, {unknown}", unknown_field(unknown, known))
+    fields = with_backend({k: plain(v, place) for k, v in given.items() if k in known})
+    try:
+        return Entry(place, EnvConfig.model_validate(fields), set())
+    except ValidationError as error:
+        faults = error.errors(include_url=False)
+    for path, text in _explain(faults, fields):
+        problems.add(f"{place}, {path}", text)
+    faulty = {str(fault["loc"][0]) for fault in faults}
+    right = {k: v for k, v in fields.items() if k not in faulty}
+    return Entry(place, EnvConfig.model_validate({"name": "?", "backend": "?"} | right), faulty)
+
+
+def _explain(
+    faults: Sequence[ErrorDetails], fields: Mapping[str, Any]
+) -> Iterator[tuple[str, str]]:
+    """Yield path and text of each fault. Branches of a union share a path, so they share a text."""
+    texts: dict[str, list[str]] = {}
+    inputs: dict[str, str] = {}
+    for fault in faults:
+        path = _path(fault["loc"], fields)
+        text = fault["msg"].removeprefix("Value error, ").removeprefix("Input ")
+        text = text.replace("valid tuple", "list")
+        texts.setdefault(path, []).append("is required" if fault["type"] == "missing" else text)
+        if fault["type"] not in ("missing", "value_error"):
+            inputs[path] = f", got {as_text(fault['input'])}"
+    for path, (first, *others) in texts.items():
+        alternatives = [first, *(other.removeprefix("should be ") for other in others)]
+        yield path, " or ".join(alternatives) + inputs.get(path, "")
+
+
+def _path(location: Sequence[int | str], fields: Mapping[str, Any]) -> str:
+    """Return the dotted path of a fault, without what pydantic adds for unions and keys."""
+    value: Any = fields
+    parts: list[str] = []
+    for part in location:
+        try:
+            value = value[part]
+        except (KeyError, IndexError, TypeError):
+            break
+        parts.append(str(part))
+    return ".".join(parts or map(str, location[:1]))

@@ -1,0 +1,229 @@
+"""One entry of a configuration: its fields, their types and defaults."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, Literal, cast
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from rlightning_aio.config.problems import unknown_field
+from rlightning_aio.registry import ENVS, PLACEMENTS, placement_of
+from rlightning_aio.sharing import num_batches, num_cores
+
+__all__ = [
+    "CALLABLE",
+    "MADE_BY_GYMNASIUM",
+    "EnvConfig",
+    "VideoConfig",
+    "moved",
+    "with_backend",
+]
+
+CALLABLE = "callable"
+"""Name of the backend whose envs come from a callable."""
+MADE_BY_GYMNASIUM = ("gymnasium", "mujoco", "ale")
+"""Backends whose `env_kwargs` go to `gymnasium.make`."""
+
+
+class VideoConfig(BaseModel):
+    """The episodes of an entry's envs to film, and the folder for the files."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, defer_build=True)
+
+    folder: str = Field(min_length=1)
+    """Folder for ``<env id>-episode-<n>.mp4``, created if missing; n counts the env's episodes
+    from 0, or on from the last film in the folder."""
+    envs: tuple[Annotated[int, Field(ge=0)], ...] = Field(default=(0,), strict=False)
+    """Numbers of the envs to film, from 0. Each gets a worker of its own, so that no other env
+    waits for a frame, unless `EnvConfig.envs_per_process` is a number."""
+    sub_env: int = Field(default=0, ge=0)
+    """Number of the sub-environment to film."""
+    every: int = Field(default=1, ge=1)
+    """Film episodes 0, every, 2 * every, …"""
+    episodes: tuple[Annotated[int, Field(ge=0)], ...] | None = Field(default=None, strict=False)
+    """Film only these."""
+
+    @field_validator("folder")
+    @classmethod
+    def _find_from_anywhere(cls, folder: str) -> str:
+        # A "~" that names no user is part of the name.
+        return os.path.abspath(os.path.expanduser(folder))  # noqa: PTH100, PTH111
+
+    def wants(self, episode: int) -> bool:
+        """Return True if the episode with this number is to be filmed."""
+        if self.episodes is not None:
+            return episode in self.episodes
+        return episode % self.every == 0
+
+
+class EnvConfig(BaseModel):
+    """One entry of ``envs:``, which makes ``num_workers`` envs of one kind."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, defer_build=True)
+
+    name: str = Field(min_length=1)
+    """Name of the entry; its envs have the ids ``<name>-0``, ``<name>-1``, …"""
+    backend: str = Field(default="", validate_default=True)
+    """Simulator backend (``rlightning-aio backends`` lists them). Where envs come from a callable,
+    the default is ``callable``."""
+    task: str = ""
+    """Task name within the backend; required by every backend but ``env_server``. For the
+    backend ``callable``: ``module:function``, which is called with ``env_kwargs``."""
+    make_env: Callable[..., Any] | tuple[Callable[..., Any], ...] | None = Field(
+        default=None, repr=False
+    )
+    """One callable, or one for each env. The worker calls it with ``env_kwargs``, and it returns a
+    `gymnasium.Env`, a `gymnasium.vector.VectorEnv` or a `BaseEnv`."""
+    num_workers: int = Field(default=1, ge=1)
+    """Number of envs. With ``auto``, `num_envs` is the total number of sub-environments; they are
+    spread over the cores, and both fields then hold the result."""
+    num_envs: int = Field(default=1, ge=1)
+    """Number of vectorised sub-environments in each env, where the backend supports them."""
+    max_episode_steps: int | None = Field(default=None, ge=1)
+    """Step limit of an episode; None leaves it to the simulator."""
+    num_cpus: float = Field(default=1, ge=0)
+    """CPUs of each worker; 0 reserves none (``placement: ray`` only)."""
+    num_gpus: float = Field(default=0.0, ge=0)
+    """GPUs of each worker, of those that Ray manages or this process sees; a whole number, or a
+    fraction of one GPU."""
+    env_kwargs: dict[str, Any] = Field(default_factory=dict)
+    """Passed to the backend."""
+    placement: str = "process"
+    """Place where the envs live: worker processes, this process (``inline``), its event loop
+    (``loop``, for awaitable envs), or Ray actors."""
+    max_concurrency: int | None = Field(default=None, ge=1)
+    """Number of this entry's envs that may execute a request at once; the others queue. None sets
+    no limit (``placement: loop`` only)."""
+    envs_per_process: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
+    """Envs that share a worker."""
+    min_results: int | None = Field(default=None, ge=1)
+    """Number of results for which `collect_async`, `Collector` and `evaluate` wait by default; the
+    values of all entries are added up."""
+    step_timeout: float | None = Field(default=None, gt=0)
+    """Seconds that one step may take before the env counts as hung."""
+    reset_timeout: float | None = Field(default=None, gt=0)
+    """Seconds that one reset may take."""
+    start_timeout: float = Field(default=120.0, gt=0)
+    """Seconds from the start of a worker until its envs are built."""
+    on_worker_death: Literal["restart", "raise", "resume"] = "restart"
+    """Reaction to a worker that dies or hangs; ``raise`` by default for hardware."""
+    snapshot_every: int | None = Field(default=None, ge=1)
+    """Number of steps after which an env's state is saved, for ``on_worker_death: resume``."""
+    max_restarts: int = Field(default=3, ge=0)
+    """Number of restarts in a row, without a step in between, before giving up."""
+    imports: tuple[str, ...] = Field(default=(), strict=False)
+    """Modules imported in the worker before the env is built."""
+    interpreter: str | None = None
+    """Python of another virtual environment for this entry's workers."""
+    env_vars: dict[str, str] = Field(default_factory=dict)
+    """Environment variables of the worker, set before anything is imported; ``{worker_index}`` in a
+    value stands for the number of the worker among the entry's."""
+    cpu_affinity: bool = False
+    """Pin worker k to the k-th core this process may use."""
+    ray_options: dict[str, Any] = Field(default_factory=dict)
+    """Arguments for ``.options()`` of a Ray actor, except `num_cpus` and `num_gpus`, and
+    ``address``, the cluster's (``placement: ray`` only)."""
+    video: VideoConfig | None = None
+    """Episodes to film from the start; `record_video` films envs of a running group."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _suggest_known_names(cls, fields: Any) -> Any:
+        if not isinstance(fields, Mapping):
+            return fields
+        given = cast("Mapping[str, Any]", fields)
+        for name in given:
+            if name not in cls.model_fields:
+                raise ValueError(f"{name}: {unknown_field(name, cls.model_fields)}")
+        return _spread_over_cores(with_backend(given))
+
+    @field_validator("backend")
+    @classmethod
+    def _require_backend(cls, backend: str) -> str:
+        if not backend:
+            raise ValueError("is required")
+        return backend
+
+    @field_validator("num_workers", mode="before")
+    @classmethod
+    def _refuse_auto(cls, num_workers: Any) -> Any:
+        if num_workers == "auto":
+            raise ValueError(
+                "'auto' spreads the sub-environments of num_envs over the cores, and these envs "
+                "have none; give a number"
+            )
+        return num_workers
+
+    @field_validator("make_env", mode="before")
+    @classmethod
+    def _accept_lists(cls, makers: Any) -> Any:
+        return tuple(cast("list[Any]", makers)) if isinstance(makers, list) else makers
+
+    @field_validator("env_vars", mode="before")
+    @classmethod
+    def _write_numbers_out(cls, env_vars: Any) -> Any:
+        # YAML reads `OMP_NUM_THREADS: 1` as a number. A boolean stays refused: programs
+        # disagree on whether it is spelt 1, true or True.
+        if not isinstance(env_vars, Mapping):
+            return env_vars
+        items = cast("Mapping[Any, Any]", env_vars).items()
+        return {k: str(v) if type(v) in (int, float) else v for k, v in items}
+
+    @field_validator("env_vars")
+    @classmethod
+    def _accept_usable_names(cls, env_vars: dict[str, str]) -> dict[str, str]:
+        for name, value in env_vars.items():
+            if not name or "=" in name or "\0" in name + value:
+                raise ValueError(f"{name!r} can't be set in an environment")
+        return env_vars
+
+    @field_validator("placement")
+    @classmethod
+    def _know_placement(cls, placement: str) -> str:
+        if placement not in PLACEMENTS:
+            *others, last = map(repr, PLACEMENTS)
+            raise ValueError(f"should be {', '.join(others)} or {last}, got {placement!r}")
+        return placement
+
+    @field_validator("interpreter")
+    @classmethod
+    def _expand_home(cls, interpreter: str | None) -> str | None:
+        # pathlib would make `python` of `./python`, which is looked for elsewhere.
+        return interpreter and os.path.expanduser(interpreter)  # noqa: PTH111
+
+    @model_validator(mode="after")
+    def _leave_hardware_stopped(self) -> EnvConfig:
+        # A robot's worker is replaced only if the user asks for it. Assigned past pydantic, which
+        # would count the field as set by the user.
+        if "on_worker_death" not in self.model_fields_set and ENVS.is_hardware(self.backend):
+            object.__setattr__(self, "on_worker_death", "raise")
+        return self
+
+
+def with_backend(fields: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return `fields` with the backend ``callable`` added where a callable implies it."""
+    if "backend" in fields or ("make_env" not in fields and ":" not in str(fields.get("task"))):
+        return fields
+    return {**fields, "backend": CALLABLE}
+
+
+def _spread_over_cores(fields: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return `fields` with ``num_workers: auto`` replaced by numbers, where the backend can."""
+    total, name = fields.get("num_envs", 1), str(fields.get("backend"))
+    backend = ENVS.described(name)
+    several = name != CALLABLE and (backend is None or backend.vectorized)
+    if fields.get("num_workers") != "auto" or not several or type(total) is not int or total < 1:
+        return fields
+    # Other backends compute many sub-environments at once by themselves.
+    spread = fields.get("placement") != "inline" and ENVS.is_cpu_bound(name)
+    count = num_batches(total, num_cores()) if spread else 1
+    return {**fields, "num_workers": count, "num_envs": total // count}
+
+
+def moved(config: EnvConfig, placement: str) -> EnvConfig:
+    """Return the entry with another placement, without the fields that have no meaning there."""
+    kept = config.model_fields_set - placement_of(config.backend, placement).refuses.keys()
+    fields = {name: getattr(config, name) for name in kept}
+    return EnvConfig.model_validate({**fields, "placement": placement})

@@ -1,0 +1,100 @@
+"""`EpisodeVideo`: films of chosen episodes of a queue, or only of those that don't succeed.
+
+Rule: the env's worker films, as for `record_video`. An episode is filmed into a folder of its own,
+and its film gets its name when the outcome is known.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import zlib
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rlightning_aio.config import VideoConfig
+from rlightning_aio.files import check_folder, finish_file
+from rlightning_aio.hosts.messages import RECORD_VIDEO
+
+if TYPE_CHECKING:
+    import os
+    from collections.abc import Callable
+
+    from rlightning_aio.collecting.procedure import Procedure
+    from rlightning_aio.evaluation.records import EpisodeRecord, EpisodeSpec
+
+__all__ = ["EpisodeVideo", "Filming"]
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeVideo:
+    """The episodes to film.
+
+    Attributes:
+        folder: for ``<entry>-<task>-seed-<seed>.mp4``; created if missing. Options of the episode
+            add a number to the name.
+        wants: returns True for an episode to film; None films all.
+        failed_only: keep the films of episodes whose success is False, and delete the others.
+    """
+
+    folder: str | os.PathLike[str]
+    wants: Callable[[EpisodeSpec], bool] | None = None
+    failed_only: bool = False
+
+
+@dataclass(slots=True)
+class Filming:
+    """The films in progress.
+
+    Args:
+        group: whose envs are filmed.
+        video: the episodes to film.
+
+    Raises:
+        OSError: nothing can be written into the folder.
+    """
+
+    group: Any
+    video: EpisodeVideo
+    _filmed: set[str] = field(default_factory=set[str])
+    """Envs that are filming an episode."""
+
+    def __post_init__(self) -> None:
+        check_folder(self.video.folder)
+
+    def begin(self, env_id: str, spec: EpisodeSpec) -> Procedure[None]:
+        """Film the next episode of an idle env, if it is wanted."""
+        if self.video.wants is None or self.video.wants(spec):
+            folder = self._folder(env_id)
+            shutil.rmtree(folder, ignore_errors=True)
+            order = VideoConfig(folder=str(folder), episodes=(0,))
+            yield partial(self.group[env_id].call, RECORD_VIDEO, order)
+            self._filmed.add(env_id)
+
+    def end(self, env_id: str, record: EpisodeRecord) -> Procedure[None]:
+        """Stop filming an idle env, and keep or delete the film of the episode."""
+        if env_id in self._filmed:
+            yield partial(self.group[env_id].call, RECORD_VIDEO, None)
+            self._filmed.remove(env_id)
+            folder = self._folder(env_id)
+            if not self.video.failed_only or record.success is False:
+                for film in folder.glob("*-episode-0.mp4"):
+                    finish_file(film, Path(self.video.folder, _name(record)))
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def drop(self, env_id: str) -> None:
+        """Delete what was filmed of an episode that was lost."""
+        if env_id in self._filmed:
+            self._filmed.remove(env_id)
+            shutil.rmtree(self._folder(env_id), ignore_errors=True)
+
+    def _folder(self, env_id: str) -> Path:
+        return Path(self.video.folder, f"{env_id}.partial").absolute()
+
+
+def _name(record: EpisodeRecord) -> str:
+    entry, task, seed, options = record.key
+    number = f"-{zlib.crc32(options.encode()):08x}" if options else ""
+    return re.sub(r"[^\w.-]+", "_", f"{entry}-{task}-seed-{seed}{number}") + ".mp4"

@@ -1,0 +1,48 @@
+"""Parts of both kinds of evaluation: answers of a policy, rewards, and success of an episode."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final, cast
+
+import numpy as np
+
+from rlightning_aio.batch import BatchedData
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+__all__ = ["responses", "success_of", "summed_rewards"]
+
+_VERDICTS: Final = ("success", "is_success")
+
+
+def responses(batch: BatchedData, answer: Any) -> list[BatchedData]:
+    """Convert a policy's answer to batches of responses."""
+    if isinstance(answer, BatchedData):
+        return [answer]
+    if isinstance(answer, list):
+        listed = cast("list[Any]", answer)
+        if listed and all(isinstance(one, BatchedData) for one in listed):
+            return listed
+    return [batch.respond(action=answer)]
+
+
+def summed_rewards(reward: Any) -> NDArray[np.float64]:
+    """Sum rewards over agents."""
+    if isinstance(reward, dict):
+        reward = np.sum(list(cast("dict[str, Any]", reward).values()), axis=0)
+    return np.asarray(reward, np.float64)
+
+
+def success_of(info: dict[str, Any], sub_env: int = 0) -> bool | None:
+    """Read the success of an episode from its last info, or from the ``final_info`` in it."""
+    final: Any = info.get("final_info")
+    places: list[Any] = [final, info] if isinstance(final, dict) else [info]
+    for found in places:
+        for key in _VERDICTS:
+            given, known = found.get(key), found.get(f"_{key}")
+            if given is not None and (known is None or known[sub_env]):
+                # It may be a tensor on another device.
+                array = np.asarray(given.tolist() if hasattr(given, "tolist") else given)
+                return bool(array.reshape(-1)[sub_env if array.size > 1 else 0])
+    return None

@@ -1,0 +1,150 @@
+"""Writes result files atomically.
+
+Rule: each file that the library saves for a user is written by `write_file`, or renamed by
+`finish_file` if another program writes it. Links are followed; anything but a regular file is
+refused, and so is a read-only file, even for root. A replaced file keeps its mode and owner. Each
+`OSError` raised here names the user's path.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import secrets
+import stat
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Generator, Iterable
+
+__all__ = ["check_folder", "check_regular", "check_writable", "finish_file", "write_file"]
+
+_PROBE: Final = bytes(4096)
+"""One block, because an empty file fits even a full disk."""
+_KINDS: Final = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a FIFO",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a character device",
+    stat.S_IFBLK: "a block device",
+}
+
+
+def check_writable(path: str | os.PathLike[str]) -> None:
+    """Check that `write_file` could succeed, by writing a temporary block to the same folder.
+
+    Raises:
+        OSError: it would fail; the message says why.
+    """
+    with _naming(path), _partial_file(check_regular(path).parent) as file:
+        file.write(_PROBE)
+
+
+def check_folder(folder: str | os.PathLike[str]) -> None:
+    """Create `folder` if missing, and check that files can be written to it.
+
+    Raises:
+        OSError: they can't; the message says why.
+    """
+    with _naming(folder):
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        with _partial_file(Path(folder)) as file:
+            file.write(_PROBE)
+
+
+def write_file(
+    path: str | os.PathLike[str], content: bytes | Iterable[bytes], *, mode: int = 0o666
+) -> None:
+    """Write a file, replacing an existing one once the new one is complete.
+
+    Args:
+        path: a link is followed, and its target replaced.
+        content: the bytes, or parts of them in order.
+        mode: of a new file, before the umask.
+
+    Raises:
+        OSError: it can't be written; an existing file is unchanged.
+    """
+    with _naming(path), _partial_file(check_regular(path).parent, mode) as file:
+        file.writelines((content,) if isinstance(content, bytes) else content)
+        file.flush()
+        finish_file(Path(file.name), path)
+
+
+def finish_file(partial: Path, path: str | os.PathLike[str]) -> None:
+    """Give the complete file `partial` the name `path`, replacing an existing file.
+
+    Raises:
+        OSError: it can't be renamed; both files are unchanged.
+    """
+    target = check_regular(path)
+    with _naming(path):
+        descriptor = os.open(partial, os.O_RDONLY)
+        try:
+            with contextlib.suppress(FileNotFoundError):
+                _take_after(descriptor, target.stat())
+            # Some file systems report a full disk only here.
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+        partial.replace(target)
+
+
+def _take_after(descriptor: int, before: os.stat_result) -> None:
+    """Give a new file the owner and the mode of the one that it replaces."""
+    with contextlib.suppress(PermissionError):  # Only root may give files away.
+        os.fchown(descriptor, before.st_uid, before.st_gid)
+    os.fchmod(descriptor, stat.S_IMODE(before.st_mode))
+
+
+def check_regular(path: str | os.PathLike[str]) -> Path:
+    """Resolve `path` to that of a regular file, which may be missing.
+
+    Raises:
+        OSError: it is something else, or read-only.
+    """
+    target = Path(os.path.realpath(path))
+    with _naming(path):
+        try:
+            mode = target.stat().st_mode
+        except FileNotFoundError:
+            return target
+        if not stat.S_ISREG(mode):
+            number = errno.EISDIR if stat.S_ISDIR(mode) else errno.EEXIST
+            kind = _KINDS.get(stat.S_IFMT(mode), "something else")
+            raise OSError(number, f"it is {kind}, not a regular file")
+        # Root could write it, but the mode says to keep it.
+        if not mode & 0o222 or not os.access(target, os.W_OK):
+            raise PermissionError(errno.EACCES, "it is read-only")
+    return target
+
+
+@contextlib.contextmanager
+def _partial_file(folder: Path, mode: int = 0o666) -> Generator[BinaryIO]:
+    """Open a new file in `folder`, which is removed at the end unless it was renamed."""
+    partial = folder / f".rlightning-aio-{secrets.token_hex(8)}.part"
+    try:
+        # Only an opener can set the mode before a secret is written.
+        file = open(partial, "xb", opener=lambda path, flags: os.open(path, flags, mode))  # noqa: SIM115
+    except FileNotFoundError as error:
+        raise FileNotFoundError(errno.ENOENT, f"there is no folder {folder}") from error
+    except OSError as error:
+        raise OSError(error.errno, f"folder {folder}: {error.strerror}") from error
+    try:
+        with file:
+            yield file
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _naming(path: str | os.PathLike[str]) -> Generator[None]:
+    """Make each `OSError` name `path`."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename == os.fspath(path):
+            raise
+        raise OSError(error.errno, error.strerror, os.fspath(path)) from error

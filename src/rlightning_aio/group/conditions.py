@@ -1,0 +1,59 @@
+"""`Conditions`: whether anything is unlike an ordinary step.
+
+The ordinary step (`steps`) asks one question about everything else: is `active` 0? The component
+that knows of a condition sets it and clears it; while any is set, the general path is taken.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+__all__ = [
+    "BESIDE_ROWS",
+    "CLOSED",
+    "CUT_BEFORE",
+    "DEATH",
+    "FAULT",
+    "FIRST_RESULTS",
+    "LOST_EPISODE",
+    "RECORDING",
+    "UNLIKE_ENVS",
+    "Conditions",
+]
+
+CLOSED: Final = 1 << 0
+"""The group is not open: before `init`, and after `close`."""
+UNLIKE_ENVS: Final = 1 << 1
+"""The envs are not all in workers of this machine (or alone in this process), have different
+layouts, or need more than what fits in a row."""
+DEATH: Final = 1 << 2
+"""A worker was replaced and has not shown that it works, or was given up."""
+LOST_EPISODE: Final = 1 << 3
+"""An env lost its episode or was restored, and a result has still to show it."""
+CUT_BEFORE: Final = 1 << 4
+"""An env reached the step limit of an `auto_reset` context that is closed now."""
+BESIDE_ROWS: Final = 1 << 5
+"""A result that is ready is not, or not only, what its row holds."""
+FAULT: Final = 1 << 6
+"""An error waits for the collector."""
+FIRST_RESULTS: Final = 1 << 7
+"""Observations are still being compared with the bounds of their spaces."""
+RECORDING: Final = 1 << 8
+"""A timeline is being recorded."""
+
+
+class Conditions:
+    """The conditions of one group.
+
+    Attributes:
+        active: the sum of those that are set; 0 in an ordinary step.
+    """
+
+    __slots__ = ("active",)
+
+    def __init__(self) -> None:
+        self.active = CLOSED | FIRST_RESULTS
+
+    def note(self, condition: int, holds: bool) -> None:
+        """Set or clear a condition."""
+        self.active = self.active | condition if holds else self.active & ~condition

@@ -1,0 +1,68 @@
+"""`EnvEpisode`: one episode of one env, for an agent that is one coroutine for each env.
+
+Invariant: its env is idle at its end, even where the agent was cancelled during a step. So no
+result of it ever comes to a call that collects those of other envs.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any, Self
+
+if TYPE_CHECKING:
+    from collections.abc import Coroutine
+
+    from rlightning_aio.group.interface import EnvHandleInterface
+    from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
+
+__all__ = ["EnvEpisode"]
+
+
+class EnvEpisode:
+    """What `EnvGroup.episode` returns; an asynchronous context manager.
+
+    Attributes:
+        env: the handle of the env.
+        last: its newest result; after entry that of the reset.
+    """
+
+    last: EnvRet | MultiAgentEnvRet
+
+    def __init__(
+        self, env: EnvHandleInterface, seed: int | None, options: dict[str, Any] | None
+    ) -> None:
+        self.env = env
+        self._seed, self._options = seed, options
+        self._running: asyncio.Task[EnvRet | MultiAgentEnvRet] | None = None
+
+    async def __aenter__(self) -> Self:
+        await self._wait_for(self.env.reset(self._seed, self._options))
+        return self
+
+    async def __aexit__(self, *exc: object) -> None:
+        running, self._running = self._running, None
+        if running is not None:
+            await asyncio.wait({running})
+            # Read, so that asyncio doesn't log an error that nobody asks for.
+            _ = running.cancelled() or running.exception()
+
+    @property
+    def is_over(self) -> bool:
+        """True if the newest result ended the episode."""
+        return bool(self.last.last_terminated or self.last.last_truncated)
+
+    async def step(self, response: PolicyResponse | Any) -> EnvRet | MultiAgentEnvRet:
+        """Step with a `PolicyResponse`, or with a bare action, and wait for the result.
+
+        Cancelled, it leaves the result to the end of the episode. Errors are those of
+        `EnvHandle.step`.
+        """
+        return await self._wait_for(self.env.step(response))
+
+    async def _wait_for(
+        self, answer: Coroutine[Any, Any, EnvRet | MultiAgentEnvRet]
+    ) -> EnvRet | MultiAgentEnvRet:
+        self._running = running = asyncio.ensure_future(answer)
+        self.last = await asyncio.shield(running)
+        self._running = None
+        return self.last

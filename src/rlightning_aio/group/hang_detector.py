@@ -1,0 +1,148 @@
+"""`HangDetector`: finds workers that exceed a time limit, and ends them by force.
+
+Rule: read pending output before killing a host. The worker measures how long its env takes, and
+stops its clock while it waits for the trainer to read. A worker that executes nothing gets its
+limit again whenever data passes between the two. Before a kill, the host is asked for completions
+that the trainer, late itself, has not read yet.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from rlightning_aio.group.host_record import Stage
+from rlightning_aio.protocol.entries import Operation, slot_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rlightning_aio.group.host_record import HostRecord
+    from rlightning_aio.group.observed import Observed
+    from rlightning_aio.group.requests import Requests
+
+__all__ = ["HangDetector", "has_news"]
+
+_OBEY_SECONDS: Final = 5.0
+"""Limit for the exit of a killed worker to be reported. After that, the process that should have
+killed it hangs, too. Only an overloaded machine needs a tenth of it.
+"""
+
+
+class HangDetector:
+    """See the module.
+
+    Args:
+        records: of the group's hosts; the list grows until the group starts.
+
+    Attributes:
+        timed: some requests have a time limit.
+        any_dying: a killed host has not reported its exit. If neither holds, nothing needs to be
+            checked.
+    """
+
+    def __init__(
+        self, records: Sequence[HostRecord], requests: Requests, observed: Observed
+    ) -> None:
+        self._records = records
+        self._requests = requests
+        self._observed = observed
+        self.any_dying = False
+        self._now = 0.0
+        self.timed = False
+
+    def expiries(self) -> list[float | None]:
+        """Return the times when `check` must be called."""
+        times: list[float | None] = []
+        if self.timed:
+            times += [self._expiry(r) for r in self._records if r.timed and self._in_flight(r)]
+        if self.any_dying:
+            times += [r.die_by or self._now for r in self._records if r.dying]
+        return times
+
+    def check(self, now: float) -> None:
+        """Kill workers that have exceeded a limit, and destroy those that survive a kill."""
+        self._now = now
+        if self.timed:
+            for record in self._records:
+                if record.timed and self._in_flight(record):
+                    self._check_hung(record)
+        self._check_dying()
+
+    def kill(self, record: HostRecord, *, dump: bool) -> None:
+        """Kill a host; with `dump`, its worker writes its stacks first."""
+        record.kill(dump=dump)
+        if record.killable is not None:
+            record.dying = self.any_dying = True
+
+    def _in_flight(self, record: HostRecord) -> int:
+        return self._requests.in_flight[record.host.host_id]
+
+    def _expiry(self, record: HostRecord) -> float | None:
+        """Return the time when the worker's current request exceeds its limit."""
+        if record.stage is not Stage.UP or record.hung_slot is not None:
+            return None
+        assert record.killable is not None
+        entry, since_ns = record.killable.executing()
+        limits = (record.config.step_timeout, record.config.reset_timeout)
+        shortest = min(limit for limit in limits if limit is not None)
+        if not (entry and since_ns):
+            # A stopped process executes none of its requests.
+            idle = record.idle == self._progress(record)
+            return (record.idle_since if idle else self._now) + shortest
+        op = self._requests.numbering.op(slot_of(entry))
+        limit = {Operation.STEP: limits[0], Operation.RESET: limits[1]}.get(Operation(op or 3))
+        # A request without a limit is checked again, because the next one may have a limit.
+        return self._now + shortest if limit is None else since_ns / 1e9 + limit
+
+    def _progress(self, record: HostRecord) -> tuple[int, ...]:
+        """Return numbers that change with every request, reply, and part of a reply."""
+        assert record.killable is not None
+        slots = slice(record.slots.start, record.slots.stop)
+        entries = int(self._requests.numbering.entry[slots].sum())
+        return self._in_flight(record), entries, record.killable.traffic
+
+    def _check_hung(self, record: HostRecord) -> None:
+        assert record.killable is not None
+        entry, since_ns = record.killable.executing()
+        if not (entry and since_ns):
+            progress = self._progress(record)
+            if progress != record.idle:
+                record.idle, record.idle_since = progress, self._now
+                return
+        expiry = self._expiry(record)
+        if expiry is None or self._now < expiry or has_news(record):
+            return
+        record.hung_slot = self._hung_slot(record, entry)
+        if self._observed.observer is not None:
+            host_id = record.host.host_id
+            self._observed.observer.note_fate("hung", host_id, record.hung_slot, "")
+        self.kill(record, dump=True)
+
+    def _hung_slot(self, record: HostRecord, entry: int) -> int:
+        """Return the slot of `entry`, or the first busy slot if that request is over."""
+        busy = self._requests.owed(np.array(record.slots, np.intp))
+        slot = slot_of(entry)
+        return slot if slot in busy else int(busy[0])
+
+    def _check_dying(self) -> None:
+        """Destroy hosts that a kill has not ended, together with their fork server."""
+        if not self.any_dying:
+            return
+        for record in self._records:
+            if not record.dying:
+                continue
+            if record.die_by is None:
+                # Counted from now, because the time of the kill may have been an old one.
+                record.die_by = self._now + _OBEY_SECONDS
+            elif self._now >= record.die_by and not has_news(record):
+                assert record.killable is not None
+                record.die_by = None
+                record.killable.destroy()
+        self.any_dying = any(record.dying for record in self._records)
+
+
+def has_news(record: HostRecord) -> bool:
+    """Read what a host has sent, and return True if there was anything."""
+    return record.killable is not None and record.killable.catch_up()

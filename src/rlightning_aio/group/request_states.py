@@ -1,0 +1,91 @@
+"""The states and owners of a request, what can happen to it, and the table of legal transitions."""
+
+from __future__ import annotations
+
+from enum import Enum, IntEnum, auto
+from typing import Final
+
+__all__ = ["COLLECTOR", "LEGAL", "NOBODY", "Event", "Owner", "State"]
+
+
+class State(IntEnum):
+    """State of a slot's request."""
+
+    IDLE = 0
+    """Nothing is outstanding: the env can get a request."""
+    BUSY = 1
+    """Sent, and not answered."""
+    READY = 2
+    """The row holds a result that has not been returned."""
+    SPENT = 3
+    """Ended without a result, in a call that still waits for other envs."""
+
+
+class Owner(Enum):
+    """Who gets the reply of a request."""
+
+    COLLECTOR = auto()
+    TICKET = auto()
+    NOBODY = auto()
+
+
+class Event(Enum):
+    """What can happen to a request."""
+
+    SENT = auto()
+    SENT_FOR_CALL = auto()
+    JOINED = auto()
+    STEPPED_AT_ONCE = auto()
+    """The only env, in this process, was stepped without a request."""
+    CLAIMED = auto()
+    """A call takes a first result that waited for the collector."""
+    DROPPED = auto()
+    """A call asks for more than that first result."""
+    RESULT = auto()
+    VALUE = auto()
+    FAULT = auto()
+    WITHDRAWN = auto()
+    RESTARTED = auto()
+    HANDED_OUT = auto()
+    SETTLED = auto()
+    """Its call has all replies that it waited for."""
+    GIVEN_UP = auto()
+    """Its call no longer waits."""
+    METHOD_GIVEN_UP = auto()
+    """The same for a method call, whose value no other call can use."""
+
+
+_IDLE, _BUSY, _READY, _SPENT = State
+_C, _T, _N = Owner
+
+LEGAL: Final[dict[tuple[State, Owner, Event], tuple[State, Owner]]] = {
+    # An idle slot has no owner, which the table writes as the collector.
+    (_IDLE, _C, Event.SENT): (_BUSY, _C),
+    (_IDLE, _C, Event.SENT_FOR_CALL): (_BUSY, _T),
+    (_IDLE, _C, Event.JOINED): (_READY, _C),
+    (_IDLE, _C, Event.STEPPED_AT_ONCE): (_READY, _C),
+    (_BUSY, _C, Event.RESULT): (_READY, _C),
+    (_BUSY, _C, Event.FAULT): (_IDLE, _C),
+    (_BUSY, _C, Event.WITHDRAWN): (_IDLE, _C),
+    (_BUSY, _C, Event.RESTARTED): (_BUSY, _C),
+    (_READY, _C, Event.HANDED_OUT): (_IDLE, _C),
+    (_READY, _C, Event.CLAIMED): (_READY, _T),
+    (_READY, _C, Event.DROPPED): (_IDLE, _C),
+    (_BUSY, _T, Event.RESULT): (_READY, _T),
+    (_BUSY, _T, Event.VALUE): (_SPENT, _T),
+    (_BUSY, _T, Event.FAULT): (_SPENT, _T),
+    (_BUSY, _T, Event.RESTARTED): (_BUSY, _T),
+    (_BUSY, _T, Event.GIVEN_UP): (_BUSY, _C),
+    (_BUSY, _T, Event.METHOD_GIVEN_UP): (_BUSY, _N),
+    (_READY, _T, Event.GIVEN_UP): (_READY, _C),
+    (_SPENT, _T, Event.GIVEN_UP): (_IDLE, _C),
+    (_READY, _T, Event.SETTLED): (_READY, _C),
+    (_SPENT, _T, Event.SETTLED): (_IDLE, _C),
+    (_BUSY, _N, Event.VALUE): (_IDLE, _C),
+    (_BUSY, _N, Event.FAULT): (_IDLE, _C),
+}
+"""State and owner after each possible event. A combination that is missing can't happen."""
+
+COLLECTOR: Final = 0
+NOBODY: Final = -1
+"""Owners in the table; tickets have numbers above 0."""

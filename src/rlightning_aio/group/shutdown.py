@@ -1,0 +1,116 @@
+"""`Shutdown`: the end of a group's hosts: closed in order, disowned after a fork, or abandoned.
+
+Rule: it waits only by yielding a `Wait`. Left out: single deaths, which `Supervisor` handles.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import TYPE_CHECKING, Final
+
+from rlightning_aio.group.host_record import Stage
+from rlightning_aio.group.wait import Procedure, Wait
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from rlightning_aio.group.host_record import HostRecord
+    from rlightning_aio.group.lifetime import Lifetime
+    from rlightning_aio.group.slab_layout import SlabLayout
+    from rlightning_aio.hosts.arena import Arena
+    from rlightning_aio.hosts.base import Shared
+
+__all__ = ["Shutdown"]
+
+_CLOSE_SECONDS: Final = 1.5
+"""Limit for envs to close before their worker is killed."""
+_KILL_SECONDS: Final = 0.3
+"""Limit for a kill to be reported."""
+_END_SECONDS: Final = 1.5
+"""Limit for a released fork server to end its workers and pass on their output."""
+
+
+class Shutdown:
+    """See the module.
+
+    Args:
+        lifetime: of the group.
+        records: of its hosts; the list grows until the group starts.
+        resources: shared by hosts, see `base.Wiring`.
+        layout, arena: of the group; released with the hosts.
+    """
+
+    def __init__(
+        self,
+        lifetime: Lifetime,
+        records: Sequence[HostRecord],
+        resources: Mapping[object, Shared],
+        layout: SlabLayout,
+        arena: Arena,
+    ) -> None:
+        self._lifetime = lifetime
+        self._records = records
+        self._resources = resources
+        self._layout = layout
+        self._arena = arena
+
+    def close(self, now: float) -> Procedure[None]:
+        """Close all envs, and kill workers that take too long. Idempotent."""
+        if self._lifetime.closed:
+            return
+        self._lifetime.end()
+        alive = [r for r in self._records if r.stage not in (Stage.NEW, Stage.CLOSED)]
+        for record in alive:
+            record.held = record.restart_at = None
+            if record.stage in (Stage.FAILED, Stage.DOWN):
+                record.stage = Stage.CLOSED
+            else:
+                record.host.close()
+        try:
+            yield from self._until_closed(alive, now + _CLOSE_SECONDS)
+        finally:
+            stuck = any(r.stage not in (Stage.NEW, Stage.CLOSED) for r in self._records)
+            self._let_go(_KILL_SECONDS if stuck else _END_SECONDS)
+
+    def _until_closed(self, records: Sequence[HostRecord], by: float) -> Procedure[None]:
+        killed = False
+        now = yield Wait(0.0)
+        while any(r.stage is not Stage.CLOSED for r in records):
+            if now >= by:
+                if killed:
+                    return  # A worker that survives the kill ends with its fork server.
+                killed, by = True, now + _KILL_SECONDS
+                for record in records:
+                    if record.stage is not Stage.CLOSED:
+                        record.kill(dump=False)
+            now = yield Wait(by)
+
+    def _let_go(self, seconds: float) -> None:
+        for record in self._records:
+            record.host.release()
+        for shared in self._resources.values():
+            shared.release(seconds)
+        self._layout.release()
+        self._arena.close()
+
+    def disown(self) -> None:
+        """Release this process's copies after a fork, without affecting the parent's group."""
+        self._lifetime.end()
+        for record in self._records:
+            if record.killable is not None:
+                record.host.release()
+        for shared in self._resources.values():
+            shared.disown()
+
+    def abandon(self) -> None:
+        """Release everything immediately: the group was garbage-collected without a close."""
+        if self._lifetime.closed:
+            return
+        self._lifetime.end()
+        started = any(r.stage is not Stage.NEW for r in self._records)
+        self._let_go(_END_SECONDS)
+        if started:
+            # The garbage collector calls this, so no caller's line would help.
+            warnings.warn(
+                "an EnvGroup was not closed; its envs were killed", ResourceWarning, stacklevel=1
+            )

@@ -1,0 +1,106 @@
+"""The bytes of a snapshot: states of envs, and the identity of each env.
+
+Rule: a snapshot is checked completely before anything is restored or unpickled: first its checksum,
+then the identity of each env. Only workers unpickle.
+Left out: a signature. A person who can write the file can make a worker execute any code.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any, Final, cast
+
+import msgspec
+
+from rlightning_aio.errors import SnapshotError
+from rlightning_aio.sealing import seal, unseal
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from rlightning_aio.config import EnvConfig
+    from rlightning_aio.types import EnvMeta
+
+__all__ = ["EnvSnapshot", "check_same", "identity_of", "pack", "unpack"]
+
+_BEGINNING: Final = b"rlightning-aio snapshot 1\n"
+_ADDRESS: Final = re.compile(r" at 0x[0-9a-f]+")
+_VERSION: Final = "version of "
+
+
+class EnvSnapshot(msgspec.Struct, array_like=True):
+    """One env of a snapshot.
+
+    Attributes:
+        env_id: of the env when the snapshot was taken.
+        identity: must be the same for the env that is restored, see `identity_of`.
+        num_steps, is_cut: its `Position` in the episode.
+        state: the pickled state of the env and its last result.
+    """
+
+    env_id: str
+    identity: dict[str, str]
+    num_steps: int
+    is_cut: bool
+    state: bytes
+
+
+def identity_of(config: EnvConfig, meta: EnvMeta, versions: Mapping[str, str]) -> dict[str, str]:
+    """The properties, by name, that an env must share with one that it is restored from.
+
+    Args:
+        config: its entry.
+        meta: of the env.
+        versions: of the libraries that it uses, in its worker.
+    """
+    maker: Any = config.make_env
+    maker = cast("tuple[Any, ...]", maker)[0] if isinstance(maker, tuple) else maker
+    made_by = getattr(maker, "__qualname__", type(maker).__name__) if maker else config.task
+    return {
+        "backend": config.backend,
+        "task": made_by,
+        "env_kwargs": _ADDRESS.sub("", repr(sorted(config.env_kwargs.items()))),
+        "num_envs": str(config.num_envs),
+        "max_episode_steps": str(config.max_episode_steps),
+        "observation space": _ADDRESS.sub("", str(meta.observation_space)),
+        "action space": _ADDRESS.sub("", str(meta.action_space)),
+        **{f"{_VERSION}{name}": version for name, version in versions.items()},
+    }
+
+
+def check_same(snapshot: EnvSnapshot, identity: Mapping[str, str], described: str) -> None:
+    """Raise `SnapshotError` if a snapshot's identity isn't `identity`, that of env `described`."""
+    ours = snapshot.identity
+    for name in {**ours, **identity}:
+        if name.startswith(_VERSION) and not (name in ours and name in identity):
+            continue  # An env may load a library only in its first reset.
+        if ours.get(name) != identity.get(name):
+            raise SnapshotError(
+                f"the snapshot of {snapshot.env_id!r} can't be put into {described}: its {name} is "
+                f"{ours.get(name, 'unknown')}, and here it is {identity.get(name, 'unknown')}; "
+                "nothing was changed"
+            )
+
+
+def pack(snapshots: Sequence[EnvSnapshot]) -> bytes:
+    """The bytes that `EnvGroup.snapshot` returns."""
+    return seal(_BEGINNING, msgspec.msgpack.encode(snapshots))
+
+
+def unpack(data: bytes) -> list[EnvSnapshot]:
+    """The inverse of `pack`.
+
+    Raises:
+        SnapshotError: `data` is not a snapshot, or was changed or truncated.
+    """
+    if not isinstance(data, bytes | bytearray | memoryview):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise SnapshotError(
+            f"a snapshot is the bytes that snapshot() returned, not a {type(data).__name__}"
+        )
+    try:
+        content = unseal(_BEGINNING, bytes(data))
+    except ValueError as error:
+        raise SnapshotError(
+            f"the snapshot {error}; read the file again, in binary; nothing was changed"
+        ) from None
+    return msgspec.msgpack.decode(content, type=list[EnvSnapshot])

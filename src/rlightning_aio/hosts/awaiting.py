@@ -1,0 +1,159 @@
+"""`Awaiting`: a worker's awaitable envs, all at once, on an event loop of the worker's own.
+
+The worker's channel wakes the loop. While envs have time limits, the worker says every now and
+then that its loop is alive: the trainer kills a worker whose loop an env blocks for longer than
+the limit. Requests that only wait too long are cancelled here (see `AwaitedEnvs`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import pickle
+from typing import TYPE_CHECKING, Any, cast
+
+from rlightning_aio.hosts.awaited_envs import AwaitedEnvs
+from rlightning_aio.hosts.messages import ErrorText, Failed, Raised, Result, Value
+from rlightning_aio.hosts.pickling import dumped
+from rlightning_aio.protocol.frames import FrameKind
+
+if TYPE_CHECKING:
+    import socket
+    from collections.abc import Callable, Sequence
+
+    from rlightning_aio.hosts.awaited_runner import AwaitedRunner
+    from rlightning_aio.hosts.messages import Completion, StartOrder
+    from rlightning_aio.hosts.runner import EnvRunner
+
+__all__ = ["Awaiting"]
+
+
+class Awaiting:
+    """See the module.
+
+    Args:
+        order, first_slot: of the worker.
+        runners: of its envs.
+        report: takes the entries of requests whose results are all in their rows.
+        send: sends a frame: its kind, a number, a payload.
+        enter: says that an env's code runs now, by an entry; None if nothing has a time limit.
+    """
+
+    def __init__(
+        self,
+        order: StartOrder,
+        first_slot: int,
+        runners: Sequence[EnvRunner],
+        report: Callable[[int], None],
+        send: Callable[[FrameKind, int, bytes], None],
+        enter: Callable[[int], None] | None,
+    ) -> None:
+        self._send = send
+        self._enter = enter
+        self._entered = 0
+        self._envs = AwaitedEnvs(
+            0,
+            first_slot,
+            order,
+            inline=False,
+            post=self._post,
+            done=report,
+            enter=None if enter is None else self._note_entered,
+        )
+        self._runners = cast("Sequence[AwaitedRunner]", runners)
+        config = order.config
+        limits = [limit for limit in (config.step_timeout, config.reset_timeout) if limit]
+        self._beat_seconds = min(limits, default=0.0) / 4
+
+    def submit(self, entry: int, arguments: Any) -> None:
+        self._envs.submit(entry, arguments)
+
+    def serve(
+        self,
+        channel: socket.socket,
+        take_requests: Callable[[], bool],
+        disconnect: Callable[[], None],
+    ) -> list[tuple[int, ErrorText]]:
+        """Execute requests until there are no more, and close the envs.
+
+        Args:
+            channel: readable when there are requests.
+            take_requests: submits them; False if there will be no more.
+            disconnect: is called before the envs are closed, if `take_requests` raises.
+
+        Returns what closing has raised, with the env's index.
+        """
+        return _run(self._serve(channel, take_requests, disconnect))
+
+    async def _serve(
+        self,
+        channel: socket.socket,
+        take_requests: Callable[[], bool],
+        disconnect: Callable[[], None],
+    ) -> list[tuple[int, ErrorText]]:
+        loop = asyncio.get_running_loop()
+        self._envs.adopt(self._runners)
+        ended: asyncio.Future[None] = loop.create_future()
+
+        def look() -> None:
+            try:
+                if take_requests() or ended.done():
+                    return
+            except BaseException as error:
+                loop.remove_reader(channel)
+                ended.set_exception(error)
+            else:
+                ended.set_result(None)
+
+        def beat() -> None:
+            assert self._enter is not None
+            self._enter(self._entered)
+            loop.call_later(self._beat_seconds, beat)
+
+        if self._enter is not None:
+            beat()
+        loop.add_reader(channel, look)
+        # uvloop has made it non-blocking; a reply that the socket can't hold waits for the trainer.
+        channel.setblocking(True)
+        look()
+        try:
+            await ended
+        except BaseException:
+            disconnect()
+            await self._envs.close()
+            raise
+        finally:
+            loop.remove_reader(channel)
+        return await self._envs.close()
+
+    def _note_entered(self, entry: int) -> None:
+        self._entered = entry
+        assert self._enter is not None
+        self._enter(entry)
+
+    def _post(self, completion: Completion) -> None:
+        """Send a completion; what can't be pickled is an error of its request."""
+        kind, payload = FrameKind.ERROR, b""
+        assert isinstance(completion, Result | Value | Raised | Failed)
+        try:
+            if isinstance(completion, Result):
+                kind, payload = FrameKind.RESULT, dumped(completion.out_of_band, "the result")
+                if completion.restarted:
+                    kind = FrameKind.RESTARTED
+                    payload = pickle.dumps((completion.restarted, payload))
+            elif isinstance(completion, Value):
+                kind, payload = FrameKind.VALUE, dumped(completion.value, "what it returned")
+            elif isinstance(completion, Raised):
+                kind, payload = FrameKind.ERROR, pickle.dumps(completion.error)
+            else:
+                kind, payload = FrameKind.FAILED, pickle.dumps(completion.fault)
+        except Exception as error:
+            kind, payload = FrameKind.ERROR, pickle.dumps(ErrorText.of(error))
+        self._send(kind, completion.entry, payload)
+
+
+def _run(main: Any) -> Any:
+    try:
+        import uvloop  # noqa: PLC0415  # There is none for Windows.
+    except ImportError:
+        return asyncio.run(main)
+    return uvloop.run(main)

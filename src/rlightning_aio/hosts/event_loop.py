@@ -1,0 +1,200 @@
+"""What envs do to the event loop that they share: how long they hold it, and what they leave.
+
+`watched` awaits a coroutine and measures each of its turns. `TimeLimit` finds requests that take
+too long with one timer for all envs. Tasks that an env starts belong to it, because they inherit
+its context; `cancel_leftovers` finds them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import logging
+import time
+from collections import deque
+from contextvars import Context, ContextVar
+from types import coroutine
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Coroutine, Generator, Mapping
+
+__all__ = [
+    "LONG_TURN_SECONDS",
+    "OWNER",
+    "TimeLimit",
+    "cancel",
+    "cancel_leftovers",
+    "log",
+    "place_of",
+    "tasks_of",
+    "watched",
+]
+
+LONG_TURN_SECONDS: Final = 0.1
+"""An env that holds the event loop for longer is reported."""
+OWNER: Final[ContextVar[object]] = ContextVar("rlightning_aio_env", default=None)
+"""The env on whose behalf code runs, also in tasks that the env has started."""
+log = logging.getLogger("rlightning_aio")
+
+
+@coroutine
+def watched(
+    answering: Coroutine[Any, Any, Any],
+    report: Callable[[int, float], None],
+    enter: Callable[[int], object] | None,
+    entry: int,
+) -> Generator[Any, Any, Any]:
+    """Await `answering`.
+
+    Args:
+        answering: a coroutine that has not begun.
+        report: gets `entry` and the seconds of each turn longer than `LONG_TURN_SECONDS`.
+        enter: gets `entry` before each turn.
+        entry: of the request.
+    """
+    send, throw, clock = answering.send, answering.throw, time.monotonic
+    error: BaseException | None = None
+    while True:
+        if enter is not None:
+            enter(entry)
+        began = clock()
+        try:
+            future = send(None) if error is None else throw(error)
+        except StopIteration as stop:
+            return stop.value
+        finally:
+            held = clock() - began
+            if held > LONG_TURN_SECONDS:
+                report(entry, held)
+        error = None
+        try:
+            yield future
+        except BaseException as thrown:
+            error = thrown
+
+
+def place_of(answering: Any) -> str:
+    """Name the calls in which the env's code waits, from the outermost in."""
+    frames: list[Any] = []
+    while answering is not None:
+        frame = getattr(answering, "cr_frame", None) or getattr(answering, "gi_frame", None)
+        if frame is not None and not frame.f_globals["__name__"].startswith("rlightning_aio.hosts"):
+            frames.append(frame)
+        answering = getattr(answering, "cr_await", getattr(answering, "gi_yieldfrom", None))
+    return " > ".join(
+        f"{frame.f_code.co_qualname}, {frame.f_code.co_filename}:{frame.f_lineno}"
+        for frame in frames
+    )
+
+
+class _Executing(Protocol):
+    entry: int
+
+
+class TimeLimit:
+    """Calls `expire` with each env whose request takes longer than `seconds`.
+
+    All requests have the same limit, so that the first to begin is the first whose time is up. One
+    timer serves all of them. Requests whose time is up get a tenth of it in addition, and as long
+    as the timer was late: while something else blocked the event loop, no env could go on.
+
+    Args:
+        seconds: the limit.
+        expire: gets the env and the limit.
+    """
+
+    def __init__(self, seconds: float, expire: Callable[[Any, float], None]) -> None:
+        self.seconds = seconds
+        self._expire = expire
+        self._running: deque[tuple[float, _Executing, int]] = deque()
+        self._timer: asyncio.TimerHandle
+        self._is_set = False
+        self._late: dict[int, asyncio.TimerHandle] = {}
+        self._num_late = 0
+
+    def begin(self, env: _Executing, loop: asyncio.AbstractEventLoop) -> None:
+        """`env` begins to execute `env.entry`, which is another one as soon as that has ended."""
+        self._running.append((time.monotonic() + self.seconds, env, env.entry))
+        if not self._is_set:
+            self._is_set = True
+            self._timer = loop.call_later(self.seconds, self._look, loop)
+
+    def end(self) -> None:
+        """Let nothing expire any more."""
+        self._running.clear()
+        for timer in (*self._late.values(), *((self._timer,) if self._is_set else ())):
+            timer.cancel()
+
+    def _look(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Find the requests whose time is up, and when to look for the next ones."""
+        self._is_set = False
+        now, lateness = time.monotonic(), 0.0
+        late: list[tuple[_Executing, int]] = []
+        while self._running:
+            expiry, env, entry = self._running[0]
+            if env.entry == entry and expiry > now:
+                self._is_set = True
+                self._timer = loop.call_later(expiry - now, self._look, loop)
+                break
+            self._running.popleft()
+            if env.entry == entry:
+                late.append((env, entry))
+                lateness = max(lateness, now - expiry)
+        if late:
+            self._num_late = number = self._num_late + 1
+            more = self.seconds / 10 + lateness
+            self._late[number] = loop.call_later(more, self._judge, number, late)
+
+    def _judge(self, number: int, late: list[tuple[_Executing, int]]) -> None:
+        del self._late[number]
+        for env, entry in late:
+            if env.entry == entry:
+                self._expire(env, self.seconds)
+
+
+async def cancel(tasks: Collection[asyncio.Task[Any]], seconds: float) -> set[asyncio.Task[Any]]:
+    """Cancel `tasks` and wait for them for some seconds; returns those that go on."""
+    for task in tasks:
+        task.cancel()
+    return (await asyncio.wait(tasks, timeout=seconds))[1] if tasks else set()
+
+
+async def cancel_leftovers(
+    names: Mapping[object, str], seconds: float, *, but: Collection[object] = ()
+) -> None:
+    """Report and cancel the tasks that closed envs have left running.
+
+    Args:
+        names: the envs' names, by what `OWNER` is in their contexts.
+        seconds: how long to wait for the tasks.
+        but: tasks that are known already.
+    """
+    left: dict[str, list[asyncio.Task[Any]]] = {}
+    for task, owner in tasks_of(names, asyncio.get_running_loop()).items():
+        if task not in but:
+            left.setdefault(names[owner], []).append(task)
+    for name, tasks in left.items():
+        log.warning(
+            "env %r left %d tasks running when it was closed (%s); they are cancelled: end them in "
+            "its close()",
+            name,
+            len(tasks),
+            ", ".join(task.get_name() for task in tasks),
+        )
+    await cancel([task for tasks in left.values() for task in tasks], seconds)
+
+
+def tasks_of(
+    envs: Collection[object], loop: asyncio.AbstractEventLoop
+) -> dict[asyncio.Task[Any], object]:
+    """Tasks that belong to one of `envs`, with that env, except the one that runs now."""
+    tasks = asyncio.all_tasks(loop) - {asyncio.current_task(loop)}
+    owners = {task: _owner_of(task) for task in tasks}
+    return {task: owner for task, owner in owners.items() if owner in envs}
+
+
+def _owner_of(task: asyncio.Task[Any]) -> object:
+    # Tasks have `get_context` from Python 3.12 on; but each refers to its context.
+    context = next((one for one in gc.get_referents(task) if type(one) is Context), None)
+    return None if context is None else context.get(OWNER)

@@ -1,0 +1,78 @@
+"""`ServerSettings`: the ``env_kwargs`` of an env_server entry, checked before anything starts."""
+
+from __future__ import annotations
+
+import ipaddress
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
+
+from rlightning_aio.errors import ConfigError
+from rlightning_aio.registry import did_you_mean
+from rlightning_aio.remote.keys import read_server_keys
+
+if TYPE_CHECKING:
+    from rlightning_aio.config import EnvConfig
+
+__all__ = ["ServerSettings", "server_settings"]
+
+
+class ServerSettings(BaseModel):
+    """``env_kwargs`` of an env_server entry."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    host: str = "127.0.0.1"
+    """Address to listen on; a public one needs ``keys``, or ``insecure: true``."""
+    port: int = Field(default=0, ge=0, le=65535, validation_alias=AliasChoices("port", "zmq_port"))
+    """Port to listen on; 0 picks a free one."""
+    min_clients: int = Field(default=1, ge=1)
+    """Clients that ``reset`` waits for."""
+    connect_timeout: float = Field(default=60.0, gt=0)
+    """Seconds that ``reset`` waits for them."""
+    heartbeat: float = Field(default=5.0, ge=0.1, le=86400)
+    """Seconds within which a dead client is found."""
+    keys: Path | None = None
+    """Its directory, made by ``rlightning-aio keygen``; only clients listed there are let in."""
+    insecure: bool = False
+    """Listen on a public address without keys: any machine that reaches it may be an env."""
+
+
+_FIELDS: Final = (*ServerSettings.model_fields, "zmq_port")
+
+
+def server_settings(config: EnvConfig) -> ServerSettings:
+    """Return the checked ``env_kwargs`` of an env_server entry.
+
+    Raises:
+        ConfigError: naming entry and field.
+    """
+    place = f"entry {config.name!r}, env_kwargs"
+    for name in config.env_kwargs:
+        if name not in _FIELDS:
+            hint = did_you_mean(name, _FIELDS, end=" ")
+            raise ConfigError(f"{place}.{name}: unknown field; {hint}Known: {', '.join(_FIELDS)}")
+    try:
+        settings = ServerSettings.model_validate(config.env_kwargs)
+    except ValidationError as error:
+        fault = error.errors(include_url=False)[0]
+        raise ConfigError(
+            f"{place}.{fault['loc'][0]}: {fault['msg']}, got {fault['input']!r}"
+        ) from None
+    if settings.keys is not None:
+        read_server_keys(settings.keys)
+    if not (_is_loopback(settings.host) or settings.keys or settings.insecure):
+        raise ConfigError(
+            f"{place}.host: {settings.host!r} can be reached from other machines, and without "
+            "keys any of them could pose as an env; set keys (see `rlightning-aio keygen`), "
+            "or insecure: true if the network is your own"
+        )
+    return settings
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False

@@ -1,0 +1,382 @@
+"""`OpenEnvServer`: a group's envs as sessions of an OpenEnv server, for OpenEnv's own clients.
+
+Each connection to ``/ws`` gets an env of its own as long as one is free, and gives it back at its
+end. Observations and infos travel as JSON: arrays as nested lists. Sessions that were created over
+``POST /mcp`` keep their envs until they are closed there.
+Left out: ``POST /reset`` and ``/step``, whose envs live for one call, and tools, which no env has.
+"""
+
+from __future__ import annotations
+
+import json
+import uuid
+from collections import deque
+from functools import partial
+from http import HTTPStatus
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any, Final, Self, cast
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+from gymnasium import spaces
+from websockets.asyncio.server import serve
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Response
+
+from rlightning_aio.envs.post_connection import PostConnection
+from rlightning_aio.errors import ConfigError, RLightningError
+from rlightning_aio.protocol.columns import as_array, is_dict, is_tuple
+from rlightning_aio.spaces import Anything
+
+if TYPE_CHECKING:
+    import gymnasium as gym
+    from websockets.asyncio.server import Server, ServerConnection
+    from websockets.http11 import Request
+
+    from rlightning_aio.group.aio import EnvGroup, EnvHandle
+
+__all__ = ["OpenEnvServer"]
+
+# Of JSON-RPC, as OpenEnv's servers use them.
+_PARSE_ERROR: Final = -32700
+_INVALID_REQUEST: Final = -32600
+_METHOD_NOT_FOUND: Final = -32601
+_INVALID_PARAMS: Final = -32602
+_INTERNAL_ERROR: Final = -32603
+_SERVER_ERROR: Final = -32000
+
+
+class _Session:
+    """An env that a client has.
+
+    Attributes:
+        is_kept: it was created over ``/mcp``, and outlives its socket.
+        is_attached: it has a socket.
+        is_closing: it ends with its socket.
+    """
+
+    def __init__(self, key: str, env: EnvHandle, *, is_kept: bool) -> None:
+        self.key = key
+        self.env = env
+        self.is_kept = is_kept
+        self.is_attached = self.is_closing = False
+        self.state: dict[str, Any] = {"episode_id": None, "step_count": 0}
+
+
+class OpenEnvServer:
+    """Serves the envs of a group whose entries have the same spaces; see the module.
+
+    Use it as an asynchronous context manager, inside that of the group.
+
+    Args:
+        group: initialised.
+        name: of the environment, as clients are told it.
+        host: address to listen on.
+        port: to listen on; 0 picks a free one.
+
+    Raises:
+        ConfigError: on entry, if it can't listen there.
+    """
+
+    def __init__(self, group: EnvGroup, name: str, host: str, port: int) -> None:
+        self._group = group
+        self._name = name
+        self._host, self._port = host, port
+        self._free = deque(group.env_ids)
+        self._sessions: dict[str, _Session] = {}
+        self._space: Any = group.get_action_spaces()[0]
+        self._server: Server
+
+    async def __aenter__(self) -> Self:
+        try:
+            self._server = await serve(
+                self._talk,
+                self._host,
+                self._port,
+                process_request=self._http,
+                max_size=None,
+                create_connection=cast("Any", partial(PostConnection, answer=self._post)),
+            )
+        except OSError as error:
+            reason = error.strerror or error
+            raise ConfigError(f"can't listen at {self._host}:{self._port}: {reason}") from error
+        return self
+
+    async def __aexit__(self, *exc: object) -> None:
+        self._server.close()
+        await self._server.wait_closed()
+
+    @property
+    def url(self) -> str:
+        """The address for clients."""
+        return f"http://{self._host}:{next(iter(self._server.sockets)).getsockname()[1]}"
+
+    # -- HTTP ---------------------------------------------------------------------
+
+    def _http(self, connection: ServerConnection, request: Request) -> Response | None:
+        del connection
+        path = request.path.partition("?")[0]
+        if path == "/ws":
+            return None
+        answers = {"/health": self._health, "/metadata": self._metadata, "/schema": self._schema}
+        found = answers.get(path)
+        status = HTTPStatus.NOT_FOUND if found is None else HTTPStatus.OK
+        body = _not_found(path) if found is None else json.dumps(found()).encode()
+        headers = {"Content-Type": "application/json", "Content-Length": str(len(body))}
+        return Response(status, status.phrase, Headers(headers), body)
+
+    def _health(self) -> dict[str, Any]:
+        return {"status": "healthy"}
+
+    def _metadata(self) -> dict[str, Any]:
+        text = f"{len(self._group)} sessions of an environment of rlightning-aio"
+        return {"name": self._name, "description": text, "version": version("rlightning-aio")}
+
+    def _schema(self) -> dict[str, Any]:
+        (observation, *_) = self._group.get_observation_spaces()
+        state = {"episode_id": {"type": "string"}, "step_count": {"type": "integer"}}
+        return {
+            "action": _fields_schema(self._space, "action"),
+            "observation": _fields_schema(observation, "observation"),
+            "state": {"type": "object", "properties": state},
+        }
+
+    async def _post(self, path: str, body: bytes) -> tuple[HTTPStatus, bytes]:
+        if path != "/mcp":
+            return HTTPStatus.NOT_FOUND, _not_found(path)
+        try:
+            request: Any = json.loads(body)
+        except ValueError:
+            answer = _rpc_error(None, _PARSE_ERROR, "Parse error")
+        else:
+            answer = self._rpc(request, None)
+        return HTTPStatus.OK, json.dumps(answer).encode()
+
+    # -- sessions -----------------------------------------------------------------
+
+    def _rpc(self, request: Any, session: _Session | None) -> dict[str, Any]:
+        """Answer a JSON-RPC request: of a session over its socket, or of anybody over HTTP."""
+        method, number = (
+            (cast("Any", request).get("method"), cast("Any", request).get("id"))
+            if isinstance(request, dict)
+            else (None, None)
+        )
+        if not isinstance(method, str):
+            return _rpc_error(number, _INVALID_REQUEST, "Invalid request: it needs a method")
+        params: Any = cast("Any", request).get("params") or {}
+        if not isinstance(params, dict):
+            return _rpc_error(number, _INVALID_PARAMS, "Params must be an object")
+        if method == "openenv/session/create":
+            created = session or self._create(is_kept=True)
+            if created is not None:
+                return _rpc_result(number, session_id=created.key)
+            most = len(self._group)
+            return _rpc_error(
+                number, _SERVER_ERROR, self._full(), active_sessions=most, max_sessions=most
+            )
+        if method == "openenv/session/close":
+            return self._close(number, cast("Any", params).get("session_id"), session)
+        if method in ("tools/list", "tools/call"):
+            return _rpc_error(number, _INTERNAL_ERROR, "Environment does not support MCP")
+        return _rpc_error(number, _METHOD_NOT_FOUND, f"Method not found: {method}")
+
+    def _close(self, number: Any, key: Any, own: _Session | None) -> dict[str, Any]:
+        session = self._sessions.get(key) if isinstance(key, str) else None
+        if session is None:
+            return _rpc_error(number, _INVALID_PARAMS, f"Unknown session_id: {key}")
+        if session is own:
+            text = "Cannot close active WebSocket-managed session via MCP method"
+            return _rpc_error(number, _INVALID_REQUEST, text)
+        session.is_closing = True
+        if session.is_attached:
+            return _rpc_result(number, session_id=key, closed=False, closing=True)
+        self._end(session)
+        return _rpc_result(number, session_id=key, closed=True)
+
+    def _full(self) -> str:
+        return f"all {len(self._group)} sessions are in use"
+
+    def _create(self, *, is_kept: bool) -> _Session | None:
+        """A session with an env; None if all are in use."""
+        if not self._free:
+            return None
+        env = self._group[self._free.popleft()]
+        session = _Session(str(uuid.uuid4()), env, is_kept=is_kept)
+        self._sessions[session.key] = session
+        return session
+
+    def _end(self, session: _Session) -> None:
+        del self._sessions[session.key]
+        self._free.append(session.env.env_id)
+
+    async def _talk(self, socket: ServerConnection) -> None:
+        """Serve one connection."""
+        assert socket.request is not None
+        (key,) = parse_qs(urlsplit(socket.request.path).query).get("session_id", [None])
+        try:
+            session = self._create(is_kept=False) if key is None else self._sessions.get(key)
+            if session is None and key is None:
+                most = len(self._group)
+                await _send_error(
+                    socket,
+                    "CAPACITY_REACHED",
+                    self._full(),
+                    active_sessions=most,
+                    max_sessions=most,
+                )
+            elif session is None:
+                await _send_error(socket, "SESSION_ERROR", f"Unknown session_id: {key}")
+            elif session.is_attached:
+                text = f"Session {key} already has an attached WebSocket"
+                await _send_error(socket, "SESSION_ERROR", text)
+            else:
+                await self._attach(socket, session)
+        except ConnectionClosed:
+            return
+
+    async def _attach(self, socket: ServerConnection, session: _Session) -> None:
+        session.is_attached = True
+        try:
+            await self._serve(socket, session)
+        finally:
+            session.is_attached = False
+            if session.is_closing or not session.is_kept:
+                self._end(session)
+
+    async def _serve(self, socket: ServerConnection, session: _Session) -> None:
+        while True:
+            try:
+                message: Any = json.loads(await socket.recv())
+                kind: Any = message.get("type")
+                data: dict[str, Any] = message.get("data") or {}
+            except (ValueError, AttributeError) as error:
+                await _send_error(socket, "INVALID_JSON", f"Invalid JSON: {error}")
+                continue
+            if kind == "close":
+                return
+            try:
+                reply = await self._reply(session, kind, data)
+            except (KeyError, TypeError, ValueError) as error:
+                await _send_error(socket, "VALIDATION_ERROR", f"Invalid message: {error}")
+            except RLightningError as error:
+                await _send_error(socket, "EXECUTION_ERROR", str(error))
+            else:
+                if reply is None:
+                    await _send_error(socket, "UNKNOWN_TYPE", f"Unknown message type: {kind}")
+                else:
+                    await socket.send(json.dumps({"type": reply[0], "data": reply[1]}))
+
+    async def _reply(
+        self, session: _Session, kind: Any, data: dict[str, Any]
+    ) -> tuple[str, dict[str, Any]] | None:
+        """Execute a message, and return the type and data of its reply; None if it is unknown."""
+        if kind == "state":
+            return "state", session.state
+        if kind == "mcp":
+            return "mcp", self._rpc(data, session)
+        if kind == "reset":
+            seed, episode_id = data.pop("seed", None), data.pop("episode_id", None)
+            answer = _observed(await session.env.reset(seed, data or None))
+            session.state = {"episode_id": episode_id, "step_count": 0}
+        elif kind == "step":
+            answer = _observed(await session.env.step(_action_in(self._space, data)))
+            session.state["step_count"] += 1
+        else:
+            return None
+        return "observation", answer
+
+
+def _not_found(path: str) -> bytes:
+    return json.dumps({"detail": f"there is no {path}; sessions are at /ws"}).encode()
+
+
+def _rpc_result(number: Any, **result: Any) -> dict[str, Any]:
+    return {"jsonrpc": "2.0", "id": number, "result": result}
+
+
+def _rpc_error(number: Any, code: int, message: str, **data: Any) -> dict[str, Any]:
+    error = {"code": code, "message": message, "data": data or None}
+    return {"jsonrpc": "2.0", "id": number, "error": error}
+
+
+async def _send_error(socket: ServerConnection, code: str, message: str, **more: Any) -> None:
+    data = {"message": message, "code": code, **more}
+    await socket.send(json.dumps({"type": "error", "data": data}))
+
+
+def _observed(ret: Any) -> dict[str, Any]:
+    """A result as the data of OpenEnv's observation message."""
+    observation = _jsonable(ret.observation)
+    if not isinstance(observation, dict):
+        observation = {"observation": observation}
+    metadata: dict[str, Any] = _jsonable(ret.info)
+    if ret.last_truncated:
+        metadata["truncated"] = True
+    done = bool(ret.last_terminated or ret.last_truncated)
+    data: dict[str, Any] = {
+        "observation": observation,
+        "reward": float(ret.last_reward),
+        "done": done,
+    }
+    return {**data, "metadata": metadata} if metadata else data
+
+
+def _jsonable(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(k): _jsonable(v) for k, v in cast("dict[Any, Any]", value).items()}
+    if isinstance(value, list | tuple):
+        return [_jsonable(one) for one in cast("list[Any]", value)]
+    if value is None or isinstance(value, str | bool | int | float):
+        return value
+    if isinstance(value, np.ndarray | np.generic) or hasattr(value, "detach"):
+        return as_array(value).tolist()
+    return repr(value)
+
+
+def _action_in(space: gym.Space[Any], data: dict[str, Any]) -> Any:
+    """The action that the fields of a step message mean.
+
+    Raises:
+        KeyError, TypeError, ValueError: they mean none.
+    """
+    if is_dict(space):
+        return {key: _value_in(inner, data[key]) for key, inner in space.spaces.items()}
+    if "action" in data:
+        return _value_in(space, data["action"])
+    if isinstance(space, Anything):
+        return data
+    raise KeyError("the message has no field 'action'")
+
+
+def _value_in(space: gym.Space[Any], value: Any) -> Any:
+    if is_dict(space):
+        return {key: _value_in(inner, value[key]) for key, inner in space.spaces.items()}
+    if is_tuple(space):
+        return tuple(map(_value_in, space.spaces, value))
+    return value if space.shape is None else np.asarray(value, space.dtype)
+
+
+def _fields_schema(space: Any, name: str) -> dict[str, Any]:
+    """The JSON Schema of the object that a value of `space` travels as."""
+    if is_dict(space):
+        return _schema_of(space)
+    return {"type": "object", "properties": {name: _schema_of(space)}}
+
+
+def _schema_of(space: Any) -> dict[str, Any]:
+    if is_dict(space):
+        parts = {key: _schema_of(inner) for key, inner in space.spaces.items()}
+        return {"type": "object", "properties": parts, "required": list(parts)}
+    if isinstance(space, spaces.Discrete):
+        discrete = cast("spaces.Discrete[Any]", space)
+        low, count = int(discrete.start), int(discrete.n)
+        return {"type": "integer", "minimum": low, "maximum": low + count - 1}
+    if isinstance(space, spaces.Text):
+        return {"type": "string", "maxLength": space.max_length}
+    if getattr(space, "shape", None) is not None:
+        schema: dict[str, Any] = {"type": "number" if space.dtype.kind == "f" else "integer"}
+        for size in reversed(space.shape):
+            schema = {"type": "array", "items": schema, "minItems": size, "maxItems": size}
+        return schema
+    return {}

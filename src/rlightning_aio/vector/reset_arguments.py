@@ -1,0 +1,56 @@
+"""Arguments of a vector env's `reset`: one seed for each env, and the mask of envs to reset."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from rlightning_aio.group.seeds import checked_seed
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+__all__ = ["checked_mask", "seeds_of_envs"]
+
+
+def seeds_of_envs(seed: int | Sequence[int | None] | None, num_envs: int) -> list[Any]:
+    """Return a seed or None for each env; a single seed counts up.
+
+    Raises:
+        ValueError: there are not `num_envs` seeds, or one is out of range.
+    """
+    if seed is None:
+        return [None] * num_envs
+    if not isinstance(seed, Sequence | np.ndarray):
+        first = checked_seed(seed)
+        return [first + k for k in range(num_envs)]
+    if len(seed) != num_envs:
+        raise ValueError(f"{len(seed)} seeds for num_envs={num_envs}; give one for each")
+    return [
+        None if one is None else checked_seed(one, f" of env {k}") for k, one in enumerate(seed)
+    ]
+
+
+def checked_mask(mask: Any, num_envs: int) -> NDArray[np.bool_]:
+    """Return ``options["reset_mask"]``, a bool array ``[num_envs]``.
+
+    Raises:
+        TypeError: it is no array of bools.
+        ValueError: it has another shape, or selects no env.
+    """
+    # Gymnasium's tests match these messages.
+    what = "`options['reset_mask']` must"
+    if not isinstance(mask, np.ndarray):
+        raise TypeError(f"{what} be a numpy array, got {type(mask)}")
+    array = cast("NDArray[Any]", mask)
+    if array.shape != (num_envs,):
+        raise ValueError(f"{what} have shape `({num_envs},)`, got {array.shape}")
+    if array.dtype != np.bool_:
+        raise TypeError(f"{what} have `dtype=np.bool_`, got {array.dtype}")
+    if not array.any():
+        raise ValueError(
+            f"{what} contain a boolean array with at least one True value, got reset_mask={array}"
+        )
+    return array

@@ -1,0 +1,58 @@
+"""What `make run` shows."""
+
+from __future__ import annotations
+
+import os
+import pty
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+from patience import HANG
+from run_python import output_of
+
+ROOT = Path(__file__).parents[2]
+DEMO = ROOT / "benchmarks" / "demo.py"
+
+
+def test_it_ends_with_the_ratio_of_this_machine_and_the_next_steps(tmp_path: Path) -> None:
+    shown = output_of(DEMO, "--rounds", "1", "--seconds", "0.05", folder=tmp_path)
+    rates = re.findall(r"(make_vec|AsyncVectorEnv) .* ([\d,]+) env steps/s", shown)
+    theirs, ours = (float(rate.replace(",", "")) for _, rate in rates)
+    (ratio,) = re.findall(r"make_vec is ([\d.]+) times as fast", shown)
+    # Rates are shown with three digits.
+    assert abs(float(ratio) - ours / theirs) <= 0.05 + 0.01 * ours / theirs
+    for page in re.findall(r"(?:docs|examples)/\w+\.\w+", shown):
+        assert (ROOT / page).exists(), page
+
+
+def test_ctrl_c_ends_it_with_what_was_measured(tmp_path: Path) -> None:
+    """On a terminal, where all processes get the signal."""
+    terminal, theirs = pty.openpty()
+    with subprocess.Popen(
+        [sys.executable, DEMO, "--rounds", "1000000", "--seconds", "0.05"],
+        cwd=tmp_path,
+        env={**os.environ, "COLUMNS": "100", "TERM": "xterm"},
+        stdin=theirs,
+        stdout=theirs,
+        stderr=theirs,
+        start_new_session=True,
+    ) as process:
+        os.close(theirs)
+        shown = b""
+        while shown.count(b"env steps/s") < 3:
+            shown += os.read(terminal, 10_000)
+        os.killpg(process.pid, signal.SIGINT)
+        try:
+            while part := os.read(terminal, 10_000):
+                shown += part
+        except OSError:  # The last process has closed the terminal.
+            pass
+        assert process.wait(HANG) == 130
+    os.close(terminal)
+    text = shown.decode()
+    assert "Traceback" not in text
+    assert "times as fast" in text
+    assert "Next:" in text

@@ -1,0 +1,34 @@
+"""How many Python calls a step makes on the trainer's side: no more than was agreed.
+
+And how many files a death passes through.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+SCRIPT = Path(__file__).parents[2] / "benchmarks" / "step_calls.py"
+MOST = {
+    "step_async and collect_async": {"calls": 60, "functions": 45, "files": 10},
+    "the same, asynchronous": {"calls": 60, "functions": 45, "files": 10},
+    "step": {"calls": 60, "functions": 45, "files": 10},
+    "VectorEnv.step": {"calls": 80},
+    "Collector.collect, 16 transitions": {"calls": 400},
+    "death with resume: files": {"files of src": 20},
+}
+
+
+def test_a_step_makes_few_calls() -> None:
+    """The counts are exact, so a step that passes by one more object is noticed here."""
+    command = [sys.executable, str(SCRIPT), "--json"]
+    # The debug modes that tests run in, asyncio's and ours, make calls of their own.
+    surroundings = {name: value for name, value in os.environ.items() if "DEBUG" not in name}
+    ended = subprocess.run(command, capture_output=True, check=True, text=True, env=surroundings)
+    found = json.loads(ended.stdout)
+    for name, limits in MOST.items():
+        for what, most in limits.items():
+            assert found[name][what] <= most, (name, what, found[name])

@@ -1,0 +1,122 @@
+"""Rewards that are NaN, infinite or huge: what can be figured is, and the rest is null."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from cli.command import invoke, invoke_json, run, write_config
+
+from rlightning_aio.evaluation.estimates import mean_estimate
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+REWARDS = {"plain": "1", "unknown": "nan", "endless": "inf", "below": "-inf", "huge": "1e308"}
+ODD = ("unknown-0", "endless-0", "below-0", "huge-0")
+"""Three steps of 1e308 are more than a float holds."""
+
+
+def config(folder: Path, rewards: dict[str, str] = REWARDS) -> str:
+    return write_config(
+        folder,
+        *(
+            {
+                "name": name,
+                "task": "cli.judged_env:rewarded",
+                "env_kwargs": {"reward": reward},
+                "placement": "inline",
+            }
+            for name, reward in rewards.items()
+        ),
+    )
+
+
+def strict(constant: str) -> Any:
+    raise AssertionError(f"{constant} is not JSON")
+
+
+def check_notes(notes: list[str]) -> None:
+    (note,) = (note for note in notes if "eval" not in note)
+    assert all(env_id in note for env_id in ODD)
+    assert "plain" not in note
+
+
+def test_eval_prints_and_keeps_what_it_played(tmp_path: Path) -> None:
+    file, plot = tmp_path / "episodes.jsonl", tmp_path / "plot.png"
+    words = ("eval", config(tmp_path), "--seed", 0, "--resume", file)
+    # In a process of its own: matplotlib keeps its fonts open.
+    done = run(*words, "--episodes", 2, "--json", "--plot", plot)
+    assert (done.returncode, done.stderr.count("warning")) == (0, 0), done.stderr
+    assert plot.read_bytes().startswith(b"\x89PNG")
+    document = json.loads(done.stdout, parse_constant=strict)
+    check_notes(document["notes"])
+    means = {entry["name"]: entry["total_reward"]["mean"] for entry in document["entries"]}
+    assert means == {"plain": 3.0, "unknown": None, "endless": None, "below": None, "huge": None}
+    lengths = [entry["length"]["mean"] for entry in document["entries"]]
+    assert lengths == [3.0] * 5
+    assert len(document["episodes"]) == 10
+    for line in file.read_text().splitlines():
+        json.loads(line, parse_constant=strict)
+    again = invoke_json(*words, "--episodes", 3)
+    assert len(again["episodes"]) == 15
+    check_notes(again["notes"])
+
+
+@pytest.mark.parametrize("words", [["eval"], ["rollout", "--steps", "200"]], ids=lambda w: w[0])
+def test_the_table_says_whose_returns_are_odd(tmp_path: Path, words: list[str]) -> None:
+    done = invoke(*words, config(tmp_path), "--seed", 0)
+    assert done.exit_code == 0
+    check_notes([line for line in done.stdout.splitlines() if line.startswith("returns of")])
+    assert " nan " not in done.stdout
+
+
+def test_rollout_prints_what_it_collected(tmp_path: Path) -> None:
+    words = ("rollout", config(tmp_path), "--seed", 0, "--steps", 200)
+    done = run(*words, "--json", "--plot", tmp_path / "plot.png")
+    assert (done.returncode, done.stderr.count("warning")) == (0, 0), done.stderr
+    document = json.loads(done.stdout, parse_constant=strict)
+    check_notes(document["notes"])
+    means = [entry["mean_return"] for entry in document["entries"]]
+    assert means == [3.0, None, None, None, None]
+
+
+def test_ordinary_returns_need_no_note(tmp_path: Path) -> None:
+    assert invoke_json("eval", config(tmp_path, {"plain": "1"}))["notes"] == []
+
+
+def test_a_rollout_says_that_its_means_favour_short_episodes(tmp_path: Path) -> None:
+    """And what measures a policy; where no episode has ended, there is no mean."""
+    one = config(tmp_path, {"plain": "1"})
+    (note,) = invoke_json("rollout", one, "--steps", 200)["notes"]
+    assert "ended first" in note
+    assert "rlightning-aio eval" in note
+    table = invoke("rollout", one, "--steps", 200).stdout
+    assert "rlightning-aio eval" in " ".join(table.split())
+    assert invoke_json("rollout", one, "--steps", 1)["notes"] == []
+
+
+def test_large_returns_are_averaged_and_short_in_the_table(tmp_path: Path) -> None:
+    large = config(tmp_path, {"large": "5e300"})
+    for words in (("eval", large), ("rollout", large, "--steps", 200)):
+        notes = invoke_json(*words)["notes"]
+        assert [note for note in notes if "large" in note] == []
+        assert "1.5e+301" in invoke(*words).stdout
+
+
+def test_estimates_of_any_values() -> None:
+    assert mean_estimate([]) is None
+    for values in ([1e308, 1.5e308, 1.7e308], [-1e308, 1.2e308], [5e-324, 0.0], [0.0, 0.0]):
+        found = mean_estimate(values)
+        assert found is not None
+        assert min(values) <= found.mean <= max(values)
+        assert found.low is not None
+        assert found.high is not None
+        assert found.low <= found.mean <= found.high
+    for values in ([math.nan, 1.0], [math.inf, 1.0], [math.inf, -math.inf], [math.nan]):
+        found = mean_estimate(values)
+        assert found is not None
+        assert not math.isfinite(found.mean)
+        assert (found.low, found.high, found.count) == (None, None, len(values))

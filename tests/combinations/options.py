@@ -1,0 +1,239 @@
+"""Options of a group, and a choice of them in which each pair of values comes together."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import itertools
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, Protocol, Self, TypeVar
+
+import numpy as np
+from combinations.played import KINDS, TASKS, Transition, act, as_tuple, played
+from patience import HANG
+
+import rlightning_aio
+import rlightning_aio.sync
+from rlightning_aio.errors import NothingPending
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rlightning_aio.batch import BatchedData
+
+SEED, NUM_ENVS = 7, 3
+PLACEMENTS: dict[str, dict[str, Any]] = {
+    "inline": {"placement": "inline"},
+    "process": {"envs_per_process": 2},
+    # Two envs in a worker, and one here.
+    "split": {"placement": "split", "envs_per_process": 2},
+    "ray": {"placement": "ray", "num_cpus": 0, "envs_per_process": 2, "start_timeout": HANG},
+}
+HERE = ("inline", "process", "split")
+"""Those that need no cluster."""
+FACTORS: dict[str, tuple[Any, ...]] = {
+    "kind": tuple(KINDS),
+    "placement": HERE,
+    "zero_copy": (True, False),
+    "task": tuple(TASKS),
+    "limit": (math.inf, 4),
+    "snapshot_every": (None, 3),
+    "results": ((1, None), (2, 2), (2, None)),
+    "is_async": (False, True),
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """What a group is built with, and how it is used.
+
+    Attributes:
+        results: `min_results` and `max_results` of a collect.
+    """
+
+    kind: str
+    placement: str
+    zero_copy: bool
+    task: str
+    limit: float
+    snapshot_every: int | None
+    results: tuple[int, int | None]
+    is_async: bool
+
+    def __str__(self) -> str:
+        """An id for a test."""
+        copies = "views" if self.zero_copy else "copies"
+        limit = "" if self.limit == math.inf else f"-limit {self.limit}"
+        kept = f"-every {self.snapshot_every}" if self.snapshot_every else ""
+        least, most = self.results
+        awaited = "-async" if self.is_async else ""
+        words = f"{self.task}-{self.kind}-{self.placement}-{copies}-{least} to {most or 'all'}"
+        return f"{words}{limit}{kept}{awaited}"
+
+    @property
+    def fits(self) -> bool:
+        """CartPole warns of steps after its end, and there is nothing to resume in one process."""
+        steps_on = self.task == "CartPole" and self.kind == "three together"
+        return not steps_on and not (self.snapshot_every and self.placement == "inline")
+
+
+class Choice(Protocol):
+    """One value of each factor."""
+
+    @property
+    def fits(self) -> bool:
+        """There can be such a group."""
+        ...
+
+
+C = TypeVar("C", bound=Choice)
+
+
+def pairwise(make: Callable[..., C], factors: dict[str, tuple[Any, ...]]) -> list[C]:
+    """Few choices among which every two values of different factors come together."""
+    pairs = {
+        choice: set(itertools.combinations(enumerate(values), 2))
+        for values in itertools.product(*factors.values())
+        if (choice := make(*values)).fits
+    }
+    missing = set[Any]().union(*pairs.values())
+    chosen: list[C] = []
+    while missing:
+        chosen.append(max(pairs, key=lambda choice: len(pairs[choice] & missing)))
+        missing -= pairs[chosen[-1]]
+    return chosen
+
+
+class Use:
+    """A group that is used from plain code, whichever driver it has.
+
+    Attributes:
+        group: initialised.
+    """
+
+    def __init__(self, options: Options) -> None:
+        self.options, self.kind = options, KINDS[options.kind]
+        entry = {
+            "name": "env",
+            "make_env": partial(self.kind.make, options.task),
+            "num_workers": NUM_ENVS,
+            "snapshot_every": options.snapshot_every,
+            **PLACEMENTS[options.placement],
+        }
+        if options.snapshot_every is not None:
+            entry["on_worker_death"] = "resume"
+        build = rlightning_aio if options.is_async else rlightning_aio.sync
+        self._runner = asyncio.Runner() if options.is_async else None
+        self.group: Any = build.build_env_group(entry, zero_copy=options.zero_copy)
+        self.done(self.group.init())
+
+    def done(self, result: Any) -> Any:
+        """What a call has returned; awaited, if it must be."""
+        if not inspect.iscoroutine(result):
+            return result
+        assert self._runner is not None
+        return self._runner.run(result)
+
+    def drain(self) -> None:
+        """Leave nothing outstanding."""
+        while True:
+            try:
+                self.done(self.group.collect_async(wait_all=True))
+            except NothingPending:
+                return
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.done(self.group.close())
+        if self._runner is not None:
+            self._runner.close()
+
+    @property
+    def size(self) -> int:
+        """Sub-environments of the group."""
+        return NUM_ENVS * max(self.kind.width, 1)
+
+    def act(self, batch: BatchedData) -> Any:
+        """The policy's actions."""
+        return act(self.options.task, batch.observation)
+
+    def model(self, count: int) -> list[list[Transition]]:
+        """`count` transitions at least of each env, after a reset with `SEED`."""
+        return [
+            own
+            for k in range(NUM_ENVS)
+            for own in self.played(SEED + k * max(self.kind.width, 1), count)
+        ]
+
+    def played(self, seed: int, count: int) -> list[list[Transition]]:
+        """The same of one env, whose first reset has that seed."""
+        seeds = range(seed, seed + max(self.kind.width, 1))
+        return played(self.options.task, self.kind.mode, seeds, self.options.limit, count)
+
+
+class Books:
+    """One list for each env, of what a user stores who goes by the batch's own columns."""
+
+    def __init__(self, use: Use) -> None:
+        self._use = use
+        self.lists: list[list[Transition]] = [[] for _ in range(use.size)]
+        self.num_results = 0
+        self._seen: dict[int, Any] = {}
+        self._first: dict[int, bool] = {}
+        self._waits: set[int] = set()
+
+    def take(self, batch: BatchedData) -> None:
+        """Store the transitions that end in `batch`."""
+        self.num_results += len(batch)
+        shape = batch.is_reset.shape
+        columns = [
+            np.reshape(column, (-1, *np.shape(column)[len(shape) :]))
+            for column in (batch.observation, batch.reward, batch.terminated, batch.truncated)
+        ]
+        resets, limits = batch.is_reset.reshape(-1), batch.limit_reached.reshape(-1)
+        actions = None if resets.all() else np.reshape(batch.sent.action, (resets.size, -1))
+        infos = batch.info()
+        for row, index in enumerate(batch.index.reshape(-1).tolist()):
+            observation, reward, terminated, truncated = (column[row] for column in columns)
+            after = observation
+            ended = bool(terminated or truncated)
+            if ended and self._use.kind.mode == "same_step":
+                env, sub_env = divmod(row, max(self._use.kind.width, 1))
+                final = infos[env]["final_obs"]
+                after = final[sub_env] if self._use.kind.width > 1 else final
+            if resets[row]:
+                self._waits.discard(index)
+                self._first[index] = True
+            elif index not in self._waits:
+                assert actions is not None
+                self.lists[index].append(
+                    Transition(
+                        self._seen[index],
+                        as_tuple(actions[row]),
+                        float(reward),
+                        bool(terminated),
+                        bool(truncated or limits[row]),
+                        as_tuple(after),
+                        self._first[index],
+                    )
+                )
+                self._first[index] = ended
+                if ended and self._use.kind.mode == "disabled":
+                    self._waits.add(index)
+            self._seen[index] = as_tuple(observation)
+
+    def check(self, at_least: int) -> None:
+        """Compare them with what the envs must have done, `at_least` transitions each."""
+        assert min(map(len, self.lists)) >= at_least
+        assert_as_played(self._use, self.lists)
+
+
+def assert_as_played(use: Use, lists: list[list[Transition]]) -> None:
+    """Each list is the beginning of what its env must do."""
+    model = use.model(max(map(len, lists)))
+    for own, expected in zip(lists, model, strict=True):
+        assert own == expected[: len(own)]

@@ -1,0 +1,259 @@
+"""An OpenEnv server over websockets that fails as a list of fates says.
+
+It speaks the protocol of OpenEnv 0.10. Each action has a unique number, which the observation
+repeats. The server records the numbers that it has executed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import json
+from collections import Counter, deque
+from functools import partial
+from http import HTTPStatus
+from typing import Any, Self
+from urllib.parse import parse_qs, urlsplit
+
+from websockets.asyncio.server import ServerConnection, serve
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed
+from websockets.frames import Opcode
+from websockets.http11 import Request, Response
+
+from rlightning_aio.envs.post_connection import PostConnection
+
+STEP_ERRORS = ("INVALID_JSON", "UNKNOWN_TYPE", "VALIDATION_ERROR", "EXECUTION_ERROR")
+CONNECT_ERRORS = ("CAPACITY_REACHED", "FACTORY_ERROR", "SESSION_ERROR", "unreachable")
+FATES = (
+    "ok",
+    "late",
+    "never",
+    "lost before",
+    "lost after",
+    "half a frame",
+    "no JSON",
+    "another type",
+    "leaked",
+    "idle loss",
+    "restart",
+    *STEP_ERRORS,
+)
+"""`never`: the reply comes after the socket is closed; `leaked`: the slot stays taken, too."""
+GOES_ON = ("ok", "late", "another type")
+ANSWERED = (*GOES_ON, "never", "idle loss")
+
+
+class Session:
+    """One env. `is_kept`: it outlives its socket; `is_attached`: it has a socket."""
+
+    def __init__(self, *, is_kept: bool) -> None:
+        self.is_kept = is_kept
+        self.is_attached = self.is_closing = self.is_leaked = False
+        self.step_count, self.episode_id = 0, None
+
+
+class Misbehaving:
+    """The server; see the module's docstring.
+
+    Attributes:
+        fates, connect_fates: of the next messages and connections; later ones succeed.
+        executed: number of executions of each action.
+        sessions: by id; most: the largest number at once.
+        refused: a connection was refused.
+        creating, may_create: set while a session waits to be created; set to let it continue.
+        loses_pongs: pings are never answered.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self.fates: deque[str] = deque()
+        self.connect_fates: deque[str] = deque()
+        self.executed: Counter[int] = Counter()
+        self.capacity = capacity
+        self.sessions: dict[str, Session] = {}
+        self.most = 0
+        self.refused = asyncio.Event()
+        self.creating, self.may_create = asyncio.Event(), asyncio.Event()
+        self.may_create.set()
+        self.loses_pongs = False
+        self._ids = map(str, itertools.count())
+        self._sockets: set[ServerConnection] = set()
+
+    async def __aenter__(self) -> Self:
+        connection = partial(PostConnection, answer=self._post)
+        self._server = await serve(
+            self._talk, "127.0.0.1", 0, process_request=self._http, create_connection=connection
+        )
+        self.url = f"http://127.0.0.1:{self._server.sockets[0].getsockname()[1]}"
+        return self
+
+    async def __aexit__(self, *exc: object) -> None:
+        self._server.close()
+        await self._server.wait_closed()
+
+    def reap(self) -> None:
+        """Free the leaked slots."""
+        for key in [key for key, session in self.sessions.items() if session.is_leaked]:
+            self.sessions[key].is_leaked = False
+            self._detach(key)
+
+    def restart(self) -> None:
+        """Forget all sessions."""
+        self.sessions.clear()
+        for socket in self._sockets:
+            socket.transport.abort()
+
+    def _http(self, connection: ServerConnection, request: Request) -> Response | None:
+        if request.path.startswith("/ws"):
+            if self.connect_fates and self.connect_fates[0] == "unreachable":
+                self.connect_fates.popleft()
+                connection.transport.abort()
+            return None
+        body = json.dumps({"status": "healthy"}).encode()
+        return Response(HTTPStatus.OK, "OK", Headers({"Content-Length": str(len(body))}), body)
+
+    # -- sessions
+
+    async def _post(self, path: str, body: bytes) -> tuple[HTTPStatus, bytes]:
+        assert path == "/mcp"
+        request = json.loads(body)
+        if request["method"] == "openenv/session/create":
+            self.creating.set()
+            await self.may_create.wait()
+        answer = self._rpc(request["method"], request["params"])
+        return HTTPStatus.OK, json.dumps({"jsonrpc": "2.0", "id": request["id"], **answer}).encode()
+
+    def _rpc(self, method: str, params: dict[str, Any]) -> dict[str, Any]:
+        if method == "openenv/session/create":
+            created = self._created(is_kept=True)
+            if created in self.sessions:
+                return {"result": {"session_id": created}}
+            data = {"max_sessions": 1} if created == "CAPACITY_REACHED" else {"factory_name": "f"}
+            return {"error": {"code": -32000, "message": created, "data": data}}
+        assert method == "openenv/session/close"
+        session = self.sessions.get(params["session_id"])
+        if session is None:
+            return {"error": {"code": -32602, "message": "Unknown session_id"}}
+        session.is_closing = True
+        if not session.is_attached:
+            del self.sessions[params["session_id"]]
+        return {"result": {"closing": session.is_attached}}
+
+    def _created(self, *, is_kept: bool) -> str:
+        """Return the id of a new session, or the code of an error."""
+        fate = self.connect_fates.popleft() if self.connect_fates else "ok"
+        if len(self.sessions) >= self.capacity:
+            fate = "CAPACITY_REACHED"
+        if fate != "ok":
+            self.refused.set()
+            self.reap()
+            return "FACTORY_ERROR" if fate == "unreachable" else fate
+        key = next(self._ids)
+        self.sessions[key] = Session(is_kept=is_kept)
+        self.most = max(self.most, len(self.sessions))
+        return key
+
+    def _attached(self, query: str) -> tuple[str, str]:
+        """Return the id of the session for a socket, or the code and text of an error."""
+        (key,) = parse_qs(query).get("session_id", [""])
+        if key == "":
+            key = self._created(is_kept=False)
+            if key not in self.sessions:
+                return key, "as it should not"
+        elif key not in self.sessions:
+            return "SESSION_ERROR", f"Unknown session_id: {key}"
+        elif self.sessions[key].is_attached:
+            self.reap()
+            return "SESSION_ERROR", f"Session {key} already has an attached WebSocket"
+        self.sessions[key].is_attached = True
+        return key, ""
+
+    def _detach(self, key: str) -> None:
+        session = self.sessions.get(key)
+        if session is not None and not session.is_leaked:
+            session.is_attached = False
+            if session.is_closing or not session.is_kept:
+                del self.sessions[key]
+
+    # -- messages
+
+    async def _talk(self, socket: ServerConnection) -> None:
+        assert socket.request is not None
+        key, text = self._attached(urlsplit(socket.request.path).query)
+        if text:
+            await self._error(socket, key, text)
+            return
+        if self.loses_pongs:
+            send = socket.protocol.send_frame
+            socket.protocol.send_frame = lambda frame: (  # type: ignore[method-assign]
+                None if frame.opcode is Opcode.PONG else send(frame)
+            )
+        self._sockets.add(socket)
+        session = self.sessions[key]
+        try:
+            while await self._answer(socket, session, json.loads(await socket.recv())):
+                pass
+        except ConnectionClosed:
+            pass
+        finally:
+            self._sockets.discard(socket)
+            if self.sessions.get(key) is session:
+                self._detach(key)
+
+    async def _answer(self, socket: ServerConnection, session: Session, message: Any) -> bool:
+        fate = self.fates.popleft() if self.fates else "ok"
+        if fate == "never" and message["type"] != "step":
+            fate = "late"  # Only steps have a short limit.
+        if fate in STEP_ERRORS:
+            await self._error(socket, fate, "as it should not")
+            return True
+        if fate != "lost before":
+            reply = self._executed(session, message)
+            if fate == "another type":
+                reply["type"] = "state" if reply["type"] == "observation" else "observation"
+            await self._begin(socket, session, fate)
+            if fate in ANSWERED:
+                await socket.send(json.dumps(reply))
+            if fate in GOES_ON:
+                return True
+        socket.transport.abort()
+        return False
+
+    async def _begin(self, socket: ServerConnection, session: Session, fate: str) -> None:
+        """Do what precedes the reply, or replaces it."""
+        if fate == "late":
+            await asyncio.sleep(0.005)
+        elif fate == "never":
+            await socket.wait_closed()
+        elif fate == "no JSON":
+            await socket.send("{")
+        elif fate == "half a frame":
+            socket.transport.write(b"\x81\x7e\x01\x00{")
+        elif fate == "restart":
+            self.restart()
+        session.is_leaked = fate == "leaked"
+
+    def _executed(self, session: Session, message: Any) -> dict[str, Any]:
+        kind, data = message["type"], message.get("data")
+        if kind == "state":
+            state = {"step_count": session.step_count, "episode_id": session.episode_id}
+            return {"type": "state", "data": state}
+        if kind == "mcp":
+            return {"type": "mcp", "data": {"result": data["params"]}}
+        if kind == "reset":
+            session.step_count, session.episode_id = 0, data["episode_id"]
+            answers = None
+        else:
+            answers = data["number"]
+            self.executed[answers] += 1
+            session.step_count += 1
+        seen = {"answers": answers, "episode": session.episode_id, "count": session.step_count}
+        observed = {"observation": seen, "reward": 1.0, "done": False}
+        return {"type": "observation", "data": observed}
+
+    async def _error(self, socket: ServerConnection, code: str, message: str) -> None:
+        data = {"code": code, "message": message}
+        await socket.send(json.dumps({"type": "error", "data": data}))
+
+
+numbers = itertools.count()

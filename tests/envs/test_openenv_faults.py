@@ -1,0 +1,205 @@
+"""The `openenv` backend against a server that misbehaves, driven by a state machine.
+
+Its 20 examples have 20 steps each. With RLIGHTNING_AIO_EXAMPLES=100 and RLIGHTNING_AIO_STEPS=100 it
+takes 10,000 steps, and `pytest -s` prints what the server was asked.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import os
+from typing import Any
+
+import pytest
+from envs.misbehaving_openenv import CONNECT_ERRORS, FATES, Misbehaving, numbers
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    rule,
+    run_state_machine_as_test,
+)
+from patience import HANG
+
+import rlightning_aio as rl
+from rlightning_aio.envs import openenv_session
+from rlightning_aio.errors import EnvRaised
+
+ENVS = 4
+CAUSES = (".ServerGone", ".ServerRefused")
+EACH = st.sets(st.integers(0, ENVS - 1), min_size=1)
+
+
+class Machine(RuleBasedStateMachine):
+    """Four envs at a server with four slots.
+
+    Attributes:
+        steps, sent, executed: how many steps all machines took; actions that were sent to envs,
+            and those that the server executed.
+        asked: the number of the action in flight, by env.
+        raised: the envs that must be reset.
+    """
+
+    steps = sent = executed = 0
+
+    @initialize(session=st.sampled_from(["own", "keep"]), loses_pongs=st.booleans())
+    def begin(self, session: str, *, loses_pongs: bool) -> None:
+        self.runner = asyncio.Runner()
+        self.asked: dict[str, int] = {}
+        self.raised: set[str] = set()
+        self.run(self._begin(session, loses_pongs=loses_pongs))
+
+    @invariant()
+    def count(self) -> None:
+        Machine.steps += 1
+
+    def run(self, coroutine: Any) -> Any:
+        return self.runner.run(asyncio.wait_for(coroutine, HANG))
+
+    async def _begin(self, session: str, *, loses_pongs: bool) -> None:
+        self.server = await Misbehaving(ENVS).__aenter__()
+        self.server.loses_pongs = loses_pongs
+        entry = {"name": "o", "backend": "openenv", "task": self.server.url, "num_workers": ENVS}
+        entry |= {"placement": "loop", "step_timeout": 0.05, "max_restarts": 10**6}
+        self.group = rl.build_env_group({**entry, "env_kwargs": {"session": session}})
+        await self.group.init()
+        self.resetting = self.group.auto_reset(math.inf)
+        self.resetting.__enter__()
+        await self.group.reset()
+
+    @property
+    def idle(self) -> list[str]:
+        return [i for i in self.group.env_ids if i not in self.asked and i not in self.raised]
+
+    @rule(fates=st.lists(st.sampled_from(FATES), min_size=1, max_size=6))
+    def misbehave(self, fates: list[str]) -> None:
+        self.server.fates.extend(fates)
+
+    @rule(fates=st.lists(st.sampled_from(CONNECT_ERRORS), min_size=1, max_size=3))
+    def refuse(self, fates: list[str]) -> None:
+        self.server.connect_fates.extend(fates)
+
+    @rule()
+    def restart(self) -> None:
+        self.server.restart()
+
+    @rule(which=EACH)
+    def step(self, which: set[int]) -> None:
+        self.run(self._reset([i for i in sorted(self.raised) if int(i[2:]) in which]))
+        self.run(self._step([i for i in self.idle if int(i[2:]) in which]))
+
+    async def _step(self, ids: list[str]) -> None:
+        if ids:
+            steps = [rl.PolicyResponse(i, {"number": next(numbers)}) for i in ids]
+            Machine.sent += len(ids)
+            self.asked |= {one.env_id: one.action["number"] for one in steps}
+            self.group.step_async(rl.BatchedData(ids, steps))
+
+    @rule(share=st.floats(0, 1))
+    def collect(self, share: float) -> None:
+        self.run(self._collect(math.ceil(share * len(self.asked))))
+
+    @rule()
+    def collect_what_is_ready(self) -> None:
+        """A deadline cancels nothing."""
+        self.run(self._collect(len(self.asked), deadline=0.002))
+
+    async def _collect(self, count: int, deadline: float | None = None) -> None:
+        """Check that every request ends once, in a result for its own action or in an error."""
+        target = len(self.asked) - count
+        while len(self.asked) > target:
+            try:
+                batch, _ = await self.group.collect_async(min_results=1, deadline=deadline)
+            except TimeoutError:
+                return
+            except EnvRaised as error:
+                del self.asked[error.env_id]
+                self.raised.add(error.env_id)
+                continue
+            no_answer = batch.restarted | batch.truncated | batch.is_reset
+            for env_id, seen, none in zip(batch.ids(), batch.observation, no_answer, strict=True):
+                number = self.asked.pop(env_id)
+                assert none or seen["answers"] == number
+            if deadline is not None:
+                return
+
+    @rule(which=EACH)
+    def reset(self, which: set[int]) -> None:
+        self.run(self._reset([i for i in self.group.env_ids if int(i[2:]) in which]))
+
+    async def _reset(self, ids: list[str]) -> None:
+        for env_id in ids:
+            if env_id in self.asked:
+                continue
+            try:
+                batch, _ = await self.group.reset(env_ids=[env_id])
+            except EnvRaised:
+                self.raised.add(env_id)
+                continue
+            self.raised.discard(env_id)
+            assert [one["answers"] for one in batch.observation] == [None]
+
+    @rule(which=EACH)
+    def call(self, which: set[int]) -> None:
+        """Check that calls get their own replies, too."""
+        self.run(self._call([i for i in self.idle if int(i[2:]) in which]))
+
+    async def _call(self, ids: list[str]) -> None:
+        for env_id in ids:
+            number = next(numbers)
+            try:
+                reply = await self.group[env_id].call("mcp", "echo", {"number": number})
+                assert reply == {"result": {"number": number}}
+                assert "step_count" in await self.group[env_id].call("state")
+            except EnvRaised as error:
+                assert error.exception_type.endswith(CAUSES)  # noqa: PT017
+
+    def teardown(self) -> None:
+        if hasattr(self, "runner"):
+            try:
+                self.run(self._end())
+            finally:
+                self.runner.close()
+
+    async def _end(self) -> None:
+        """Check that every env is usable, no action has run twice, and no slot is taken."""
+        await self._collect(len(self.asked))
+        self.server.fates.clear()
+        self.server.connect_fates.clear()
+        while True:
+            await self._reset(list(self.group.env_ids))
+            ids = self.group.env_ids
+            await self._step(ids)
+            asked = dict(self.asked)
+            batch, _ = await self.group.collect_async(wait_all=True, ordered=True)
+            self.asked.clear()
+            if batch.restarted.any():
+                continue  # The machine was busy.
+            assert not batch.truncated.any()
+            seen = [one["answers"] for one in batch.observation]
+            assert seen == [asked[i] for i in ids]
+            break
+        self.resetting.__exit__(None, None, None)
+        await self.group.close()
+        assert set(self.server.executed.values()) <= {1}
+        Machine.executed += len(self.server.executed)
+        assert self.server.most <= ENVS
+        self.server.reap()
+        while self.server.sessions:  # noqa: ASYNC110  # It has still to see the sockets close.
+            await asyncio.sleep(0.001)
+        await self.server.__aexit__()
+
+
+# On a busy machine a session may take longer to close than `close` waits.
+@pytest.mark.filterwarnings("ignore:close.. of env .* took longer")
+def test_whatever_a_server_does_each_request_ends_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No reply answers another request, no action runs twice, no slot leaks, all envs recover."""
+    monkeypatch.setattr(openenv_session, "_KEEPALIVE_SECONDS", 0.002)
+    monkeypatch.setattr(openenv_session, "_PAUSE_SECONDS", (0.001, 0.01))
+    steps = int(os.environ.get("RLIGHTNING_AIO_STEPS", "20"))
+    run_state_machine_as_test(Machine, settings=settings(stateful_step_count=steps))
+    told = f"{Machine.steps} steps: {Machine.sent} actions, {Machine.executed} executed once"
+    print(f"{told}; no slot was leaked")  # noqa: T201

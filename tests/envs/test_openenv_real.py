@@ -1,0 +1,130 @@
+"""The `openenv` backend and `serve` with OpenEnv itself, which has its own Python."""
+
+# pyright: basic
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import socket
+import subprocess
+from contextlib import contextmanager
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import pytest
+from cli.command import start, write_config
+from cli.test_interrupt import interrupt
+from envs.openenv_actions import STEPS, action_of, seed_of
+
+import rlightning_aio as rl
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+HERE = Path(__file__).parent
+PYTHON = os.environ.get("OPENENV_PYTHON", "")
+OPENENV = [PYTHON, str(HERE / "openenv_server.py")]
+# It is to be as fast as usual, and errors of tools that are meant to be are no news.
+AS_USUAL = {k: v for k, v in os.environ.items() if k != "PYTHONASYNCIODEBUG"}
+AS_USUAL["FASTMCP_LOG_LEVEL"] = "CRITICAL"
+pytestmark = [
+    pytest.mark.simulators,
+    pytest.mark.skipif(not PYTHON, reason="OPENENV_PYTHON names no Python with OpenEnv"),
+]
+
+
+@contextmanager
+def served(kind: str, sessions: int) -> Iterator[str]:
+    """The address of an OpenEnv server."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    process = subprocess.Popen([*OPENENV, "serve", kind, str(port), str(sessions)], env=AS_USUAL)
+    try:
+        yield f"http://127.0.0.1:{port}"
+    finally:
+        process.terminate()
+        process.wait()
+
+
+CUT = {"truncated_field": "late", "columns": {"total": 1000}}
+
+
+@pytest.mark.parametrize("kind", ["dice", "echo", "tools"])
+def test_sessions_equal_stepping_the_env_directly(kind: str) -> None:
+    """Observations, rewards, ends and metadata, over 64 sessions of both sorts."""
+    episodes = int(os.environ.get("RLIGHTNING_AIO_EPISODES", "2"))
+    command = [*OPENENV, "direct", kind, "64", str(episodes)]
+    with (
+        served(kind, 64) as url,
+        subprocess.Popen(command, stdout=subprocess.PIPE, env=AS_USUAL) as direct,
+    ):
+        found = [
+            asyncio.run(play(kind, url, session, 64, episodes), debug=False)
+            for session in ("own", "keep")
+        ]
+        assert direct.stdout is not None
+        expected = json.load(direct.stdout)
+    assert found == [expected, expected]
+    print(f"{kind}: {sum(map(len, chain(*expected)))} equal results")  # noqa: T201
+
+
+async def play(
+    kind: str, url: str, session: str, count: int, episodes: int
+) -> list[list[list[Any]]]:
+    """Rows of observation, reward, done and metadata: of each session, each episode."""
+    kwargs = {"session": session, **(CUT if kind == "dice" else {})}
+    entry = {"name": "d", "backend": "openenv", "task": url, "num_workers": count}
+    entry |= {"placement": "loop", "env_kwargs": kwargs}
+    played: list[list[list[Any]]] = [[] for _ in range(count)]
+    async with rl.build_env_group(entry) as group:
+        for episode in range(episodes):
+            batch, _ = await group.reset(seed=[seed_of(k, episode) for k in range(count)])
+            for k, row in enumerate(rows_of(batch)):
+                played[k].append([row])
+            running = list(range(count))
+            for step in range(STEPS):
+                steps = [
+                    rl.PolicyResponse(f"d-{k}", action_of(kind, k, episode, step)) for k in running
+                ]
+                batch, _ = await group.step(rl.BatchedData([one.env_id for one in steps], steps))
+                for k, row in zip(running, rows_of(batch), strict=True):
+                    played[k][-1].append(row)
+                running = [k for k, done in zip(running, batch.done, strict=True) if not done]
+                if not running:
+                    break
+    return played
+
+
+def rows_of(batch: Any) -> list[list[Any]]:
+    rows: list[list[Any]] = []
+    for ret in batch.values():
+        observation, metadata = ret.observation, dict(ret.info)
+        if "rest" in observation:
+            observation = {"total": observation["total"].item(), **observation["rest"]}
+            assert ret.last_truncated == metadata.get("late", False)
+        done = ret.last_terminated or ret.last_truncated
+        assert done == ("episode" in metadata)
+        metadata.pop("episode", None)  # The group's own.
+        rows.append([observation, ret.last_reward, done, metadata])
+    return rows
+
+
+def test_the_client_of_openenv_uses_our_server(tmp_path: Path) -> None:
+    pole = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1", "num_workers": 4}
+    with start("serve", write_config(tmp_path, pole), "--port", 0) as server:
+        assert server.stdout is not None
+        url = server.stdout.readline().split()[-1]
+        client = [PYTHON, str(HERE / "openenv_client.py"), url, "4"]
+        text = subprocess.run(client, stdout=subprocess.PIPE, check=True, env=AS_USUAL).stdout
+        interrupt(server)
+    env = gym.make("CartPole-v1")
+    for seed, (first, *rows) in enumerate(json.loads(text)):
+        assert first == env.reset(seed=seed)[0].tolist()
+        for number, (observation, reward, done) in enumerate(rows, 1):
+            found, gained, terminated, truncated, _ = env.step(number % 2)
+            assert (observation, reward) == (found.tolist(), gained)
+            assert done == (terminated or truncated)

@@ -1,0 +1,225 @@
+"""Episode continuity: the transition table, and random use compared with a naive model."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+
+from rlightning_aio.config import EnvConfig
+from rlightning_aio.group.continuity import (
+    LEGAL,
+    Continuity,
+    LossEvent,
+    LossPhase,
+    Position,
+    Report,
+)
+from rlightning_aio.group.env_table import EnvTable
+from rlightning_aio.protocol.slab import AS_RESTORED, IS_RESET, NO_SEED, OVER
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+SLOT = np.array([0])
+STEP = np.array([True])
+
+
+def new_continuity(size: int = 1) -> Continuity:
+    config = EnvConfig(name="e", backend="gymnasium", task="x")
+    return Continuity(EnvTable([config] * size, [f"e-{k}" for k in range(size)]))
+
+
+def part_of(slots: Any, is_reset: Any, over: Any) -> Any:
+    """Return the columns of a part of a batch that continuity reads."""
+    flags = np.zeros((len(slots), 4), np.bool_)
+    flags[:, IS_RESET], flags[:, OVER] = is_reset, over
+    return SimpleNamespace(slots=np.array(slots), flags=flags, positions=None)
+
+
+EVENTS: dict[LossEvent, Callable[[Continuity], object]] = {
+    LossEvent.EPISODE_LOST: lambda c: c.lose([0], "was killed"),
+    LossEvent.REPORT_SENT: lambda c: c.report_losses(SLOT, ~STEP),
+    LossEvent.RESUME_SENT: lambda c: c.report_losses(SLOT, STEP),
+    LossEvent.RESET_SENT: lambda c: c.note_resets([0]),
+    LossEvent.SHOW_SENT: lambda c: c.note_shows([0], [Position(3, is_cut=False)]),
+    LossEvent.ANSWERED: lambda c: c.answered(SLOT),
+    LossEvent.RAISED: lambda c: c.raised(0),
+    LossEvent.GIVEN_UP: lambda c: c.give_up([0]),
+}
+"""A call that makes each event happen to slot 0, which has a checkpoint."""
+
+
+def in_phase(phase: LossPhase) -> Continuity:
+    """Drive slot 0 into a phase by public methods."""
+    continuity = new_continuity()
+    continuity.save(0, b"state", 1, before=True, is_step=True)
+    if phase not in (LossPhase.INTACT, LossPhase.SHOWING):
+        EVENTS[LossEvent.EPISODE_LOST](continuity)
+    by_event = {
+        LossPhase.REPORTING: LossEvent.REPORT_SENT,
+        LossPhase.RESUMING: LossEvent.RESUME_SENT,
+        LossPhase.RESETTING: LossEvent.RESET_SENT,
+        LossPhase.SHOWING: LossEvent.SHOW_SENT,
+    }
+    if phase in by_event:
+        EVENTS[by_event[phase]](continuity)
+    return continuity
+
+
+def phase_of(continuity: Continuity) -> LossPhase:
+    loss = continuity._losses.get(0)
+    return LossPhase.INTACT if loss is None else loss.phase
+
+
+@pytest.mark.parametrize(("phase", "event"), LEGAL)
+def test_each_transition_of_the_table_happens(phase: LossPhase, event: LossEvent) -> None:
+    """Through public methods; `exceptional` is True while an env is not intact."""
+    continuity = in_phase(phase)
+    assert phase_of(continuity) is phase
+    if event is LossEvent.GIVEN_UP and phase is LossPhase.INTACT:
+        assert LEGAL[phase, event] is LossPhase.INTACT
+    EVENTS[event](continuity)
+    assert phase_of(continuity) is LEGAL[phase, event]
+    assert continuity.exceptional == (LEGAL[phase, event] is not LossPhase.INTACT)
+
+
+@pytest.mark.parametrize(
+    ("phase", "event"),
+    [pair for pair in itertools.product(LossPhase, LossEvent) if pair not in LEGAL],
+)
+def test_every_other_event_is_refused(phase: LossPhase, event: LossEvent) -> None:
+    """A pair that is not in the table raises and changes nothing."""
+    continuity = in_phase(phase)
+    with pytest.raises(RuntimeError, match=f"is {phase.name}, where {event.name} can't happen"):
+        continuity._move(0, event)
+    assert phase_of(continuity) is phase
+
+
+def test_a_lost_episode_resumes_from_its_last_valid_checkpoint() -> None:
+    """A checkpoint of an unanswered request doesn't count; the report has what was lost."""
+    continuity = new_continuity()
+    for number in range(1, 6):
+        if number == 3:
+            continuity.save(0, b"third", number, before=False, is_step=True)
+        continuity.returned(SLOT, (), continuity.judge(SLOT, ()))
+    continuity.save(0, b"sixth", 6, before=False, is_step=True)
+    continuity.drop_unanswered([0], [6])
+    continuity.lose([0], "was killed")
+    assert continuity.checkpoints([0]) == (b"third",)
+    reports, seeds = continuity.report_losses(SLOT, STEP)
+    assert (reports.tolist(), seeds.tolist()) == ([True], [AS_RESTORED])
+    assert continuity.answered(SLOT) == [Report(0, "was killed", 2)]
+    shown = part_of([0], [True], [False])
+    continuity.returned(SLOT, [shown], continuity.judge(SLOT, [shown]))
+    assert continuity.positions(SLOT) == [Position(3, is_cut=False)]
+
+
+def test_an_env_that_is_being_reset_or_due_does_not_resume() -> None:
+    """It begins a new episode, although it has a checkpoint."""
+    continuity = in_phase(LossPhase.LOST)
+    reports, seeds = continuity.report_losses(SLOT, ~STEP)
+    assert (reports.tolist(), seeds.tolist()) == ([True], [NO_SEED])
+    assert continuity.answered(SLOT) == [Report(0, "was killed", None)]
+
+
+def test_an_env_that_dies_while_it_resumes_resumes_again() -> None:
+    """Although its request is a reset by then."""
+    continuity = in_phase(LossPhase.RESUMING)
+    continuity.lose([0], "was killed again")
+    _, seeds = continuity.report_losses(SLOT, ~STEP)
+    assert seeds.tolist() == [AS_RESTORED]
+    assert continuity.answered(SLOT) == [Report(0, "was killed again", 0)]
+
+
+@dataclass
+class ModelEnv:
+    """The model's view of one env."""
+
+    num_steps: int = 0
+    cut: bool = False
+    ended: bool = False
+
+
+class ContextMachine(RuleBasedStateMachine):
+    """Steps, resets and ends of a few envs inside and outside contexts, in random batches."""
+
+    @initialize(size=st.integers(1, 4))
+    def start(self, size: int) -> None:
+        self.continuity = new_continuity(size)
+        self.model = [ModelEnv() for _ in range(size)]
+        self.limit: int | None = None
+        self.on_done = True
+
+    @precondition(lambda self: self.limit is None)
+    @rule(limit=st.integers(1, 4), on_done=st.booleans())
+    def enter(self, limit: int, on_done: bool) -> None:
+        self.continuity.begin(limit, on_done=on_done)
+        self.limit, self.on_done = limit, on_done
+
+    @precondition(lambda self: self.limit is not None)
+    @rule()
+    def leave(self) -> None:
+        self.continuity.end()
+        self.limit = None
+
+    @rule(data=st.data(), fails=st.sampled_from((False, False, True)))
+    def step(self, data: st.DataObject, fails: bool) -> None:
+        """Return one batch. If memory runs out, it is judged again."""
+        slots = data.draw(
+            st.lists(st.sampled_from(range(len(self.model))), min_size=1, unique=True)
+        )
+        due = np.broadcast_to(self.continuity.resets(np.array(slots)), len(slots))
+        resets, overs, cuts = [], [], []
+        for slot, is_due in zip(slots, due.tolist(), strict=True):
+            env = self.model[slot]
+            expected = env.cut or (self.on_done and env.ended)
+            assert is_due == (self.limit is not None and expected)
+            if self.limit is None:
+                env.cut = False
+            if is_due:
+                self.model[slot] = env = ModelEnv()
+            else:
+                env.num_steps += 1
+                env.ended = env.ended or data.draw(st.booleans())
+            resets.append(is_due)
+            overs.append(env.ended)
+            cuts.append(self.limit is not None and not is_due and env.num_steps >= self.limit)
+            env.cut = env.cut or cuts[-1]
+        self.hand_out(slots, resets, overs, cuts, fails)
+
+    @rule(data=st.data())
+    def reset(self, data: st.DataObject) -> None:
+        slots = data.draw(
+            st.lists(st.sampled_from(range(len(self.model))), min_size=1, unique=True)
+        )
+        self.continuity.note_resets(slots)
+        for slot in slots:
+            self.model[slot] = ModelEnv()
+        nothing = [False] * len(slots)
+        self.hand_out(slots, [True] * len(slots), nothing, nothing, fails=False)
+
+    def hand_out(
+        self, slots: list[int], resets: list[bool], overs: list[bool], cuts: list[bool], fails: bool
+    ) -> None:
+        flagged = [part_of(slots, resets, overs)] if any(resets + overs) else []
+        for _ in range(1 + fails):
+            verdict = self.continuity.judge(np.array(slots), flagged)
+        is_cut = [False] * len(slots) if verdict.is_cut is None else verdict.is_cut.tolist()
+        assert is_cut == cuts
+        self.continuity.returned(np.array(slots), flagged, verdict)
+
+    @invariant()
+    def positions_agree(self) -> None:
+        if hasattr(self, "model"):
+            positions = self.continuity.positions(np.arange(len(self.model)))
+            assert positions == [Position(env.num_steps, env.cut) for env in self.model]
+
+
+TestContext = ContextMachine.TestCase

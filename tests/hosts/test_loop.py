@@ -1,0 +1,513 @@
+"""`placement: loop`: what awaitable envs may do wrong, and what no other place has."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+import time
+import warnings
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from hosts.awaited import (
+    BIG,
+    BIG_BYTES,
+    BLOCK,
+    CANCELLED,
+    END,
+    EXIT,
+    GATE,
+    HANG,
+    IGNORE,
+    INTERRUPT,
+    LEAK,
+    OWN,
+    RAISE,
+    STEP,
+    Scripted,
+)
+from hosts.beside_others import steps
+from patience import HANG as LONG
+
+import rlightning_aio as rl
+import rlightning_aio.sync
+from rlightning_aio.errors import ConfigError, EnvHung, EnvRaised, StartFailed, WorkerDied
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+SOON = 0.3
+"""A limit that is meant to pass. What answers beside it needs a few turns of the loop, which even a
+machine with much else to do takes in that time; and a loop that is kept waiting prolongs it.
+"""
+
+
+@pytest.fixture(autouse=True)
+async def fresh() -> AsyncIterator[None]:
+    Scripted.built.clear()
+    Scripted.closed.clear()
+    Scripted.gates.clear()
+    Scripted.at_gate.clear()
+    Scripted.let_go = asyncio.Event()
+    yield
+    Scripted.let_go.set()
+    await asyncio.sleep(0)
+
+
+def entry(name: str = "e", placement: str = "loop", **fields: Any) -> dict[str, Any]:
+    return {"name": name, "placement": placement, **OWN, **fields}
+
+
+@pytest.fixture(params=["loop", "process"])
+def place(request: pytest.FixtureRequest) -> dict[str, Any]:
+    """Both places with an event loop: this process's, and a worker's own for all of its envs."""
+    if request.param == "loop":
+        return {"placement": "loop"}
+    return {"placement": "process", "envs_per_process": 100}
+
+
+async def until_at_gate(*env_ids: str) -> None:
+    while not Scripted.at_gate.issuperset(env_ids):  # noqa: ASYNC110  # Seldom more than twice.
+        await asyncio.sleep(0)
+
+
+# -- many at once
+
+
+async def test_all_envs_of_an_entry_are_in_flight_at_once() -> None:
+    """A thousand steps wait at gates that open only when all of them have come."""
+    count = 1000
+    async with rl.build_env_group(entry(num_workers=count)) as group:
+        batch, _ = await group.reset(seed=5)
+        assert batch.observation[:, 3].tolist() == list(range(5, 5 + count))
+        gate = asyncio.Event()
+        Scripted.gates.update(dict.fromkeys(group.env_ids, gate))
+        group.step_async(batch.respond(action=np.full(count, GATE)))
+        await until_at_gate(*group.env_ids)
+        gate.set()
+        batch, _ = await group.collect_async(wait_all=True, ordered=True)
+        assert batch.observation[:, 2].tolist() == [1.0] * count
+
+
+async def test_awaitable_envs_of_one_worker_are_in_flight_at_once() -> None:
+    """Each waits for all others to begin, which only happens if none holds the worker."""
+    config = entry("m", "process", num_workers=8, envs_per_process=8) | {"backend": "meeting"}
+    with rlightning_aio.sync.build_env_group(config) as group:
+        batch, _ = group.reset()
+        for _ in range(3):
+            batch, _ = group.step(batch.respond(action=np.zeros(8, int)))
+        assert batch.reward.tolist() == [8.0] * 8
+
+
+async def test_a_collect_wakes_once_for_the_number_it_waits_for() -> None:
+    async with rl.build_env_group(entry(num_workers=50)) as group:
+        batch, _ = await group.reset()
+        gates = {env_id: asyncio.Event() for env_id in group.env_ids}
+        Scripted.gates.update(gates)
+        group.step_async(batch.respond(action=np.full(50, GATE)))
+        collecting = asyncio.ensure_future(group.collect_async(min_results=20))
+        for env_id in group.env_ids[:19]:
+            gates[env_id].set()
+        for _ in range(20):
+            await asyncio.sleep(0)
+        assert not collecting.done()
+        gates["e-40"].set()
+        batch, _ = await collecting
+        assert sorted(batch.ids()) == sorted([*group.env_ids[:19], "e-40"])
+        for gate in gates.values():
+            gate.set()
+        assert len((await group.collect_async(wait_all=True))[0]) == 30
+
+
+async def test_max_concurrency_limits_how_many_are_busy() -> None:
+    """The others queue, first come, first served, which doesn't count as their time."""
+    config = entry(num_workers=6, max_concurrency=2, step_timeout=0.4)
+    async with rl.build_env_group(config) as group:
+        batch, _ = await group.reset()
+        gates = {env_id: asyncio.Event() for env_id in group.env_ids}
+        Scripted.gates.update(gates)
+        group.step_async(batch.respond(action=np.full(6, GATE)))
+        opened: list[int] = []
+        for pair in (("e-0", "e-1"), ("e-2", "e-3"), ("e-4", "e-5")):
+            await until_at_gate(*pair)
+            assert Scripted.at_gate == set(pair)
+            await asyncio.sleep(0.2)
+            opened.append(time.monotonic_ns())
+            for env_id in pair:
+                gates[env_id].set()
+        batch, _ = await group.collect_async(wait_all=True, ordered=True)
+        assert not batch.restarted.any()
+        assert batch.observation[:, 2].tolist() == [1.0] * 6
+        assert (batch.busy_ns[4:] < time.monotonic_ns() - opened[1]).all()
+
+
+async def test_an_agent_may_be_one_coroutine_for_each_env() -> None:
+    """While other envs of the group are collected in batches."""
+
+    async def agent(env_id: str, seed: int) -> tuple[int, int]:
+        async with group.episode(env_id, seed=seed) as env:
+            count = 0
+            while not env.is_over:
+                count += 1
+                await env.step(END if count == 5 + seed else STEP)
+            last: Any = env.last
+            return count, int(last.observation[3])
+
+    async with rl.build_env_group(entry(num_workers=12)) as group:
+        batched = group.env_ids[8:]
+        agents = [asyncio.ensure_future(agent(group.env_ids[k], k)) for k in range(8)]
+        batch, _ = await group.reset(env_ids=batched)
+        for _ in range(10):
+            group.step_async(batch.respond(action=np.zeros(len(batch), int)))
+            batch, _ = await group.collect_async(min_results=2)
+            assert set(batch.ids()) <= set(batched)
+        assert await asyncio.gather(*agents) == [(5 + k, k) for k in range(8)]
+
+
+async def test_an_episode_that_is_cancelled_leaves_its_env_idle() -> None:
+    """The result of the step that was in flight is in nobody's way."""
+
+    async def agent() -> None:
+        async with group.episode("e-0") as env:
+            await env.step(GATE)
+
+    async with rl.build_env_group(entry(num_workers=2)) as group:
+        gate = Scripted.gates["e-0"] = asyncio.Event()
+        running = asyncio.ensure_future(agent())
+        await until_at_gate("e-0")
+        running.cancel()
+        await asyncio.sleep(0)
+        gate.set()
+        with pytest.raises(asyncio.CancelledError):
+            await running
+        batch, _ = await group.reset()
+        assert batch.observation[:, 1].tolist() == [2, 1]
+
+
+# -- envs that take too long
+
+
+async def test_a_step_that_takes_too_long_is_cancelled_and_its_env_rebuilt(
+    place: dict[str, Any], caplog: pytest.LogCaptureFixture
+) -> None:
+    """The marked result is a reset of the new env; the others have not noticed."""
+    async with rl.build_env_group(entry(num_workers=3, step_timeout=SOON, **place)) as group:
+        await group.reset(seed=1)
+        batch, _ = await group.step(steps(e_0=STEP, e_1=HANG, e_2=STEP))
+        assert batch.restarted.tolist() == batch.is_reset.tolist() == [False, True, False]
+        assert batch.truncated.tolist() == [False, True, False]
+        assert batch.info("worker_restarted", "") == ["", "hung in a step and was cancelled", ""]
+        assert batch.observation.tolist() == [[1, 1, 1, 1], [2, 1, 0, -1], [1, 1, 1, 3]]
+        batch, _ = await group.step(steps(e_0=STEP, e_1=STEP, e_2=END))
+        assert batch.observation[:, 2].tolist() == [2, 1, 2]
+        assert not batch.restarted.any()
+        assert group.get_workers()[0]["restarts"] == 1
+    if place["placement"] == "loop":
+        assert Scripted.closed[0] == "e-1"
+        assert f"'e-1' took longer than {SOON} s for a step" in caplog.text
+        assert "Scripted.step" in caplog.text
+
+
+async def test_a_step_that_ends_as_its_time_is_up_has_one_end() -> None:
+    """Its time is up in the turn of the loop before the one in which it would have ended."""
+    async with rl.build_env_group(entry(step_timeout=SOON)) as group:
+        batch, _ = await group.reset()
+        gate = Scripted.gates["e-0"] = asyncio.Event()
+        group.step_async(batch.respond(action=[GATE]))
+        await until_at_gate("e-0")
+        await asyncio.sleep(SOON)
+        gate.set()
+        time.sleep(SOON)  # noqa: ASYNC251  # The last timer and the gate are in one turn then.
+        batch, _ = await group.collect_async()
+        assert batch.restarted.all() or batch.observation[0, 2] == 1
+        batch, _ = await group.step(steps(e_0=STEP))
+        assert not batch.restarted.any()
+
+
+async def test_time_during_which_the_event_loop_was_blocked_is_nobodys() -> None:
+    """A policy that computes for longer than the limit costs no env its episode."""
+    asyncio.get_running_loop().set_debug(False)  # It would keep what it warns of.
+    async with rl.build_env_group(entry(num_workers=20, step_timeout=SOON)) as group:
+        batch, _ = await group.reset()
+        group.step_async(batch.respond(action=np.full(20, STEP)))
+        await asyncio.sleep(0)
+        time.sleep(2 * SOON)  # noqa: ASYNC251
+        batch, _ = await group.collect_async(wait_all=True, ordered=True)
+        assert not batch.restarted.any()
+
+
+async def test_a_reset_that_takes_too_long_is_repeated_by_a_new_env(place: dict[str, Any]) -> None:
+    async with rl.build_env_group(entry(num_workers=2, reset_timeout=SOON, **place)) as group:
+        batch, _ = await group.reset(seed=7, options={"hang": 1})
+        assert batch.restarted.all()
+        assert batch.observation.tolist() == [[2, 1, 0, 7], [2, 1, 0, 8]]
+
+
+@pytest.mark.parametrize("fields", [{"on_worker_death": "raise"}, {"max_restarts": 0}], ids=str)
+async def test_an_env_that_is_not_rebuilt_raises_from_then_on(
+    place: dict[str, Any], fields: dict[str, Any]
+) -> None:
+    config = entry(num_workers=2, step_timeout=SOON, **fields, **place)
+    async with rl.build_env_group(config) as group:
+        batch, _ = await group.reset()
+        with pytest.raises(EnvHung, match=rf"'e-1' took longer than {SOON} s for a step") as raised:
+            await group.step(steps(e_0=STEP, e_1=HANG))
+        assert raised.value.results.ids() == ["e-0"]
+        with pytest.raises(EnvHung, match="is not rebuilt"):
+            await group.step(steps(e_1=STEP))
+        batch, _ = await group.step(steps(e_0=STEP))
+        assert batch.observation[0, 2] == 2
+
+
+async def test_restarts_in_a_row_are_counted_until_a_step_succeeds() -> None:
+    async with rl.build_env_group(entry(step_timeout=SOON, max_restarts=1)) as group:
+        await group.reset()
+        for _ in range(3):
+            batch, _ = await group.step(steps(e_0=HANG))
+            assert batch.restarted.all()
+            await group.step(steps(e_0=STEP))
+        await group.step(steps(e_0=HANG))
+        with pytest.raises(EnvHung, match="after 1 restarts in a row"):
+            await group.step(steps(e_0=HANG))
+
+
+async def test_an_env_that_can_not_be_rebuilt_is_given_up() -> None:
+    config = entry(step_timeout=SOON, max_restarts=2, env_kwargs={"builds": 1})
+    async with rl.build_env_group(config) as group:
+        await group.reset()
+        with pytest.raises(WorkerDied, match=r"could not be rebuilt: .*no more of these"):
+            await group.step(steps(e_0=HANG))
+
+
+async def test_a_step_that_ignores_its_cancellation_is_left_behind(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Its env is replaced all the same, and what it returns at last goes nowhere."""
+    async with rl.build_env_group(entry(step_timeout=SOON)) as group:
+        await group.reset()
+        batch, _ = await group.step(steps(e_0=IGNORE))
+        assert batch.restarted.all()
+        assert "goes on although it was cancelled" in caplog.text
+        Scripted.let_go.set()
+        for _ in range(5):
+            await asyncio.sleep(0)
+        batch, _ = await group.step(steps(e_0=STEP))
+        assert batch.observation.tolist() == [[2, 1, 1, -1]]
+
+
+# -- what they raise, and what they leave
+
+
+async def test_a_cancelled_error_of_its_own_is_an_error_of_the_env(place: dict[str, Any]) -> None:
+    """Nobody who waits is cancelled, and the env can be used again."""
+    async with rl.build_env_group(entry(num_workers=2, **place)) as group:
+        await group.reset()
+        with pytest.raises(EnvRaised, match="CancelledError: its own"):
+            await group.step(steps(e_0=CANCELLED, e_1=STEP))
+        with pytest.raises(EnvRaised, match="ValueError: as it was asked to"):
+            await group.step(steps(e_0=RAISE))
+        with pytest.raises(EnvRaised, match="SystemExit: 5"):
+            await group.step(steps(e_0=EXIT, e_1=STEP))
+        batch, _ = await group.reset()
+        assert batch.observation[:, 1].tolist() == [2, 2]
+
+
+async def test_methods_may_be_coroutine_functions(place: dict[str, Any]) -> None:
+    async with rl.build_env_group(entry(**place)) as group:
+        assert await group["e-0"].call("double", 21) == 42
+
+
+async def test_an_env_that_blocks_the_event_loop_is_reported(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """By entry, env and duration, whether or not asyncio is in its debug mode."""
+    asyncio.get_running_loop().set_debug(False)
+    async with rl.build_env_group(entry("slow", num_workers=2)) as group:
+        await group.reset()
+        await group.step(steps(slow_0=STEP, slow_1=BLOCK))
+    (report,) = [r for r in caplog.records if "blocked the event loop" in r.getMessage()]
+    assert report.levelno == logging.WARNING
+    args: Any = report.args
+    env_id, entry_name, milliseconds, doing = args
+    assert (env_id, entry_name, doing) == ("slow-1", "slow", "step")
+    assert milliseconds >= 120
+
+
+async def test_tasks_that_an_env_leaves_behind_are_cancelled(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    others = asyncio.create_task(asyncio.Event().wait())
+    async with rl.build_env_group(entry(num_workers=2)) as group:
+        await group.reset()
+        await group.step(steps(e_0=STEP, e_1=LEAK))
+    assert "env 'e-1' left 1 tasks running when it was closed (left behind)" in caplog.text
+    assert not others.done()
+    others.cancel()
+
+
+async def test_an_interrupt_that_an_env_raises_in_a_worker_is_its_own() -> None:
+    """Another env that shares the event loop stays in its step."""
+    config = entry("m", "process", num_workers=2, envs_per_process=2, step_timeout=SOON)
+    async with rl.build_env_group(config) as group:
+        await group.reset()
+        group.step_async(steps(m_0=INTERRUPT, m_1=HANG))
+        with pytest.raises(EnvRaised, match=r"'m-0'.*KeyboardInterrupt"):
+            await group.collect_async()
+        batch, _ = await group.collect_async()
+        assert batch.info("worker_restarted") == ["hung in a step and was cancelled"]
+
+
+async def test_a_worker_waits_until_the_trainer_has_read_a_big_info() -> None:
+    """Sent in parts, it comes as a whole, and what follows it as well."""
+    config = entry("b", "process", num_workers=3, envs_per_process=3)
+    async with rl.build_env_group(config) as group:
+        await group.reset()
+        for _ in range(3):
+            group.step_async(steps(b_0=BIG, b_1=BIG, b_2=STEP))
+            batch, _ = await group.collect_async(wait_all=True, ordered=True, deadline=LONG)
+            sizes = [len(info.get("blob", b"")) for info in batch.info()]
+            assert sizes == [BIG_BYTES, BIG_BYTES, 0]
+
+
+# -- the end
+
+
+async def test_a_group_can_be_closed_during_a_step() -> None:
+    group = rl.build_env_group(entry(num_workers=3))
+    await group.init()
+    batch, _ = await group.reset()
+    Scripted.gates.update({env_id: asyncio.Event() for env_id in group.env_ids})
+    group.step_async(batch.respond(action=np.full(3, GATE)))
+    await until_at_gate(*group.env_ids)
+    await group.close()
+    assert sorted(Scripted.closed) == ["e-0", "e-1", "e-2"]
+
+
+async def test_a_close_that_is_cancelled_cancels_what_envs_have_left() -> None:
+    """Nobody waits for their tasks then, but none of them goes on."""
+    group = rl.build_env_group(entry())
+    await group.init()
+    await group.reset()
+    await group.step(steps(e_0=LEAK))
+    (left,) = (task for task in asyncio.all_tasks() if task.get_name() == "left behind")
+    closing = asyncio.ensure_future(group.close())
+    await asyncio.sleep(0)
+    closing.cancel()
+    await asyncio.wait({closing})
+    await group.close()
+    assert left.done() or left.cancelling()
+    await asyncio.wait({left})
+
+
+@pytest.mark.parametrize("wrong", [{"close": "hangs"}, {}], ids=["close hangs", "step goes on"])
+async def test_closing_ends_whatever_envs_do(wrong: dict[str, Any]) -> None:
+    """Within the time that a group gives its hosts; the env is named in a warning."""
+    group = rl.build_env_group(entry(num_workers=2, env_kwargs=wrong))
+    await group.init()
+    await group.reset()
+    group.step_async(steps(e_1=STEP if wrong else IGNORE))
+    if wrong:
+        await group.collect_async()
+    else:
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        await group.close()
+    named = {str(w.message).split("'")[1] for w in caught}
+    assert named == ({"e-0", "e-1"} if wrong else {"e-1"})
+    assert sorted(Scripted.closed) == ["e-0", "e-1"]
+
+
+async def test_a_cancelled_start_leaves_nothing_running() -> None:
+    group = rl.build_env_group(entry(num_workers=2000))
+    starting = asyncio.create_task(group.init())
+    for _ in range(3):
+        await asyncio.sleep(0)
+    starting.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await starting
+
+
+# -- who may live there
+
+
+class Plain:
+    """Gymnasium's methods as coroutine functions, and no base class."""
+
+    def __init__(self) -> None:
+        from gymnasium import spaces
+
+        self.observation_space, self.action_space = spaces.Discrete(100), spaces.Discrete(9)
+        self.total = 0
+
+    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        await asyncio.sleep(0)
+        self.total = seed or 0
+        return self.total, {"options": options}
+
+    async def step(self, action: Any) -> Any:
+        await asyncio.sleep(0)
+        self.total += int(action)
+        return self.total, float(action), self.total > 50, False, {}
+
+
+async def test_an_object_with_gymnasiums_methods_will_do(place: dict[str, Any]) -> None:
+    """Made by a callable, which need not be sent anywhere under `placement: loop`."""
+    config = rl.EnvConfig(name="p", make_env=Plain, num_workers=3, **place)
+    async with rl.build_env_group(config) as group:
+        batch, _ = await group.reset(seed=10)
+        with group.auto_reset(math.inf):
+            for _ in range(30):
+                batch, _ = await group.step(batch.respond(action=np.array([1, 5, 8])))
+        assert batch.observation.tolist() == [40, 45, 0]
+
+
+def test_a_synchronous_group_has_no_event_loop_for_them() -> None:
+    with pytest.raises(ConfigError, match="a synchronous group has no event loop for placement"):
+        rlightning_aio.sync.build_env_group(entry())
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        (entry() | {"backend": "gymnasium", "task": "CartPole-v1"}, "would block the event loop"),
+        (entry(placement="inline"), "is awaitable"),
+        (entry() | {"backend": "half awaitable"}, "must both be `async def`"),
+    ],
+    ids=["not awaitable", "inline", "half of it"],
+)
+async def test_an_env_that_does_not_suit_its_place_is_refused(
+    config: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(StartFailed, match=message):
+        await rl.build_env_group(config).init()
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"placement": "process", "max_concurrency": 3}, "max_concurrency: has no meaning"),
+        ({"max_concurrency": 0}, "max_concurrency: should be greater"),
+        ({"interpreter": "python3"}, "interpreter: has no meaning"),
+        ({"on_worker_death": "resume"}, "snapshot_every: has no meaning here"),
+    ],
+    ids=str,
+)
+def test_fields_that_mean_nothing_there_are_refused(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        rl.build_env_group({**entry(), **fields})
+
+
+async def test_snapshots_are_taken_and_restored() -> None:
+    async with rl.build_env_group(entry(num_workers=2)) as group:
+        await group.reset(seed=3)
+        before, _ = await group.step(steps(e_0=STEP, e_1=STEP))
+        snapshot = await group.snapshot()
+        await group.step(steps(e_0=STEP, e_1=STEP))
+        batch, _ = await group.restore(snapshot)
+        assert batch.observation.tolist() == before.observation.tolist()
+        batch, _ = await group.step(steps(e_0=STEP, e_1=STEP))
+        assert batch.observation[:, 2].tolist() == [2, 2]

@@ -1,0 +1,254 @@
+"""`evaluate` with a queue: each episode once, on any free env, whatever happens to workers."""
+
+from __future__ import annotations
+
+import json
+import os
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import rlightning_aio as rl
+from rlightning_aio import sync
+from rlightning_aio.evaluation import (
+    EpisodeRecord,
+    EpisodeSpec,
+    EpisodeVideo,
+    QueueEvaluation,
+    ResultsFile,
+    evaluate,
+)
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+class Tasks(gym.Env[Any, Any]):
+    """An episode has as many steps as its seed says, plus one, each with the task as reward.
+
+    It succeeds if the seed is even. ``breaks`` maps tasks to what their first step does.
+    """
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    action_space = gym.spaces.Discrete(2)
+    render_mode = "rgb_array"
+
+    def __init__(self, switches: bool = True, breaks: dict[str, str] | None = None) -> None:
+        self.switches_task = switches
+        self._breaks, self._task = breaks or {}, "1"
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        self._task = (options or {}).get("task", self._task)
+        self._seed, self._left = seed or 0, (seed or 0) + 1 + (options or {}).get("longer", 0)
+        return self._observation(), {}
+
+    def _observation(self) -> Any:
+        return np.array([float(self._task), self._left], np.float64)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        match self._breaks.get(self._task):
+            case "raise":
+                raise ValueError("as asked for")
+            case "exit":
+                os._exit(3)
+        self._left -= 1
+        over = self._left == 0
+        info = {"is_success": self._seed % 2 == 0} if over else {}
+        return self._observation(), float(self._task), over, False, info
+
+    def render(self) -> Any:
+        return np.full((16, 16, 3), self._left, np.uint8)
+
+
+def group_of(num_workers: int = 3, **fields: Any) -> sync.EnvGroup:
+    entry = {"name": "env", "make_env": Tasks, "placement": "inline", "num_workers": num_workers}
+    return sync.build_env_group({**entry, **fields})
+
+
+def nothing(batch: rl.BatchedData) -> Any:
+    return np.zeros(len(batch), np.int64)
+
+
+QUEUE = [EpisodeSpec(task, seed) for task in ("1", "2", "3") for seed in range(4)]
+
+
+def evaluated(group: sync.EnvGroup, episodes: Any = QUEUE, **kwargs: Any) -> QueueEvaluation:
+    with group, group.auto_reset(100):
+        return evaluate(group, kwargs.pop("policy", nothing), episodes, **kwargs)
+
+
+def rows(found: QueueEvaluation) -> list[tuple[Any, ...]]:
+    return sorted((one.task, one.seed, one.total_reward, one.length) for one in found.records)
+
+
+ROWS = [(one.task, one.seed, (one.seed + 1.0) * int(one.task), one.seed + 1) for one in QUEUE]
+
+
+def test_each_episode_runs_once_on_any_free_env() -> None:
+    """The policy is called with the ready envs, which all tasks share."""
+    sizes: list[int] = []
+
+    def noting(batch: rl.BatchedData) -> Any:
+        sizes.append(len(batch))
+        return nothing(batch)
+
+    seen: list[EpisodeRecord] = []
+    found = evaluated(group_of(), policy=noting, on_episode=seen.append, min_results=3)
+    assert rows(found) == ROWS
+    assert seen == found.records
+    assert max(sizes) == 3
+    assert {one.env_id for one in seen} == {"env-0", "env-1", "env-2"}
+    assert all(one.success == (one.seed % 2 == 0) and one.entry == "env" for one in seen)
+    assert list(found.by_task()) == ["1", "2", "3"]
+    success = found.by_task()["2"].success
+    assert success is not None
+    assert (success.mean, success.count) == (0.5, 4)
+
+
+def test_options_reach_the_reset() -> None:
+    """They make episodes of one seed different ones."""
+    options = [None, {"longer": 1}, {"longer": 2}]
+    found = evaluated(group_of(), [EpisodeSpec("1", 0, chosen) for chosen in options])
+    assert sorted(one.length or 0 for one in found.records) == [1, 2, 3]
+
+
+async def test_it_is_awaited_over_an_asynchronous_group() -> None:
+    """So may its policy be."""
+
+    async def policy(batch: rl.BatchedData) -> Any:
+        return nothing(batch)
+
+    entry = {"name": "env", "make_env": Tasks, "placement": "inline", "num_workers": 2}
+    async with rl.build_env_group(entry) as group:
+        with group.auto_reset(100):
+            assert rows(await evaluate(group, policy, QUEUE)) == ROWS
+
+
+def test_an_entry_is_found_by_its_task() -> None:
+    """An env that doesn't switch plays its own task; the entry that has the task is preferred."""
+    one, two = (
+        {
+            "name": f"entry-{task}", "backend": "gymnasium", "task": task, "placement": "inline",
+        }
+        for task in ("CartPole-v1", "MountainCar-v0")
+    )  # fmt: skip
+    queue = [EpisodeSpec("CartPole-v1", 0), EpisodeSpec("", 1, entry="entry-MountainCar-v0")]
+    with sync.build_env_group([one, two]) as group, group.auto_reset(5):
+        found = evaluate(group, lambda batch: [0] * len(batch), queue)
+        assert {(one.entry, one.task) for one in found.records} == {
+            ("entry-CartPole-v1", "CartPole-v1"),
+            ("entry-MountainCar-v0", "MountainCar-v0"),
+        }
+        with pytest.raises(ValueError, match=r"no entry of this group can play .*'Pendulum-v1'"):
+            evaluate(group, nothing, [EpisodeSpec("Pendulum-v1", 0)])
+        with pytest.raises(ValueError, match=r"entries .* can play .*; name one"):
+            evaluate(group, nothing, [EpisodeSpec("", 0)])
+        with pytest.raises(ValueError, match=r"the queue has .*seed=3.* twice"):
+            evaluate(group, nothing, [EpisodeSpec("CartPole-v1", 3)] * 2)
+
+
+def test_sub_environments_are_refused() -> None:
+    """They would end their episodes together."""
+    entry = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1", "num_envs": 2}
+    with pytest.raises(ValueError, match="has 2 sub-environments"):
+        evaluated(sync.build_env_group({**entry, "placement": "inline"}), [])
+
+
+# -- faults -------------------------------------------------------------------------------
+
+
+def test_an_episode_whose_env_raises_fails_after_some_attempts() -> None:
+    """The other episodes are played, and figures are those of played ones."""
+    found = evaluated(group_of(env_kwargs={"breaks": {"2": "raise"}}), max_attempts=2)
+    assert rows(found)[:4] + rows(found)[8:] == ROWS[:4] + ROWS[8:]
+    assert [one.task for one in found.failed] == ["2"] * 4
+    for one in found.failed:
+        assert (one.total_reward, one.length, one.success) == (None, None, None)
+        assert len(one.lost) == 2
+        assert one.cause is not None
+        assert "raised in step: ValueError: as asked for" in one.cause
+    assert found.success is not None
+    assert (found.success.count, found.lost) == (8, 8)
+
+
+def test_an_episode_whose_worker_always_ends_fails() -> None:
+    """Its worker is replaced each time, and other episodes continue."""
+    group = group_of(2, env_kwargs={"breaks": {"2": "exit"}}, placement="process")
+    queue = [EpisodeSpec("1", 0), EpisodeSpec("2", 0), EpisodeSpec("3", 5)]
+    found = evaluated(group, queue, max_attempts=2)
+    (failed,) = found.failed
+    assert (failed.task, len(failed.lost)) == ("2", 2)
+    assert "exited with code 3" in str(failed.cause)
+    assert [(one.task, one.length) for one in found.records if one.cause is None] == [
+        ("1", 1),
+        ("3", 6),
+    ]
+
+
+@pytest.mark.parametrize("together", [1, 2])
+def test_an_env_whose_worker_is_not_replaced_leaves(together: int) -> None:
+    """The others play its episodes; with no env left the evaluation ends in the error."""
+    fields = {
+        "env_kwargs": {"breaks": {"2": "exit"}}, "placement": "process",
+        "on_worker_death": "raise", "envs_per_process": together,
+    }  # fmt: skip
+    queue = [EpisodeSpec("1", 3), EpisodeSpec("2", 0), EpisodeSpec("3", 9)]
+    found = evaluated(group_of(4, **fields), queue, max_attempts=1)
+    assert {one.task for one in found.records} == {"1", "2", "3"}
+    assert "2" in {one.task for one in found.failed}
+    with pytest.raises(rl.WorkerDied, match="exited with code 3"):
+        evaluated(group_of(2, **fields), queue)
+
+
+# -- the file -----------------------------------------------------------------------------
+
+
+def test_an_interrupted_evaluation_resumes_from_its_file(tmp_path: Path) -> None:
+    """Episodes in the file aren't played again, and lost attempts of others still count."""
+    path, subject = tmp_path / "results.jsonl", {"policy": "nothing"}
+    breaks = {"env_kwargs": {"breaks": {"2": "raise"}}}
+    seen: list[EpisodeRecord] = []
+
+    def interrupts(record: EpisodeRecord) -> None:
+        seen.append(record)
+        if len(seen) == 6:
+            raise KeyboardInterrupt
+
+    with ResultsFile(path, subject) as results:
+        with pytest.raises(KeyboardInterrupt):
+            evaluated(group_of(**breaks), results=results, on_episode=interrupts, max_attempts=2)
+        with pytest.raises(rl.ConfigError, match="another eval is writing this file"):
+            ResultsFile(path, subject)
+    path.write_text(path.read_text() + '{"entry": "env", "ta')
+    before = [json.loads(line) for line in path.read_text().splitlines()[1:-1]]
+    with ResultsFile(path, subject) as results:
+        assert results.played == seen
+        found = evaluated(group_of(), results=results, max_attempts=2)
+    assert found.records[:6] == seen
+    assert len(found.records) == len({one.key for one in found.records}) == 12
+    lost = sum("attempt_lost" in row for row in before)
+    assert found.lost == lost == 4
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    assert lines[0] == subject
+    kept = {(row["task"], row["seed"]): row for row in lines if "return" in row}
+    assert kept["3", 2] == {
+        "entry": "env", "task": "3", "seed": 2, "options": None, "env_id": kept["3", 2]["env_id"],
+        "return": 9.0, "length": 3, "success": True, "cause": None, "lost": [],
+    }  # fmt: skip
+    with pytest.raises(rl.ConfigError, match="its policy is nothing, not other"):
+        ResultsFile(path, {"policy": "other"})
+
+
+# -- films --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("failed_only", [False, True])
+def test_chosen_or_failed_episodes_are_filmed(tmp_path: Path, failed_only: bool) -> None:
+    """Their films are named after them, and nothing else is left."""
+    video = EpisodeVideo(tmp_path, lambda spec: spec.task == "2", failed_only=failed_only)
+    assert rows(evaluated(group_of(), video=video)) == ROWS
+    seeds = (1, 3) if failed_only else range(4)
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == [f"env-2-seed-{seed}.mp4" for seed in seeds]

@@ -1,0 +1,227 @@
+"""Running normalisation against lists of all values, and against Gymnasium's wrappers."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from collecting.scripted import Disturbed, Script, scripted_group
+from group import sample_envs
+from gymnasium.wrappers import NormalizeObservation, NormalizeReward
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rlightning_aio import sync
+from rlightning_aio.collecting import Collector
+from rlightning_aio.normalize import Normalizer
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+assert sample_envs  # Registers its envs.
+
+# The weight of the initial statistics, with mean 0 and variance 1.
+FIRST = 1e-4
+
+
+def moments(values: list[Any]) -> tuple[Any, Any]:
+    """Return mean and variance of `values` and the initial statistics."""
+    total = len(values) + FIRST
+    mean = np.sum(values, axis=0) / total
+    squares = np.sum([(value - mean) ** 2 for value in values], axis=0)
+    return mean, (squares + FIRST * (1 + mean**2)) / total
+
+
+def normal(value: Any, values: list[Any]) -> Any:
+    mean, variance = moments(values)
+    return np.clip((value - mean) / np.sqrt(variance + 1e-8), -10, 10)
+
+
+class Lists:
+    """Every observation and discounted return of each env."""
+
+    def __init__(self, gamma: float) -> None:
+        self.gamma = gamma
+        self.observations: dict[int, list[Any]] = defaultdict(list)
+        self.returns: dict[int, list[float]] = defaultdict(list)
+        self.current: dict[int, float] = {}
+
+    def note(self, env: int, observation: Any, reward: float, *, is_reset: bool, done: bool) -> Any:
+        self.observations[env].append(observation)
+        if is_reset:
+            self.current[env] = 0.0
+            return
+        self.current[env] = self.current[env] * self.gamma + reward
+        self.returns[env].append(self.current[env])
+        if done:
+            self.current[env] = 0.0
+
+    def scaled(self, env: int, reward: float) -> float:
+        if not self.returns[env]:
+            return np.clip(reward / math.sqrt(1 + 1e-8), -10, 10)
+        _, variance = moments(self.returns[env])
+        return np.clip(reward / math.sqrt(variance + 1e-8), -10, 10)
+
+
+class Policy:
+    """Records each batch twice, and compares."""
+
+    def __init__(self, gamma: float) -> None:
+        self.normalizer, self.lists = Normalizer(gamma), Lists(gamma)
+
+    def __call__(self, batch: Any) -> dict[str, Any]:
+        seen = self.normalizer.observe(batch)
+        assert seen.dtype == np.float32
+        assert seen.shape == batch.observation.shape
+        rows = [column.reshape(-1).tolist() for column in (
+            batch.index, batch.reward, batch.is_reset, batch.done
+        )]  # fmt: skip
+        observations, flat = batch.observation.reshape(-1, 3), seen.reshape(-1, 3)
+        for k, (env, reward, is_reset, done) in enumerate(zip(*rows, strict=True)):
+            self.lists.note(env, observations[k], reward, is_reset=is_reset, done=done)
+            expected = normal(observations[k], self.lists.observations[env])
+            np.testing.assert_allclose(flat[k], expected, rtol=1e-4, atol=1e-4)
+        return {"action": np.zeros((*batch.is_reset.shape, 1)), "seen": seen}
+
+
+@given(st.data(), st.sampled_from(["single", "same_step", "vector", "same_step_vector"]))
+def test_values_are_normalised_by_all_results_of_each_env(data: Any, kind: str) -> None:
+    """In any order of results; returns start again at resets, ends and losses."""
+    draw = data.draw
+    generator = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    group, logs = scripted_group(kind, draw(st.integers(1, 4)), draw(st.sampled_from([0.1, 0.5])))
+    policy = Policy(draw(st.sampled_from([0.0, 0.5, 0.99])))
+    with group, group.auto_reset(math.inf):
+        disturbed: Any = Disturbed(
+            group,
+            logs,
+            choose=lambda count: int(generator.integers(count)),
+            loses=lambda: generator.random() < 0.1,
+            interrupts=lambda: False,
+        )
+        rollout = Collector(disturbed, policy, num_transitions=40, min_results=2).collect()
+    scaled = policy.normalizer.scaled(rollout.reward, rollout.index)
+    expected = [
+        policy.lists.scaled(int(env), float(reward))
+        for env, reward in zip(rollout.index, rollout.reward, strict=True)
+    ]
+    np.testing.assert_allclose(scaled, expected, rtol=1e-4, atol=1e-4)
+    after = policy.normalizer.normalized(rollout.end_observation, rollout.at_ends("index"))
+    for env, found, shown in zip(
+        rollout.at_ends("index").tolist(), after, rollout.end_observation, strict=True
+    ):
+        expected = normal(shown, policy.lists.observations[env])
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
+    of_all = [o for own in policy.lists.observations.values() for o in own]
+    np.testing.assert_allclose(
+        policy.normalizer.normalized(rollout.observation),
+        [normal(shown, of_all) for shown in rollout.observation],
+        rtol=1e-2,  # Each env contributes its own first value.
+        atol=1e-2,
+    )
+
+
+def trees(generator: np.random.Generator, count: int) -> dict[str, Any]:
+    return {
+        "image": generator.integers(256, size=(count, 4, 4, 3), dtype=np.uint8),
+        "arm": (generator.normal(3, 2, (count, 2)), generator.integers(5, size=count)),
+        "speed": generator.normal(size=count).astype(np.float32),
+    }
+
+
+def test_each_array_of_a_tree_has_its_own_statistics() -> None:
+    """Integers are returned as they are."""
+    generator = np.random.default_rng(0)
+    whole, arm, speed = Normalizer(), Normalizer(), Normalizer()
+    for _ in range(20):
+        index = generator.choice(6, size=4, replace=False)
+        given_tree = trees(generator, 4)
+        found = whole.update_observations(index, given_tree)
+        np.testing.assert_array_equal(found["image"], given_tree["image"])
+        np.testing.assert_array_equal(found["arm"][1], given_tree["arm"][1])
+        one = arm.update_observations(index, given_tree["arm"][0])
+        np.testing.assert_array_equal(found["arm"][0], one)
+        one = speed.update_observations(index, given_tree["speed"])
+        np.testing.assert_array_equal(found["speed"], one)
+
+
+def test_it_continues_where_it_was_saved(tmp_path: Path) -> None:
+    generator = np.random.default_rng(0)
+    saved = Normalizer()
+    index = np.arange(3)
+
+    def next_of(normalizer: Normalizer, seed: int) -> tuple[Any, Any]:
+        own = np.random.default_rng(seed)
+        tree, starts = trees(own, 3), own.random(3) < 0.2
+        scaled = normalizer.update_rewards(index, own.normal(size=3), starts)
+        return normalizer.update_observations(index, tree), scaled
+
+    for _ in range(5):
+        next_of(saved, int(generator.integers(99)))
+    np.savez(tmp_path / "normalizer.npz", **saved.state_dict())
+    loaded = Normalizer()
+    with np.load(tmp_path / "normalizer.npz") as state:
+        loaded.load_state_dict(state)
+    for seed in range(3):
+        (one, one_reward), (other, other_reward) = next_of(saved, seed), next_of(loaded, seed)
+        np.testing.assert_array_equal(one["arm"][0], other["arm"][0])
+        np.testing.assert_array_equal(one["speed"], other["speed"])
+        np.testing.assert_array_equal(one_reward, other_reward)
+
+
+def test_values_equal_those_of_gymnasiums_wrappers() -> None:
+    """Bit for bit; its wrapper starts the return again with the terminating reward."""
+
+    def make(number: int) -> Any:
+        return Script(number, 0.2)
+
+    normalizer, index = Normalizer(0.9), np.arange(2)
+    bare = [make(number) for number in index]
+    wrapped = [NormalizeReward(NormalizeObservation(make(n)), gamma=0.9) for n in index]
+
+    def both_reset(which: Any) -> None:
+        theirs = [wrapped[k].reset()[0] for k in which]
+        ours = normalizer.update_observations(which, np.array([bare[k].reset()[0] for k in which]))
+        np.testing.assert_array_equal(ours, np.clip(np.array(theirs, np.float32), -10, 10))
+
+    both_reset(index)
+    for _ in range(60):
+        theirs = [env.step(np.zeros(1)) for env in wrapped]
+        ours = [
+            np.array(column) for column in zip(*[e.step(np.zeros(1)) for e in bare], strict=True)
+        ]
+        reward = normalizer.update_rewards(index, ours[1], ours[2])
+        np.testing.assert_array_equal(reward, np.clip([t[1] for t in theirs], -10, 10))
+        seen = normalizer.update_observations(index, ours[0])
+        expected = np.clip(np.array([t[0] for t in theirs], np.float32), -10, 10)
+        np.testing.assert_array_equal(seen, expected)
+        over = np.flatnonzero(ours[2] | ours[3])
+        if len(over):
+            both_reset(over)
+
+
+def test_each_half_can_be_left_out() -> None:
+    index, observation = np.arange(2), np.array([[5.0], [7.0]])
+    reward, starts = np.array([3.0, 4.0]), np.ones(2, bool)
+    observations = Normalizer(rewards=False)
+    assert observations.update_rewards(index, reward, starts).tolist() == [3, 4]
+    assert observations.scaled(reward).tolist() == [3, 4]
+    assert (observations.update_observations(index, observation) < 5).all()
+    rewards = Normalizer(observations=False)
+    for found in (rewards.update_observations(index, observation), rewards.normalized(observation)):
+        assert found.dtype == np.float32
+        assert found.tolist() == [[5.0], [7.0]]
+    assert rewards.update_rewards(index, reward, starts).tolist() != [3, 4]
+
+
+def test_rewards_of_several_agents_are_refused() -> None:
+    crowd = {"name": "crowd", "backend": "crowd", "task": "-", "placement": "inline"}
+    with sync.build_env_group(crowd) as group:
+        batch, _ = group.reset()
+        with pytest.raises(TypeError, match="give rewards=False"):
+            Normalizer().observe(batch)
+        seen = Normalizer(rewards=False).observe(batch)
+    assert seen["tall"].dtype == np.float32

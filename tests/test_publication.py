@@ -1,0 +1,51 @@
+"""What is prepared for publication agrees with the project: the recipe, the paper, the curves."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from pathlib import Path
+
+import yaml
+
+ROOT = Path(__file__).parent.parent
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+# Names that differ on conda-forge, and what an extra of Gymnasium's brings.
+CONDA_NAMES = {"mujoco": "mujoco-python"}
+OF_EXTRAS = {"imageio", "packaging"}
+
+
+def test_the_recipe_asks_for_what_the_project_asks_for() -> None:
+    """The same version, and the same requirements with the same bounds."""
+    recipe = yaml.safe_load((ROOT / "recipe" / "recipe.yaml").read_text())
+    assert recipe["context"]["version"] == PROJECT["version"]
+    assert f">={recipe['context']['python_min']}" == PROJECT["requires-python"]
+    wanted = set()
+    for requirement in PROJECT["dependencies"]:
+        name, bound = re.match(r"([\w-]+)(?:\[\w+\])?>=([\d.]+)", requirement).groups()
+        wanted.add(f"{CONDA_NAMES.get(name, name)} >={bound}")
+    run = {entry for entry in recipe["requirements"]["run"] if not re.match(r"python |__", entry)}
+    assert {entry for entry in run if entry.split()[0] not in OF_EXTRAS} == wanted
+
+
+def test_the_paper_is_complete() -> None:
+    """About a thousand words; its figures are there, and its citations are in the bibliography."""
+    paper = (ROOT / "paper" / "paper.md").read_text()
+    bibliography = (ROOT / "paper" / "paper.bib").read_text()
+    known = set(re.findall(r"^@\w+\{(\w+),", bibliography, re.MULTILINE))
+    assert 750 <= len(paper.partition("# Summary")[2].split()) <= 1250
+    assert set(re.findall(r"@(\w+)", paper.partition("# Summary")[2])) == known
+    figures = re.findall(r"\]\((\.\.[^)]+)\)", paper)
+    assert len(figures) >= 2
+    for figure in figures:
+        assert (ROOT / "paper" / figure).is_file(), figure
+
+
+def test_every_training_example_has_a_curve_that_rises() -> None:
+    """By results/curves.json; `python benchmarks/curves.py` renews it."""
+    curves = json.loads((ROOT / "benchmarks" / "results" / "curves.json").read_text())["curves"]
+    programs = (ROOT / "examples").glob("*.py")
+    assert set(curves) == {path.stem for path in programs if "Run(" in path.read_text()}
+    for example, found in curves.items():
+        assert found["return"][-1] > found["return"][0], example

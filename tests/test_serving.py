@@ -1,0 +1,185 @@
+"""`OpenEnvServer`, with the `openenv` backend as its client."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from envs.test_openenv import on_asyncio
+from websockets.asyncio.client import connect
+
+import rlightning_aio as rl
+from rlightning_aio.envs.openenv_session import get_json, post_json
+from rlightning_aio.serving import OpenEnvServer
+
+POLE = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1", "placement": "inline"}
+COLUMN = {"columns": {"observation": {"shape": [4]}}, "truncated_field": "truncated"}
+
+
+def client_of(server: OpenEnvServer, count: int) -> dict[str, Any]:
+    entry = {"name": "far", "backend": "openenv", "task": server.url, "placement": "loop"}
+    return {**entry, "num_workers": count, "env_kwargs": COLUMN}
+
+
+@on_asyncio
+async def test_episodes_over_the_network_equal_those_of_the_env() -> None:
+    async with (
+        rl.build_env_group({**POLE, "num_workers": 2, "max_episode_steps": 15}) as served,
+        OpenEnvServer(served, "pole", "127.0.0.1", 0) as server,
+        rl.build_env_group(client_of(server, 2)) as group,
+        group.auto_reset(math.inf),
+    ):
+        plain = [gym.make("CartPole-v1", max_episode_steps=15) for _ in range(2)]
+        batch, _ = await group.reset(seed=[11, 12])
+        firsts = [env.reset(seed=11 + k)[0] for k, env in enumerate(plain)]
+        np.testing.assert_array_equal(batch.observation["observation"], firsts)
+        ended = np.zeros(2, bool)
+        for number in range(15):
+            action = number // 2 % 2
+            batch, _ = await group.step(batch.respond(action=[{"action": action}] * 2))
+            for k, env in enumerate(plain):
+                if ended[k]:
+                    continue
+                observation, reward, terminated, truncated, _ = env.step(action)
+                np.testing.assert_array_equal(batch.observation["observation"][k], observation)
+                assert batch.reward[k] == reward
+                assert (batch.terminated[k], batch.truncated[k]) == (terminated, truncated)
+                ended[k] = terminated or truncated
+        assert ended.all()
+
+
+@on_asyncio
+async def test_its_envs_are_described() -> None:
+    async with (
+        rl.build_env_group(POLE) as served,
+        OpenEnvServer(served, "pole", "127.0.0.1", 0) as server,
+    ):
+        assert await asyncio.to_thread(get_json, server.url, "/health") == {"status": "healthy"}
+        assert (await asyncio.to_thread(get_json, server.url, "/metadata"))["name"] == "pole"
+        schema = await asyncio.to_thread(get_json, server.url, "/schema")
+    assert schema["action"]["properties"]["action"] == {
+        "type": "integer",
+        "minimum": 0,
+        "maximum": 1,
+    }
+    assert schema["observation"]["properties"]["observation"]["minItems"] == 4
+
+
+@on_asyncio
+async def test_invalid_messages_do_not_change_the_session() -> None:
+    """A client that exceeds the number of sessions gets an error."""
+
+    async def ask(text: str) -> Any:
+        await socket.send(text)
+        return json.loads(await socket.recv())
+
+    async with (
+        rl.build_env_group(POLE) as served,
+        OpenEnvServer(served, "pole", "127.0.0.1", 0) as server,
+    ):
+        address = server.url.replace("http", "ws") + "/ws"
+        async with connect(address, proxy=None) as socket:
+            await ask('{"type": "reset", "data": {"seed": 1, "episode_id": "e"}}')
+            codes = [
+                (await ask(text))["data"]["code"]
+                for text in (
+                    "{",
+                    '{"type": "dance"}',
+                    '{"type": "step", "data": {"act": 1}}',
+                    '{"type": "step", "data": {"action": [1, 2]}}',
+                )
+            ]
+            assert codes == [
+                "INVALID_JSON",
+                "UNKNOWN_TYPE",
+                "VALIDATION_ERROR",
+                "VALIDATION_ERROR",
+            ]
+            assert (await ask('{"type": "step", "data": {"action": 1}}'))["data"]["reward"] == 1
+            state = await ask('{"type": "state"}')
+            assert state["data"] == {"episode_id": "e", "step_count": 1}
+            async with connect(address, proxy=None) as second:
+                refusal = json.loads(await second.recv())
+            assert refusal["data"]["code"] == "CAPACITY_REACHED"
+        for _ in range(100):
+            async with connect(address, proxy=None) as socket:
+                if (await ask('{"type": "reset"}'))["type"] == "observation":
+                    return
+        pytest.fail("the session's env was not given back")
+
+
+async def rpc(server: OpenEnvServer, method: str, **params: Any) -> Any:
+    """Return the result or the code of the error."""
+    request = {"jsonrpc": "2.0", "id": 7, "method": method, "params": params}
+    answer = await post_json(f"{server.url}/mcp", request)
+    assert (answer["jsonrpc"], answer["id"]) == ("2.0", 7)
+    return answer["result"] if "result" in answer else answer["error"]["code"]
+
+
+@on_asyncio
+async def test_tools_are_answered_as_by_an_environment_without_any() -> None:
+    async with (
+        rl.build_env_group(POLE) as served,
+        OpenEnvServer(served, "pole", "127.0.0.1", 0) as server,
+    ):
+        assert await rpc(server, "tools/list") == -32603
+        assert await rpc(server, "tools/call", name="add") == -32603
+        assert await rpc(server, "dance") == -32601
+        assert (await post_json(f"{server.url}/mcp", {}))["error"]["code"] == -32600
+        with pytest.raises(ConnectionError, match="404"):
+            await post_json(f"{server.url}/step", {})
+        async with connect(server.url.replace("http", "ws") + "/ws", proxy=None) as socket:
+            data = {"jsonrpc": "2.0", "id": 1, "method": "tools/list"}
+            await socket.send(json.dumps({"type": "mcp", "data": data}))
+            reply = json.loads(await socket.recv())
+        assert reply["type"] == "mcp"
+        assert reply["data"]["error"]["message"] == "Environment does not support MCP"
+
+
+@on_asyncio
+async def test_a_created_session_outlives_its_socket() -> None:
+    async with (
+        rl.build_env_group(POLE) as served,
+        OpenEnvServer(served, "pole", "127.0.0.1", 0) as server,
+    ):
+        key = (await rpc(server, "openenv/session/create"))["session_id"]
+        assert await rpc(server, "openenv/session/create") == -32000
+        address = server.url.replace("http", "ws") + f"/ws?session_id={key}"
+        async with connect(address, proxy=None) as socket:
+            await socket.send('{"type": "reset", "data": {"seed": 1}}')
+            await socket.recv()
+            await socket.send('{"type": "step", "data": {"action": 1}}')
+            await socket.recv()
+            async with connect(address, proxy=None) as second:
+                assert (
+                    "already has an attached" in json.loads(await second.recv())["data"]["message"]
+                )
+            answer = await rpc(server, "openenv/session/close", session_id=key)
+            assert answer == {"session_id": key, "closed": False, "closing": True}
+        while isinstance(  # noqa: ASYNC110
+            created := await rpc(server, "openenv/session/create"), int
+        ):
+            await asyncio.sleep(0)  # The server has still to see the socket close.
+        key = created["session_id"]
+        assert (await rpc(server, "openenv/session/close", session_id=key))["closed"]
+        assert await rpc(server, "openenv/session/close", session_id=key) == -32602
+
+
+@on_asyncio
+async def test_kept_sessions_of_the_backend_are_those_of_the_server() -> None:
+    async with (
+        rl.build_env_group({**POLE, "num_workers": 2}) as served,
+        OpenEnvServer(served, "pole", "127.0.0.1", 0) as server,
+    ):
+        config = client_of(server, 2)
+        config["env_kwargs"] = {**COLUMN, "session": "keep"}
+        for _ in range(2):  # The first group has left no session behind.
+            async with rl.build_env_group(config) as group:
+                batch, _ = await group.reset(seed=[3, 4])
+                batch, _ = await group.step(batch.respond(action=[{"action": 1}] * 2))
+                assert batch.reward.tolist() == [1, 1]

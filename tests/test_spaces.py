@@ -1,0 +1,151 @@
+"""`spaces.Anything`: columns of plain Python values, wherever columns go."""
+
+from __future__ import annotations
+
+import json
+import math
+import pickle
+from typing import TYPE_CHECKING, Any
+from unittest import mock
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+import rlightning_aio as rl
+from rlightning_aio.collecting import Collector
+from rlightning_aio.spaces import Anything
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+class Talk:
+    """Answers each message with a dict; another part of the observation counts. Ends after four."""
+
+    observation_space = spaces.Dict(
+        messages=Anything(), count=spaces.Box(0, 9, (1,), np.float32), tokens=Anything()
+    )
+    action_space = Anything()
+
+    def _observation(self) -> Any:
+        tokens = list(range(self.count))
+        count = np.full(1, self.count, np.float32)
+        return {"messages": list(self.messages), "count": count, "tokens": tokens}
+
+    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        self.count, self.messages = 0, [{"role": "system", "content": f"seed {seed}"}]
+        return self._observation(), {"task": {"seed": seed}}
+
+    async def step(self, action: Any) -> Any:
+        self.count += 1
+        self.messages.append({"role": "assistant", **action})
+        return self._observation(), 1.0, self.count >= 4, False, {"said": action["content"]}
+
+
+def entry(placement: str = "loop") -> rl.EnvConfig:
+    fields = {} if placement == "loop" else {"envs_per_process": 3}
+    return rl.EnvConfig(name="t", make_env=Talk, num_workers=3, placement=placement, **fields)
+
+
+def say(batch: Any) -> list[Any]:
+    return [
+        {"content": f"{len(m)} to {i}"}
+        for i, m in zip(batch.ids(), batch.observation["messages"], strict=True)
+    ]
+
+
+@pytest.mark.parametrize("placement", ["loop", "process"])
+async def test_columns_are_lists_next_to_arrays(placement: str) -> None:
+    async with rl.build_env_group(entry(placement)) as group:
+        batch, _ = await group.reset(seed=4)
+        assert batch.observation["count"].tolist() == [[0], [0], [0]]
+        assert [m[0]["content"] for m in batch.observation["messages"]] == [
+            "seed 4",
+            "seed 5",
+            "seed 6",
+        ]
+        actions = say(batch)
+        group.step_async(batch.respond(action=actions, tokens=[[1], [2, 3], []]))
+        batch, _ = await group.collect_async(wait_all=True, ordered=True)
+        assert batch.sent.action == actions
+        assert batch.sent.tokens == [[1], [2, 3], []]
+        assert batch.observation["tokens"] == [[0], [0], [0]]
+        assert batch.observation["messages"][1][1] == {"role": "assistant", **actions[1]}
+        assert batch.info("said") == [action["content"] for action in actions]
+        assert batch.take([2, 0]).observation["messages"][0][0]["content"] == "seed 6"
+
+
+async def test_a_single_response_makes_a_list_of_one_action() -> None:
+    async with rl.build_env_group(entry()) as group:
+        await group.reset()
+        ret = await group["t-1"].step({"content": "hello", "tool": "search"})
+        assert ret.observation["messages"][-1]["tool"] == "search"
+        group.step_async(rl.BatchedData(["t-1"], [rl.PolicyResponse("t-1", {"content": "x"})]))
+        batch, _ = await group.collect_async()
+        assert batch.sent.action == [{"content": "x"}]
+
+
+async def test_rollouts_hold_lists_next_to_arrays() -> None:
+    def policy(batch: Any) -> dict[str, Any]:
+        tokens = [list(range(len(m))) for m in batch.observation["messages"]]
+        return {"action": say(batch), "tokens": tokens, "log_prob": np.zeros(len(batch))}
+
+    async with rl.build_env_group(entry()) as group:
+        with group.auto_reset(math.inf):
+            collector = Collector(group, policy, num_transitions=24, min_results=2, seed=0)
+            for _ in range(3):
+                rollout = await collector.collect()
+    seen, counts = rollout.observation["messages"], rollout.observation["count"]
+    assert isinstance(rollout.tokens, list)
+    assert list(map(len, rollout.tokens)) == list(map(len, seen)) == (counts[:, 0] + 1).tolist()
+    assert isinstance(rollout.action, list)
+    after = rollout.next_observation["messages"]
+    assert [messages[-1]["content"] for messages in after] == [a["content"] for a in rollout.action]
+    assert len(rollout.end_observation["messages"]) == len(rollout.at_ends("tokens"))
+    assert json.loads(json.dumps(seen)) == seen
+    assert rollout.log_prob.shape == (24,)
+    assert rollout.advantages(np.zeros(24), np.zeros(len(rollout.ends)), 0.9, 0.9).shape == (24,)
+
+
+async def test_a_block_of_rollouts_holds_nested_lists() -> None:
+    async with rl.build_env_group(entry()) as group:
+        with group.auto_reset(math.inf):
+            policy = lambda batch: {"action": say(batch)}  # noqa: E731
+            rollout = await Collector(group, policy, num_transitions=15, wait_all=True).collect()
+    assert rollout.shape == (5, 3)
+    assert [len(row) for row in rollout.action] == [3] * 5
+
+
+async def test_snapshots_statistics_and_timelines_take_them(tmp_path: Path) -> None:
+    async with rl.build_env_group(entry()) as group:
+        with group.trace(tmp_path / "trace.json"):
+            batch, _ = await group.reset(seed=1)
+            batch, _ = await group.step(batch.respond(action=say(batch)))
+            snapshot = await group.snapshot()
+            before = batch.observation["messages"]
+            batch, _ = await group.step(batch.respond(action=say(batch)))
+            batch, _ = await group.restore(snapshot)
+        assert batch.observation["messages"] == before
+    assert json.loads((tmp_path / "trace.json").read_text())["traceEvents"]
+
+
+async def test_nothing_is_pickled_on_the_loop() -> None:
+    async with rl.build_env_group(entry()) as group:
+        with (
+            mock.patch.object(pickle, "dumps", side_effect=AssertionError),
+            mock.patch.object(pickle, "loads", side_effect=AssertionError),
+        ):
+            batch, _ = await group.reset(seed=1)
+            for _ in range(3):
+                batch, _ = await group.step(batch.respond(action=say(batch)))
+                assert len(batch.observation["messages"]) == len(batch.info("said")) == 3
+
+
+def test_it_is_a_space() -> None:
+    space = Anything()
+    assert {"any": [object()]} in space
+    assert space == pickle.loads(pickle.dumps(space))
+    assert repr(spaces.Tuple([space])) == "Tuple(Anything())"
+    with pytest.raises(NotImplementedError, match="give a policy"):
+        space.sample()
