@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from contextlib import closing
 from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Any
 
@@ -204,7 +205,8 @@ def test_beside_stable_baselines3s_processes(task: str) -> None:
     makers = makers_of(task)
     # Forking leaves no fork server behind.
     theirs = vec_env.SubprocVecEnv(makers, start_method="fork")
-    compare_with_stable_baselines3(VecEnv(makers), theirs, task, makers)
+    with closing(theirs), closing(VecEnv(makers)) as ours:
+        compare_with_stable_baselines3(ours, theirs, task, makers)
 
 
 @pytest.mark.simulators
@@ -220,8 +222,9 @@ def test_together_beside_stable_baselines3s_processes(task: str) -> None:
     ours = make_vec_env(
         task, 4, env_kwargs={"max_episode_steps": 150}, vec_env_kwargs={"envs_per_process": 2}
     ).venv
-    assert len(ours.group.env_ids) == 2
-    compare_with_stable_baselines3(ours, theirs, task, makers)
+    with closing(theirs), closing(ours):
+        assert len(ours.group.env_ids) == 2
+        compare_with_stable_baselines3(ours, theirs, task, makers)
 
 
 def as_numpys(infos: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -242,7 +245,8 @@ def compare_with_stable_baselines3(ours: Any, theirs: Any, task: str, makers: li
     assert_alike(found, next(plain)[0])
     ends = 0
     for turn, (each, of_loop) in enumerate(zip(actions, plain, strict=True)):
-        found = ours.step(each)
+        *found, lazy = ours.step(each)
+        found = (*found, list(lazy))
         *expected, infos = theirs.step(each)
         expected[1] = expected[1].astype(np.float64)  # Rewards of some tasks are ints.
         infos, reset_infos = list(infos), list(theirs.reset_infos)
@@ -257,5 +261,3 @@ def compare_with_stable_baselines3(ours: Any, theirs: Any, task: str, makers: li
                 assert_alike(info["terminal_observation"], observation, f"{task}, {turn}")
                 ends += 1
     assert ends > 2
-    ours.close()
-    theirs.close()
