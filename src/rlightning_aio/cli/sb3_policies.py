@@ -12,10 +12,8 @@ import json
 import zipfile
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.protocol.columns import mapped
+from rlightning_aio.policies import PredictPolicy
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -60,6 +58,7 @@ class SB3Policy:
         except Exception as error:  # Unpickling may raise anything.
             words = f"{type(error).__name__}: {error}"
             raise ConfigError(f"--policy {path}: can't be loaded as {name}: {words}") from error
+        self._predict = PredictPolicy(self._model)
 
     def check(self, metas: Sequence[EnvMeta]) -> None:
         """Check that the model was trained on envs with these spaces.
@@ -78,12 +77,7 @@ class SB3Policy:
                     )
 
     def __call__(self, batch: BatchedData) -> Any:
-        head = batch.is_reset.shape
-        observation = mapped(
-            lambda leaf: leaf.reshape(-1, *leaf.shape[len(head) :]), batch.observation
-        )
-        actions, _ = self._model.predict(observation, deterministic=True)
-        return np.reshape(actions, (*head, *actions.shape[1:]))
+        return self._predict(batch)
 
 
 def _size(space: Any, num_envs: int) -> Any:

@@ -1,0 +1,102 @@
+"""`ActionChunks`: plays chunks of actions open loop, each env its own.
+
+Rule: a chunk belongs to one episode of one env. What is left of it is dropped when the episode is
+over, also when it was lost with a worker.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rlightning_aio.errors import BadAction
+from rlightning_aio.policies.episodes import begins_of_envs
+from rlightning_aio.protocol.columns import as_array, index, mapped, stacked
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from numpy.typing import NDArray
+
+    from rlightning_aio.batch import BatchedData
+
+__all__ = ["ActionChunks"]
+
+
+class ActionChunks:
+    """Plays the chunks of actions that a policy returns, one action at each step.
+
+    The policy is called with the envs that have no action left: those that begin an episode, and
+    those that have played their chunk.
+
+    Args:
+        policy: called with a batch of results; returns chunks of actions, ``[n, horizon, *action]``
+            (a dict or tuple of such arrays for Dict and Tuple spaces). It may be a coroutine
+            function if the group is asynchronous.
+        n_action_steps: number of actions to play of each chunk; None plays all.
+
+    Raises:
+        ValueError: `n_action_steps` is below 1, or an env has sub-environments.
+        BadAction: the policy did not return a chunk of so many actions for each result.
+    """
+
+    def __init__(
+        self, policy: Callable[[BatchedData], Any], n_action_steps: int | None = None
+    ) -> None:
+        if n_action_steps is not None and n_action_steps < 1:
+            raise ValueError(f"n_action_steps must be at least 1, not {n_action_steps!r}")
+        self._policy, self._steps = policy, n_action_steps
+        self._left: dict[str, deque[Any]] = {}
+        """Actions that envs will play next."""
+
+    def __call__(self, batch: BatchedData) -> Any:
+        """Return the next action of each env, awaitable if the policy's answer is."""
+        env_ids = batch.env_ids()
+        for row in np.flatnonzero(begins_of_envs(batch)).tolist():
+            self._left.pop(env_ids[row], None)
+        rows = [row for row, env_id in enumerate(env_ids) if not self._left.get(env_id)]
+        if not rows:
+            return self._next(env_ids)
+        asked = batch if len(rows) == len(env_ids) else batch.take(rows)
+        answer = self._policy(asked)
+        if hasattr(answer, "__await__"):
+            return self._awaited(answer, asked.env_ids(), env_ids)
+        self._keep(answer, asked.env_ids())
+        return self._next(env_ids)
+
+    async def _awaited(self, answer: Awaitable[Any], asked: list[str], env_ids: list[str]) -> Any:
+        self._keep(await answer, asked)
+        return self._next(env_ids)
+
+    def _keep(self, chunks: Any, env_ids: list[str]) -> None:
+        """Keep a chunk for each env."""
+        lengths = set[int]()
+        chunks = mapped(lambda leaf: _checked(leaf, len(env_ids), lengths), chunks)
+        horizon = min(lengths, default=0)
+        if len(lengths) > 1 or not horizon:
+            raise BadAction(f"the actions of a chunk are as many as {sorted(lengths)}")
+        if self._steps is not None and self._steps > horizon:
+            raise BadAction(
+                f"the policy's chunks have {horizon} actions, fewer than "
+                f"n_action_steps={self._steps}"
+            )
+        for row, env_id in enumerate(env_ids):
+            chunk = index(chunks, row)
+            self._left[env_id] = deque(index(chunk, k) for k in range(self._steps or horizon))
+
+    def _next(self, env_ids: list[str]) -> Any:
+        return stacked([self._left[env_id].popleft() for env_id in env_ids])
+
+
+def _checked(leaf: Any, count: int, lengths: set[int]) -> NDArray[Any]:
+    """Copy a leaf of chunks, which a policy may overwrite, and add the number of their actions."""
+    array = np.array(as_array(leaf))
+    if array.ndim < 2 or len(array) != count:
+        raise BadAction(
+            f"the policy returned {array.shape}; chunks of actions for {count} envs should be "
+            f"({count}, horizon, *action)"
+        )
+    lengths.add(array.shape[1])
+    return array
