@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -59,7 +61,7 @@ def test_sub_environments_have_a_state_each() -> None:
 
 
 @pytest.mark.simulators
-def test_models_of_stable_baselines3(tmp_path: Any) -> None:
+def test_models_of_stable_baselines3() -> None:
     """Episodes are those of SB3's own loop, by seed."""
     sb3 = pytest.importorskip("stable_baselines3")
     model = sb3.PPO("MlpPolicy", "CartPole-v1", n_steps=64, seed=0, device="cpu").learn(64)
@@ -77,3 +79,15 @@ def test_models_of_stable_baselines3(tmp_path: Any) -> None:
         found = evaluate(group, PredictPolicy(model), QUEUE)
     returns = {one.seed: one.total_reward for one in found.records}
     assert [returns[spec.seed] for spec in QUEUE] == expected
+
+
+@pytest.mark.simulators
+def test_the_program_of_the_page_runs(tmp_path: Path) -> None:
+    """It evaluates a model of Stable-Baselines3."""
+    pytest.importorskip("stable_baselines3")
+    page = Path(__file__).parents[2] / "docs" / "evaluating.md"
+    programs = re.findall(r"^```python\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
+    (program,) = (one for one in programs if "stable_baselines3" in one)
+    file = tmp_path / "program.py"
+    file.write_text(program)
+    assert float(output_of(file, folder=tmp_path, asyncio_debug=False)) > 0
