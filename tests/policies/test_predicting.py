@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from policies.counting import QUEUE, check, group_of
+from run_python import output_of
 
 from rlightning_aio import sync
 from rlightning_aio.evaluation import evaluate
