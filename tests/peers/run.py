@@ -1,6 +1,6 @@
 """Run other projects' own tests against this library, in place of the classes they are about.
 
-    python tests/peers/run.py SOURCES [PEER ...] [arguments of pytest]
+    python tests/peers/run.py SOURCES [--only PEER] [arguments of pytest]
 
 SOURCES is a folder that holds one folder with the sources of each project, its `tests` among them:
 a clone of Gymnasium's repository, Stable-Baselines3's source package, a clone of RLightning's
