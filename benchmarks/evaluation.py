@@ -1,7 +1,8 @@
 """Ways to play a fixed set of episodes: how long they take, and how busy the envs are.
 
 ``--part busy``: uneven episodes, and a policy that needs 20 ms for each batch; how busy the workers
-are is the share of the time in which they step or reset.
+are is the share of the time in which they step. At the end, with fewer episodes left than envs,
+nothing can keep all workers busy, so few episodes give a lower share.
 
 ``--part metaworld`` (needs `rlightning-aio[metaworld]`): MetaWorld's 50 tasks, with its scripted
 policies, 10 episodes each, in a plain loop, as which each episode must end; by a queue; dealt in
@@ -50,7 +51,7 @@ class Uneven(gym.Env[Any, Any]):
         return np.zeros(1, np.float32), 1.0, self._left == 0, False, {}
 
 
-def busy(num_workers: int, envs_each: int, episodes: int) -> None:
+def busy(num_workers: int, envs_each: int, episodes: int, min_results: int) -> None:
     """Print how busy the workers are while the policy takes 20 ms for each batch."""
     working = {"ns": 0, "batches": 0}
 
@@ -67,7 +68,7 @@ def busy(num_workers: int, envs_each: int, episodes: int) -> None:
     specs = [EpisodeSpec("", seed) for seed in range(episodes)]
     with sync.build_env_group(entry) as group, group.auto_reset(1000):
         begun = time.perf_counter()
-        found = evaluate(group, policy, specs)
+        found = evaluate(group, policy, specs, min_results=min_results)
         seconds = time.perf_counter() - begun
     steps = sum(record.length or 0 for record in found.records)
     share = working["ns"] / 1e9 / seconds / num_workers
@@ -151,7 +152,7 @@ def waiting_for_the_last(specs: list[EpisodeSpec]) -> list[tuple[str, int, Outco
 
 
 def queued(
-    specs: list[EpisodeSpec], num_workers: int, envs_each: int
+    specs: list[EpisodeSpec], num_workers: int, envs_each: int, min_results: int
 ) -> list[tuple[str, int, Outcome]]:
     """Play the episodes as a queue."""
     policies: dict[str, Any] = {}
@@ -169,7 +170,7 @@ def queued(
         "num_workers": num_workers * envs_each, "envs_per_process": envs_each,
     }  # fmt: skip
     with sync.build_env_group(entry) as group, group.auto_reset():
-        found: QueueEvaluation = evaluate(group, policy, specs)
+        found: QueueEvaluation = evaluate(group, policy, specs, min_results=min_results)
     assert not found.failed, found.failed[0].cause
     return [
         (one.task, one.seed, (one.total_reward or 0.0, one.length or 0, bool(one.success)))
@@ -177,24 +178,22 @@ def queued(
     ]
 
 
-def metaworld(
-    num_tasks: int, episodes: int, num_workers: int, envs_each: int, chosen: list[str] | None
-) -> None:
+def metaworld(args: argparse.Namespace) -> None:
     """Print how long each way takes, and how many of its episodes end as in the first one."""
     from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 
-    tasks = [*ALL_V3_ENVIRONMENTS][:num_tasks]
-    specs = [EpisodeSpec(task, seed) for task in tasks for seed in range(episodes)]
+    tasks = [*ALL_V3_ENVIRONMENTS][: args.tasks]
+    specs = [EpisodeSpec(task, seed) for task in tasks for seed in range(args.episodes)]
     ways = {
         "plain loop": lambda: plain_loop(specs),
-        "a queue": lambda: queued(specs, num_workers, envs_each),
-        "dealt in advance": lambda: dealt(specs, num_workers),
+        "a queue": lambda: queued(specs, args.workers, args.envs_each, args.min_results),
+        "dealt in advance": lambda: dealt(specs, args.workers),
         "waiting for the last": lambda: waiting_for_the_last(specs),
     }
     seconds: dict[str, float] = {}
     expected: dict[Any, Any] = {}
     for name, play in ways.items():
-        if chosen is not None and name not in chosen:
+        if args.way is not None and name not in args.way:
             continue
         begun = time.perf_counter()
         found = {(task, seed): outcome for task, seed, outcome in play()}
@@ -207,21 +206,28 @@ def metaworld(
             f"success {rate:.1%}, {equal} of {len(specs)} episodes equal",
             flush=True,
         )
+    if queue := seconds.pop("a queue", None):
+        ratios = (f"{queue / other:.2f} of {name!r}" for name, other in seconds.items())
+        print(f"a queue takes {', '.join(ratios)}")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--part", choices=("busy", "metaworld"), default="busy")
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--envs-each", type=int, default=8)
-    parser.add_argument("--episodes", type=int)
+    parser.add_argument("--envs-each", type=int, default=4)
+    parser.add_argument("--min-results", type=int, help="half of the envs, unless given")
+    parser.add_argument("--episodes", type=int, help="300, or 10 of each task")
     parser.add_argument("--tasks", type=int, default=50)
     parser.add_argument("--way", action="append", help="only this way to play MetaWorld's episodes")
     args = parser.parse_args()
+    # One half of the envs step while the policy answers the other.
+    args.min_results = args.min_results or args.workers * args.envs_each // 2
+    args.episodes = args.episodes or (300 if args.part == "busy" else 10)
     if args.part == "busy":
-        busy(args.workers, args.envs_each, args.episodes or 300)
+        busy(args.workers, args.envs_each, args.episodes, args.min_results)
     else:
-        metaworld(args.tasks, args.episodes or 10, args.workers, args.envs_each, args.way)
+        metaworld(args)
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from rlightning_aio.evaluation import (
     ResultsFile,
     evaluate,
 )
+from rlightning_aio.evaluation.waiting import Attempts, WaitingEpisodes
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -147,6 +148,22 @@ def test_an_entry_is_found_by_its_task() -> None:
             evaluate(group, nothing, [EpisodeSpec("", 0)])
         with pytest.raises(ValueError, match=r"the queue has .*seed=3.* twice"):
             evaluate(group, nothing, [EpisodeSpec("CartPole-v1", 3)] * 2)
+
+
+def test_an_env_continues_with_its_task() -> None:
+    """Whatever the order of the queue; then with the task of the most episodes for each env."""
+    queue = [EpisodeSpec(task, seed) for seed in range(4) for task in ("1", "2")]
+    found = evaluated(group_of(1), queue)
+    assert [one.task for one in found.records] == ["1"] * 4 + ["2"] * 4
+    assert [one.seed for one in found.records] == [*range(4), *range(4)]
+
+    waiting = WaitingEpisodes()
+    for task, number in (("a", 2), ("b", 3), ("c", 3)):
+        for seed in range(number):
+            waiting.add(Attempts(EpisodeSpec(task, seed)))
+    asked = (("a", "b"), ("x", "b"), ("x", "bc"))
+    taken = [waiting.take(own, others).spec for own, others in asked]
+    assert [(spec.task, spec.seed) for spec in taken] == [("a", 0), ("c", 0), ("b", 0)]
 
 
 def test_sub_environments_are_refused() -> None:

@@ -44,7 +44,7 @@ def simulator_of(task: str) -> Any:
 def begun(env: Any, seed: int) -> Any:
     env.seed(seed)
     env._freeze_rand_vec = False
-    env.reset()
+    env.reset_model()
     env._freeze_rand_vec = True
     return env.reset()[0]
 

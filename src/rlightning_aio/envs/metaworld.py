@@ -130,10 +130,10 @@ class MetaworldTask(gym.Env[Any, Any]):
         super().reset(seed=seed)
         simulator = self._simulator
         simulator.seed(int(self.np_random.integers(2**31)) if seed is None else seed)
-        # A reset sets everything up twice, and draws places each time, which must agree. So the
-        # places of a first reset are kept for a second one.
+        # A reset sets everything up twice, and draws places each time, which must agree. So they
+        # are drawn before it, and kept.
         simulator._freeze_rand_vec = False
-        simulator.reset()
+        simulator.reset_model()
         simulator._freeze_rand_vec = True
         state, _ = simulator.reset()
         return self._observed(state), {}

@@ -8,7 +8,7 @@ worker is not replaced leaves, and the others play its episodes.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from rlightning_aio.errors import EnvFault, WorkerDied
 from rlightning_aio.evaluation.episode_video import EpisodeVideo, Filming
 from rlightning_aio.evaluation.outcomes import responses, success_of, summed_rewards
 from rlightning_aio.evaluation.records import EpisodeRecord, EpisodeSpec, QueueEvaluation
+from rlightning_aio.evaluation.waiting import Attempts, WaitingEpisodes
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -41,21 +42,13 @@ class QueueRules:
     on_episode: Callable[[EpisodeRecord], None] | None
 
 
-@dataclass(slots=True)
-class _Attempts:
-    """An episode that is waiting or playing, and why earlier attempts were lost."""
-
-    spec: EpisodeSpec
-    lost: list[str] = field(default_factory=list[str])
-
-
 class QueuePlay:
     """An evaluation of a queue in progress.
 
     Args:
         group: an initialised group.
         policy: see `evaluate`.
-        episodes: to play, in this order.
+        episodes: to play; those of a task in this order.
         rules: the options.
 
     Raises:
@@ -84,9 +77,11 @@ class QueuePlay:
         self._reward = np.zeros(len(metas))
         self._length = np.zeros(len(metas), np.int64)
         self._found = QueueEvaluation()
-        self._waiting = {entry: deque[_Attempts]() for entry in self._entry_of.values()}
+        self._task_of = {meta.env_id: meta.task for meta in metas}
+        """The task that each env has, or has begun to switch to."""
+        self._waiting = {entry: WaitingEpisodes() for entry in self._entry_of.values()}
         self._fill(episodes)
-        self._playing: dict[str, _Attempts] = {}
+        self._playing: dict[str, Attempts] = {}
         self._idle = dict.fromkeys(self._metas)
         """Envs that may begin an episode, in order."""
         self._pending: set[str] = set()
@@ -112,7 +107,7 @@ class QueuePlay:
         self._found.records += [record for key, record in played.items() if key in by_key]
         for key, spec in by_key.items():
             if key not in played:
-                self._waiting[spec.entry].append(_Attempts(spec, [*lost.get(key, ())]))
+                self._waiting[spec.entry].add(Attempts(spec, [*lost.get(key, ())]))
 
     def _assigned(self, spec: EpisodeSpec) -> EpisodeSpec:
         """Return an episode with the entry that plays it."""
@@ -165,12 +160,22 @@ class QueuePlay:
             if env_id is None:
                 return
             del self._idle[env_id]
-            attempts = self._waiting[self._entry_of[env_id]].popleft()
+            attempts = self._next_for(env_id)
             self._playing[env_id] = attempts
+            self._task_of[env_id] = attempts.spec.task
             try:
                 yield from self._begin(env_id, attempts.spec)
             except WorkerDied as fault:
                 self._note_fault(fault)
+
+    def _next_for(self, env_id: str) -> Attempts:
+        entry = self._entry_of[env_id]
+        others = (
+            task
+            for other, task in self._task_of.items()
+            if other not in (env_id, *self._gone) and self._entry_of[other] == entry
+        )
+        return self._waiting[entry].take(self._task_of[env_id], others)
 
     def _begin(self, env_id: str, spec: EpisodeSpec) -> Procedure[None]:
         if self._filming is not None:
@@ -259,7 +264,7 @@ class QueuePlay:
             replace(record, total_reward=total, length=length, success=success_of(info))
         )
 
-    def _outcome(self, env_id: str, attempts: _Attempts) -> EpisodeRecord:
+    def _outcome(self, env_id: str, attempts: Attempts) -> EpisodeRecord:
         spec = attempts.spec
         return EpisodeRecord(
             spec.entry, spec.task, spec.seed, spec.options, env_id,
@@ -277,7 +282,7 @@ class QueuePlay:
         if self._rules.results is not None:
             self._rules.results.add_lost(attempts.spec, cause)
         if len(attempts.lost) < self._rules.max_attempts:
-            self._waiting[attempts.spec.entry].append(attempts)
+            self._waiting[attempts.spec.entry].add(attempts)
         else:
             self._ended.append(replace(self._outcome(env_id, attempts), cause=cause))
 
