@@ -13,7 +13,8 @@ ISAAC := .venv-isaac
 RLLIB := .venv-rllib
 # OpenEnv runs in processes of its own, and brings a hundred packages that nothing else here needs.
 OPENENV := .venv-openenv
-# MetaWorld and LeRobot's tasks need MuJoCo 3, and pygame in place of pygame-ce.
+# MetaWorld and LeRobot's tasks need MuJoCo 3, and pygame in place of pygame-ce. The two projects of
+# policy servers pin far more than the code that their tests use, so they come alone.
 ROBOTS := .venv-robots
 # What other projects' own tests need, and where `make test-peers PEERS=folder` finds their sources.
 PEERS_VENV := .venv-peers
@@ -51,7 +52,7 @@ test-simulators: environments ## the tests of every backend, on the real simulat
 	$(ISAAC)/bin/python -m pytest -m simulators -rs tests/envs/test_isaac.py
 	$(SIMULATORS)/bin/python -m pytest --numprocesses 3 --dist worksteal -m simulators -rs tests/benchmarks tests/cli tests/envs tests/examples tests/policies tests/vector tests/test_docs.py tests/test_wheel.py
 	$(RLLIB)/bin/python -m pytest -m simulators -rs tests/vector/test_pages.py
-	MUJOCO_GL=egl $(ROBOTS)/bin/python -m pytest -m simulators -rs tests/cli/test_robots_page.py tests/envs/test_metaworld.py tests/envs/test_lerobot_tasks.py
+	MUJOCO_GL=egl $(ROBOTS)/bin/python -m pytest -m simulators -rs tests/cli/test_robots_page.py tests/envs/test_metaworld.py tests/envs/test_lerobot_tasks.py tests/policies/test_real_servers.py
 
 # With -rs, each test that is skipped says what it lacks.
 test-gpu: export WARP_CACHE_PATH := $(CURDIR)/$(ISAAC)/warp-cache
@@ -145,7 +146,8 @@ $(OPENENV)/installed: | $(OPENENV)/bin/python
 $(ROBOTS)/installed: pyproject.toml constraints.txt | $(ROBOTS)/bin/python
 	grep -vE '^(mujoco|numpy|opencv|pygame-ce)' constraints.txt > $(ROBOTS)/constraints.txt
 	$(PIP_INSTALL) --constraint $(ROBOTS)/constraints.txt --editable '.[metaworld,pusht,aloha]' \
-	    hypothesis imageio-ffmpeg pytest pytest-asyncio pytest-timeout pytest-xdist
+	    anyio hypothesis imageio-ffmpeg msgpack pytest pytest-asyncio pytest-timeout pytest-xdist websockets
+	$(PIP_INSTALL) --no-deps openpi-client==0.1.2 vla-eval==0.8.0
 	@touch $@
 
 $(RLLIB)/installed: pyproject.toml constraints.txt | $(RLLIB)/bin/python

@@ -25,6 +25,7 @@ __all__ = [
     "EnvRaised",
     "GroupClosed",
     "NothingPending",
+    "PolicyServerError",
     "RLightningError",
     "RemoteTraceback",
     "ReplayDiverged",
@@ -84,6 +85,10 @@ class EnvBusy(RLightningError, RuntimeError):
 
 class NothingPending(RLightningError, RuntimeError):
     """A collect would never return, because no request is outstanding."""
+
+
+class PolicyServerError(RLightningError, ConnectionError):
+    """A policy server is missing or silent, reports an error, or breaks its protocol."""
 
 
 class ReplayDiverged(RLightningError, RuntimeError):

@@ -22,6 +22,7 @@ from rlightning_aio.cli.option_files import check_option_file
 from rlightning_aio.cli.options import AsJson, Config, Overrides, PlotFile, TraceFile, check_seed
 from rlightning_aio.cli.plots import check_plot, draw_evaluation
 from rlightning_aio.cli.policies import load_policy
+from rlightning_aio.cli.policy_servers import is_server, served_policy
 from rlightning_aio.cli.queue_evaluating import QueueOrder, evaluate_queue
 from rlightning_aio.cli.queue_options import (
     EpisodesFile,
@@ -49,6 +50,7 @@ from rlightning_aio.cli.terminal import (
 from rlightning_aio.config import load_config
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.evaluation import Episode, Evaluation, evaluate
+from rlightning_aio.policies import ActionChunks
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -83,8 +85,17 @@ class _Order:
 _PolicyOrModel: TypeAlias = Annotated[
     str,
     typer.Option(
-        metavar="MODULE:CALLABLE|FILE.zip|random",
-        help="Takes a batch, returns actions; or a model saved by Stable-Baselines3.",
+        metavar="MODULE:CALLABLE|FILE.zip|openpi://HOST:PORT|vla-eval://HOST:PORT|random",
+        help="Takes a batch, returns actions; or a model saved by Stable-Baselines3; or the "
+        "address of a policy server.",
+    ),
+]
+_ActionSteps: TypeAlias = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        help="The policy returns chunks of actions; play this many of each before the next.",
+        show_default="all, of openpi://",
     ),
 ]
 _Algo: TypeAlias = Annotated[
@@ -167,6 +178,7 @@ def evaluation(
     overrides: Overrides = None,
     policy: _PolicyOrModel = _RANDOM,
     algo: _Algo = None,
+    action_steps: _ActionSteps = None,
     episodes: _Episodes = None,
     seed: _Seed = None,
     episodes_file: EpisodesFile = None,
@@ -206,18 +218,18 @@ def evaluation(
     check_option_file("--trace", trace)
     films = (video, video_every, video_failed, video_episode)
     queue = QueueOptions(episodes_file, tasks, seeds, max_attempts, *films)
-    chosen, named = _policy(policy, algo)
-    if queue.wanted:
-        _refuse({"--episodes": episodes, "--seed": seed, "--video-env": video_env})
-        facts = {"config": str(config), "policy": policy}
-        evaluate_queue(
-            configs, queue, QueueOrder(chosen, named, resume, plot, trace, as_json, facts)
-        )
-        return
-    output = _Output(config, policy, seed, episodes or 10, plot, as_json)
-    about = subject(configs, named, seed)
-    configs = filmed(configs, video, video_env, video_every)
     with contextlib.ExitStack() as stack:
+        chosen, named = _policy(policy, algo, action_steps, stack)
+        if queue.wanted:
+            _refuse({"--episodes": episodes, "--seed": seed, "--video-env": video_env})
+            facts = {"config": str(config), "policy": policy}
+            evaluate_queue(
+                configs, queue, QueueOrder(chosen, named, resume, plot, trace, as_json, facts)
+            )
+            return
+        output = _Output(config, policy, seed, episodes or 10, plot, as_json)
+        about = subject(configs, named, seed)
+        configs = filmed(configs, video, video_env, video_every)
         kept = None if resume is None else stack.enter_context(EvaluationFile(resume, about))
         played = _within([] if kept is None else kept.played, output.episodes)
         _play(_Order(configs, output.episodes, seed, chosen, played, trace), kept, output)
@@ -263,14 +275,26 @@ def _check_envs(path: Path, configs: Sequence[EnvConfig]) -> None:
             )
 
 
-def _policy(name: str, algorithm: str | None) -> tuple[Policy | None, str]:
+def _policy(
+    name: str, algorithm: str | None, steps: int | None, stack: contextlib.ExitStack
+) -> tuple[Policy | None, str]:
     """Return the policy, or None for random actions, and a text that identifies it."""
     if name.endswith(".zip"):
-        policy = SB3Policy(Path(name), algorithm)
-        return policy, f"{name}, SHA-256 {digest_of(Path(name))}"
+        if steps is not None:
+            raise ConfigError(f"--action-steps is for policies that return chunks, not {name!r}")
+        model = SB3Policy(Path(name), algorithm)
+        return model, f"{name}, SHA-256 {digest_of(Path(name))}"
     if algorithm is not None:
         raise ConfigError(f"--algo is for a model that Stable-Baselines3 has saved, not {name!r}")
-    return (None if name == _RANDOM else load_policy(name)), name
+    if name == _RANDOM:
+        if steps is not None:
+            raise ConfigError("--action-steps is for policies that return chunks, not 'random'")
+        return None, name
+    policy = served_policy(name, stack) if is_server(name) else load_policy(name)
+    if steps is None and not name.startswith("openpi://"):
+        return policy, name
+    played = "" if steps is None else f", {counted(steps, 'action')} of each chunk"
+    return ActionChunks(policy, steps), f"{name}{played}"
 
 
 def _within(played: Sequence[Episode], episodes: int) -> list[Episode]:

@@ -81,7 +81,7 @@ class Responder:
         """Return batches of responses that together answer `batch`.
 
         Raises:
-            PolicyRaised: the policy raised an exception.
+            PolicyRaised: the policy raised an exception that is none of this package.
         """
         parts = list(batch.by_name().values()) if self._separate else [batch]
         return [await self._respond(part) for part in parts]
@@ -91,8 +91,8 @@ class Responder:
             answer = self._policy(batch)
             if inspect.isawaitable(answer):
                 answer = await answer
-        except ConfigError:
-            raise  # Random actions can't be drawn.
+        except RLightningError:
+            raise  # Random actions can't be drawn, a policy server is missing, and the like.
         except Exception as error:
             raise PolicyRaised(_raised(error)) from error
         return answer if isinstance(answer, BatchedData) else batch.respond(action=answer)

@@ -1,8 +1,7 @@
-"""Policies for `evaluate`: action chunks, models with a `predict`, clients of policy servers.
+"""Policies for `evaluate`: action chunks, and models with a `predict`.
 
 Rule: a policy is called with a batch of results and returns one action for each, and whatever it
-keeps between calls belongs to one env's episode and ends with it. Clients speak over WebSockets
-and unpickle nothing.
+keeps between calls belongs to one env's episode and ends with it.
 """
 
 from __future__ import annotations

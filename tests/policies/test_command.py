@@ -1,0 +1,94 @@
+"""``rlightning-aio eval`` with a policy server, and with chunks of actions."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from cli.command import invoke, invoke_json, write_config
+from policies.counting import chunk_of
+from policies.servers import OpenPiServer, VlaEvalServer, serving
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+ENTRY = {
+    "name": "env", "task": "policies.counting:Counting", "placement": "inline", "num_workers": 2,
+}  # fmt: skip
+
+
+def chunks(batch: Any) -> Any:
+    """A policy that the command names."""
+    return np.stack([chunk_of(observation) for observation in batch.observation])
+
+
+def check(document: Any) -> None:
+    assert [row["seed"] for row in sorted(document["rows"], key=lambda row: row["seed"])] == [
+        *range(4)
+    ]
+    assert all(row["return"] == row["length"] == row["seed"] + 4 for row in document["rows"])
+
+
+@pytest.mark.parametrize("server", [OpenPiServer(), VlaEvalServer()], ids=["openpi", "vla-eval"])
+def test_a_policy_server_is_named_by_its_address(
+    server: Any, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    """Actions of its chunks are played open loop."""
+    config = write_config(tmp_path, ENTRY)
+    with serving(server) as url:
+        policy = url.replace("ws", request.node.callspec.id, 1)
+        check(
+            invoke_json("eval", config, "--policy", policy, "--action-steps", 3, "--seeds", "0:4")
+        )
+
+
+def test_all_actions_of_openpi_s_chunks_are_played_by_default(tmp_path: Path) -> None:
+    """Its server always returns chunks."""
+    config = write_config(tmp_path, {**ENTRY, "env_kwargs": {"period": 5}})
+    with serving(OpenPiServer()) as url:
+        policy = url.replace("ws", "openpi", 1)
+        check(invoke_json("eval", config, "--policy", policy, "--seeds", "0:4"))
+
+
+def test_a_policy_of_a_module_may_return_chunks(tmp_path: Path) -> None:
+    """The number of steps belongs to the subject of the results file."""
+    config, file = write_config(tmp_path, ENTRY), tmp_path / "results.jsonl"
+    words = ("eval", config, "--policy", "policies.test_command:chunks", "--resume", file)
+    check(invoke_json(*words, "--action-steps", 3, "--seeds", "0:4"))
+    done = invoke(*words, "--action-steps", 2, "--seeds", "0:4")
+    assert done.exit_code == 2
+    assert "3 actions of each chunk" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        (["--policy", "http://localhost:1"], 2, "should begin with openpi:// or vla-eval://"),
+        (["--policy", "openpi://localhost:x"], 2, "should look like ws://localhost:8000"),
+        (["--policy", "openpi://"], 2, "should look like ws://localhost:8000"),
+        (["--action-steps", 2], 2, "is for policies that return chunks, not 'random'"),
+    ],
+)
+def test_what_is_no_policy_server_is_refused(
+    words: list[Any], code: int, message: str, tmp_path: Path
+) -> None:
+    """Before anything starts."""
+    done = invoke("eval", write_config(tmp_path, ENTRY), *words, "--seeds", "0:4")
+    assert done.exit_code == code
+    assert message in done.stderr
+
+
+def test_an_error_of_the_server_is_shown_in_words(tmp_path: Path) -> None:
+    """The command ends with it, without a traceback of its own."""
+
+    class Server(OpenPiServer):
+        def answer(self, connection: Any, observation: dict[str, Any]) -> None:
+            connection.send("KeyError: 'observation/image'")
+
+    config = write_config(tmp_path, ENTRY)
+    with serving(Server()) as url:
+        done = invoke("eval", config, "--policy", url.replace("ws", "openpi", 1), "--seeds", "0:4")
+    assert done.exit_code == 1
+    assert "reports an error:\nKeyError: 'observation/image'" in done.stderr
+    assert "Traceback" not in done.stderr

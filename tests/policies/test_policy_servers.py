@@ -1,0 +1,320 @@
+"""Clients of policy servers: answers, lost connections, errors, and servers that misbehave."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from typing import Any
+
+import numpy as np
+import pytest
+from policies.counting import QUEUE, Counting, check, group_of
+from policies.servers import OpenPiServer, VlaEvalServer, packed, serving
+
+import rlightning_aio as rl
+from rlightning_aio.errors import PolicyServerError
+from rlightning_aio.evaluation import evaluate
+from rlightning_aio.policies import ActionChunks
+from rlightning_aio.policy_servers import OpenPiPolicy, VlaEvalPolicy
+
+
+def evaluated(policy: Any, workers: int = 2, **fields: Any) -> Any:
+    with group_of(workers, **fields) as group, group.auto_reset(100):
+        return evaluate(group, policy, QUEUE)
+
+
+# -- right answers ------------------------------------------------------------------------
+
+
+def test_chunks_of_an_openpi_server_are_played() -> None:
+    """It gets the observation and the instruction of the episode."""
+    server = OpenPiServer()
+    with serving(server) as url, OpenPiPolicy(url) as policy:
+        check(evaluated(ActionChunks(policy, 3)))
+    seen = {(one["prompt"], *one["observation/state"].tolist()) for one in server.seen}
+    asked = {(one.seed, step) for one in QUEUE for step in range(0, one.seed + 4, 3)}
+    assert seen == {(f"lift {seed}", seed, step) for seed, step in asked}
+    assert server.connections == 2
+
+
+@pytest.mark.parametrize("chunks", [True, False])
+def test_actions_of_a_vla_eval_server_are_played(chunks: bool) -> None:
+    """Each env is a session, in which the server is told where episodes begin and end."""
+    server = VlaEvalServer(chunks=chunks)
+    with serving(server) as url, VlaEvalPolicy(url) as policy:
+        found = evaluated(
+            ActionChunks(policy, 3) if chunks else policy, 3, env_kwargs={"breaks": True}
+        )
+    check(found)
+    texts = sorted(task["task_description"] for task in server.tasks)
+    assert texts == sorted(
+        f"lift {one.seed}" for one in found.records for _ in range(len(one.lost) + 1)
+    )
+    assert all(task["name"] == task["task_description"] for task in server.tasks)
+    assert server.ended == len(server.tasks) - 3
+
+
+async def test_they_are_awaited_over_an_asynchronous_group() -> None:
+    """The loop of the group goes on while a server computes."""
+    entry = {"name": "env", "make_env": Counting, "placement": "inline", "num_workers": 2}
+    with serving(OpenPiServer()) as url, OpenPiPolicy(url) as policy:
+        async with rl.build_env_group(entry) as group:
+            with group.auto_reset(100):
+                check(await evaluate(group, ActionChunks(policy, 3), QUEUE))
+
+
+def test_what_is_sent_can_be_chosen() -> None:
+    """Arrays of any number type, texts and nested maps; the key is sent along."""
+    keys: list[Any] = []
+
+    class Server(OpenPiServer):
+        def __call__(self, connection: Any) -> None:
+            keys.append(connection.request.headers["Authorization"])
+            super().__call__(connection)
+
+        def answer(self, connection: Any, observation: dict[str, Any]) -> None:
+            super().answer(connection, {"observation/state": observation["nested"]["state"]})
+
+    def observe(observation: Any, info: dict[str, Any]) -> dict[str, Any]:
+        image = np.full((4, 6, 3), 7, np.uint8)[:, ::2]
+        more = {"image": image, "gripper": np.float32(0.5), "n": np.int64(3), "ok": np.bool_(True)}
+        return {"nested": {"state": observation}, "prompt": info["task_description"], **more}
+
+    server = Server()
+    with serving(server) as url, OpenPiPolicy(url, observe, api_key="abc") as policy:
+        check(evaluated(ActionChunks(policy, 3)))
+    assert set(keys) == {"Api-Key abc"}
+    assert server.seen[0]["image"].shape == (4, 3, 3)
+    assert (server.seen[0]["image"] == 7).all()
+    assert [server.seen[0][key] for key in ("gripper", "n", "ok")] == [0.5, 3, True]
+
+
+# -- lost connections ---------------------------------------------------------------------
+
+
+def test_an_openpi_server_is_asked_again_over_another_connection() -> None:
+    """It keeps nothing about episodes, so its answer is the same."""
+
+    class Server(OpenPiServer):
+        def answer(self, connection: Any, observation: dict[str, Any]) -> None:
+            if len(self.seen) % 3:
+                super().answer(connection, observation)
+            else:
+                connection.close()
+
+    server = Server()
+    with serving(server) as url, OpenPiPolicy(url) as policy:
+        check(evaluated(ActionChunks(policy, 3)))
+    assert server.connections > 2
+
+
+def test_a_server_that_starts_late_is_waited_for() -> None:
+    """Connections are refused until it listens."""
+    with socket.create_server(("127.0.0.1", 0)) as unused:
+        port = unused.getsockname()[1]
+    refused = threading.Event()
+    with OpenPiPolicy(f"ws://127.0.0.1:{port}") as policy:
+        found: list[Any] = []
+
+        def evaluating() -> None:
+            refused.set()
+            found.append(evaluated(ActionChunks(policy, 3)))
+
+        thread = threading.Thread(target=evaluating)
+        thread.start()
+        refused.wait()
+        with serving(OpenPiServer(), port):
+            thread.join()
+    check(found[0])
+
+
+def test_a_session_that_is_lost_within_an_episode_is_an_error() -> None:
+    """The server has forgotten the episode."""
+
+    class Server(VlaEvalServer):
+        def answer(self, connection: Any, payload: Any, seq: int, steps: int) -> None:
+            if steps == 2:
+                connection.close()
+            super().answer(connection, payload, seq, steps)
+
+    message = r"has closed the connection of env-\d in place of an answer: .*what it knew"
+    with (
+        serving(Server(chunks=False)) as url,
+        VlaEvalPolicy(url) as policy,
+        pytest.raises(PolicyServerError, match=message),
+    ):
+        evaluated(policy)
+
+
+# -- servers that are wrong ---------------------------------------------------------------
+
+
+def test_a_missing_server_is_named() -> None:
+    """Once the time for it to start is over."""
+    with socket.create_server(("127.0.0.1", 0)) as unused:
+        url = f"ws://127.0.0.1:{unused.getsockname()[1]}"
+    with (
+        OpenPiPolicy(url, connect_timeout=0.1) as policy,
+        pytest.raises(PolicyServerError, match=rf"{url} can't be reached: .*; start it"),
+    ):
+        evaluated(policy)
+
+
+@pytest.mark.parametrize("kind", [OpenPiPolicy, VlaEvalPolicy])
+def test_a_silent_server_is_an_error(kind: Any) -> None:
+    """After the time for an answer; before or after the first frames."""
+
+    def handler(connection: Any) -> None:
+        for _ in connection:
+            pass
+
+    with (
+        serving(handler) as url,
+        kind(url, timeout=0.2) as policy,
+        pytest.raises(PolicyServerError, match=r"has not answered env-\d in 0.2 s"),
+    ):
+        evaluated(policy)
+
+
+def test_the_error_of_an_openpi_server_is_shown() -> None:
+    """It is a text frame, a traceback."""
+
+    class Server(OpenPiServer):
+        def answer(self, connection: Any, observation: dict[str, Any]) -> None:
+            connection.send("Traceback …\nKeyError: 'observation/image'")
+            connection.close(1011)
+
+    with (
+        serving(Server()) as url,
+        OpenPiPolicy(url) as policy,
+        pytest.raises(PolicyServerError, match=r"reports an error:\nTrace.*\n.*/image'"),
+    ):
+        evaluated(policy)
+
+
+def test_the_error_of_a_vla_eval_server_is_shown() -> None:
+    """It is a frame of its own."""
+
+    class Server(VlaEvalServer):
+        def answer(self, connection: Any, payload: Any, seq: int, steps: int) -> None:
+            self.send(connection, "error", {"error": "observation_failed: no image"}, seq)
+
+    with (
+        serving(Server()) as url,
+        VlaEvalPolicy(url) as policy,
+        pytest.raises(PolicyServerError, match="observation_failed: no image"),
+    ):
+        evaluated(policy)
+
+
+def array_of(**fields: Any) -> bytes:
+    good = {"__ndarray__": True, "data": bytes(24), "dtype": "<f8", "shape": [3]}
+    return packed(
+        {"actions": {k.encode(): v for k, v in {**good, **fields}.items()}}, as_bytes=True
+    )
+
+
+@pytest.mark.parametrize(
+    ("frame", "message"),
+    [
+        (b"", "can't be read"),
+        (b"\xc1", "can't be read"),
+        (b"\x91" * 100_000, "can't be read"),
+        (b"\xdd\xff\xff\xff\xff", "can't be read"),
+        (b"\xa1\xff", "can't be read"),
+        (b"\xc4\x00", "not a map with 'actions'"),
+        (packed({"action": 1}, as_bytes=True), r"a map with \['action'\], not"),
+        (packed({"actions": "up"}, as_bytes=True), "no numbers"),
+        (packed({"actions": [[1, 2], [3]]}, as_bytes=True), "no numbers"),
+        (packed({"actions": []}, as_bytes=True), "no numbers"),
+        (array_of(dtype="|O"), "dtype '|O', which is none of numbers"),
+        (array_of(dtype="<f8,<f8"), "none of numbers"),
+        (array_of(dtype=["<f8"]), "none of numbers"),
+        (array_of(shape=[1 << 40]), "can't be read"),
+        (array_of(shape="x"), "can't be read"),
+        (array_of(data=b"123"), "can't be read"),
+        (array_of(data="123"), "can't be read"),
+    ],
+)  # fmt: skip
+def test_a_frame_that_is_no_answer_is_refused(frame: bytes, message: str) -> None:
+    """Nothing in it is executed, and no memory is taken for what it only claims to hold."""
+
+    class Server(OpenPiServer):
+        def answer(self, connection: Any, observation: dict[str, Any]) -> None:
+            connection.send(frame)
+
+    with (
+        serving(Server()) as url,
+        OpenPiPolicy(url) as policy,
+        pytest.raises(PolicyServerError, match=message),
+    ):
+        evaluated(policy)
+
+
+def test_a_frame_above_the_limit_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The connection is closed before it is read."""
+    monkeypatch.setattr("rlightning_aio.policy_servers.connection.MAX_BYTES", 1000)
+
+    class Server(OpenPiServer):
+        def answer(self, connection: Any, observation: dict[str, Any]) -> None:
+            connection.send(bytes(1001))
+
+    server = Server()
+    with (
+        serving(server) as url,
+        OpenPiPolicy(url) as policy,
+        pytest.raises(PolicyServerError, match="its frames may have"),
+    ):
+        evaluated(policy, 1)
+    assert server.connections == 1
+
+
+@pytest.mark.parametrize(
+    "change", [{"seq": 7}, {"type": "hello"}, {"payload": 3}, {"type": ["action"]}]
+)
+def test_a_frame_that_answers_nothing_is_refused(change: dict[str, Any]) -> None:
+    """An answer repeats the number of its request."""
+
+    class Server(VlaEvalServer):
+        def answer(self, connection: Any, payload: Any, seq: int, steps: int) -> None:
+            good = {"type": "action", "payload": {}, "seq": seq, "timestamp": 0.0}
+            connection.send(packed({**good, **change}, as_bytes=False))
+
+    with (
+        serving(Server()) as url,
+        VlaEvalPolicy(url) as policy,
+        pytest.raises(PolicyServerError, match=r"in place of the answer|is none of vla-eval's"),
+    ):
+        evaluated(policy)
+
+
+def test_another_version_of_the_protocol_is_refused() -> None:
+    """The server names it in its first frame."""
+
+    class Server(VlaEvalServer):
+        def send(self, connection: Any, kind: str, payload: Any, seq: int) -> None:
+            super().send(connection, kind, {"protocol_version": 2}, seq)
+
+    with (
+        serving(Server()) as url,
+        VlaEvalPolicy(url) as policy,
+        pytest.raises(PolicyServerError, match="speaks version 2 of vla-eval's protocol"),
+    ):
+        evaluated(policy)
+
+
+@pytest.mark.parametrize("url", ["localhost:8000", "http://localhost", "ws://", "ws://a:b", ""])
+def test_a_url_that_is_none_is_refused(url: str) -> None:
+    """Before anything is connected."""
+    with pytest.raises(rl.ConfigError, match="should look like ws://localhost:8000"):
+        OpenPiPolicy(url)
+
+
+def test_what_can_t_be_sent_is_named() -> None:
+    """Objects and texts in arrays."""
+    for value in (object(), np.array(["a"]), np.array([None])):
+        with (
+            OpenPiPolicy("ws://localhost:1", lambda _, info, value=value: {"x": value}) as policy,
+            pytest.raises(TypeError, match="can't be sent to a policy server"),
+        ):
+            evaluated(policy)
