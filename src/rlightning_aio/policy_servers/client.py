@@ -39,7 +39,7 @@ R = TypeVar("R")
 _ATTEMPTS: Final = 3
 """A request that loses its connection this often has failed."""
 _TOO_BIG: Final = 1009
-_SHOWN: Final = 2000
+_END: Final = 2000
 """Characters of a server's error, from its end, in a message."""
 
 
@@ -208,8 +208,8 @@ class PolicyClient(abc.ABC, Generic[R]):
 
     def _raised(self, text: str) -> PolicyServerError:
         """Return the error that a server reports."""
-        shown = text if len(text) <= _SHOWN else f"… {text[-_SHOWN:]}"
-        return self._error(f"reports an error:\n{shown.strip()}")
+        end = text if len(text) <= _END else f"… {text[-_END:]}"
+        return self._error(f"reports an error:\n{end.strip()}")
 
     # -- the end ----------------------------------------------------------------------
 
