@@ -1,6 +1,7 @@
 # The two commands of the README are `make run` and `make test`; `make help` lists the rest.
-# Every target makes the virtual environment it needs, once, and again only after
-# pyproject.toml or constraints.txt changed.
+# Every target makes the virtual environment it needs, once, and again only after pyproject.toml,
+# constraints.txt or the compiled kernel changed. Without a C compiler, Python twins take the
+# kernel's place (CC=/bin/false make test).
 
 # The versions in constraints.txt were resolved for Python 3.11; later ones work as well.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
@@ -126,10 +127,12 @@ $(VENV)/installed-release: extras := [test,release]
 # Two libraries whose pages it runs, too.
 $(SIMULATORS)/installed: pages := skrl tianshou
 $(SIMULATORS)/installed: extras := [test,ale,envpool,examples,maniskill,notebook,openenv,pettingzoo,piper,sb3,torchrl]
+# What an installation is made from.
+SOURCES := pyproject.toml setup.py constraints.txt src/rlightning_aio/protocol/_kernel.c
 STAMPS := $(VENV)/installed $(addprefix $(VENV)/installed-,test check docs bench ray release)
 $(STAMPS): | $(PY)
 $(SIMULATORS)/installed: | $(SIMULATORS)/bin/python
-$(STAMPS) $(SIMULATORS)/installed: pyproject.toml constraints.txt
+$(STAMPS) $(SIMULATORS)/installed: $(SOURCES)
 	$(PIP_INSTALL) --constraint constraints.txt --editable '.$(extras)' $(pages)
 	@touch $@
 

@@ -151,6 +151,21 @@ def _held() -> dict[str, str]:
     return _children() | {name: name for name in _descriptors() | _shared_memory()}
 
 
+@pytest.fixture(scope="module", params=["python", "c"])
+def implementation(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Use each implementation of the hot path in turn, in this process and in its workers."""
+    from rlightning_aio.protocol import kernel
+
+    if request.param == "c" and kernel.compiled() is None:
+        pytest.skip("the compiled kernel was not built")
+    before = kernel.selected
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(kernel.VARIABLE, request.param)
+        kernel.select(request.param)
+        yield request.param
+    kernel.select(before)
+
+
 @pytest.fixture(autouse=True)
 def nothing_left_behind() -> Iterator[None]:
     before = _held()

@@ -222,10 +222,12 @@ def test_help_has_examples(command: list[str]) -> None:
 
 
 def test_version_is_printed() -> None:
-    """--version prints it and nothing else."""
+    """--version prints it, and which implementation of the hot path is active."""
     import rlightning_aio
+    from rlightning_aio.protocol import kernel
 
-    assert invoke("--version").stdout == f"{rlightning_aio.__version__}\n"
+    expected = f"{rlightning_aio.__version__} (hot path: {kernel.selected})\n"
+    assert invoke("--version").stdout == expected
 
 
 def test_trace_writes_a_timeline(tmp_path: Path) -> None:

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
     NewGroup = Callable[..., FakeGroup]
 
+pytestmark = pytest.mark.usefixtures("implementation")
+
 
 @pytest.fixture
 def new_group() -> Iterator[NewGroup]:

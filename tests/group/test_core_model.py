@@ -26,6 +26,7 @@ from hypothesis.stateful import (
     invariant,
     precondition,
     rule,
+    run_state_machine_as_test,
 )
 
 from rlightning_aio.batch import BatchedData
@@ -43,6 +44,8 @@ from rlightning_aio.types import PolicyResponse
 
 if TYPE_CHECKING:
     from group.fake_host import Running
+
+pytestmark = pytest.mark.usefixtures("implementation")
 
 ACTIONS = st.sampled_from((PLAIN, PLAIN, PLAIN, TERMINATES, TRUNCATES, RAISES, SENDS_INFO))
 
@@ -626,5 +629,6 @@ class CoreMachine(RuleBasedStateMachine):
             assert count >= sum(r.answer is None for r in outstanding)
 
 
-TestCore = CoreMachine.TestCase
-TestCore.settings = settings(stateful_step_count=40)
+def test_the_core() -> None:
+    """In any order of events."""
+    run_state_machine_as_test(CoreMachine, settings=settings(stateful_step_count=40))

@@ -21,17 +21,26 @@ from group.fake_host import (
 )
 from hypothesis import settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
 
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import RLightningError
 from rlightning_aio.group.conditions import UNLIKE_ENVS
 from rlightning_aio.group.trace import Trace
 from rlightning_aio.group.wait import CollectRules
-from rlightning_aio.protocol import exchange
+from rlightning_aio.protocol import kernel
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+pytestmark = pytest.mark.usefixtures("implementation")
 
 ACTIONS = st.sampled_from((PLAIN,) * 6 + (TERMINATES, TRUNCATES, RAISES, SENDS_INFO))
 
@@ -275,8 +284,9 @@ class Twins(RuleBasedStateMachine):
         assert active[0] == active[1]
 
 
-TestSteps = Twins.TestCase
-TestSteps.settings = settings(stateful_step_count=50)
+def test_steps() -> None:
+    """Both paths, in any order of events."""
+    run_state_machine_as_test(Twins, settings=settings(stateful_step_count=50))
 
 
 def test_steps_are_ordinary_before_and_after_a_death() -> None:
@@ -290,7 +300,7 @@ def test_steps_are_ordinary_before_and_after_a_death() -> None:
 
     def turn() -> None:
         nonlocal batch
-        with patch.object(exchange, "submit", wraps=exchange.submit) as submit:
+        with patch.object(kernel, "submit", wraps=kernel.submit) as submit:
             step = group.core.steps.step(batch.respond(action=np.full(4, PLAIN)), group.now)
             running = group.begin(step)
         published.append(submit.called)

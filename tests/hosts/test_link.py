@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from protocol.memory_of_rings import unused
 
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.hosts.arena import Arena, map_shared
@@ -30,8 +31,8 @@ from rlightning_aio.hosts.messages import (
     Value,
 )
 from rlightning_aio.hosts.process import ForkServer, ProcessHost, _surroundings
+from rlightning_aio.protocol.bell import TrainerBell, WorkerBell, bell_size
 from rlightning_aio.protocol.entries import Operation, entry
-from rlightning_aio.protocol.exchange import TrainerBell, WorkerBell, bell_size
 from rlightning_aio.protocol.frames import BELL, FrameKind, FrameReader, encode
 from rlightning_aio.protocol.info import InfoSchema
 from rlightning_aio.protocol.rings import WorkerRings, rings_size
@@ -41,6 +42,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from rlightning_aio.hosts.fork_messages import Fork
+
+pytestmark = pytest.mark.usefixtures("implementation")
 
 CONFIG = EnvConfig(name="two", backend="gymnasium", task="CartPole-v1", num_workers=2)
 SCHEMA = InfoSchema.of({"x": 1.5})
@@ -135,7 +138,9 @@ class Scene:
 
     def serve(self, *in_rows: int) -> None:
         """Execute waiting requests; report those of `in_rows`, by default all."""
-        self.rings.serve(lambda one: not in_rows or one in in_rows, self.ring, lambda: None)
+        self.rings.serve(
+            lambda one: not in_rows or one in in_rows, unused, self.ring, unused, [], 0
+        )
 
     def ring(self) -> None:
         self.rung += 1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rlightning_aio.protocol.exchange import TrainerBell, WorkerBell, bell_size
+from rlightning_aio.protocol.bell import TrainerBell, WorkerBell, bell_size
 from rlightning_aio.protocol.rings import TrainerRings, WorkerRings, rings_size
 
 
@@ -21,6 +21,11 @@ def both_sides(
     bell = TrainerBell(ring, 1)
     trainer = TrainerRings(rings, num_envs, bell, 0)
     return bell, trainer, WorkerRings(rings, num_envs, WorkerBell(ring, 1, 0))
+
+
+def unused(*arguments: object) -> None:
+    """Stand in for a function of the worker that a test has no use for."""
+    del arguments
 
 
 def memory_size(num_envs: int) -> int:

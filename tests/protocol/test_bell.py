@@ -14,11 +14,21 @@ import numpy as np
 import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
+from protocol.memory_of_rings import unused
 
+from rlightning_aio.protocol.bell import TrainerBell, WorkerBell, bell_size
 from rlightning_aio.protocol.entries import Operation, entry
-from rlightning_aio.protocol.exchange import TrainerBell, WorkerBell, bell_size
 from rlightning_aio.protocol.rings import TrainerRings, WorkerRings, rings_size
+
+pytestmark = pytest.mark.usefixtures("implementation")
 
 
 class Worker:
@@ -161,8 +171,9 @@ class BellMachine(RuleBasedStateMachine):
         assert list(self.trainer.counters) == [w.count for w in self.workers]
 
 
-TestBell = BellMachine.TestCase
-TestBell.settings = settings(stateful_step_count=60)
+def test_the_bell() -> None:
+    """In any order of events."""
+    run_state_machine_as_test(BellMachine, settings=settings(stateful_step_count=60))
 
 
 def bells(num_workers: int) -> tuple[TrainerBell, list[WorkerBell]]:
@@ -238,7 +249,7 @@ def test_a_released_bell_is_silent() -> None:
 def _work(rings: WorkerRings, channel: socket.socket) -> None:
     """A worker without envs, which ends when the trainer closes the channel."""
     while True:
-        if rings.serve(lambda _: True, lambda: channel.send(b"!"), lambda: None):
+        if rings.serve(lambda _: True, unused, lambda: channel.send(b"!"), unused, [], 0):
             continue
         if rings.fall_asleep():
             if not channel.recv(1 << 16):

@@ -12,10 +12,18 @@ from collections import deque
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
-from protocol.memory_of_rings import both_sides, memory_size
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
+from protocol.memory_of_rings import both_sides, memory_size, unused
 
 from rlightning_aio.protocol.entries import (
     NUMBER_SHIFT,
@@ -33,6 +41,8 @@ if TYPE_CHECKING:
     from rlightning_aio.protocol.rings import WorkerRings
 
 STEP = Operation.STEP
+
+pytestmark = pytest.mark.usefixtures("implementation")
 
 
 class RingsMachine(RuleBasedStateMachine):
@@ -80,7 +90,9 @@ class RingsMachine(RuleBasedStateMachine):
             executed.append(request)
             return in_rows[len(executed) - 1]
 
-        served = self.worker.serve(execute, lambda: bells.append(len(executed)), lambda: None)
+        served = self.worker.serve(
+            execute, unused, lambda: bells.append(len(executed)), unused, [], 0
+        )
         assert served == bool(self.requested)
         assert executed == list(self.requested)
         self.reported += [done for done, in_row in zip(executed, in_rows, strict=True) if in_row]
@@ -165,8 +177,9 @@ class RingsMachine(RuleBasedStateMachine):
         assert self.worker.has_news() == bool(self.frames[0] or self.requested)
 
 
-TestRings = RingsMachine.TestCase
-TestRings.settings = settings(stateful_step_count=40)
+def test_rings() -> None:
+    """In any order of events."""
+    run_state_machine_as_test(RingsMachine, settings=settings(stateful_step_count=40))
 
 
 @given(
@@ -200,7 +213,7 @@ def test_the_trainer_sees_the_entry_in_execution_and_its_start() -> None:
 def _work(rings: WorkerRings, channel: socket.socket) -> None:
     """A worker without envs, which ends when the trainer closes the channel."""
     while True:
-        if rings.serve(lambda _: True, lambda: channel.send(b"!"), lambda: None):
+        if rings.serve(lambda _: True, unused, lambda: channel.send(b"!"), unused, [], 0):
             continue
         if rings.fall_asleep():
             if not channel.recv(1 << 16):

@@ -23,11 +23,15 @@ def main() -> None:
     # up, and an exception could get lost in code that expects none.
     signal.signal(signal.SIGINT, _quit)
     warnings.showwarning = _say
-    from rlightning_aio.cli.app import app  # noqa: PLC0415
-    from rlightning_aio.cli.terminal import ResultStream  # noqa: PLC0415
     from rlightning_aio.errors import ConfigError  # noqa: PLC0415
-    from rlightning_aio.hosts.standard_streams import stdout_set_aside  # noqa: PLC0415
 
+    try:
+        from rlightning_aio.cli.app import app  # noqa: PLC0415
+        from rlightning_aio.cli.terminal import ResultStream  # noqa: PLC0415
+        from rlightning_aio.hosts.standard_streams import stdout_set_aside  # noqa: PLC0415
+    except ConfigError as error:  # Of the environment variables that imports read.
+        sys.stderr.write(f"error: {error}\n")
+        sys.exit(2)
     sys.stdout = cast("TextIO", ResultStream(stdout_set_aside()))
     if sys.stderr is None:  # pyright: ignore[reportUnnecessaryComparison]  # Closed by the caller.
         sys.stderr = open(2, "w", closefd=False)  # noqa: SIM115  # To the end of the process.

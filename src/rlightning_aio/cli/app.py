@@ -19,6 +19,7 @@ from rlightning_aio.cli.serving import serve
 from rlightning_aio.cli.tasks import tasks
 from rlightning_aio.cli.terminal import guarded
 from rlightning_aio.cli.tune import tune
+from rlightning_aio.protocol import kernel
 
 __all__ = ["app"]
 
@@ -33,7 +34,7 @@ app = typer.Typer(
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(rlightning_aio.__version__)
+        typer.echo(f"{rlightning_aio.__version__} (hot path: {kernel.selected})")
         raise typer.Exit
 
 
@@ -42,7 +43,10 @@ def prepare(
     version: Annotated[
         bool,
         typer.Option(
-            "--version", callback=_print_version, is_eager=True, help="Print the version."
+            "--version",
+            callback=_print_version,
+            is_eager=True,
+            help="Print the version, and whether the compiled kernel is used (c) or not (python).",
         ),
     ] = False,
 ) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from rlightning_aio.batch.columns import ResultColumns
 from rlightning_aio.batch.sent import UNASKED, copied
 from rlightning_aio.group.conditions import BESIDE_ROWS
-from rlightning_aio.protocol import exchange
+from rlightning_aio.protocol import kernel
 from rlightning_aio.protocol.columns import Rows, gather, mapped, stacked
 from rlightning_aio.protocol.info import NO_INFO, PICKLED
 from rlightning_aio.protocol.slab import TRUNCATED
@@ -182,7 +182,7 @@ class Results:
         slots, layout = part.slots, self._layout
         slab = layout.slabs[layout.slab.item(slots.item(0))]
         rows = slice(0, len(slots)) if slots is self._envs.all else layout.row[slots]
-        part.episode_return, part.episode_length = exchange.gather(
+        part.episode_return, part.episode_length = kernel.gather(
             (slab.episode_return, slab.episode_length), rows
         )
 
@@ -219,7 +219,7 @@ class Results:
         in_rows = type(observation) is np.ndarray and not self._zero_copy
         if in_rows:
             columns.append(observation)
-        reward, flags, times, *others = exchange.gather(columns, rows)
+        reward, flags, times, *others = kernel.gather(columns, rows)
         out_of_band: dict[int, Any] = {}
         restarted, whole = None, False
         if self._any_restarted:

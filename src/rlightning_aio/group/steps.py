@@ -22,7 +22,7 @@ from rlightning_aio.group.hint import HINT_AFTER_BATCHES
 from rlightning_aio.group.supervisor import LOOK_SECONDS
 from rlightning_aio.group.wait import ANY, TURN, Procedure
 from rlightning_aio.hosts.messages import ErrorText
-from rlightning_aio.protocol import exchange
+from rlightning_aio.protocol import exchange, kernel
 from rlightning_aio.protocol.slab import TRUNCATED
 
 if TYPE_CHECKING:
@@ -271,7 +271,7 @@ class Steps:
     def _publish(self, slots: NDArray[np.intp], now: float) -> None:
         """Number the requests and give them to their workers."""
         requests = self._requests
-        asleep = exchange.submit(
+        asleep = kernel.submit(
             slots,
             self._continuity.due[slots],
             int(now * 1e9),
@@ -317,8 +317,7 @@ class Steps:
             total = sum(in_flight)
             bell = self._bell
             goal = bell.read[-1] + min(first, total)
-            bell.arm(goal, at_last=first >= total)
-            if sum(bell.counters) >= goal:
+            if bell.arm(goal, at_last=first >= total):
                 now = yield TURN
             else:
                 now = yield ANY
@@ -339,7 +338,7 @@ class Steps:
             return
         slots = None
         if not self._conditions.active:
-            slots = exchange.complete(
+            slots = kernel.complete(
                 bell.counters,
                 bell.read,
                 requests.numbering.entry,

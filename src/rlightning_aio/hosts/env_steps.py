@@ -1,16 +1,18 @@
 """Functions that execute steps: the short way of plain Gymnasium envs, and steps in two halves.
 
-The short way writes what `RowWriter` would, into memoryviews: assigning an element of one costs a
-fifth of assigning an element of an array. All other steps are written by `EnvRunner`.
+The short way writes what `RowWriter` would, by `kernel.row_step`. All other steps are written by
+`EnvRunner`.
 """
 
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, cast
 
 import numpy as np
 
+from rlightning_aio.protocol import kernel
+from rlightning_aio.protocol.exchange import Row
 from rlightning_aio.protocol.info import NO_INFO, PICKLED
 
 if TYPE_CHECKING:
@@ -40,8 +42,6 @@ class StepWith(Protocol):
 class ShortWay:
     """Steps and resets of an env of one agent and one sub-environment.
 
-    It remembers what it wrote last, and so writes flags only when they change.
-
     Args:
         slab, row: where results go.
         writer: of that row.
@@ -51,71 +51,32 @@ class ShortWay:
     def __init__(self, slab: Slab, row: int, writer: RowWriter, *, resets_itself: bool) -> None:
         self._slab, self._row, self._writer = slab, row, writer
         self._resets_itself = resets_itself
-        self._return, self._length = 0.0, 0
-        # The last result was a reset; it, or one since the last reset, ended the episode.
-        self._is_reset = self._is_over = False
-
-    def row_changed(self) -> None:
-        """Read what others wrote into the row."""
-        slab, row = self._slab, self._row
-        self._return, self._length = slab.episode_return.item(row), slab.episode_length.item(row)
-        self._is_reset, self._is_over = slab.is_reset.item(row), slab.over.item(row)
 
     def stepper(
         self, step: BareStep, get_input: GetInput, write_observation: Callable[[Any], None]
     ) -> StepWith:
         """Return a function that steps the env by `step`."""
-        slab, row, writer, resets_itself = self._slab, self._row, self._writer, self._resets_itself
-        write_info, keep, clock = writer.write_info, writer.keep, time.monotonic_ns
-        rewards, marks, resets = view(slab.reward), view(slab.info_mark), view(slab.is_reset)
-        returns, lengths = view(slab.episode_return), view(slab.episode_length)
-        done_times, busy_times = view(slab.done_ns), view(slab.busy_ns)
-        # A plain array that fits is copied here, which saves a call.
-        in_row = np.empty(0)
-        if type(slab.observation) is np.ndarray:
-            in_row = slab.observation[row, ...]
-        shape, dtype = in_row.shape, in_row.dtype
-
-        def execute(get_input: GetInput = get_input) -> OutOfBand | None:
-            began = clock()
-            observation, reward, terminated, truncated, info = step(get_input())
-            done = clock()
-            done_times[row] = done
-            busy_times[row] = done - began
-            if (
-                type(observation) is np.ndarray
-                and observation.dtype is dtype
-                and observation.shape == shape
-            ):
-                in_row[...] = observation
-            else:
-                write_observation(observation)
-            try:
-                rewards[row] = reward
-            except TypeError:
-                rewards[row] = reward = writer.number("reward", reward)
-            if self._is_reset:
-                resets[row] = self._is_reset = False
-            if self._is_over and resets_itself:
-                self._return = self._length = 0
-            returns[row] = self._return = self._return + reward
-            lengths[row] = self._length = self._length + 1
-            if self._is_over or terminated or truncated:
-                self._write_ends(bool(terminated), bool(truncated))
-            marks[row] = mark = write_info(info) if info else NO_INFO
-            return keep({"info": info}) if mark == PICKLED else None
-
-        return execute
-
-    def _write_ends(self, terminated: bool, truncated: bool) -> None:
-        """Write the flags of a step that ends an episode, or comes after an end."""
-        slab, row = self._slab, self._row
-        slab.terminated[row], slab.truncated[row] = terminated, truncated
-        if self._is_over and not self._resets_itself:
-            # A step after the end belongs to no episode; see `EpisodeSums`.
-            slab.episode_return[row] = slab.episode_length[row] = 0
-        self._is_over = terminated or truncated or not self._resets_itself
-        slab.over[row] = self._is_over
+        slab, writer, one = self._slab, self._writer, slice(self._row, self._row + 1)
+        plain = type(slab.observation) is np.ndarray
+        row = Row(
+            reward=view(slab.reward[one]),
+            flags=view(slab.flags[self._row]),
+            episode_return=view(slab.episode_return[one]),
+            episode_length=view(slab.episode_length[one]),
+            info_mark=view(slab.info_mark[one]),
+            times=view(slab.times[self._row]),
+            observation=cast("Any", slab.observation)[self._row, ...] if plain else None,
+        )
+        return kernel.row_step(
+            row,
+            step,
+            get_input,
+            write_observation,
+            writer.number,
+            writer.write_info,
+            writer.keep,
+            self._resets_itself,
+        )
 
     def resetter(self, reset: BareReset, write_observation: Callable[[Any], None]) -> Execute:
         """Return a function that resets the env by `reset`, with the seed in the row."""
@@ -125,7 +86,6 @@ class ShortWay:
             began = clock()
             observation, info = reset(seed=slab.take_seed(row), options=None)
             done = clock()
-            self._return, self._length, self._is_reset, self._is_over = 0.0, 0, True, False
             slab.flags[row] = False
             slab.is_reset[row] = True
             slab.reward[row] = slab.episode_return[row] = 0.0

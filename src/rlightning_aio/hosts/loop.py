@@ -26,7 +26,7 @@ from rlightning_aio.hosts.messages import (
     Saved,
 )
 from rlightning_aio.hosts.runner import attach_all
-from rlightning_aio.protocol.exchange import WorkerBell, bell_size
+from rlightning_aio.protocol.bell import WorkerBell, bell_size
 from rlightning_aio.protocol.info import InfoSchemas
 
 if TYPE_CHECKING:

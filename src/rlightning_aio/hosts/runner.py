@@ -126,8 +126,8 @@ class EnvRunner:
         self._read_action: Callable[[], Any] | None = None
         if slab.action is not None:
             self._read_action = row_reader(layout.action_space, slab.action, row)
-        # The short way, if there is one; it and the writer must know what the other wrote.
-        self._short: ShortWay | None = None
+        # There is a short way, which writes behind the back of the writer.
+        self._has_short_way = False
         self._bind(layout, send_checkpoint)
         if self._camera is not None:
             self._start_filming(self._camera)
@@ -258,12 +258,13 @@ class EnvRunner:
         self, bare: BareStep, get_input: GetInput, write_observation: Callable[[Any], None]
     ) -> StepWith:
         resets_itself = self.meta.autoreset == "same_step"
-        self._short = ShortWay(self._slab, self._row, self._writer, resets_itself=resets_itself)
+        self._has_short_way = True
+        short = ShortWay(self._slab, self._row, self._writer, resets_itself=resets_itself)
         bare_reset = self.env.bare_reset()
         if bare_reset is not None:
-            reset = self._short.resetter(bare_reset, write_observation)
+            reset = short.resetter(bare_reset, write_observation)
             self._reset_env = followed(reset, self._checkpoints.note_result)
-        return self._short.stepper(bare, get_input, write_observation)
+        return short.stepper(bare, get_input, write_observation)
 
     def _bare_store(self, layout: RowLayout) -> Callable[[BareResult, int], OutOfBand | None]:
         """Return a function that puts a bare result, and the ns it took, into the row."""
@@ -297,13 +298,7 @@ class EnvRunner:
 
     def reset_from_row(self) -> OutOfBand | None:
         """Start a new episode with the seed in the row, or show the restored result there."""
-        return self._show() if self._checkpoints.must_show() else self._reset_env()
-
-    def _show(self) -> OutOfBand | None:
-        out_of_band = self._checkpoints.show()
-        if self._short is not None:
-            self._short.row_changed()
-        return out_of_band
+        return self._checkpoints.show() if self._checkpoints.must_show() else self._reset_env()
 
     def _reset_from_row(self) -> OutOfBand | None:
         return self._reset(self._slab.take_seed(self._row), None)
@@ -320,9 +315,9 @@ class EnvRunner:
     def _store(
         self, result: EnvRet | MultiAgentEnvRet, busy_ns: int, *, stepped: bool
     ) -> OutOfBand | None:
-        writer, short = self._writer, self._short
+        writer = self._writer
         writer.write_times(time.monotonic_ns(), busy_ns)
-        if short is not None:
+        if self._has_short_way:
             writer.row_changed()
         if stepped:
             ends = writer.checked_ends(
@@ -331,8 +326,6 @@ class EnvRunner:
             writer.write_ends(*ends, result.info)
         else:
             writer.begin_episode(result.info)
-        if short is not None:
-            short.row_changed()
         observation = result.observation
         self._checkpoints.whole = None
         if holds_tensor(observation):

@@ -24,17 +24,15 @@ from rlightning_aio.hosts.messages import ErrorText
 from rlightning_aio.hosts.pickling import dumped, dumped_with_code
 from rlightning_aio.hosts.runner import attach_all, close_all
 from rlightning_aio.hosts.spinner import Spinner
+from rlightning_aio.protocol.bell import WorkerBell, bell_size
 from rlightning_aio.protocol.entries import (
-    OP_BITS,
-    OP_MASK,
-    SLOT_MASK,
     Operation,
     answers_with_value,
     entry,
     op_of,
     slot_of,
 )
-from rlightning_aio.protocol.exchange import WorkerBell, bell_size
+from rlightning_aio.protocol.exchange import CAREFUL
 from rlightning_aio.protocol.frames import BELL, CHUNK_BYTES, Frame, FrameKind, FrameReader, encode
 from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
 from rlightning_aio.protocol.rings import WorkerRings, rings_size
@@ -153,33 +151,55 @@ class Worker:
         while not self._closing:
             if rings.has_frame():
                 self._receive_some()
-            elif not rings.serve(self._run, self._ring, self._receive_some):
+            elif not rings.serve(
+                self._run,
+                self._finish,
+                self._ring,
+                self._receive_some,
+                self._steps,
+                self._first_slot,
+            ):
                 break
         rings.idle()
 
     def _run(self, request: int) -> bool:
-        """Execute one request of the ring; return True if its row holds the whole reply."""
+        """Execute one request of the ring; return True if its row holds the whole reply.
+
+        Most steps are executed by `exchange.serve` itself.
+        """
         if self._closing:
             return False
-        # `slot_of` and `op_of` inline: calls would slow down every step.
-        index = ((request >> OP_BITS) & SLOT_MASK) - self._first_slot
+        index = slot_of(request) - self._first_slot
         if self._timed:
             self._rings.begin(request, time.monotonic_ns())
         try:
             out_of_band = (
                 self._steps[index]()
-                if request & OP_MASK == _STEP
+                if op_of(request) == _STEP
                 else self._runners[index].reset_from_row()
             )
         except BaseException as error:
-            self._send_error(request, error)
+            self._finish(request, error)
             return False
-        if self._is_child:
-            _end_child()
-        if out_of_band is None:
+        if out_of_band is None and not self._is_child:
             return True
-        self._send_result(request, out_of_band)
+        self._finish(request, out_of_band)
         return False
+
+    def _finish(self, request: int, outcome: Any) -> None:
+        """Reply to a step or reset whose outcome is not in its row alone.
+
+        Args:
+            request: the entry.
+            outcome: what is out of band, or the exception that the env raised.
+        """
+        failed = isinstance(outcome, BaseException)
+        if self._is_child:
+            _end_child(outcome if failed else None)
+        if failed:
+            self._send_error(request, outcome)
+        else:
+            self._send_result(request, outcome)
 
     def _ring(self) -> None:
         self._write(BELL)
@@ -223,6 +243,7 @@ class Worker:
         It continues in the code of the env. It ends if that code returns.
         """
         self._is_child = True
+        self._rings.own[CAREFUL] = 1
         self._channel.close()
         for memory in self._shared:
             make_private(memory)
@@ -230,7 +251,7 @@ class Worker:
     def _begin(self, request: int) -> None:
         """Publish the current request, in case the worker dies in it."""
         if self._is_child:
-            _end_child()
+            _end_child(sys.exception())
         self._rings.begin(request, time.monotonic_ns())
 
     def _begin_with(self, index: int) -> None:
@@ -248,6 +269,7 @@ class Worker:
             self._spinner = Spinner(enabled=order.spins)
             config = order.config
             self._timed = (config.step_timeout or config.reset_timeout) is not None
+            self._rings.own[CAREFUL] = self._timed
             self._order = order
             for runner in built_envs(order):
                 self._runners.append(runner)
@@ -307,6 +329,7 @@ class Worker:
     def _close(self, frame: Frame) -> None:
         del frame
         self._closing = True
+        self._rings.own[CAREFUL] = 1
         if self._awaits and self._attached:
             return  # The event loop closes them.
         errors = self._close_envs()
@@ -324,7 +347,7 @@ class Worker:
 
     def _write(self, data: bytes) -> None:
         if self._is_child:
-            _end_child()
+            _end_child(sys.exception())
         try:
             try:
                 sent = self._channel.send(data, socket.MSG_DONTWAIT)
@@ -368,9 +391,8 @@ class Worker:
         self._send(FrameKind.INFO_SCHEMA, number, pickle.dumps(schema))
 
 
-def _end_child() -> NoReturn:
+def _end_child(error: BaseException | None) -> NoReturn:
     """End a process that an env forked; print its error, and send no reply."""
-    error = sys.exception()
     code = 1
     if isinstance(error, SystemExit) and (error.code is None or isinstance(error.code, int)):
         code = error.code or 0

@@ -1,19 +1,13 @@
-"""The array functions that carry every ordinary step, and the bell that wakes a waiting trainer.
+"""The functions of the hot path, in Python; `kernel` chooses between them and compiled ones.
 
-`submit`, `complete` and `gather` take and return plain arrays and buffers, so a compiled function
-can replace each of them. The first two use the rings of all workers (`rings`).
-
-The *bell* is shared memory with a counter of reports for each worker, and a word that the trainer
-*arms* with a goal for the sum of the counters. The worker whose report reaches the goal rings, with
-a few bytes in its channel. So the trainer is woken once, when enough results are ready.
+Each has a twin of the same name and contract in `_kernel.c`. `submit`, `complete` and `gather` are
+the trainer's: they carry every ordinary step between arrays and the rings of all workers. `serve`
+and `row_step` are the worker's. `arm` and `is_due` are the two sides of the bell (`bell`).
 
 Invariant: each shared word has one writer. A writer publishes (entry first, then the counter) and
 fences before it checks whether the other side sleeps (`rings`), or sums all counters: of two
-workers that finish together at least one sees the full sum.
-Without a fence: a worker's read of the armed word after each report, because a fence would slow
-fast envs. While the report is on its way to memory, for a fraction of a microsecond, the worker
-may overlook a bell that is being armed. So the trainer fences after arming, and checks `reached`
-again a few microseconds later. A worker that runs out of work checks with a fence.
+workers that finish together at least one sees the full sum. What another process wrote is checked
+before it is used as a position, because that process may have failed in the middle of anything.
 Absent on purpose: decisions. The group checks requests and interprets results.
 """
 
@@ -21,17 +15,22 @@ from __future__ import annotations
 
 import platform
 import threading
+import time
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
 from rlightning_aio.protocol.entries import (
     NUMBER_SHIFT,
+    OP_BITS,
     OP_BITS_ARRAY,
+    OP_MASK,
+    SLOT_MASK,
     SLOT_MASK_ARRAY,
     WITHOUT_OP,
     Operation,
 )
+from rlightning_aio.protocol.info import NO_INFO, PICKLED
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -42,23 +41,37 @@ __all__ = [
     "ARMED",
     "AT_LAST",
     "BUSY",
+    "CAREFUL",
     "FEW_NUMBERS",
+    "FRAMES_SEEN",
     "FRAMES_TO_TRAINER",
+    "FRAMES_TO_WORKER",
+    "GOAL_MASK",
+    "GOAL_SHIFT",
     "IN_ORDER",
     "LINE",
+    "NUM_COUNTS",
+    "REPORTED",
     "REQUESTS_SENT",
     "SEEN",
     "SENT",
+    "SETTLED",
+    "TAKEN",
     "WORKER_ASLEEP",
     "Ring",
-    "TrainerBell",
-    "WorkerBell",
-    "bell_size",
+    "Row",
+    "WorkerSide",
+    "arm",
     "complete",
     "gather",
+    "is_due",
     "new_fence",
+    "row_step",
+    "serve",
     "submit",
     "sum_of_squares",
+    "take",
+    "unpacked",
 ]  # fmt: skip
 
 LINE: Final = 8
@@ -70,31 +83,40 @@ Elsewhere a count could become visible before its entry."""
 # Words of a ring, each on its own cache line to avoid false sharing.
 REQUESTS_SENT: Final = 0 * LINE
 WORKER_ASLEEP: Final = 1 * LINE
+FRAMES_TO_WORKER: Final = 2 * LINE
 FRAMES_TO_TRAINER: Final = 3 * LINE
 # The trainer's own counts: requests sent, and frames of the worker that were read.
 SENT: Final = 0
 SEEN: Final = 1
+# The worker's own: requests taken, reports, frames read, the armed word that needs no ring by this
+# worker (or no further one), and a flag: each request needs `execute`.
+TAKEN: Final = 0
+REPORTED: Final = 1
+FRAMES_SEEN: Final = 2
+SETTLED: Final = 3
+CAREFUL: Final = 4
+NUM_COUNTS: Final = 5
 
 BUSY: Final = 1
 """The state of a slot whose request is in flight."""
 
 # Words of the bell: the armed word, then the counters of the workers, each on its own line.
 ARMED: Final = 0
-_COUNTERS: Final = LINE
 
 # Bits of the armed word, from the lowest: 1; 1 if only workers without further work check it; the
 # sum at which to ring; and an epoch that counts restarts of workers. 0 is disarmed.
 AT_LAST: Final = 2
-_GOAL_SHIFT: Final = 2
-_GOAL_MASK: Final = (1 << 53) - 1
-_EPOCH_SHIFT: Final = 55
-_EPOCH_MASK: Final = 0x7F
-_FEW: Final = 12
-"""Up to this number of counters, a Python sum is faster than NumPy."""
+GOAL_SHIFT: Final = 2
+GOAL_MASK: Final = (1 << 53) - 1
+
+# Flags of a row; see `slab`.
+_TERMINATED, _TRUNCATED, _IS_RESET, _OVER = range(4)
+
 FEW_NUMBERS: Final = 8192
 """Up to this many numbers, BLAS multiplies in one thread."""
 
-_NEXT_STEP: Final = np.array((1 << NUMBER_SHIFT) + int(Operation.STEP))
+_STEP: Final = int(Operation.STEP)
+_NEXT_STEP: Final = np.array((1 << NUMBER_SHIFT) + _STEP)
 
 
 class Ring(NamedTuple):
@@ -112,6 +134,43 @@ class Ring(NamedTuple):
     reports: NDArray[np.int64]
     own: memoryview[int]
     wake: Callable[[], None]
+
+
+class WorkerSide(NamedTuple):
+    """The rings and the bell of one worker, as it uses them itself.
+
+    Attributes:
+        words: shared counters and flags.
+        requests, reports: shared, both of the same length, a power of two.
+        own: the worker's own counts.
+        bell: shared; counter: position of this worker's counter there.
+    """
+
+    words: memoryview[int]
+    requests: memoryview[int]
+    reports: memoryview[int]
+    own: memoryview[int]
+    bell: memoryview[int]
+    counter: int
+
+
+class Row(NamedTuple):
+    """The row of an env of one agent and one sub-environment, one buffer for each column.
+
+    Attributes:
+        reward, episode_return, episode_length, info_mark: of one element.
+        flags: the four of `slab`.
+        times: when the result was ready, and how long the env took, in ns.
+        observation: an array; None if a row has several, or none.
+    """
+
+    reward: memoryview[float]
+    flags: memoryview[bool]
+    episode_return: memoryview[float]
+    episode_length: memoryview[int]
+    info_mark: memoryview[int]
+    times: memoryview[int]
+    observation: NDArray[Any] | None
 
 
 def new_fence() -> Callable[[], None]:
@@ -197,7 +256,7 @@ def submit(
     return asleep
 
 
-def complete(
+def complete(  # noqa: C901  # Calls would slow down every batch.
     counters: memoryview[int],
     read: memoryview[int],
     entry: NDArray[np.int64],
@@ -232,6 +291,8 @@ def complete(
         if ring is None or ring.words[FRAMES_TO_TRAINER] > ring.own[SEEN]:
             return None
         reports = ring.reports
+        if not 0 < count - before <= len(reports):
+            return None
         start = before & (len(reports) - 1)
         end = start + count - before
         parts.append(reports[start:end])
@@ -239,6 +300,8 @@ def complete(
             parts.append(reports[: end - len(reports)])
         found.append((host, count, count - before))
         total += count - before
+    if total > len(entry):
+        return None
     if len(parts) == 1:
         entries = parts[0]
     else:
@@ -249,7 +312,8 @@ def complete(
             start += len(part)
     slots = entries >> OP_BITS_ARRAY
     slots &= SLOT_MASK_ARRAY
-    if len((entry[slots] != entries).nonzero()[0]):
+    # A slot beyond the last one is compared with the last one's entry, which differs.
+    if len((entry.take(slots, mode="clip") != entries).nonzero()[0]):
         return None
     for host, count, num_read in found:
         read[host] = count
@@ -276,144 +340,197 @@ def sum_of_squares(numbers: NDArray[Any]) -> float:
     return float(np.vdot(numbers, numbers))  # Unlike `dot`, it does not warn of an overflow.
 
 
-def bell_size(num_workers: int) -> int:
-    """Size in bytes of the bell of a group with `num_workers` workers."""
-    return 8 * (_COUNTERS + LINE * num_workers)
+# -- the bell -------------------------------------------------------------------------
 
 
-def _words(buffer: memoryview, num_workers: int) -> memoryview[int]:
-    return buffer.cast("B")[: bell_size(num_workers)].cast("q")
-
-
-def _sum_of(words: memoryview[int]) -> Callable[[], int]:
-    """Make a function that sums all counters."""
-    counters = words[_COUNTERS::LINE]
-    if len(counters) == 1:
-        return lambda: words[_COUNTERS]
-    if len(counters) <= _FEW:
-        return lambda: sum(counters)
-    array: NDArray[np.int64] = np.frombuffer(words, np.int64)[_COUNTERS::LINE]
-    return lambda: int(array.sum())
-
-
-class TrainerBell:
-    """The trainer's side: arms the bell, and counts unread reports.
+def arm(bell: memoryview[int], armed: int, fence: Callable[[], None]) -> bool:
+    """Write the armed word. Return True if the goal is reached, so no ring needs to be awaited.
 
     Args:
-        buffer: the bell's memory, zeroed.
-        num_workers: number of counters.
-
-    Attributes:
-        counters: shared, the number of reports of each worker.
-        read: the number of reports of each worker that were read, followed by their sum;
-            read_by_worker: without the sum.
+        bell: its words, shared.
+        armed: the word; if it stands there already, no worker rings for it again.
+        fence: see `new_fence`.
     """
-
-    def __init__(self, buffer: memoryview, num_workers: int) -> None:
-        self._fence = new_fence()
-        self._epoch = 0
-        self._attach(buffer, num_workers)
-
-    def _attach(self, buffer: memoryview, num_workers: int) -> None:
-        self._words = _words(buffer, num_workers)
-        self._sum = _sum_of(self._words)
-        self.counters = self._words[_COUNTERS::LINE]
-        self.read = memoryview(bytearray(8 * (num_workers + 1))).cast("q")
-        self.read_by_worker = self.read[:num_workers]
-        self._armed = 0
-
-    def took(self, index: int, count: int) -> None:
-        """Record that `count` reports of a worker were read."""
-        self.read[index] += count
-        self.read[-1] += count
-
-    def restart(self, index: int) -> None:
-        """Reset the counter of a worker that is replaced, and disarm the bell.
-
-        A call that waits must arm it again.
-        """
-        self._words[_COUNTERS + LINE * index] = 0
-        self.took(index, -self.read[index])
-        self._epoch = (self._epoch + 1) & _EPOCH_MASK
-        self.disarm()
-
-    def unread(self) -> int:
-        """Number of unread reports of all workers."""
-        return self._sum() - self.read[-1]
-
-    def with_news(self) -> list[int]:
-        """Workers with unread reports."""
-        if self.counters == self.read_by_worker:
-            return []
-        return [k for k, count in enumerate(self.counters) if count != self.read[k]]
-
-    def goal(self, wanted: int) -> int:
-        """Goal for a number of unread reports; it stays the same until they are read."""
-        return self.read[-1] + wanted
-
-    def arm(self, goal: int, *, at_last: bool) -> None:
-        """Make a worker ring once, at `goal`; repeated calls with the same goal change nothing.
-
-        Args:
-            goal: see `goal`.
-            at_last: only workers without further work need to check.
-        """
-        armed = (self._epoch << _EPOCH_SHIFT) | (goal << _GOAL_SHIFT) | (AT_LAST if at_last else 0)
-        if armed | 1 != self._armed:
-            self._words[ARMED] = self._armed = armed | 1
-            self._fence()
-
-    def reached(self) -> bool:
-        """Return True if the goal of the armed bell is reached, so no ring needs to be awaited."""
-        return self._armed != 0 and self._sum() >= (self._armed >> _GOAL_SHIFT & _GOAL_MASK)
-
-    def disarm(self) -> None:
-        """Prevent rings while the trainer is awake."""
-        if self._armed:
-            self._words[ARMED] = self._armed = 0
-
-    def release(self, seconds: float = 0.0) -> None:
-        """Release the shared memory; later answers of the bell are meaningless."""
-        del seconds
-        self._attach(memoryview(bytearray(8 * len(self._words))), len(self.read_by_worker))
-
-    def disown(self) -> None:
-        """Release the shared memory in a forked process; the parent continues to use it."""
-        self.release()
+    if bell[ARMED] != armed:
+        bell[ARMED] = armed
+        fence()
+    return sum(bell[LINE::LINE]) >= (armed >> GOAL_SHIFT & GOAL_MASK)
 
 
-class WorkerBell:
-    """The worker's side: counts its reports, and decides when to ring.
+def is_due(bell: memoryview[int], own: memoryview[int], fence: Callable[[], None]) -> bool:
+    """Return True, once after each arming, if this worker must ring the trainer now.
 
-    Attributes:
-        words, own: the shared memory, and the position of its own counter there.
-        settled: the armed word that needs no ring by this worker, or no further one.
+    Args:
+        bell: its words, shared.
+        own: the worker's own counts.
+        fence: see `new_fence`.
     """
+    fence()
+    armed = bell[ARMED]
+    if armed == own[SETTLED]:
+        return False
+    if armed and sum(bell[LINE::LINE]) < (armed >> GOAL_SHIFT & GOAL_MASK):
+        return False
+    own[SETTLED] = armed
+    return armed != 0
 
-    def __init__(self, buffer: memoryview, num_workers: int, index: int) -> None:
-        self.words = _words(buffer, num_workers)
-        self._sum = _sum_of(self.words)
-        self.own = _COUNTERS + LINE * index
-        self._fence = new_fence()
-        self.settled = 0
 
-    def publish(self, count: int) -> bool:
-        """Publish the number of reports. Return True if `is_due` must be called now."""
-        words = self.words
-        words[self.own] = count
-        armed = words[ARMED]
-        return armed != self.settled and not armed & AT_LAST
+# -- the worker -----------------------------------------------------------------------
 
-    def is_due(self) -> bool:
-        """Return True, once after each arming, if this worker must ring the trainer now.
 
-        A worker must also call this when it runs out of work.
-        """
-        self._fence()
-        armed = self.words[ARMED]
-        if armed == self.settled:
-            return False
-        if armed and self._sum() < (armed >> _GOAL_SHIFT & _GOAL_MASK):
-            return False
-        self.settled = armed
-        return armed != 0
+def take(side: WorkerSide, fence: Callable[[], None]) -> list[int]:
+    """Take all waiting entries, in order.
+
+    Raises:
+        RuntimeError: the trainer's count is impossible.
+    """
+    own, ring = side.own, side.requests
+    before = own[TAKEN]
+    count = side.words[REQUESTS_SENT] - before
+    if not count:
+        return []
+    if not 0 < count <= len(ring):
+        raise RuntimeError(f"{count} requests in a ring for {len(ring)}")
+    if not IN_ORDER:
+        fence()
+    start = before & (len(ring) - 1)
+    own[TAKEN] = before + count
+    split = min(count, len(ring) - start)
+    return ring[start : start + split].tolist() + ring[: count - split].tolist()
+
+
+def serve(  # noqa: C901  # Calls would slow down every step.
+    side: WorkerSide,
+    execute: Callable[[int], bool],
+    finish: Callable[[int, object], object],
+    ring: Callable[[], object],
+    receive: Callable[[], object],
+    steps: list[Callable[[], Any]],
+    first_slot: int,
+    fence: Callable[[], None],
+) -> bool:
+    """Take waiting entries, execute them in order and report them; False if there were none.
+
+    Args:
+        side: of the worker.
+        execute: executes an entry that is no step, and any while the flag `CAREFUL` is set;
+            returns True if it must be reported here.
+        finish: replies to a step that raised (given the exception) or has parts out of band, and
+            is called after any step that has set `CAREFUL`.
+        ring: wakes the trainer; called when the group's bell is due.
+        receive: reads frames; called before an entry if the channel has one.
+        steps: steps each env; returns None if the row holds the whole result.
+        first_slot: of `steps`.
+        fence: see `new_fence`.
+    """
+    requests = take(side, fence)
+    if not requests:
+        return False
+    from_trainer, _, reports, own, bell, counter = side
+    mask = len(reports) - 1
+    for request in requests:
+        if from_trainer[FRAMES_TO_WORKER] != own[FRAMES_SEEN]:
+            receive()
+        index = (request >> OP_BITS & SLOT_MASK) - first_slot
+        if not own[CAREFUL] and request & OP_MASK == _STEP and 0 <= index < len(steps):
+            try:
+                outcome = steps[index]()
+            except BaseException as error:  # noqa: BLE001  # It is the env's, and is sent.
+                outcome = error
+            if outcome is not None or own[CAREFUL]:
+                finish(request, outcome)
+                continue
+        elif not execute(request):
+            continue
+        sent = own[REPORTED]
+        reports[sent & mask] = request
+        own[REPORTED] = sent = sent + 1
+        if not IN_ORDER:
+            fence()
+        bell[counter] = sent
+        armed = bell[ARMED]
+        if armed != own[SETTLED] and not armed & AT_LAST and is_due(bell, own, fence):
+            ring()
+    if is_due(bell, own, fence):
+        ring()
+    return True
+
+
+def unpacked(result: Any) -> tuple[Any, Any, Any, Any, Any]:
+    """Return the five parts of the result of a step.
+
+    Raises:
+        TypeError, ValueError: it has no parts, or another number of them.
+    """
+    observation, reward, terminated, truncated, info = result
+    return observation, reward, terminated, truncated, info
+
+
+def row_step(
+    row: Row,
+    step: Callable[[Any], Any],
+    get_input: Callable[[], Any],
+    write_observation: Callable[[Any], None],
+    number: Callable[[str, Any], float],
+    write_info: Callable[[dict[str, Any]], int],
+    keep: Callable[[dict[str, Any]], dict[str, Any]],
+    resets_itself: bool,
+) -> Callable[..., dict[str, Any] | None]:
+    """Make a function that steps an env and writes the result into its row.
+
+    The function may be given another `get_input` for a step. It returns the part of the result
+    that is out of band. The row holds all that it must know of the steps before.
+
+    Args:
+        row: of the env.
+        step: of the env, as in Gymnasium.
+        get_input: returns the input of a step.
+        write_observation: writes an observation that isn't an array like the row's.
+        number: converts a reward that isn't a number.
+        write_info: writes an info that isn't empty; returns its mark.
+        keep: returns the parts out of band, for the trainer to keep.
+        resets_itself: the env begins the next episode in the step that ends one.
+    """
+    clock = time.monotonic_ns
+    rewards, flags, returns, lengths, marks, times, observation_in_row = row
+    # A plain array that fits is copied here, which saves a call.
+    in_row = np.empty(0) if observation_in_row is None else observation_in_row
+    can_copy, shape, dtype = observation_in_row is not None, in_row.shape, in_row.dtype
+
+    def execute(get_input: Callable[[], Any] = get_input) -> dict[str, Any] | None:
+        began = clock()
+        observation, reward, terminated, truncated, info = step(get_input())
+        times[0] = done = clock()
+        times[1] = done - began
+        if (
+            type(observation) is np.ndarray
+            and observation.dtype is dtype
+            and observation.shape == shape
+            and can_copy
+        ):
+            in_row[...] = observation
+        else:
+            write_observation(observation)
+        try:
+            rewards[0] = reward
+        except TypeError:
+            rewards[0] = number("reward", reward)
+        flags[_IS_RESET] = False
+        was_over = flags[_OVER]
+        if was_over and resets_itself:
+            returns[0] = lengths[0] = 0
+        returns[0] += rewards[0]
+        lengths[0] += 1
+        if was_over or terminated or truncated:
+            write_ends(bool(terminated), bool(truncated), was_over)
+        marks[0] = mark = write_info(info) if info else NO_INFO
+        return keep({"info": info}) if mark == PICKLED else None
+
+    def write_ends(terminated: bool, truncated: bool, was_over: bool) -> None:
+        flags[_TERMINATED], flags[_TRUNCATED] = terminated, truncated
+        if was_over and not resets_itself:
+            # A step after the end belongs to no episode; see `EpisodeSums`.
+            returns[0] = lengths[0] = 0
+        flags[_OVER] = terminated or truncated or not resets_itself
+
+    return execute

@@ -2,7 +2,7 @@
 
 The trainer appends requests and reads reports; the worker reads requests and appends reports. A
 worker without requests marks itself as asleep and waits for its channel, where the trainer wakes
-it with a few bytes. `exchange` describes how workers wake the trainer.
+it with a few bytes. `bell` describes how workers wake the trainer.
 
 Invariant: each word has one writer. A writer publishes (entry first, then the counter) and fences
 before it checks whether the other side sleeps; a sleeper publishes that it sleeps and fences
@@ -16,31 +16,36 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from rlightning_aio.protocol import kernel
 from rlightning_aio.protocol.exchange import (
-    ARMED,
-    AT_LAST,
+    FRAMES_SEEN,
     FRAMES_TO_TRAINER,
+    FRAMES_TO_WORKER,
     IN_ORDER,
     LINE,
+    REPORTED,
     REQUESTS_SENT,
     SEEN,
     SENT,
+    TAKEN,
     WORKER_ASLEEP,
     Ring,
+    WorkerSide,
     new_fence,
+    take,
 )
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from typing import Any
 
     from numpy.typing import NDArray
 
-    from rlightning_aio.protocol.exchange import TrainerBell, WorkerBell
+    from rlightning_aio.protocol.bell import TrainerBell, WorkerBell
 
 __all__ = ["TrainerRings", "WorkerRings", "rings_size"]
 
 # Words that `exchange` doesn't use.
-_FRAMES_TO_WORKER: Final = 2 * LINE
 _CURRENT: Final = 4 * LINE
 _CURRENT_SINCE_NS: Final = 4 * LINE + 1
 _WORDS: Final = 5 * LINE
@@ -118,15 +123,24 @@ class TrainerRings:
     def count_frame(self) -> bool:
         """Count a frame that was written to the channel; True if the worker must be rung."""
         self._frames_sent += 1
-        self._words[_FRAMES_TO_WORKER] = self._frames_sent
+        self._words[FRAMES_TO_WORKER] = self._frames_sent
         return self.worker_sleeps()
 
     def reports(self) -> NDArray[np.int64]:
-        """Read all unread reports, in order."""
+        """Read all unread reports, in order.
+
+        Raises:
+            RuntimeError: the worker's count is impossible.
+        """
         before = self._bell.read[self._index]
         count = self._bell.counters[self._index] - before
         if not count:
             return self._reports[:0]
+        if not 0 < count <= self._capacity:
+            raise RuntimeError(
+                f"worker {self._index} has written into memory that isn't its own: it counts "
+                f"{count} unread results, of at most {self._capacity}"
+            )
         if not IN_ORDER:
             self._fence()
         start = before & self._mask
@@ -158,39 +172,33 @@ class TrainerRings:
 
 
 class WorkerRings:
-    """The worker's side: reads requests, appends reports, publishes when it sleeps."""
+    """The worker's side: reads requests, appends reports, publishes when it sleeps.
+
+    Attributes:
+        own: the worker's own counts; see `exchange`.
+    """
 
     def __init__(self, buffer: memoryview, num_envs: int, bell: WorkerBell) -> None:
-        self._words, self._requests, self._reports = _split(buffer, num_envs)
+        self._words, requests, reports = _split(buffer, num_envs)
+        self._reports = reports
         self._mask = _capacity(num_envs) - 1
         self._fence = new_fence()
         self._bell = bell
-        self._read = 0
-        self._sent = 0
+        self.own = bell.own
+        self._side = WorkerSide(self._words, requests, reports, self.own, bell.words, bell.counter)
         self._frames_sent = 0
-        self._frames_seen = 0
 
     def requests(self) -> list[int]:
         """Read all waiting entries, in order."""
-        sent = self._words[REQUESTS_SENT]
-        if sent == self._read:
-            return []
-        if not IN_ORDER:
-            self._fence()
-        start = self._read & self._mask
-        end = start + sent - self._read
-        self._read = sent
-        ring = self._requests
-        found = ring[start:end].tolist()
-        return found if end <= len(ring) else found + ring[: end - len(ring)].tolist()
+        return take(self._side, self._fence)
 
     def has_frame(self) -> bool:
         """Return True if the channel has a frame that `frame_seen` has not counted."""
-        return self._words[_FRAMES_TO_WORKER] != self._frames_seen
+        return self._words[FRAMES_TO_WORKER] != self.own[FRAMES_SEEN]
 
     def frame_seen(self) -> None:
         """Count a frame that was read from the channel."""
-        self._frames_seen += 1
+        self.own[FRAMES_SEEN] += 1
 
     def begin(self, current: int, now_ns: int) -> None:
         """Publish the entry whose execution begins."""
@@ -214,47 +222,25 @@ class WorkerRings:
     def serve(
         self,
         execute: Callable[[int], bool],
+        finish: Callable[[int, Any], object],
         ring: Callable[[], object],
         receive: Callable[[], object],
+        steps: list[Callable[[], Any]],
+        first_slot: int,
     ) -> bool:
-        """Read waiting entries and execute them in order; False if there were none.
-
-        Args:
-            execute: executes an entry; returns True if it must be reported here.
-            ring: wakes the trainer; called when the group's bell is due.
-            receive: reads frames; called before an entry if the channel has one.
-        """
-        requests = self.requests()
-        if not requests:
-            return False
-        reports, mask, bell, words = self._reports, self._mask, self._bell, self._bell.words
-        own = bell.own
-        from_trainer = self._words
-        for request in requests:
-            if from_trainer[_FRAMES_TO_WORKER] != self._frames_seen:
-                receive()
-            if not execute(request):
-                continue
-            reports[self._sent & mask] = request
-            self._sent = sent = self._sent + 1
-            if not IN_ORDER:
-                self._fence()
-            # `WorkerBell.publish`, inlined because a call would slow each step.
-            words[own] = sent
-            armed = words[ARMED]
-            if armed != bell.settled and not armed & AT_LAST and bell.is_due():
-                ring()
-        if bell.is_due():
-            ring()
-        return True
+        """Read waiting entries and execute them in order; see `exchange.serve`."""
+        return kernel.serve(
+            self._side, execute, finish, ring, receive, steps, first_slot, self._fence
+        )
 
     def report(self, request: int, ring: Callable[[], object]) -> None:
         """Report an entry that came in a frame and whose reply is in its row; see `serve`."""
-        self._reports[self._sent & self._mask] = request
-        self._sent += 1
+        sent = self.own[REPORTED]
+        self._reports[sent & self._mask] = request
+        self.own[REPORTED] = sent + 1
         if not IN_ORDER:
             self._fence()
-        self._bell.publish(self._sent)
+        self._bell.publish(sent + 1)
         if self._bell.is_due():
             ring()
 
@@ -265,8 +251,8 @@ class WorkerRings:
 
     def has_news(self) -> bool:
         """Return True if an entry or a frame waits."""
-        words = self._words
-        return words[REQUESTS_SENT] != self._read or words[_FRAMES_TO_WORKER] != self._frames_seen
+        words, own = self._words, self.own
+        return words[REQUESTS_SENT] != own[TAKEN] or words[FRAMES_TO_WORKER] != own[FRAMES_SEEN]
 
     def fall_asleep(self) -> bool:
         """Publish that this worker sleeps; False if an entry or a frame has just come."""
