@@ -256,7 +256,7 @@ def submit(
     return asleep
 
 
-def complete(  # noqa: C901  # Calls would slow down every batch.
+def complete(
     counters: memoryview[int],
     read: memoryview[int],
     entry: NDArray[np.int64],
@@ -302,14 +302,7 @@ def complete(  # noqa: C901  # Calls would slow down every batch.
         total += count - before
     if total > len(entry):
         return None
-    if len(parts) == 1:
-        entries = parts[0]
-    else:
-        entries = np.empty(total, np.int64)
-        start = 0
-        for part in parts:
-            entries[start : start + len(part)] = part
-            start += len(part)
+    entries = parts[0] if len(parts) == 1 else _joined(parts, total)
     slots = entries >> OP_BITS_ARRAY
     slots &= SLOT_MASK_ARRAY
     # A slot beyond the last one is compared with the last one's entry, which differs.
@@ -320,6 +313,15 @@ def complete(  # noqa: C901  # Calls would slow down every batch.
         read[-1] += num_read
         in_flight[host] -= num_read
     return slots
+
+
+def _joined(parts: list[NDArray[np.int64]], total: int) -> NDArray[np.int64]:
+    entries = np.empty(total, np.int64)
+    start = 0
+    for part in parts:
+        entries[start : start + len(part)] = part
+        start += len(part)
+    return entries
 
 
 def gather(columns: Sequence[NDArray[Any]], rows: slice | NDArray[np.intp]) -> list[NDArray[Any]]:
@@ -478,8 +480,8 @@ def row_step(
 ) -> Callable[..., dict[str, Any] | None]:
     """Make a function that steps an env and writes the result into its row.
 
-    The function may be given another `get_input` for a step. It returns the part of the result
-    that is out of band. The row holds all that it must know of the steps before.
+    The function may be given another `get_input`. It returns the part of the result that is out of
+    band. What it must know of the steps before is in the row.
 
     Args:
         row: of the env.
@@ -493,7 +495,6 @@ def row_step(
     """
     clock = time.monotonic_ns
     rewards, flags, returns, lengths, marks, times, observation_in_row = row
-    # A plain array that fits is copied here, which saves a call.
     in_row = np.empty(0) if observation_in_row is None else observation_in_row
     can_copy, shape, dtype = observation_in_row is not None, in_row.shape, in_row.dtype
 
@@ -522,15 +523,19 @@ def row_step(
         returns[0] += rewards[0]
         lengths[0] += 1
         if was_over or terminated or truncated:
-            write_ends(bool(terminated), bool(truncated), was_over)
+            _write_ends(row, bool(terminated), bool(truncated), was_over, resets_itself)
         marks[0] = mark = write_info(info) if info else NO_INFO
         return keep({"info": info}) if mark == PICKLED else None
 
-    def write_ends(terminated: bool, truncated: bool, was_over: bool) -> None:
-        flags[_TERMINATED], flags[_TRUNCATED] = terminated, truncated
-        if was_over and not resets_itself:
-            # A step after the end belongs to no episode; see `EpisodeSums`.
-            returns[0] = lengths[0] = 0
-        flags[_OVER] = terminated or truncated or not resets_itself
-
     return execute
+
+
+def _write_ends(
+    row: Row, terminated: bool, truncated: bool, was_over: bool, resets_itself: bool
+) -> None:
+    """Write the flags of a step that ends an episode, or comes after an end."""
+    row.flags[_TERMINATED], row.flags[_TRUNCATED] = terminated, truncated
+    if was_over and not resets_itself:
+        # A step after the end belongs to no episode; see `EpisodeSums`.
+        row.episode_return[0] = row.episode_length[0] = 0
+    row.flags[_OVER] = terminated or truncated or not resets_itself
