@@ -12,7 +12,7 @@ import json
 from collections import Counter, deque
 from functools import partial
 from http import HTTPStatus
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 from urllib.parse import parse_qs, urlsplit
 
 from websockets.asyncio.server import ServerConnection, serve
@@ -22,6 +22,9 @@ from websockets.frames import Opcode
 from websockets.http11 import Request, Response
 
 from rlightning_aio.envs.post_connection import PostConnection
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 STEP_ERRORS = ("INVALID_JSON", "UNKNOWN_TYPE", "VALIDATION_ERROR", "EXECUTION_ERROR")
 CONNECT_ERRORS = ("CAPACITY_REACHED", "FACTORY_ERROR", "SESSION_ERROR", "unreachable")
@@ -63,6 +66,7 @@ class Misbehaving:
         refused: a connection was refused.
         creating, may_create: set while a session waits to be created; set to let it continue.
         loses_pongs: pings are never answered.
+        on_never: gets the number of an action whose fate is `never`.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -76,11 +80,12 @@ class Misbehaving:
         self.creating, self.may_create = asyncio.Event(), asyncio.Event()
         self.may_create.set()
         self.loses_pongs = False
+        self.on_never: Callable[[int], object] = lambda number: None
         self._ids = map(str, itertools.count())
         self._sockets: set[ServerConnection] = set()
 
     async def __aenter__(self) -> Self:
-        connection = partial(PostConnection, answer=self._post)
+        connection: Any = partial(PostConnection, answer=self._post)
         self._server = await serve(
             self._talk, "127.0.0.1", 0, process_request=self._http, create_connection=connection
         )
@@ -211,7 +216,7 @@ class Misbehaving:
             reply = self._executed(session, message)
             if fate == "another type":
                 reply["type"] = "state" if reply["type"] == "observation" else "observation"
-            await self._begin(socket, session, fate)
+            await self._begin(socket, session, fate, message)
             if fate in ANSWERED:
                 await socket.send(json.dumps(reply))
             if fate in GOES_ON:
@@ -219,11 +224,14 @@ class Misbehaving:
         socket.transport.abort()
         return False
 
-    async def _begin(self, socket: ServerConnection, session: Session, fate: str) -> None:
+    async def _begin(
+        self, socket: ServerConnection, session: Session, fate: str, message: Any
+    ) -> None:
         """Do what precedes the reply, or replaces it."""
         if fate == "late":
             await asyncio.sleep(0.005)
         elif fate == "never":
+            self.on_never(message["data"]["number"])
             await socket.wait_closed()
         elif fate == "no JSON":
             await socket.send("{")

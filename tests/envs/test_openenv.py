@@ -1,6 +1,7 @@
 """The `openenv` backend against a server that misbehaves."""
 
-# pyright: basic, reportPrivateUsage=false
+# pyright: reportPrivateUsage=false
+
 
 from __future__ import annotations
 

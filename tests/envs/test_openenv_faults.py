@@ -1,7 +1,8 @@
 """The `openenv` backend against a server that misbehaves, driven by a state machine.
 
-Its 20 examples have 20 steps each. With RLIGHTNING_AIO_EXAMPLES=100 and RLIGHTNING_AIO_STEPS=100 it
-takes 10,000 steps, and `pytest -s` prints what the server was asked.
+Its 20 examples have 20 steps each. With RLIGHTNING_AIO_EXAMPLES=200 and RLIGHTNING_AIO_STEPS=100 more
+than 10,000 actions are sent, and `pytest -s` prints how many. No request has a time limit: the time of
+one is up when a rule says so, or when the server will never answer it.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import math
 import os
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import pytest
 from envs.misbehaving_openenv import CONNECT_ERRORS, FATES, Misbehaving, numbers
@@ -27,10 +28,48 @@ from patience import HANG
 import rlightning_aio as rl
 from rlightning_aio.envs import openenv_session
 from rlightning_aio.errors import EnvRaised
+from rlightning_aio.hosts import awaited_envs
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
 
 ENVS = 4
 CAUSES = (".ServerGone", ".ServerRefused")
 EACH = st.sets(st.integers(0, ENVS - 1), min_size=1)
+
+
+def chosen(env_ids: list[str], which: set[int]) -> list[str]:
+    """At least one of them, if there are any."""
+    return [env_ids[k] for k in sorted({k % len(env_ids) for k in which})] if env_ids else []
+
+
+def no_pause(losses: int) -> float:
+    del losses
+    return 0.0
+
+
+class Patience:
+    """In place of `TimeLimit`: the time of a request is up when the test says so."""
+
+    made: ClassVar[list[Patience]] = []
+
+    def __init__(self, seconds: float, expire: Callable[[Any, float], None]) -> None:
+        self.seconds = seconds
+        self._expire = expire
+        self._running: dict[str, tuple[Any, int]] = {}
+        self.made.append(self)
+
+    def begin(self, env: Any, loop: asyncio.AbstractEventLoop) -> None:
+        del loop
+        self._running[env.name] = env, env.entry
+
+    def end(self) -> None:
+        self._running.clear()
+
+    def give_up_on(self, env_id: str) -> None:
+        env, entry = self._running.pop(env_id, (None, 0))
+        if env is not None and env.entry == entry:
+            self._expire(env, self.seconds)
 
 
 class Machine(RuleBasedStateMachine):
@@ -62,17 +101,19 @@ class Machine(RuleBasedStateMachine):
     async def _begin(self, session: str, *, loses_pongs: bool) -> None:
         self.server = await Misbehaving(ENVS).__aenter__()
         self.server.loses_pongs = loses_pongs
+        self.server.on_never = self._give_up_on
         entry = {"name": "o", "backend": "openenv", "task": self.server.url, "num_workers": ENVS}
-        entry |= {"placement": "loop", "step_timeout": 0.05, "max_restarts": 10**6}
+        entry |= {"placement": "loop", "step_timeout": HANG, "max_restarts": 10**6}
         self.group = rl.build_env_group({**entry, "env_kwargs": {"session": session}})
         await self.group.init()
+        self.patience = Patience.made.pop()
         self.resetting = self.group.auto_reset(math.inf)
         self.resetting.__enter__()
         await self.group.reset()
 
     @property
-    def idle(self) -> list[str]:
-        return [i for i in self.group.env_ids if i not in self.asked and i not in self.raised]
+    def unasked(self) -> list[str]:
+        return [i for i in self.group.env_ids if i not in self.asked]
 
     @rule(fates=st.lists(st.sampled_from(FATES), min_size=1, max_size=6))
     def misbehave(self, fates: list[str]) -> None:
@@ -88,8 +129,11 @@ class Machine(RuleBasedStateMachine):
 
     @rule(which=EACH)
     def step(self, which: set[int]) -> None:
-        self.run(self._reset([i for i in sorted(self.raised) if int(i[2:]) in which]))
-        self.run(self._step([i for i in self.idle if int(i[2:]) in which]))
+        if not self.unasked:
+            self.run(self._collect(1))
+        ids = chosen(self.unasked, which)
+        self.run(self._reset(self.raised.intersection(ids)))
+        self.run(self._step([i for i in ids if i not in self.raised]))
 
     async def _step(self, ids: list[str]) -> None:
         if ids:
@@ -98,9 +142,28 @@ class Machine(RuleBasedStateMachine):
             self.asked |= {one.env_id: one.action["number"] for one in steps}
             self.group.step_async(rl.BatchedData(ids, steps))
 
-    @rule(share=st.floats(0, 1))
-    def collect(self, share: float) -> None:
-        self.run(self._collect(math.ceil(share * len(self.asked))))
+    @rule(which=EACH)
+    def step_and_collect(self, which: set[int]) -> None:
+        self.step(which)
+        self.run(self._collect(len(self.asked)))
+
+    @rule(which=EACH)
+    def let_time_be_up(self, which: set[int]) -> None:
+        """Of steps, wherever they are."""
+        self.run(self._give_up_on_steps(chosen(list(self.asked), which)))
+
+    async def _give_up_on_steps(self, ids: list[str]) -> None:
+        for env_id in ids:
+            self.patience.give_up_on(env_id)
+
+    def _give_up_on(self, number: int) -> None:
+        """Let the time be up of a step that is never answered."""
+        for env_id in [i for i, asked in self.asked.items() if asked == number]:
+            self.patience.give_up_on(env_id)
+
+    @rule(count=st.integers(1, ENVS))
+    def collect(self, count: int) -> None:
+        self.run(self._collect(min(count, len(self.asked))))
 
     @rule()
     def collect_what_is_ready(self) -> None:
@@ -128,12 +191,10 @@ class Machine(RuleBasedStateMachine):
 
     @rule(which=EACH)
     def reset(self, which: set[int]) -> None:
-        self.run(self._reset([i for i in self.group.env_ids if int(i[2:]) in which]))
+        self.run(self._reset(chosen(self.unasked, which)))
 
-    async def _reset(self, ids: list[str]) -> None:
+    async def _reset(self, ids: Iterable[str]) -> None:
         for env_id in ids:
-            if env_id in self.asked:
-                continue
             try:
                 batch, _ = await self.group.reset(env_ids=[env_id])
             except EnvRaised:
@@ -145,7 +206,7 @@ class Machine(RuleBasedStateMachine):
     @rule(which=EACH)
     def call(self, which: set[int]) -> None:
         """Check that calls get their own replies, too."""
-        self.run(self._call([i for i in self.idle if int(i[2:]) in which]))
+        self.run(self._call(chosen(self.unasked, which)))
 
     async def _call(self, ids: list[str]) -> None:
         for env_id in ids:
@@ -169,19 +230,13 @@ class Machine(RuleBasedStateMachine):
         await self._collect(len(self.asked))
         self.server.fates.clear()
         self.server.connect_fates.clear()
-        while True:
-            await self._reset(list(self.group.env_ids))
-            ids = self.group.env_ids
-            await self._step(ids)
-            asked = dict(self.asked)
-            batch, _ = await self.group.collect_async(wait_all=True, ordered=True)
-            self.asked.clear()
-            if batch.restarted.any():
-                continue  # The machine was busy.
-            assert not batch.truncated.any()
-            seen = [one["answers"] for one in batch.observation]
-            assert seen == [asked[i] for i in ids]
-            break
+        ids = self.group.env_ids
+        await self._reset(ids)
+        await self._step(ids)
+        asked = dict(self.asked)
+        batch, _ = await self.group.collect_async(wait_all=True, ordered=True)
+        assert not (batch.truncated | batch.is_reset).any()
+        assert [one["answers"] for one in batch.observation] == [asked[i] for i in ids]
         self.resetting.__exit__(None, None, None)
         await self.group.close()
         assert set(self.server.executed.values()) <= {1}
@@ -197,6 +252,8 @@ class Machine(RuleBasedStateMachine):
 @pytest.mark.filterwarnings("ignore:close.. of env .* took longer")
 def test_whatever_a_server_does_each_request_ends_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """No reply answers another request, no action runs twice, no slot leaks, all envs recover."""
+    monkeypatch.setattr(awaited_envs, "TimeLimit", Patience)
+    monkeypatch.setattr(awaited_envs, "restart_pause", no_pause)
     monkeypatch.setattr(openenv_session, "_KEEPALIVE_SECONDS", 0.002)
     monkeypatch.setattr(openenv_session, "_PAUSE_SECONDS", (0.001, 0.01))
     steps = int(os.environ.get("RLIGHTNING_AIO_STEPS", "20"))

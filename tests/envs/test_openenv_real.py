@@ -1,6 +1,5 @@
 """The `openenv` backend and `serve` with OpenEnv itself, which has its own Python."""
 
-# pyright: basic
 
 from __future__ import annotations
 
@@ -23,7 +22,7 @@ from envs.openenv_actions import STEPS, action_of, seed_of
 import rlightning_aio as rl
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Generator
 
 HERE = Path(__file__).parent
 PYTHON = os.environ.get("OPENENV_PYTHON", "")
@@ -38,7 +37,7 @@ pytestmark = [
 
 
 @contextmanager
-def served(kind: str, sessions: int) -> Iterator[str]:
+def served(kind: str, sessions: int) -> Generator[str]:
     """The address of an OpenEnv server."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
@@ -69,7 +68,7 @@ def test_sessions_equal_stepping_the_env_directly(kind: str) -> None:
         assert direct.stdout is not None
         expected = json.load(direct.stdout)
     assert found == [expected, expected]
-    print(f"{kind}: {sum(map(len, chain(*expected)))} equal results")  # noqa: T201
+    print(f"{kind}: {sum(len(rows) for rows in chain(*expected))} equal results")  # noqa: T201
 
 
 async def play(

@@ -106,6 +106,9 @@ class Scripted(BaseEnv):
                 continue
             return
 
+    async def wait(self) -> None:
+        await self.gates[self.env_id].wait()
+
     async def double(self, value: Any) -> Any:
         await asyncio.sleep(0)
         return 2 * value

@@ -297,6 +297,23 @@ async def test_a_step_that_ignores_its_cancellation_is_left_behind(
         assert batch.observation.tolist() == [[2, 1, 1, -1]]
 
 
+async def test_an_env_that_is_replaced_takes_no_other_along() -> None:
+    """Though the other's step left the queue when a call of the first had ended."""
+    config = entry(num_workers=3, max_concurrency=2, step_timeout=SOON)
+    async with rl.build_env_group(config) as group:
+        await group.reset()
+        gate = asyncio.Event()
+        Scripted.gates.update(dict.fromkeys(group.env_ids, gate))
+        calls = [asyncio.ensure_future(group[i].call("wait")) for i in ("e-0", "e-1")]
+        await asyncio.sleep(0)
+        group.step_async(steps(e_2=IGNORE))  # It queues.
+        gate.set()
+        await asyncio.gather(*calls)
+        group.step_async(steps(e_0=HANG))
+        batch, _ = await group.collect_async(wait_all=True, deadline=LONG)
+        assert batch.restarted.tolist() == [True, True]
+
+
 # -- what they raise, and what they leave
 
 

@@ -10,10 +10,10 @@ Left out: how requests and completions travel.
 from __future__ import annotations
 
 import asyncio
-import contextvars
 import inspect
 import time
 from collections import deque
+from contextvars import Context, copy_context
 from copy import copy
 from typing import TYPE_CHECKING, Any, Final
 
@@ -65,7 +65,7 @@ class _Env:
 
     def __init__(self, index: int, runner: AwaitedRunner | None = None) -> None:
         self.index = index
-        self.context = contextvars.copy_context()
+        self.context = copy_context()
         self.context.run(OWNER.set, self)
         self.runner: Any = runner
         self.task: asyncio.Task[Any] | None = None
@@ -315,7 +315,9 @@ class AwaitedEnvs:
         place = place_of(env.answering)
         what = f"env {env.name!r} took longer than {seconds} s for a {doing} and was cancelled"
         message = f"{what} while it waited in {place}" if place else what
-        task = self._loop.create_task(self._replace(env, message, doing))
+        # In no env's context, or the end of that env would cancel it: the timer may have been set
+        # when a request of another env ended.
+        task = self._loop.create_task(self._replace(env, message, doing), context=Context())
         self._replacing.add(task)
         task.add_done_callback(self._replacing.discard)
 
