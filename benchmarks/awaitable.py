@@ -1,165 +1,277 @@
-"""Awaitable envs: their rate, the cost of a step for the trainer, and their memory.
+"""Envs that wait: their rate, what a step costs the trainer, their memory and their start-up.
 
-1,000 envs whose steps wait for 20 to 500 ms (log-normal) run on the trainer's event loop, as
-`asyncio.gather` over episodes, in threads, and in one process each. The ideal rate is that of envs
-that never wait for the trainer. Prints one JSON line for each way.
+Steps wait for 20 to 500 ms (log-normal, `waiting.py`) and do nothing else. They run on the
+trainer's event loop (`placement: loop`), as `asyncio.gather` over episodes, in a thread each, and
+in a worker process each. The ideal rate is that of envs that never wait for anybody else. A group
+collects batches of whatever is ready, a 32nd of its envs at least; `gather` and threads have no
+batches. Memory is the proportional set size of all processes. Start-up ends with the first
+observation of every env. Both are measured once, in a fresh process.
 
-    python benchmarks/awaitable.py [--envs 1000] [--seconds 20] [--ways loop,gather,threads,process]
+There are 100 processes: 1,000 would need 19 GiB, and a minute to start on two cores.
 """
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import json
 import resource
+import statistics
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import psutil
-from gymnasium import spaces
+from harness import (
+    Contender,
+    arguments,
+    machine_facts,
+    machine_text,
+    modules_of,
+    number_text,
+    take_turns,
+)
+from memory import resident_kib
+from waiting import MEAN, Awaiting, Sleeping
 
 import rlightning_aio as rl
 
-MIN_RESULTS = 32
-_DRAW = np.random.default_rng(0)
-LATENCIES = np.clip(_DRAW.lognormal(np.log(0.08), 0.7, 100_003), 0.02, 0.5).tolist()
-"""Durations of steps in seconds, drawn beforehand; each env begins at another position."""
-MEAN = sum(LATENCIES) / len(LATENCIES)
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
-
-class Waiting:
-    """A step waits and does nothing else."""
-
-    observation_space = spaces.Box(-1, 1, (8,), np.float32)
-    action_space = spaces.Discrete(4)
-    idle = np.zeros(8, np.float32)
-
-    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        del options
-        self.place = 97 * (seed or 0)
-        return self.idle, {}
-
-    async def step(self, action: Any) -> Any:
-        del action
-        await asyncio.sleep(self.latency())
-        return self.idle, 1.0, False, False, {}
-
-    def latency(self) -> float:
-        self.place = (self.place + 1) % len(LATENCIES)
-        return LATENCIES[self.place]
+ENVS, PROCESSES, MANY = 1000, 100, 10_000
+ROUNDS, SECONDS = 5, 8.0
+SHARE, RATE, TRAINER = "share of the ideal rate", "env steps/s", "trainer, µs/step"
+ALL, START, MEMORY = "all processes, µs/step", "start-up, s", "KiB/env"
+COLUMNS = (SHARE, RATE, TRAINER, ALL, START, MEMORY)
 
 
 def processor_seconds() -> float:
+    """Return the processor time of this process."""
     used = resource.getrusage(resource.RUSAGE_SELF)
     return used.ru_utime + used.ru_stime
 
 
-def memory() -> int:
-    """Return the memory in bytes of this process and its descendants."""
-    own = psutil.Process()
-    return sum(one.memory_info().rss for one in [own, *own.children(recursive=True)])
+@dataclass
+class Way(Contender):
+    """One way to run envs.
+
+    Attributes:
+        count: number of envs.
+    """
+
+    name: str
+    count: int
+
+    @property
+    def requires(self) -> tuple[str, ...]:
+        return ("rlightning_aio", "uvloop")
+
+    def setup(self) -> None:
+        import uvloop
+
+        self.runner = asyncio.Runner(loop_factory=uvloop.new_event_loop)
+        self.runner.get_loop()
+        before, began = resident_kib(), time.perf_counter()
+        self.start()
+        self.start_seconds = time.perf_counter() - began
+        self.kib = (resident_kib() - before) / self.count
+
+    def round(self, seconds: float) -> dict[str, float]:
+        """Return the figures; `ALL` is to be multiplied by the number of busy processors."""
+        spent, began = processor_seconds(), time.perf_counter()
+        rate, steps = self.play(seconds)
+        return {
+            ALL: 1e6 * (time.perf_counter() - began) / steps,
+            SHARE: rate * MEAN / self.count,
+            RATE: rate,
+            TRAINER: 1e6 * (processor_seconds() - spent) / steps,
+            START: self.start_seconds,
+            MEMORY: self.kib,
+        }
+
+    def start(self) -> None:
+        """Start all envs; returns when every one has its first observation."""
+        raise NotImplementedError
+
+    def play(self, seconds: float) -> tuple[float, int]:
+        """Step for about so long.
+
+        Returns the steps per second, and the number of steps, with those that end afterwards.
+        """
+        raise NotImplementedError
+
+    def teardown(self) -> None:
+        self.runner.close()
 
 
-async def with_group(placement: str, count: int, seconds: float) -> dict[str, Any]:
-    before, began = memory(), time.perf_counter()
-    fields = {"envs_per_process": 1} if placement == "process" else {}
-    config = rl.EnvConfig(
-        name="w",
-        make_env=Waiting,
-        num_workers=count,
-        placement=placement,
-        start_timeout=600,
-        **fields,
-    )
-    async with rl.build_env_group(config) as group:
-        start_seconds = time.perf_counter() - began
-        batch, _ = await group.reset(seed=0)
-        held = memory() - before
-        action = np.zeros(count, np.int64)
-        steps, spent = 0, processor_seconds()
-        group.step_async(batch.respond(action=action))
+@dataclass
+class InGroup(Way):
+    make_env: Callable[[], Any]
+    placement: str
+
+    def start(self) -> None:
+        self.runner.run(self._start())
+
+    async def _start(self) -> None:
+        entry: dict[str, Any] = {"name": "w", "make_env": self.make_env, "num_workers": self.count}
+        entry |= {"placement": self.placement, "start_timeout": 600}
+        if self.placement == "process":
+            entry["envs_per_process"] = 1
+        self.group = rl.build_env_group(entry)
+        await self.group.init()
+        self.batch, _ = await self.group.reset(seed=0)
+
+    def play(self, seconds: float) -> tuple[float, int]:
+        return self.runner.run(self._play(seconds))
+
+    async def _play(self, seconds: float) -> tuple[float, int]:
+        group, steps, elapsed = self.group, 0, 0.0
+        action, least = np.zeros(self.count, np.int64), self.count // 32
         began = time.perf_counter()
-        while time.perf_counter() < began + seconds:
-            batch, _ = await group.collect_async(min_results=MIN_RESULTS)
-            group.step_async(batch.respond(action=action[: len(batch)]))
+        group.step_async(self.batch.respond(action=action))
+        while elapsed < seconds:
+            batch, _ = await group.collect_async(min_results=least)
             steps += len(batch)
-        elapsed = time.perf_counter() - began
-        spent = processor_seconds() - spent
-    return {
-        "rate": steps / elapsed,
-        "trainer_us_per_step": 1e6 * spent / steps,
-        "start_seconds": start_seconds,
-        "bytes_per_env": held / count,
-    }
+            elapsed = time.perf_counter() - began
+            group.step_async(batch.respond(action=action[: len(batch)]))
+        self.batch, _ = await group.collect_async(wait_all=True)
+        return steps / elapsed, steps + self.count
+
+    def teardown(self) -> None:
+        self.runner.run(self.group.close())
+        super().teardown()
 
 
-async def with_gather(count: int, seconds: float) -> dict[str, Any]:
-    """Run one coroutine for each env, as OpenEnv recommends."""
-    envs = [Waiting() for _ in range(count)]
-    steps, spent, began = 0, processor_seconds(), time.perf_counter()
+@dataclass
+class Gather(Way):
+    """One coroutine for each env, as OpenEnv recommends."""
 
-    async def episode(env: Waiting, seed: int) -> None:
-        nonlocal steps
-        await env.reset(seed=seed)
-        while time.perf_counter() < began + seconds:
+    def start(self) -> None:
+        self.envs = [Awaiting() for _ in range(self.count)]
+        self.runner.run(self._start())
+
+    async def _start(self) -> None:
+        await asyncio.gather(*(env.reset(seed=k) for k, env in enumerate(self.envs)))
+
+    def play(self, seconds: float) -> tuple[float, int]:
+        return self.runner.run(self._play(seconds))
+
+    async def _play(self, seconds: float) -> tuple[float, int]:
+        until = time.perf_counter() + seconds
+
+        async def episode(env: Awaiting) -> int:
+            steps = 0
             await env.step(0)
-            steps += 1
+            while time.perf_counter() < until:
+                steps += 1
+                await env.step(0)
+            return steps
 
-    await asyncio.gather(*(episode(env, k) for k, env in enumerate(envs)))
-    elapsed = time.perf_counter() - began
+        steps = sum(await asyncio.gather(*(episode(env) for env in self.envs)))
+        return steps / seconds, steps + self.count
+
+
+@dataclass
+class Threads(Way):
+    """One thread for each env, which sleeps."""
+
+    def start(self) -> None:
+        self.envs = [Sleeping() for _ in range(self.count)]
+        self.pool = ThreadPoolExecutor(self.count)
+        here = threading.Barrier(self.count + 1)
+
+        def begin(k: int) -> None:
+            self.envs[k].reset(seed=k)
+            here.wait()
+
+        for k in range(self.count):
+            self.pool.submit(begin, k)
+        here.wait()
+
+    def play(self, seconds: float) -> tuple[float, int]:
+        until = time.perf_counter() + seconds
+
+        def episode(env: Sleeping) -> int:
+            steps = 0
+            env.step(0)
+            while time.perf_counter() < until:
+                steps += 1
+                env.step(0)
+            return steps
+
+        steps = sum(self.pool.map(episode, self.envs))
+        return steps / seconds, steps + self.count
+
+    def teardown(self) -> None:
+        self.pool.shutdown()
+        super().teardown()
+
+
+OURS, OURS_MANY = f"placement: loop, {ENVS:,} envs", f"placement: loop, {MANY:,} envs"
+WAYS: tuple[Contender, ...] = (
+    InGroup(OURS, ENVS, Awaiting, "loop"),
+    Gather(f"gather over episodes, {ENVS:,} envs", ENVS),
+    Threads(f"a thread for each env, {ENVS:,} envs", ENVS),
+    InGroup(f"a process for each env, {PROCESSES:,} envs", PROCESSES, Sleeping, "process"),
+    InGroup(OURS_MANY, MANY, Awaiting, "loop"),
+)
+TARGETS = ((OURS, SHARE, "≥", 0.95), (OURS, TRAINER, "≤", 40), (OURS_MANY, START, "≤", 10))
+
+
+def figures_of(rounds: list[tuple[dict[str, float], float]]) -> dict[str, Any]:
+    """Return the median, lowest and highest of each figure of a way."""
+    for values, cores in rounds:
+        values[ALL] *= cores
+    columns = {name: [values[name] for values, _ in rounds] for name in COLUMNS}
     return {
-        "rate": steps / elapsed,
-        "trainer_us_per_step": 1e6 * (processor_seconds() - spent) / steps,
+        name: {"median": statistics.median(found), "low": min(found), "high": max(found)}
+        for name, found in columns.items()
     }
 
 
-def with_threads(count: int, seconds: float) -> dict[str, Any]:
-    """Run one thread for each env, which sleeps."""
-    before, began = memory(), time.perf_counter()
-    spent = processor_seconds()
-
-    def episode(seed: int) -> int:
-        env, steps = Waiting(), 0
-        env.place = 97 * seed
-        while time.perf_counter() < began + seconds:
-            time.sleep(env.latency())
-            steps += 1
-        return steps
-
-    with ThreadPoolExecutor(count) as pool:
-        running = [pool.submit(episode, k) for k in range(count)]
-        start_seconds = time.perf_counter() - began
-        held = memory() - before
-        steps = sum(one.result() for one in running)
-    elapsed = time.perf_counter() - began
-    return {
-        "rate": steps / elapsed,
-        "trainer_us_per_step": 1e6 * (processor_seconds() - spent) / steps,
-        "start_seconds": start_seconds,
-        "bytes_per_env": held / count,
-    }
+def tables(results: dict[str, Any]) -> str:
+    lines = [f"| | {' | '.join(COLUMNS)} |", "|---" + "|---:" * len(COLUMNS) + "|"]
+    for name, found in results.items():
+        cells = (number_text(found[column]["median"]) for column in COLUMNS)
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    lines += ["", "| target | | median | lowest to highest | |", "|---|---|---:|---:|---|"]
+    for name, column, sign, bound in TARGETS:
+        if name in results:
+            found = results[name][column]
+            low, median, high = (number_text(found[k]) for k in ("low", "median", "high"))
+            is_met = found["median"] >= bound if sign == "≥" else found["median"] <= bound
+            met = "met" if is_met else "missed"
+            lines.append(
+                f"| {name}: {column} | {sign} {bound} | {median} | {low} to {high} | {met} |"
+            )
+    return "\n".join(lines)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--envs", type=int, default=1000)
-    parser.add_argument("--processes", type=int, default=50, help="envs of the way `process`")
-    parser.add_argument("--seconds", type=float, default=20.0)
-    parser.add_argument("--ways", default="loop,gather,threads,process")
-    arguments = parser.parse_args()
-    for way in arguments.ways.split(","):
-        count = arguments.processes if way == "process" else arguments.envs
-        if way in ("loop", "process"):
-            found = rl.run(with_group(way, count, arguments.seconds))
-        elif way == "gather":
-            found = rl.run(with_gather(count, arguments.seconds))
-        else:
-            found = with_threads(count, arguments.seconds)
-        found["of_ideal"] = found["rate"] * MEAN / count
-        print(json.dumps({"way": way, "envs": count, **{k: round(v, 3) for k, v in found.items()}}))
+    given = arguments(__doc__, ROUNDS, SECONDS)
+    machine = machine_facts(modules_of(WAYS))
+    turns, skipped = take_turns(
+        WAYS, given.rounds, given.seconds, given.only, lambda found: number_text(found[RATE])
+    )
+    results = {name: figures_of(rounds) for name, rounds in turns.items()}
+    shown = tables(results)
+    print(f"{shown}\n\n{machine_text(machine)}")
+    if given.json:
+        report: dict[str, Any] = {
+            "name": "awaitable",
+            "title": "Envs that wait",
+            "unit": RATE,
+            "rounds": given.rounds,
+            "seconds": given.seconds,
+            "machine": machine,
+            "results": results,
+            "targets": [],
+            "skipped": skipped,
+            "tables": shown,
+        }
+        given.json.write_text(json.dumps(report, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 `tables.md` has the table of each script, and `README.md` the comparisons that matter most.
 
-    python benchmarks/run_all.py              # all of them, about a quarter of an hour
+    python benchmarks/run_all.py              # all of them, twenty minutes
     python benchmarks/run_all.py cheetah pong
     python benchmarks/run_all.py training     # takes hours, so it runs only if it is named
 
@@ -29,7 +29,8 @@ README = HERE / "README.md"
 SCRIPTS = (
     "adapters", "cheetah", "batches", "peers", "humanoid", "cartpole", "pong", "round_trip",
     "facade", "trainer_cpu", "stragglers", "uneven", "start", "memory", "remote", "pool",
-    "tracing", "filming", "threads", "loop_pause", "headline", "exchange",
+    "tracing", "filming", "threads", "loop_pause", "headline", "exchange", "awaitable",
+    "openenv_sessions",
 )  # fmt: skip
 # Run only if they are named.
 LONG = ("training",)

@@ -6,6 +6,7 @@ import importlib
 import importlib.util
 import json
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,7 @@ ASKED = {
     "loop_pause": [],
     "headline": ["make_vec"],
     "exchange": ["sync", "bare exchange"],
+    "awaitable": ["loop, 1,000", "gather", "thread"],
     "peers": ["Gymnasium", "SB3", "Tianshou", "EnvPool, 16 of 32", "TorchRL", "PufferLib"],
 }
 # Here the work itself gives the length.
@@ -59,10 +61,17 @@ TOGETHER = (
         "loop_pause",
         "headline",
         "exchange",
+        "awaitable",
     ),
     ("round_trip", "facade", "trainer_cpu", "stragglers", "uneven", "peers", "pong", "adapters"),
 )
 RARELY_SLOW = "all work 50 µs, 2 of 8 rarely take 100 ms, 4 to a worker"
+
+
+def imported(script: str, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Return a script as a module."""
+    monkeypatch.setattr(sys, "path", [str(BENCHMARKS), *sys.path])
+    return importlib.import_module(script)
 
 
 def short_round(script: str, folder: Path) -> list[str]:
@@ -153,9 +162,21 @@ def check_pong(report: dict[str, Any]) -> None:
         assert len(report["results"]) == 2
 
 
+def check_awaitable(report: dict[str, Any]) -> None:
+    """Each way steps its envs, and what has a target is compared with it."""
+    assert len(report["results"]) == 3
+    for found in report["results"].values():
+        assert found["trainer, µs/step"]["median"] > 0
+    assert "≥ 0.95" in report["tables"]
+
+
 CHECKS = {
-    "peers": check_peers, "uneven": check_uneven, "adapters": check_adapters, "pong": check_pong
-}  # fmt: skip
+    "peers": check_peers,
+    "uneven": check_uneven,
+    "adapters": check_adapters,
+    "pong": check_pong,
+    "awaitable": check_awaitable,
+}
 
 
 # In few tests, because each starts a process: the processes of pytest would repeat a fixture.
@@ -179,8 +200,7 @@ def test_lateness_is_measured_from_the_kth_of_all_outstanding(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A result that was ready and left over counts as ready, whoever is handed out instead."""
-    monkeypatch.syspath_prepend(BENCHMARKS)
-    calls = importlib.import_module("uneven").Calls()
+    calls = imported("uneven", monkeypatch).Calls()
     now = iter([1.0, 5.0, 6.0, 7.0])
     monkeypatch.setattr("time.monotonic", lambda: next(now))
     calls.sent(range(3))
@@ -196,16 +216,14 @@ def test_lateness_is_measured_from_the_kth_of_all_outstanding(
 
 def test_every_script_has_its_place_in_the_results(monkeypatch: pytest.MonkeyPatch) -> None:
     """What `run_all` runs is what the page of all tables has room for."""
-    monkeypatch.syspath_prepend(BENCHMARKS)
-    run_all = importlib.import_module("run_all")
+    run_all = imported("run_all", monkeypatch)
     marked = re.findall(r"^<!-- (\w+) -->$", (BENCHMARKS / "tables.md").read_text(), re.MULTILINE)
     assert sorted(set(marked) - {"end"}) == sorted((*run_all.SCRIPTS, *run_all.LONG))
 
 
 def test_the_picture_shows_the_kept_results(monkeypatch: pytest.MonkeyPatch) -> None:
     """Who renews results by hand runs benchmarks/picture.py."""
-    monkeypatch.syspath_prepend(BENCHMARKS)
-    picture = importlib.import_module("picture")
+    picture = imported("picture", monkeypatch)
     assert picture.PICTURE.read_text() == picture.drawn(picture.RESULTS)
 
 
@@ -213,14 +231,13 @@ def test_a_renewed_table_stands_between_its_marks(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """A table replaces the old one of the same name and nothing else."""
-    monkeypatch.syspath_prepend(BENCHMARKS)
-    run_all = importlib.import_module("run_all")
+    run_all = imported("run_all", monkeypatch)
     monkeypatch.setattr(run_all, "RESULTS", tmp_path)
-    machine = {
+    machine: dict[str, Any] = {
         "cores": 2, "cpu": "a CPU", "memory_gib": 4, "system": "Linux", "python": "3.11",
         "versions": {},
     }  # fmt: skip
-    report = {
+    report: dict[str, Any] = {
         "title": "T", "unit": "s", "rounds": 3, "machine": machine, "targets": [], "skipped": {},
         "results": {"A": {"median": 1.0, "low": 0.5, "high": 2.0}},
     }  # fmt: skip
