@@ -1,8 +1,8 @@
 """The `openenv` backend against a server that misbehaves, driven by a state machine.
 
-Its 20 examples have 20 steps each. With RLIGHTNING_AIO_EXAMPLES=200 and RLIGHTNING_AIO_STEPS=100 more
-than 10,000 actions are sent, and `pytest -s` prints how many. No request has a time limit: the time of
-one is up when a rule says so, or when the server will never answer it.
+Its 20 examples have 20 steps each. With RLIGHTNING_AIO_EXAMPLES=200 and RLIGHTNING_AIO_STEPS=100
+more than 10,000 actions are sent, and `pytest -s` prints how many. No request has a time limit: the
+time of one is up when a rule says so, or when the server will never answer it.
 """
 
 from __future__ import annotations
