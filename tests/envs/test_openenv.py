@@ -2,7 +2,6 @@
 
 # pyright: reportPrivateUsage=false
 
-
 from __future__ import annotations
 
 import asyncio

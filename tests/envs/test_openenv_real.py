@@ -1,6 +1,5 @@
 """The `openenv` backend and `serve` with OpenEnv itself, which has its own Python."""
 
-
 from __future__ import annotations
 
 import asyncio
