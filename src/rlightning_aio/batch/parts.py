@@ -75,24 +75,45 @@ def observations_of_parts(parts: Sequence[ResultColumns]) -> Any:
     Raises:
         ValueError: the envs have different observation spaces.
     """
-    if len(parts) > 1 or parts[0].whole_results:
-        return stacked_values([part.observation_of(row) for part, row in rows_in_order(parts)])
-    part = parts[0]
-    values = [part.observation_of(row) for row in range(len(part))]
-    return _stacked_in_space(part.observation_space, values)
+    values = [part.observation_of(row) for part, row in rows_in_order(parts)]
+    known = [part.observation_space for part in parts if part.observation_space is not None]
+    if parts[0].whole_results or len(known) < len(parts):
+        return stacked_values(values)
+    return _stacked_in(known, values)
 
 
-def _stacked_in_space(space: gym.Space[Any] | None, values: list[Any]) -> Any:
-    """Stack values of `space` to columns; values without fixed size stay lists."""
-    if space is not None and is_dict(space):
-        parts = space.spaces.items()
-        return {key: _stacked_in_space(own, [value[key] for value in values]) for key, own in parts}
-    if space is not None and is_tuple(space):
-        return tuple(
-            _stacked_in_space(own, [value[k] for value in values])
-            for k, own in enumerate(space.spaces)
-        )
-    return values if space is not None and leaves(space) is None else stacked_values(values)
+def _stacked_in(known: Sequence[gym.Space[Any]], values: list[Any]) -> Any:
+    """Stack values of `known` spaces to columns; values without fixed size stay lists.
+
+    Raises:
+        ValueError: the spaces differ in structure.
+    """
+    keys = _keys_of(known[0])
+    if any(_keys_of(space) != keys for space in known):
+        raise differing()
+    if keys is None:
+        return _column(known, values)
+    inner = {key: [cast("Any", space)[key] for space in known] for key in keys}
+    columns = {key: _stacked_in(inner[key], [value[key] for value in values]) for key in keys}
+    return columns if is_dict(known[0]) else tuple(columns.values())
+
+
+def _column(known: Sequence[gym.Space[Any]], values: list[Any]) -> Any:
+    if any(leaves(space) is None for space in known):
+        return values
+    column = stacked_values(values)
+    dtype = known[0].dtype
+    if not isinstance(column, np.ndarray) or any(space.dtype != dtype for space in known):
+        return column
+    # As if the values had come through rows of fixed size: an env may count a float32 in ints.
+    return cast("NDArray[Any]", column).astype(dtype, copy=False)
+
+
+def _keys_of(space: gym.Space[Any]) -> list[Any] | None:
+    """Keys of a Dict, positions of a Tuple; None for any other space."""
+    if is_dict(space):
+        return list(space.spaces)
+    return list(range(len(space.spaces))) if is_tuple(space) else None
 
 
 def infos_of_parts(parts: Sequence[ResultColumns], *, episodes: bool) -> dict[str, Any]:
