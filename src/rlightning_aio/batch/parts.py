@@ -101,12 +101,12 @@ def _stacked_in(known: Sequence[gym.Space[Any]], values: list[Any]) -> Any:
 def _column(known: Sequence[gym.Space[Any]], values: list[Any]) -> Any:
     if any(leaves(space) is None for space in known):
         return values
-    column = stacked_values(values)
+    column: Any = stacked_values(values)
     dtype = known[0].dtype
-    if not isinstance(column, np.ndarray) or any(space.dtype != dtype for space in known):
+    if type(column) is not np.ndarray or any(space.dtype != dtype for space in known):
         return column
     # As if the values had come through rows of fixed size: an env may count a float32 in ints.
-    return cast("NDArray[Any]", column).astype(dtype, copy=False)
+    return column.astype(dtype, copy=False)
 
 
 def _keys_of(space: gym.Space[Any]) -> list[Any] | None:
