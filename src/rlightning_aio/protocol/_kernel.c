@@ -649,13 +649,14 @@ kernel_arm(PyObject *module, PyObject *args)
     return PyBool_FromLong(reached);
 }
 
-/* Whether this worker must ring the trainer now; see `exchange.is_due`. */
+/* Whether this worker must ring the trainer now; see `exchange.is_due`. It looks after each report,
+ * and, `at_last`, when it has run out of work. */
 static int
-bell_is_due(const Py_buffer *words, int64_t *own)
+bell_is_due(const Py_buffer *words, int64_t *own, int at_last)
 {
     fence();
     int64_t armed = load(words_of(words) + ARMED);
-    if (armed == own[SETTLED])
+    if (armed == own[SETTLED] || (armed & AT_LAST && !at_last))
         return 0;
     if (armed && sum_of_counters(words) < goal_of(armed))
         return 0;
@@ -679,7 +680,7 @@ kernel_is_due(PyObject *module, PyObject *args)
         if (length(&views[0]) <= ARMED || length(&views[1]) <= CAREFUL)
             PyErr_SetString(PyExc_ValueError, "a bell or a worker's counts are too short");
         else
-            found = PyBool_FromLong(bell_is_due(&views[0], words_of(&views[1])));
+            found = PyBool_FromLong(bell_is_due(&views[0], words_of(&views[1]), 1));
     }
     release_all(views, 2);
     return found;
@@ -774,12 +775,10 @@ run_loop(Loop *loop, const int64_t *requests, Py_ssize_t count)
         put(&reports[(uint64_t)own[REPORTED] & mask], requests[k]);
         own[REPORTED] = (int64_t)((uint64_t)own[REPORTED] + 1);
         publish(bell + loop->counter, own[REPORTED]);
-        int64_t armed = peek(bell + ARMED);
-        if (armed != own[SETTLED] && !(armed & AT_LAST) &&
-            bell_is_due(&loop->views[LOOP_BELL], own) && called(loop->ring) < 0)
+        if (bell_is_due(&loop->views[LOOP_BELL], own, 0) && called(loop->ring) < 0)
             return -1;
     }
-    if (bell_is_due(&loop->views[LOOP_BELL], own) && called(loop->ring) < 0)
+    if (bell_is_due(&loop->views[LOOP_BELL], own, 1) && called(loop->ring) < 0)
         return -1;
     return 0;
 }

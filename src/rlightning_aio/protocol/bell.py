@@ -4,10 +4,9 @@ It is shared memory with a counter of reports for each worker, and a word that t
 with a goal for the sum of the counters. The worker whose report reaches the goal rings, with a few
 bytes in its channel.
 
-Without a fence: a worker's read of the armed word after each report, because a fence would slow
-fast envs. While the report is on its way to memory, for a fraction of a microsecond, the worker
-may overlook a bell that is being armed. So the trainer fences after arming, and adds up the
-counters again a few microseconds later. A worker that runs out of work checks with a fence.
+Invariant: a worker publishes its counter and fences before it looks at the armed word; the trainer
+arms and fences before it adds up the counters. So the goal is seen by one of them at least, and of
+two workers that finish together at least one sees the full sum.
 """
 
 from __future__ import annotations
@@ -146,6 +145,7 @@ class WorkerBell:
         """Publish the number of reports. Return True if `is_due` must be called now."""
         words = self.words
         words[self.counter] = count
+        self._fence()
         armed = words[ARMED]
         return armed != self.own[SETTLED] and not armed & AT_LAST
 

@@ -369,8 +369,11 @@ def is_due(bell: memoryview[int], own: memoryview[int], fence: Callable[[], None
     """
     fence()
     armed = bell[ARMED]
-    if armed == own[SETTLED]:
-        return False
+    return armed != own[SETTLED] and _settle(bell, own, armed)
+
+
+def _settle(bell: memoryview[int], own: memoryview[int], armed: int) -> bool:
+    """Return True if the goal of the armed word is reached; this worker rings for it once."""
     if armed and sum(bell[LINE::LINE]) < (armed >> GOAL_SHIFT & GOAL_MASK):
         return False
     own[SETTLED] = armed
@@ -450,8 +453,9 @@ def serve(  # noqa: C901  # Calls would slow down every step.
         if not IN_ORDER:
             fence()
         bell[counter] = sent
+        fence()
         armed = bell[ARMED]
-        if armed != own[SETTLED] and not armed & AT_LAST and is_due(bell, own, fence):
+        if armed != own[SETTLED] and not armed & AT_LAST and _settle(bell, own, armed):
             ring()
     if is_due(bell, own, fence):
         ring()
