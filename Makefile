@@ -23,7 +23,7 @@ PEERS ?= peers
 PIP_INSTALL = $(@D)/bin/python -m pip install --quiet --disable-pip-version-check
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-ray environments test-simulators test-gpu test-peers test-pythons test-site check prose format docs dist bench clean
+.PHONY: help run test test-sanitized test-aarch64 test-ray environments test-simulators test-gpu test-peers test-pythons test-site check prose format docs dist bench clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 24
@@ -66,6 +66,24 @@ test-gpu: $(SIMULATORS)/installed $(ISAAC)/installed ## the tests of simulators 
 # Their versions are to be those of constraints.txt; a project without a folder in PEERS is not run.
 test-peers: $(PEERS_VENV)/installed ## Gymnasium's, SB3's and RLightning's own tests: make test-peers PEERS=folder
 	$(PEERS_VENV)/bin/python tests/peers/run.py $(PEERS)
+
+# Python's own allocator would hide what the sanitizer looks for. Interpreters leak at their end.
+test-sanitized: export PYTHONPATH := build/sanitized
+test-sanitized: export PYTHONMALLOC := malloc
+test-sanitized: export ASAN_OPTIONS := detect_leaks=0
+test-sanitized: $(VENV)/installed-test ## the compiled kernel under AddressSanitizer and UBSan
+	rm -rf build/sanitized && mkdir -p build && cp -r src build/sanitized
+	$(CC) -std=c11 -g -O1 -Wall -Wextra -Wno-missing-field-initializers -Wno-cast-function-type -Werror \
+	    -fsanitize=address,undefined -fno-sanitize-recover=all -fPIC -shared \
+	    -I$$($(PY) -c 'import sysconfig; print(sysconfig.get_path("include"))') \
+	    src/rlightning_aio/protocol/_kernel.c -o build/sanitized/rlightning_aio/protocol/_kernel.abi3.so
+	LD_PRELOAD="$$($(CC) -print-file-name=libasan.so) $$($(CC) -print-file-name=libubsan.so)" \
+	    $(PY) -m pytest tests/protocol tests/hosts/test_link.py tests/group/test_steps.py \
+	    tests/group/test_stepping.py
+
+# The rings and the kernel on another processor's memory order: Debian's qemu runs Debian's Python.
+test-aarch64: $(VENV)/installed-test ## the compiled kernel on aarch64, emulated (Debian; 200 MB)
+	tests/aarch64.sh $(PY)
 
 # The wheel and the sdist, each as the only thing in an environment of each Python that is found.
 # MuJoCo and the like come anew, so this takes some minutes.

@@ -140,6 +140,14 @@ def group_config(work: Work, envs_per_process: int | str) -> dict[str, Any]:
     }
 
 
+def use_implementation(name: str) -> None:
+    """Run the hot path by this implementation, in this process and its workers; "" is the usual."""
+    if name:
+        kernel = import_module("rlightning_aio.protocol.kernel")
+        kernel.select(name)
+        os.environ[kernel.VARIABLE] = name
+
+
 @dataclass
 class OursSync(Stepped):
     """`rlightning_aio.sync.EnvGroup`: all envs step, all results are awaited.
@@ -147,16 +155,19 @@ class OursSync(Stepped):
     Attributes:
         envs_per_process: as in a config entry.
         auto_reset: whether finished episodes are reset; not needed if episodes never end.
+        implementation: of the hot path, see `use_implementation`.
     """
 
     envs_per_process: int | str = "auto"
     auto_reset: bool = True
+    implementation: str = ""
 
     package = "rlightning_aio"
 
     def setup(self) -> None:
         from rlightning_aio.sync import build_env_group
 
+        use_implementation(self.implementation)
         self._envs = build_env_group(group_config(self.work, self.envs_per_process))
         self._envs.init()
         if self.auto_reset:
@@ -176,7 +187,7 @@ class OursAsync(Contender):
     """`rlightning_aio.EnvGroup`: ready envs are collected and stepped again.
 
     Attributes:
-        envs_per_process, auto_reset: see `OursSync`.
+        envs_per_process, auto_reset, implementation: see `OursSync`.
         min_results, max_results: of `collect_async`.
         uvloop: run on uvloop rather than on asyncio's own loop.
     """
@@ -188,6 +199,7 @@ class OursAsync(Contender):
     min_results: int = 1
     max_results: int | None = None
     uvloop: bool = True
+    implementation: str = ""
 
     _runner: ClassVar[Any] = None
 
@@ -200,6 +212,7 @@ class OursAsync(Contender):
 
         from rlightning_aio import build_env_group
 
+        use_implementation(self.implementation)
         loop_factory = import_module("uvloop").new_event_loop if self.uvloop else None
         self._runner = asyncio.Runner(loop_factory=loop_factory)
         self._envs = build_env_group(group_config(self.work, self.envs_per_process))

@@ -4,7 +4,8 @@ The bare exchange has only what a group can't omit: forked workers, one pinned t
 that they share with the trainer, an eventfd in each direction, one copy in and one copy out. Its
 envs are those of `gymnasium.make`. It has no request numbers, errors, infos, and deaths. Rounds of
 contenders alternate in one run. The processor time per step, of all processes, is given in addition
-to the rate; it depends less on other work on the machine.
+to the rate; it depends less on other work on the machine. *Python twins* are the same group
+without the compiled kernel, as after an installation without a C compiler.
 """
 
 from __future__ import annotations
@@ -129,12 +130,18 @@ def shared(shape: tuple[int, ...], dtype: Any) -> Any:
     return np.frombuffer(mmap.mmap(-1, max(size, 1)), dtype)[: int(np.prod(shape))].reshape(shape)
 
 
-def question(name: str, work: Work, pairs: list[tuple[Contender, Contender, float]]) -> Question:
+def question(
+    name: str,
+    work: Work,
+    pairs: list[tuple[Contender, Contender, float]],
+    twins: list[Contender],
+) -> Question:
+    """Make the question of one work; `twins` run without the compiled kernel."""
     return Question(
         name=name,
         title=f"{work.task}, {work.num_envs} envs",
         unit="env steps/s",
-        contenders=[contender for ours, bare, _ in pairs for contender in (ours, bare)],
+        contenders=[*(contender for pair in pairs for contender in pair[:2]), *twins],
         targets=[Target(ours.name, bare.name, bound) for ours, bare, bound in pairs],
         rounds=7,
         seconds=1.5,
@@ -146,11 +153,17 @@ QUESTIONS = (
         "exchange-cheetah",
         CHEETAH,
         [
-            (OursSync("rlightning_aio sync", CHEETAH), Bare("bare exchange", CHEETAH), 0.85),
+            (OursSync("rlightning_aio sync", CHEETAH), Bare("bare exchange", CHEETAH), 0.95),
             (
                 OursAsync("rlightning_aio async, 16 of 32", CHEETAH, min_results=16),
                 Bare("bare exchange, 16 of 32", CHEETAH, min_workers=1),
                 0.85,
+            ),
+        ],
+        [
+            OursSync("sync, Python twins", CHEETAH, implementation="python"),
+            OursAsync(
+                "async, 16 of 32, Python twins", CHEETAH, min_results=16, implementation="python"
             ),
         ],
     ),
@@ -158,6 +171,7 @@ QUESTIONS = (
         "exchange-pole",
         POLE,
         [(OursSync("rlightning_aio sync", POLE), Bare("bare exchange", POLE), 0.7)],
+        [OursSync("sync, Python twins", POLE, implementation="python")],
     ),
 )
 

@@ -106,7 +106,7 @@ CONTENDERS = {
     "filming": 2,
     "loop_pause": 2,
     "headline": 1,
-    "exchange": 6,
+    "exchange": 9,
 }
 PEERS = {
     "Gymnasium AsyncVectorEnv": "gymnasium",
