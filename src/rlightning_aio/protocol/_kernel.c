@@ -153,30 +153,43 @@ release_all(Py_buffer *views, int count)
             PyBuffer_Release(&views[k]);
 }
 
+/* A new reference, which stays valid if the list is changed meanwhile. */
+static PyObject *
+item_of(PyObject *list, Py_ssize_t position)
+{
+#ifdef Py_GIL_DISABLED
+    return PyList_GetItemRef(list, position);
+#else
+    PyObject *item = PyList_GetItem(list, position);
+    Py_XINCREF(item);
+    return item;
+#endif
+}
+
 static int
 add_to_count(PyObject *list, Py_ssize_t position, Py_ssize_t amount)
 {
-    PyObject *before = PyList_GetItem(list, position); /* Borrowed. */
+    PyObject *before = item_of(list, position);
     if (before == NULL)
         return -1;
     Py_ssize_t count = PyLong_AsSsize_t(before);
+    Py_DECREF(before);
     if (count == -1 && PyErr_Occurred())
         return -1;
     PyObject *after = PyLong_FromSsize_t(count + amount);
     return after == NULL ? -1 : PyList_SetItem(list, position, after);
 }
 
-/* ---- what is imported when it is first needed ---------------------------------------------- */
+/* ---- what the module keeps: three names of NumPy's ------------------------------------------ */
 
-static PyObject *
-numpy(const char *name)
+typedef struct {
+    PyObject *empty, *intp, *ndarray;
+} State;
+
+static inline State *
+state_of(PyObject *module)
 {
-    PyObject *module = PyImport_ImportModule("numpy");
-    if (module == NULL)
-        return NULL;
-    PyObject *found = PyObject_GetAttrString(module, name);
-    Py_DECREF(module);
-    return found;
+    return (State *)PyModule_GetState(module);
 }
 
 /* ---- rings of the trainer -------------------------------------------------------------------- */
@@ -282,7 +295,9 @@ check_submit(const Py_buffer *views, PyObject *in_flight, PyObject *rings)
             PyErr_Format(PyExc_IndexError, "host %lld of %zd", (long long)host, hosts);
             return -1;
         }
-        if (PyList_GetItem(rings, host) == Py_None) {
+        PyObject *ring = item_of(rings, host);
+        Py_XDECREF(ring);
+        if (ring == Py_None) {
             PyErr_Format(PyExc_AssertionError, "host %lld has no ring", (long long)host);
             return -1;
         }
@@ -314,10 +329,9 @@ submit_views(const Py_buffer *views, int64_t now, PyObject *in_flight, PyObject 
             int64_t host = host_of[slots[start]];
             for (end = start + 1; end < count && host_of[slots[end]] == host; end++)
                 ;
-            PyObject *ring = PyList_GetItem(rings, host); /* Borrowed, in a list that we hold. */
+            PyObject *ring = item_of(rings, host);
             if (ring == NULL)
                 goto failed;
-            Py_INCREF(ring);
             int found = turn ? is_asleep(ring) : publish_run(views, start, end, ring);
             if (found > 0)
                 found = PyList_Append(asleep, ring);
@@ -364,12 +378,9 @@ kernel_submit(PyObject *module, PyObject *args)
 
 /* An empty array of `count` positions, with its buffer. */
 static PyObject *
-new_positions(Py_ssize_t count, Py_buffer *view)
+new_positions(const State *state, Py_ssize_t count, Py_buffer *view)
 {
-    PyObject *empty = numpy("empty"), *intp = empty ? numpy("intp") : NULL;
-    PyObject *array = intp ? PyObject_CallFunction(empty, "nO", count, intp) : NULL;
-    Py_XDECREF(empty);
-    Py_XDECREF(intp);
+    PyObject *array = PyObject_CallFunction(state->empty, "nO", count, state->intp);
     if (array != NULL && get_words(array, view, 1, "positions") < 0)
         Py_CLEAR(array);
     return array;
@@ -405,8 +416,8 @@ read_reports(PyObject *ring_object, int64_t before, int64_t count, const Py_buff
 }
 
 static PyObject *
-complete_views(const Py_buffer *counters, const Py_buffer *read, const Py_buffer *entry,
-               PyObject *in_flight, PyObject *rings)
+complete_views(const State *state, const Py_buffer *counters, const Py_buffer *read,
+               const Py_buffer *entry, PyObject *in_flight, PyObject *rings)
 {
     Py_ssize_t hosts = length(counters), step = counters->strides[0] / 8;
     if (length(read) != hosts + 1 || PyList_Size(rings) < hosts ||
@@ -432,19 +443,18 @@ complete_views(const Py_buffer *counters, const Py_buffer *read, const Py_buffer
         Py_INCREF(slots);
         goto done;
     }
-    slots = new_positions((Py_ssize_t)total, &into);
+    slots = new_positions(state, (Py_ssize_t)total, &into);
     if (slots == NULL)
         goto done;
     Py_ssize_t filled = 0, found = 0;
     for (Py_ssize_t host = 0; found >= 0 && host < hosts; host++) {
         if (counts[host] == known[host])
             continue;
-        PyObject *ring = PyList_GetItem(rings, host);
+        PyObject *ring = item_of(rings, host);
         if (ring == NULL) {
             found = -1;
             break;
         }
-        Py_INCREF(ring);
         found = read_reports(ring, known[host], counts[host], entry, words_of(&into) + filled,
                              (Py_ssize_t)total - filled);
         Py_DECREF(ring);
@@ -476,7 +486,6 @@ PyDoc_STRVAR(complete_doc, "See `exchange.complete`.");
 static PyObject *
 kernel_complete(PyObject *module, PyObject *args)
 {
-    (void)module;
     PyObject *from[3], *in_flight, *rings, *fence_object;
     if (!PyArg_ParseTuple(args, "OOOO!O!O:complete", &from[0], &from[1], &from[2], &PyList_Type,
                           &in_flight, &PyList_Type, &rings, &fence_object))
@@ -486,7 +495,7 @@ kernel_complete(PyObject *module, PyObject *args)
     if (get_vector(from[0], &views[0], "qlnL", 8, 0, 1, "counters") == 0 &&
         get_words(from[1], &views[1], 1, "read") == 0 &&
         get_words(from[2], &views[2], 0, "entry") == 0)
-        found = complete_views(&views[0], &views[1], &views[2], in_flight, rings);
+        found = complete_views(state_of(module), &views[0], &views[1], &views[2], in_flight, rings);
     release_all(views, 3);
     return found;
 }
@@ -565,7 +574,6 @@ PyDoc_STRVAR(gather_doc, "See `exchange.gather`.");
 static PyObject *
 kernel_gather(PyObject *module, PyObject *args)
 {
-    (void)module;
     PyObject *columns, *rows;
     if (!PyArg_ParseTuple(args, "OO:gather", &columns, &rows))
         return NULL;
@@ -587,19 +595,15 @@ kernel_gather(PyObject *module, PyObject *args)
         chosen = words_of(&positions);
         count = length(&positions);
     }
-    PyObject *found = NULL, *empty = numpy("empty"), *all = NULL;
-    if (empty != NULL)
-        all = PySequence_List(columns);
-    if (all != NULL)
-        found = PyList_New(0);
+    PyObject *all = PySequence_List(columns), *found = all == NULL ? NULL : PyList_New(0);
     for (Py_ssize_t k = 0; found != NULL && k < PyList_Size(all); k++) {
-        PyObject *copy = gather_column(PyList_GetItem(all, k), empty, chosen, start, count);
+        PyObject *copy = gather_column(PyList_GetItem(all, k), state_of(module)->empty,
+                                       chosen, start, count);
         if (copy == NULL || PyList_Append(found, copy) < 0)
             Py_CLEAR(found);
         Py_XDECREF(copy);
     }
     Py_XDECREF(all);
-    Py_XDECREF(empty);
     if (positions.obj != NULL)
         PyBuffer_Release(&positions);
     return found;
@@ -742,10 +746,9 @@ execute_entry(Loop *loop, int64_t request)
     int64_t index = ((request >> OP_BITS) & SLOT_MASK) - loop->first_slot;
     if (!words_of(&loop->views[LOOP_OWN])[CAREFUL] && (request & OP_MASK) == STEP && index >= 0 &&
         index < PyList_Size(loop->steps)) {
-        PyObject *step = PyList_GetItem(loop->steps, index);
+        PyObject *step = item_of(loop->steps, index);
         if (step == NULL)
             return -1;
-        Py_INCREF(step); /* A frame may replace it meanwhile. */
         int found = step_env(loop, step, request);
         Py_DECREF(step);
         return found;
@@ -1106,18 +1109,17 @@ row_step_new(PyTypeObject *type, PyObject *args, PyObject *kwargs)
                           &f[GET_INPUT], &f[WRITE_OBSERVATION], &f[NUMBER], &f[WRITE_INFO],
                           &f[KEEP], &resets_itself))
         return NULL;
-    if ((f[NDARRAY] = numpy("ndarray")) == NULL)
+    State *state = PyType_GetModuleState(type);
+    if (state == NULL)
         return NULL;
+    f[NDARRAY] = state->ndarray;
     allocfunc allocate = (allocfunc)PyType_GetSlot(type, Py_tp_alloc);
     RowStep *self = (RowStep *)allocate(type, 0); /* Zeroed: no buffer is held yet. */
-    if (self == NULL) {
-        Py_DECREF(f[NDARRAY]);
+    if (self == NULL)
         return NULL;
-    }
     self->resets_itself = resets_itself;
     for (int k = 0; k < FUNCTIONS; k++) {
-        if (k != NDARRAY)
-            Py_INCREF(f[k]);
+        Py_INCREF(f[k]);
         self->functions[k] = f[k];
     }
     if (get_row(self, row) < 0) {
@@ -1154,16 +1156,52 @@ static PyMethodDef methods[] = {
 };
 
 static int
-add_types(PyObject *module)
+initialise(PyObject *module)
 {
+    PyObject *numpy = PyImport_ImportModule("numpy");
+    if (numpy == NULL)
+        return -1;
+    State *state = state_of(module);
+    state->empty = PyObject_GetAttrString(numpy, "empty");
+    state->intp = PyObject_GetAttrString(numpy, "intp");
+    state->ndarray = PyObject_GetAttrString(numpy, "ndarray");
+    Py_DECREF(numpy);
+    if (state->empty == NULL || state->intp == NULL || state->ndarray == NULL)
+        return -1;
     PyObject *type = PyType_FromModuleAndSpec(module, &row_step_spec, NULL);
     int found = type == NULL ? -1 : PyModule_AddObjectRef(module, "row_step", type);
     Py_XDECREF(type);
     return found;
 }
 
+static int
+traverse_state(PyObject *module, visitproc visit, void *arg)
+{
+    State *state = state_of(module);
+    Py_VISIT(state->empty);
+    Py_VISIT(state->intp);
+    Py_VISIT(state->ndarray);
+    return 0;
+}
+
+static int
+clear_state(PyObject *module)
+{
+    State *state = state_of(module);
+    Py_CLEAR(state->empty);
+    Py_CLEAR(state->intp);
+    Py_CLEAR(state->ndarray);
+    return 0;
+}
+
+static void
+free_module(void *module)
+{
+    clear_state(module);
+}
+
 static PyModuleDef_Slot slots[] = {
-    {Py_mod_exec, add_types},
+    {Py_mod_exec, initialise},
 #ifdef Py_mod_gil
     {Py_mod_gil, Py_MOD_GIL_NOT_USED},
 #endif
@@ -1174,9 +1212,12 @@ static struct PyModuleDef definition = {
     PyModuleDef_HEAD_INIT,
     .m_name = "rlightning_aio.protocol._kernel",
     .m_doc = "The compiled kernel; see `exchange`.",
-    .m_size = 0,
+    .m_size = sizeof(State),
     .m_methods = methods,
     .m_slots = slots,
+    .m_traverse = traverse_state,
+    .m_clear = clear_state,
+    .m_free = free_module,
 };
 
 PyMODINIT_FUNC
