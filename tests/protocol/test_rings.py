@@ -25,6 +25,7 @@ from hypothesis.stateful import (
 )
 from protocol.memory_of_rings import both_sides, memory_size, unused
 
+from rlightning_aio.protocol.bell import bell_size
 from rlightning_aio.protocol.entries import (
     NUMBER_SHIFT,
     SLOT_MASK,
@@ -34,6 +35,7 @@ from rlightning_aio.protocol.entries import (
     op_of,
     slot_of,
 )
+from rlightning_aio.protocol.exchange import REQUESTS_SENT
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -198,6 +200,21 @@ def test_a_batch_of_steps_becomes_resets_by_adding_a_mask() -> None:
     steps = np.array([entry(k + 1, k, Operation.STEP) for k in range(3)])
     found = steps + np.array([False, True, False])
     assert [op_of(one) for one in found.tolist()] == [STEP, Operation.RESET, STEP]
+
+
+@pytest.mark.parametrize("count", [-1, 9, 1 << 62, -(1 << 63)])
+def test_an_impossible_count_is_an_error_of_the_other_side(count: int) -> None:
+    """Whoever wrote it: nothing is read, so nothing is read beyond a ring."""
+    memory = memoryview(bytearray(memory_size(3)))
+    bell, trainer, worker = both_sides(3, memory)
+    bell.counters[0] = count
+    with pytest.raises(RuntimeError, match="memory that isn't its own"):
+        trainer.reports()
+    memory[bell_size(1) :].cast("q")[REQUESTS_SENT] = count
+    with pytest.raises(RuntimeError, match="in a ring for 4"):
+        worker.serve(lambda _: True, unused, unused, unused, [], 0)
+    with pytest.raises(RuntimeError, match="in a ring for 4"):
+        worker.requests()
 
 
 def test_the_trainer_sees_the_entry_in_execution_and_its_start() -> None:

@@ -356,7 +356,8 @@ class Requests:
             entries = np.concatenate([entries for _, entries in reports])
         slots = entries >> OP_BITS_ARRAY
         slots &= SLOT_MASK_ARRAY
-        current = self.numbering.entry[slots] == entries
+        # A slot beyond the last one is compared with the last one's entry, which differs.
+        current = self.numbering.entry.take(slots, mode="clip") == entries
         if np.count_nonzero(current) < len(slots):
             slots = slots[current]
             for host_id in {host_id for host_id, _ in reports}:
