@@ -17,13 +17,16 @@ OPENENV := .venv-openenv
 # MetaWorld and LeRobot's tasks need MuJoCo 3, and pygame in place of pygame-ce. The two projects of
 # policy servers pin far more than the code that their tests use, so they come alone.
 ROBOTS := .venv-robots
+# LeRobot needs Python 3.12, for which PyTorch comes with gigabytes of CUDA.
+LEROBOT := .venv-lerobot
+PYTHON_OF_LEROBOT ?= python3.12
 # What other projects' own tests need, and where `make test-peers PEERS=folder` finds their sources.
 PEERS_VENV := .venv-peers
 PEERS ?= peers
 PIP_INSTALL = $(@D)/bin/python -m pip install --quiet --disable-pip-version-check
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-sanitized test-aarch64 test-ray environments test-simulators test-gpu test-peers test-pythons test-site check prose format docs dist bench clean
+.PHONY: help run test test-sanitized test-aarch64 test-ray environments test-simulators test-gpu test-lerobot test-peers test-pythons test-site check prose format docs dist bench clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 24
@@ -62,6 +65,10 @@ test-gpu: $(SIMULATORS)/installed $(ISAAC)/installed ## the tests of simulators 
 	    $$python -c 'import torch; print(torch.__version__, "CUDA", torch.cuda.is_available())'; done
 	$(ISAAC)/bin/python -m pytest -m gpu -rs tests/envs/test_gpu.py
 	$(SIMULATORS)/bin/python -m pytest -m gpu -rs tests/envs/test_gpu.py tests/envs/test_maniskill.py
+
+test-lerobot: export HF_HUB_OFFLINE := 1
+test-lerobot: $(LEROBOT)/installed ## the tests of LeRobot and Minari (6 GB of packages, Python 3.12)
+	$(LEROBOT)/bin/python -m pytest -m simulators -rs tests/vector/test_pages.py tests/vector/test_lerobot.py tests/test_export.py
 
 # Their versions are to be those of constraints.txt; a project without a folder in PEERS is not run.
 test-peers: $(PEERS_VENV)/installed ## Gymnasium's, SB3's and RLightning's own tests: make test-peers PEERS=folder
@@ -124,7 +131,7 @@ bench: $(VENV)/installed-bench $(VENV)/installed-pufferlib $(OPENENV)/installed 
 	$(PY) benchmarks/run_all.py
 
 clean: ## remove the virtual environments and every cache
-	rm -rf $(VENV) $(SIMULATORS) $(ISAAC) $(RLLIB) $(OPENENV) $(ROBOTS) $(PEERS_VENV) build dist site .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) $(SIMULATORS) $(ISAAC) $(RLLIB) $(OPENENV) $(ROBOTS) $(LEROBOT) $(PEERS_VENV) build dist site .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 	find src tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
 
 %/bin/python:
@@ -169,6 +176,13 @@ $(ROBOTS)/installed: pyproject.toml constraints.txt | $(ROBOTS)/bin/python
 	$(PIP_INSTALL) --constraint $(ROBOTS)/constraints.txt --editable '.[metaworld,pusht,aloha]' \
 	    anyio hypothesis imageio-ffmpeg msgpack pytest pytest-asyncio pytest-timeout pytest-xdist websockets
 	$(PIP_INSTALL) --no-deps openpi-client==0.1.2 vla-eval==0.8.0
+	@touch $@
+
+$(LEROBOT)/bin/python: PYTHON := $(PYTHON_OF_LEROBOT)
+$(LEROBOT)/installed: pyproject.toml integrations/lerobot/pyproject.toml | $(LEROBOT)/bin/python
+	$(PIP_INSTALL) --editable . 'lerobot[pusht,diffusion]==0.6.1' 'minari[hdf5]==0.5.4' \
+	    hypothesis pytest pytest-asyncio pytest-timeout pytest-xdist
+	$(PIP_INSTALL) --no-deps ./integrations/lerobot
 	@touch $@
 
 $(RLLIB)/installed: pyproject.toml constraints.txt | $(RLLIB)/bin/python

@@ -1,4 +1,4 @@
-"""Policies for `evaluate`: action chunks, and models with a `predict`.
+"""Policies for `evaluate`: action chunks, and models of Stable-Baselines3 and LeRobot.
 
 Rule: a policy is called with a batch of results and returns one action for each, and whatever it
 keeps between calls belongs to one env's episode and ends with it.
@@ -7,6 +7,7 @@ keeps between calls belongs to one env's episode and ends with it.
 from __future__ import annotations
 
 from rlightning_aio.policies.chunks import ActionChunks
+from rlightning_aio.policies.lerobot import LeRobotPolicy
 from rlightning_aio.policies.predicting import PredictPolicy
 
-__all__ = ["ActionChunks", "PredictPolicy"]
+__all__ = ["ActionChunks", "LeRobotPolicy", "PredictPolicy"]

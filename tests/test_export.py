@@ -1,0 +1,121 @@
+"""Episodes of rollouts, and what Minari and LeRobot read of the datasets they are saved as."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from rlightning_aio import sync
+from rlightning_aio.collecting import Collector
+from rlightning_aio.export import EpisodeJoiner, WholeEpisode, save_lerobot, save_minari
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from rlightning_aio import BatchedData
+
+
+class Counting(gym.Env[Any, Any]):
+    """Shows the number of its episode and of its step; the third step is the last."""
+
+    observation_space = gym.spaces.Dict(
+        agent_pos=gym.spaces.Box(0, 99, (2,), np.float64),
+        pixels=gym.spaces.Box(0, 255, (64, 96, 3), np.uint8),
+    )
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self) -> None:
+        self._episode = self._step = 0
+
+    def _seen(self) -> Any:
+        place = np.array([self._episode, self._step], np.float64)
+        return {"agent_pos": place, "pixels": np.full((64, 96, 3), 40 * self._step, np.uint8)}
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed, options=options)
+        self._episode, self._step = self._episode + 1, 0
+        return self._seen(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self._step += 1
+        return self._seen(), float(self._step), self._step == 3, False, {}
+
+
+def halves(batch: BatchedData) -> dict[str, Any]:
+    return {"action": np.full((len(batch), 1), 0.5, np.float32)}
+
+
+def played(num_steps: int, rollouts: int, *, wait_all: bool = False) -> list[WholeEpisode]:
+    entry = {"name": "env", "make_env": Counting, "num_workers": 2, "placement": "inline"}
+    joiner, found = EpisodeJoiner(), []
+    with sync.build_env_group(entry) as group, group.auto_reset(9):
+        collector = Collector(group, halves, num_transitions=num_steps, wait_all=wait_all)
+        for _ in range(rollouts):
+            found += joiner.add(collector.collect())
+    return found
+
+
+@pytest.mark.parametrize("wait_all", [False, True])
+def test_rollouts_are_joined_to_whole_episodes(wait_all: bool) -> None:
+    """Wherever they were cut: here after two steps of each env."""
+    episodes = played(4, 6, wait_all=wait_all)
+    assert len(episodes) == 8
+    for episode in episodes:
+        number = episode.observation["agent_pos"][0, 0]
+        expected = [[number, step] for step in range(4)]
+        np.testing.assert_array_equal(episode.observation["agent_pos"], expected)
+        np.testing.assert_array_equal(episode.reward, [1, 2, 3])
+        np.testing.assert_array_equal(episode.terminated, [False, False, True])
+        assert not episode.truncated.any()
+        assert episode.action.shape == (3, 1)
+
+
+@pytest.mark.simulators
+@pytest.mark.filterwarnings("ignore::UserWarning:minari")  # Of what it doesn't know of the env.
+def test_minari_reads_the_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the observations, actions, rewards and ends that were played."""
+    minari = pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    episodes = played(12, 1)
+    spaces = Counting.observation_space, Counting.action_space
+    save_minari(episodes, "counting/half-v0", *spaces, jpeg_encoding=False)
+    dataset = minari.load_dataset("counting/half-v0")
+    assert dataset.total_episodes == 4
+    for episode, read in zip(episodes, dataset.iterate_episodes(), strict=True):
+        for name, of in episode.observation.items():
+            np.testing.assert_array_equal(read.observations[name], of)
+        np.testing.assert_array_equal(read.actions, episode.action)
+        np.testing.assert_array_equal(read.rewards, episode.reward)
+        np.testing.assert_array_equal(read.terminations, episode.terminated)
+
+
+@pytest.fixture(scope="module")
+def datasets() -> Any:
+    """LeRobot's module, with what it keeps for as long as the process lives."""
+    module = pytest.importorskip("lerobot.datasets.lerobot_dataset")
+    pytest.importorskip("tqdm").tqdm.get_lock()
+    return module
+
+
+@pytest.mark.simulators
+def test_lerobot_reads_the_episodes(datasets: Any, tmp_path: Path) -> None:
+    """With their numbers as they were played, and pictures as its codec keeps them."""
+    episodes = played(12, 1)
+    save_lerobot(episodes, "counting/half", tmp_path / "half", fps=10, task="count")
+    dataset = datasets.LeRobotDataset("counting/half", root=tmp_path / "half")
+    assert (dataset.num_episodes, len(dataset)) == (4, 12)
+    for position, frame in enumerate(dataset):
+        episode, step = divmod(position, 3)
+        played_by = episodes[episode]
+        seen = played_by.observation["agent_pos"][step]
+        np.testing.assert_array_equal(frame["observation.state"].numpy(), seen.astype(np.float32))
+        assert frame["observation.image"].shape == (3, 64, 96)
+        assert abs(float(frame["observation.image"].mean()) * 255 - 40 * step) < 8
+        assert float(frame["next.reward"]) == step + 1
+        assert bool(frame["next.done"]) == (step == 2)
+        assert frame["task"] == "count"
+    with pytest.raises(ValueError, match="no episode"):
+        save_lerobot([], "counting/none", tmp_path / "none", fps=10)
