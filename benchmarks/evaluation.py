@@ -6,8 +6,8 @@ nothing can keep all workers busy, so few episodes give a lower share.
 
 ``--part metaworld`` (needs `rlightning-aio[metaworld]`): MetaWorld's 50 tasks, with its scripted
 policies, 10 episodes each, in a plain loop, as which each episode must end; by a queue; dealt in
-advance to as many processes, task by task; and by LeRobot's method (an `AsyncVectorEnv` for each
-task, whose finished envs wait for the last).
+advance, task by task, to as many processes as the queue has workers, and as it has envs; and by
+LeRobot's method (an `AsyncVectorEnv` for each task, whose finished envs wait for the last).
 
     python benchmarks/evaluation.py --part busy
     python benchmarks/evaluation.py --part metaworld
@@ -187,7 +187,10 @@ def metaworld(args: argparse.Namespace) -> None:
     ways = {
         "plain loop": lambda: plain_loop(specs),
         "a queue": lambda: queued(specs, args.workers, args.envs_each, args.min_results),
-        "dealt in advance": lambda: dealt(specs, args.workers),
+        **{
+            f"dealt to {count}": partial(dealt, specs, count)
+            for count in (args.workers, args.workers * args.envs_each)
+        },
         "waiting for the last": lambda: waiting_for_the_last(specs),
     }
     seconds: dict[str, float] = {}
@@ -215,12 +218,13 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--part", choices=("busy", "metaworld"), default="busy")
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--envs-each", type=int, default=4)
+    parser.add_argument("--envs-each", type=int, help="8, or 3 of MetaWorld")
     parser.add_argument("--min-results", type=int, help="half of the envs, unless given")
     parser.add_argument("--episodes", type=int, help="300, or 10 of each task")
     parser.add_argument("--tasks", type=int, default=50)
     parser.add_argument("--way", action="append", help="only this way to play MetaWorld's episodes")
     args = parser.parse_args()
+    args.envs_each = args.envs_each or (8 if args.part == "busy" else 3)
     # One half of the envs step while the policy answers the other.
     args.min_results = args.min_results or args.workers * args.envs_each // 2
     args.episodes = args.episodes or (300 if args.part == "busy" else 10)
