@@ -4,7 +4,9 @@
  * all later versions. Another process may write anything into shared memory at any time: each word
  * is read once, and checked before it is used as a position. Every buffer is checked for the size
  * of its elements, its alignment and its length before it is used. No function keeps state of its
- * own; a `RowStep` holds buffers for its whole life, so no other thread can take them away.
+ * own; a `RowStep` holds buffers for its whole life, so no other thread can take them away. No
+ * `Py_RETURN_NONE` and its like: in headers of Python 3.12 they count on immortal objects, and
+ * Python 3.11, which may load the build, ends with "deallocating True or False".
  */
 
 #define PY_SSIZE_T_CLEAN
@@ -801,7 +803,7 @@ serve_views(Loop *loop)
     uint64_t sent = (uint64_t)load(words_of(&views[LOOP_WORDS]) + REQUESTS_SENT);
     uint64_t count = sent - (uint64_t)own[TAKEN];
     if (count == 0)
-        Py_RETURN_FALSE;
+        return Py_NewRef(Py_False);
     if (count > capacity) {
         PyErr_Format(PyExc_RuntimeError, "%lld requests in a ring for %lld", (long long)count,
                      (long long)capacity);
@@ -818,7 +820,7 @@ serve_views(Loop *loop)
     PyMem_Free(requests);
     if (found < 0)
         return NULL;
-    Py_RETURN_TRUE;
+    return Py_NewRef(Py_True);
 }
 
 PyDoc_STRVAR(serve_doc, "See `exchange.serve`.");
@@ -966,7 +968,7 @@ write_info(RowStep *self, PyObject *info)
         return NULL;
     if (!any) {
         *mark = NO_INFO;
-        Py_RETURN_NONE;
+        return Py_NewRef(Py_None);
     }
     PyObject *found = PyObject_CallFunctionObjArgs(self->functions[WRITE_INFO], info, NULL);
     long number = found == NULL ? -1 : PyLong_AsLong(found);
@@ -975,7 +977,7 @@ write_info(RowStep *self, PyObject *info)
         return NULL;
     *mark = (uint8_t)number;
     if (number != PICKLED)
-        Py_RETURN_NONE;
+        return Py_NewRef(Py_None);
     PyObject *kept = Py_BuildValue("{sO}", "info", info);
     PyObject *out_of_band =
         kept == NULL ? NULL : PyObject_CallFunctionObjArgs(self->functions[KEEP], kept, NULL);
