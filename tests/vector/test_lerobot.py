@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,10 @@ def lerobot() -> Any:
     """LeRobot, with what it keeps for as long as the process lives."""
     pytest.importorskip("lerobot")
     pytest.importorskip("tqdm").tqdm.get_lock()
+
+
+def module_of(name: str) -> Any:
+    return import_module(f"lerobot.{name}")
 
 
 def evaluated(folder: Path, *arguments: str) -> Any:
@@ -73,28 +78,21 @@ def test_a_policy_plays_as_in_lerobots_rollout(
 ) -> None:
     """Each episode, though its envs are at different steps. Saved and loaded, without noise."""
     torch = pytest.importorskip("torch")
-    from lerobot.envs.configs import PushtEnv
-    from lerobot.envs.factory import make_env
-    from lerobot.policies.factory import (
-        make_policy,
-        make_policy_config,
-        make_pre_post_processors,
-    )
-    from lerobot.scripts.lerobot_eval import rollout
-
+    envs_of, policies = module_of("envs.factory"), module_of("policies.factory")
     draw = torch.randn
     monkeypatch.setattr(torch, "randn", lambda *shape, **kwargs: draw(*shape, **kwargs) * 0)
     torch.manual_seed(0)
-    seen_as = PushtEnv(episode_length=STEPS, **SIZE)
-    config = make_policy_config(
+    seen_as = module_of("envs.configs").PushtEnv(episode_length=STEPS, **SIZE)
+    config = policies.make_policy_config(
         kind, device="cpu", push_to_hub=False, pretrained_backbone_weights=None, **SMALL[kind]
     )
-    policy = make_policy(config, env_cfg=seen_as).eval()
-    processors = make_pre_post_processors(config)
+    policy = policies.make_policy(config, env_cfg=seen_as).eval()
+    processors = policies.make_pre_post_processors(config)
     for part in (policy, *processors):
         part.save_pretrained(tmp_path)
 
-    (envs,) = make_env(seen_as, n_envs=1)["pusht"].values()
+    (envs,) = envs_of.make_env(seen_as, n_envs=1)["pusht"].values()
+    rollout = module_of("scripts.lerobot_eval").rollout
     alone = [
         rollout(envs, policy, *seen_as.get_env_processors(), *processors, seeds=[seed])
         for seed in range(4)
