@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 from hosts.awaited import (
     BIG,
     BIG_BYTES,
@@ -38,6 +39,7 @@ from rlightning_aio.errors import ConfigError, EnvHung, EnvRaised, StartFailed, 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+EAGER: Any = getattr(asyncio, "eager_task_factory", None)
 SOON = 0.3
 """A limit that is meant to pass. What answers beside it needs a few turns of the loop, which even a
 machine with much else to do takes in that time; and a loop that is kept waiting prolongs it.
@@ -454,11 +456,8 @@ async def test_a_cancelled_start_leaves_nothing_running() -> None:
 class Plain:
     """Gymnasium's methods as coroutine functions, and no base class."""
 
-    def __init__(self) -> None:
-        from gymnasium import spaces
-
-        self.observation_space, self.action_space = spaces.Discrete(100), spaces.Discrete(9)
-        self.total = 0
+    observation_space, action_space = spaces.Discrete(100), spaces.Discrete(9)
+    total: int
 
     async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
         await asyncio.sleep(0)
@@ -480,6 +479,30 @@ async def test_an_object_with_gymnasiums_methods_will_do(place: dict[str, Any]) 
             for _ in range(30):
                 batch, _ = await group.step(batch.respond(action=np.array([1, 5, 8])))
         assert batch.observation.tolist() == [40, 45, 0]
+
+
+class Slotted:
+    """As `Plain`, but without a dict of attributes."""
+
+    __slots__ = ("total",)
+    observation_space, action_space = spaces.Discrete(100), spaces.Discrete(9)
+    reset, step = Plain.reset, Plain.step
+
+
+@pytest.mark.parametrize("kind", [Plain, Slotted])
+async def test_such_an_object_goes_on_where_its_snapshot_was_taken(
+    kind: Any, place: dict[str, Any]
+) -> None:
+    config = rl.EnvConfig(name="p", make_env=kind, num_workers=2, **place)
+    async with rl.build_env_group(config) as group:
+        batch, _ = await group.reset(seed=0)
+        batch, _ = await group.step(batch.respond(action=np.array([1, 2])))
+        snapshot = await group.snapshot()
+        await group.step(batch.respond(action=np.array([5, 5])))
+        batch, _ = await group.restore(snapshot)
+        assert batch.observation.tolist() == [1, 3]
+        batch, _ = await group.step(batch.respond(action=np.array([1, 1])))
+        assert batch.observation.tolist() == [2, 4]
 
 
 def test_a_synchronous_group_has_no_event_loop_for_them() -> None:
@@ -528,3 +551,37 @@ async def test_snapshots_are_taken_and_restored() -> None:
         assert batch.observation.tolist() == before.observation.tolist()
         batch, _ = await group.step(steps(e_0=STEP, e_1=STEP))
         assert batch.observation[:, 2].tolist() == [2, 2]
+
+
+# -- event loops
+
+
+class Ready(Plain):
+    """Waits for nothing."""
+
+    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        self.total = 0
+        return 0, {}
+
+    async def step(self, action: Any) -> Any:
+        self.total += int(action)
+        return self.total, 1.0, False, False, {}
+
+
+@pytest.mark.skipif(not EAGER, reason="tasks can be eager from Python 3.12 on")
+async def test_a_loop_with_eager_tasks_will_do() -> None:
+    """A step that waits for nothing does not end while it is being sent."""
+    loop = asyncio.get_running_loop()
+    fields = {"placement": "loop", "max_concurrency": 2, "step_timeout": LONG}
+    config = rl.EnvConfig.model_validate(
+        {"name": "p", "make_env": Ready, "num_workers": 500, **fields}
+    )
+    loop.set_task_factory(EAGER)
+    try:
+        async with rl.build_env_group(config) as group:
+            batch, _ = await group.reset()
+            for _ in range(3):
+                batch, _ = await group.step(batch.respond(action=np.ones(500, int)))
+            assert (batch.observation == 3).all()
+    finally:
+        loop.set_task_factory(None)

@@ -122,7 +122,11 @@ class _AwaitableEnv(BaseEnv):
         return result_of(self.env_id, await self.env.step(self._preprocess_fn(policy_resp)))
 
     def bare_step(self) -> Any:
-        return self.env.step
+        return self._step_made
+
+    def _step_made(self, action: Any) -> Any:
+        # Looked up anew: a restore replaces an object that has slots only.
+        return self.env.step(action)
 
     def close(self) -> Awaitable[None] | None:
         close = getattr(self.env, "close", None)

@@ -14,6 +14,7 @@ import io
 import pickle
 import sys
 from dataclasses import dataclass
+from inspect import iscoroutinefunction
 from types import FunctionType, ModuleType
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 
@@ -201,11 +202,15 @@ def _kind_of_type(value: Any) -> _Kind | None:
 def _is_layer(value: Any) -> bool:
     if isinstance(value, gym.Env | gym.vector.VectorEnv):
         return True
+    kind = cast("type[Any]", type(value))
+    # An awaitable env without a base class.
+    if iscoroutinefunction(getattr(kind, "step", None)) and hasattr(value, "__dict__"):
+        return True
     # By name, so that PettingZoo isn't imported. `EzPickle` pickles constructor arguments only.
     return not isinstance(value, type) and any(
         base.__name__ == "EzPickle"
         or (base.__name__ in ("AECEnv", "ParallelEnv") and base.__module__.startswith("pettingzoo"))
-        for base in type(value).__mro__
+        for base in kind.__mro__
     )
 
 

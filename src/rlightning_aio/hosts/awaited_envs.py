@@ -26,6 +26,7 @@ from rlightning_aio.hosts.event_loop import (
     cancel,
     cancel_leftovers,
     log,
+    new_task,
     place_of,
     tasks_of,
     watched,
@@ -84,7 +85,7 @@ class _Env:
         """Begin to close the env, unless that has begun."""
         if self.closing is None:
             loop = asyncio.get_running_loop()
-            self.closing = loop.create_task(_close(self.runner), context=self.context)
+            self.closing = new_task(_close(self.runner), loop, self.context)
         return self.closing
 
 
@@ -243,7 +244,7 @@ class AwaitedEnvs:
             env.entry = entry
             op = op_of(entry)
             execution = self._execute(env, env.runner, entry, op, arguments)
-            env.task = self._loop.create_task(execution, context=env.context)
+            env.task = new_task(execution, self._loop, env.context)
             if op in self._limits:
                 self._limits[op].begin(env, self._loop)
 
@@ -317,7 +318,7 @@ class AwaitedEnvs:
         message = f"{what} while it waited in {place}" if place else what
         # In no env's context, or the end of that env would cancel it: the timer may have been set
         # when a request of another env ended.
-        task = self._loop.create_task(self._replace(env, message, doing), context=Context())
+        task = new_task(self._replace(env, message, doing), self._loop, Context())
         self._replacing.add(task)
         task.add_done_callback(self._replacing.discard)
 
@@ -336,7 +337,7 @@ class AwaitedEnvs:
                 continue
             env.runner, env.closing = runner, None
             answer = runner.answer(Operation.RESET, seed)
-            env.task = self._loop.create_task(answer, context=env.context)
+            env.task = new_task(answer, self._loop, env.context)
             limit = self._limits.get(Operation.RESET)
             if not await _ends(env.task, None if limit is None else limit.seconds):
                 kind, message = EnvHung, f"env {env.name!r} took too long for the reset after that"

@@ -26,6 +26,7 @@ __all__ = [
     "cancel",
     "cancel_leftovers",
     "log",
+    "new_task",
     "place_of",
     "tasks_of",
     "watched",
@@ -74,6 +75,15 @@ def watched(
             error = thrown
 
 
+def new_task(
+    coroutine: Coroutine[Any, Any, Any],
+    loop: asyncio.AbstractEventLoop,
+    context: Context | None = None,
+) -> asyncio.Task[Any]:
+    """Make a task that begins in a later turn of the loop, also where the loop's are eager."""
+    return asyncio.Task(coroutine, loop=loop, context=context)
+
+
 def place_of(answering: Any) -> str:
     """Name the calls in which the env's code waits, from the outermost in."""
     frames: list[Any] = []
@@ -115,7 +125,10 @@ class TimeLimit:
 
     def begin(self, env: _Executing, loop: asyncio.AbstractEventLoop) -> None:
         """`env` begins to execute `env.entry`, which is another one as soon as that has ended."""
-        self._running.append((time.monotonic() + self.seconds, env, env.entry))
+        running = self._running
+        while running and running[0][1].entry != running[0][2]:
+            running.popleft()  # It has ended; kept until its time is up, thousands would pile up.
+        running.append((time.monotonic() + self.seconds, env, env.entry))
         if not self._is_set:
             self._is_set = True
             self._timer = loop.call_later(self.seconds, self._look, loop)

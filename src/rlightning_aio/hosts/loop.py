@@ -16,6 +16,7 @@ import numpy as np
 from rlightning_aio.hosts.arena import map_shared
 from rlightning_aio.hosts.awaited_envs import AwaitedEnvs
 from rlightning_aio.hosts.copied import copied
+from rlightning_aio.hosts.event_loop import new_task
 from rlightning_aio.hosts.messages import (
     Attached,
     Built,
@@ -69,7 +70,7 @@ class LoopHost:
         self._run(self._build())
 
     def _run(self, coroutine: Coroutine[Any, Any, None]) -> None:
-        self._task = asyncio.get_running_loop().create_task(coroutine)
+        self._task = new_task(coroutine, asyncio.get_running_loop())
 
     async def _build(self) -> None:
         started = await self._envs.build()
