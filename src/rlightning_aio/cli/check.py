@@ -39,6 +39,7 @@ class _Finding:
 
     Attributes:
         skipped: the reason why it was not started.
+        steps: how many steps it made; none if only a policy can choose its actions.
         offers: an OpenEnv server's own description and schemas.
     """
 
@@ -51,6 +52,7 @@ class _Finding:
     action_space: str | None = None
     max_episode_steps: int | None = None
     skipped: str | None = None
+    steps: int = 0
     offers: dict[str, Any] | None = None
 
 
@@ -124,10 +126,22 @@ async def _try(config: EnvConfig, found: _Finding) -> None:
         found.max_episode_steps = config.max_episode_steps or meta.max_episode_steps
         respond = responder(group, Roster(group, [meta]), None, 0)
         batch, _ = await group.reset(seed=0)
+        if _has_no_samples(meta.action_space):
+            return
         with resetting(group, one):
             for _ in range(_STEPS):
                 await respond_to_all(group, respond, batch)
                 batch, _ = await group.collect_async()
+        found.steps = _STEPS
+
+
+def _has_no_samples(space: Any) -> bool:
+    """Return True for actions that are plain Python values."""
+    try:
+        space.sample()
+    except NotImplementedError:
+        return True
+    return False
 
 
 def _lines(found: _Finding) -> list[str]:
@@ -144,5 +158,7 @@ def _lines(found: _Finding) -> list[str]:
         f"  observation  {found.observation_space}",
         f"  action       {found.action_space}",
         f"  step limit   {limit or 'none'}",
-        f"  reset and stepped {_STEPS} times",
+        f"  reset and stepped {found.steps} times"
+        if found.steps
+        else "  reset; not stepped: only a policy can choose its actions",
     ]

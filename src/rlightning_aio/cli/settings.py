@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 from rlightning_aio.cli.terminal import counted
 from rlightning_aio.config import moved
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.registry import ENVS
+from rlightning_aio.registry import ENVS, PLACEMENTS
 from rlightning_aio.sharing import num_batches, num_cores
 
 if TYPE_CHECKING:
@@ -49,9 +49,14 @@ class Setting:
         return self.configs[0].placement
 
     @property
+    def has_workers(self) -> bool:
+        """Return True if some of the envs are in worker processes."""
+        return PLACEMENTS[self.placement].spreads
+
+    @property
     def workers(self) -> int:
         """Return the total number of worker processes."""
-        if self.placement == "inline":
+        if not self.has_workers:
             return 0
         return sum(_num_shares(c) - (c.placement == "split") for c in self.configs)
 
@@ -61,9 +66,7 @@ class Setting:
             "placement": self.placement,
             "workers": self.workers,
             "envs_per_process": (
-                {}
-                if self.placement == "inline"
-                else {c.name: c.envs_per_process for c in self.configs}
+                {c.name: c.envs_per_process for c in self.configs} if self.has_workers else {}
             ),
             "num_workers": {c.name: c.num_workers for c in self.configs},
             "num_envs": {c.name: c.num_envs for c in self.configs},
@@ -80,7 +83,8 @@ def possible_settings(configs: Sequence[EnvConfig]) -> list[Setting]:
 
     The envs as configured: in several numbers of workers, in this process, in both. Then, for
     simulators that step several simulations in one env (``num_envs``), the same simulations in one
-    env for each core, in workers or in both, and all in one env in this process.
+    env for each core, in workers or in both, and all in one env in this process. Awaitable envs
+    of the event loop: there and, without `max_concurrency`, in several numbers of workers.
 
     Raises:
         ConfigError: an entry's placement can't be chosen.
@@ -99,6 +103,9 @@ def possible_settings(configs: Sequence[EnvConfig]) -> list[Setting]:
 
 
 def _candidates(configs: Sequence[EnvConfig], cores: int) -> Iterator[Setting]:
+    if any(config.placement == "loop" for config in configs):
+        yield from _awaiting(configs, cores)
+        return
     here = not any(config.interpreter or config.env_vars for config in configs)
     for count in _worker_counts(configs, cores):
         yield _in_workers(configs, count)
@@ -114,6 +121,16 @@ def _candidates(configs: Sequence[EnvConfig], cores: int) -> Iterator[Setting]:
             yield _inline(batched)
         elif here:
             yield from _split(batched, cores)
+
+
+def _awaiting(configs: Sequence[EnvConfig], cores: int) -> Iterator[Setting]:
+    if all(config.placement == "loop" for config in configs):
+        yield Setting(tuple(configs), "loop" + _sizes(configs))
+    if any(config.max_concurrency for config in configs):
+        return  # It protects something, and workers have no such limit.
+    placed = [moved(config, "process") for config in configs]
+    for count in _worker_counts(placed, cores):
+        yield _in_workers(placed, count)
 
 
 def _worker_counts(configs: Sequence[EnvConfig], cores: int) -> list[int]:

@@ -226,7 +226,7 @@ def _as_yaml(config: Path, best: Contender, *, interrupted: bool = False) -> str
                 mode="json", exclude_defaults=True, include=set(entry.model_fields_set)
             ),
             "placement": entry.placement,
-            **({} if entry.placement == "inline" else {"envs_per_process": entry.envs_per_process}),
+            **({"envs_per_process": entry.envs_per_process} if setting.has_workers else {}),
             **({"min_results": least} if least else {}),
         }
         for entry, least in zip(setting.configs, wanted, strict=True)
