@@ -35,6 +35,7 @@ from patience import HANG as LONG
 import rlightning_aio as rl
 import rlightning_aio.sync
 from rlightning_aio.errors import ConfigError, EnvHung, EnvRaised, StartFailed, WorkerDied
+from rlightning_aio.evaluation import EpisodeSpec, evaluate
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -261,6 +262,24 @@ async def test_an_env_that_is_not_rebuilt_raises_from_then_on(
             await group.step(steps(e_1=STEP))
         batch, _ = await group.step(steps(e_0=STEP))
         assert batch.observation[0, 2] == 2
+
+
+async def test_an_env_that_is_not_rebuilt_gets_no_more_episodes_of_a_queue() -> None:
+    """It would lose each of them at once; meanwhile the other plays its first."""
+
+    def policy(batch: rl.BatchedData) -> Any:
+        is_given_up = bool(group.get_workers()[0]["given_up"])
+        others = END if is_given_up else STEP
+        return [HANG if env_id == "e-1" else others for env_id in batch.ids()]
+
+    config = entry(num_workers=2, step_timeout=SOON, on_worker_death="raise")
+    async with rl.build_env_group(config) as group:
+        with group.auto_reset(math.inf):
+            queue = [EpisodeSpec("-", seed) for seed in range(12)]
+            found = await evaluate(group, policy, queue)
+        assert [record.cause for record in found.records] == [None] * 12
+        assert sum(len(record.lost) for record in found.records) == 1
+        assert group.get_workers()[0]["given_up"] == ["e-1"]
 
 
 async def test_restarts_in_a_row_are_counted_until_a_step_succeeds() -> None:

@@ -295,8 +295,7 @@ class QueuePlay:
         if isinstance(fault, WorkerDied):
             struck.update(fault.env_ids)
             for worker in self._group.get_workers():
-                if worker["state"] == "failed":
-                    self._gone.update(worker["env_ids"])
+                self._gone.update(worker["given_up"])
         self._pending -= struck
         # A ready result of an env that is gone can still be collected.
         for env_id in (struck | self._gone) - self._pending:

@@ -369,10 +369,12 @@ class Facade:
 
         Never waits; other tasks may be waiting for results or for `init`.
 
-        Keys: ``entry``; ``env_ids`` (for an env_server, of the connected clients); ``pid`` (of a
-        process on this machine, else None); ``state`` (``"new"`` before `init`, ``"starting"``,
-        ``"up"``, ``"down"`` before a replacement, ``"failed"``, ``"closed"``); ``owed`` (ids of
-        envs with a request in flight, the oldest first, which is the order of execution);
+        Keys: ``entry``; ``env_ids`` (for an env_server, of the connected clients); ``given_up``
+        (ids of envs that no request reaches any more: all of a failed worker, or an awaitable one
+        that is not rebuilt); ``pid`` (of a process on this machine, else None); ``state``
+        (``"new"`` before `init`, ``"starting"``, ``"up"``, ``"down"`` before a replacement,
+        ``"failed"``, ``"closed"``); ``owed`` (ids of envs with a request in flight, the oldest
+        first, which is the order of execution);
         ``owed_seconds`` (the age of the oldest); ``restarts`` (the number of replacements).
 
         Raises:

@@ -56,6 +56,7 @@ class HostRecord:
         hung_slot: the env that hung, while its worker is being killed.
         idle: its progress when it was last seen idle, and idle_since the time (`HangDetector`).
         rebuild_error: the error of its replacement while rebuilding the envs.
+        lost_slots: of envs that are not rebuilt though their host goes on.
         failure: makes the error for requests to a host that was given up.
         killable: the host, if it can be killed.
         is_local: its envs use this machine's cores; is_hardware: they move in the real world.
@@ -83,6 +84,7 @@ class HostRecord:
     idle: tuple[int, ...] = ()
     idle_since: float = 0.0
     rebuild_error: ErrorText | None = None
+    lost_slots: set[int] = field(default_factory=set[int])
     failure: Callable[[], WorkerDied] | None = None
     killable: Killable | None = field(init=False)
     timed: bool = field(init=False)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from rlightning_aio.errors import EnvAway, EnvRaised
+from rlightning_aio.errors import EnvAway, EnvRaised, WorkerDied
 from rlightning_aio.group.request_states import COLLECTOR
 from rlightning_aio.group.supervisor import GivenUp, Replaced
 from rlightning_aio.hosts.messages import (
@@ -143,8 +143,11 @@ class Intake:
 
     def _on_failed(self, completion: Failed) -> None:
         slot = self._requests.end(completion.host_id, completion.entry)
-        if slot is not None:
-            self._fail(self._requests.alone(slot), lambda _: completion.fault)
+        if slot is None:
+            return
+        if isinstance(completion.fault, WorkerDied):
+            self._supervisor.note_lost_env(completion.host_id, slot)
+        self._fail(self._requests.alone(slot), lambda _: completion.fault)
 
     def _on_withdrawn(self, completion: Withdrawn) -> None:
         slot = self._requests.end(completion.host_id, completion.entry)

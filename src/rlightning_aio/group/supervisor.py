@@ -409,6 +409,7 @@ class Supervisor:
             self._on_refused(record, _refusal(record, error), now)
             return
         record.restarts += 1
+        record.lost_slots.clear()
         record.refusals, record.refused_since = 0, None
         assert record.order is not None
         checkpoints = self._continuity.checkpoints(record.slots)
@@ -465,6 +466,10 @@ class Supervisor:
         """Record that a host has rebuilt one of its envs."""
         self._records[host_id].restarts += 1
         self._note_fate("hung", host_id, cause, slot)
+
+    def note_lost_env(self, host_id: int, slot: int) -> None:
+        """Record that a host will not rebuild one of its envs."""
+        self._records[host_id].lost_slots.add(slot)
 
     def _note_fate(self, fate: Fate, host_id: int, cause: str = "", slot: int = -1) -> None:
         if self._observed.observer is not None:

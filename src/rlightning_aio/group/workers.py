@@ -57,9 +57,11 @@ class Workers:
         slots = np.array(record.slots, np.intp)
         busy = requests.owed(slots)
         busy = busy[np.argsort(requests.sent_ns[busy], kind="stable")]
+        lost = record.slots if record.stage is Stage.FAILED else sorted(record.lost_slots)
         return {
             "entry": record.config.name,
             "env_ids": [env_id for slot in slots if (env_id := env_ids[slot])],
+            "given_up": [env_id for slot in lost if (env_id := env_ids[slot])],
             "pid": getattr(record.host, "pid", None),
             "state": _STATES.get(record.stage, "starting"),
             "owed": [env_ids[slot] for slot in busy],
