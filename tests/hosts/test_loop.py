@@ -7,7 +7,7 @@ import logging
 import math
 import time
 import warnings
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import pytest
@@ -187,6 +187,30 @@ async def test_an_episode_that_is_cancelled_leaves_its_env_idle() -> None:
             await running
         batch, _ = await group.reset()
         assert batch.observation[:, 1].tolist() == [2, 1]
+
+
+async def test_an_episode_that_is_cancelled_in_its_reset_leaves_its_env_idle() -> None:
+    """Nothing leaves a context that was not entered yet."""
+
+    class Opening(Plain):
+        at_gate: ClassVar = asyncio.Event()
+        gate: ClassVar = asyncio.Event()
+
+        async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+            self.at_gate.set()
+            await self.gate.wait()
+            return await super().reset(seed=seed, options=options)
+
+    config = rl.EnvConfig(name="p", make_env=Opening, placement="loop")
+    async with rl.build_env_group(config) as group:
+        entering = asyncio.ensure_future(group.episode("p-0", seed=1).__aenter__())
+        await Opening.at_gate.wait()
+        entering.cancel()
+        asyncio.get_running_loop().call_soon(Opening.gate.set)
+        with pytest.raises(asyncio.CancelledError):
+            await entering
+        batch, _ = await group.reset(seed=2)
+        assert batch.observation.tolist() == [2]
 
 
 # -- envs that take too long

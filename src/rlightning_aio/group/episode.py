@@ -36,7 +36,11 @@ class EnvEpisode:
         self._running: asyncio.Task[EnvRet | MultiAgentEnvRet] | None = None
 
     async def __aenter__(self) -> Self:
-        await self._wait_for(self.env.reset(self._seed, self._options))
+        try:
+            await self._wait_for(self.env.reset(self._seed, self._options))
+        except BaseException:
+            await self.__aexit__()  # Nobody else calls it for a context that was not entered.
+            raise
         return self
 
     async def __aexit__(self, *exc: object) -> None:
