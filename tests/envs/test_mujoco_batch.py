@@ -418,13 +418,19 @@ def test_one_of_them_is_rendered() -> None:
 
 
 @pytest.mark.parametrize(
-    ("placement", "num_workers", "num_threads"),
-    [("inline", 1, 4), ("inline", 2, 2), ("inline", 8, 1), ("process", 2, 2)],
+    ("placement", "num_workers", "brief", "num_threads"),
+    [
+        ("inline", 1, False, 4),
+        ("inline", 2, False, 2),
+        ("inline", 8, False, 1),
+        ("inline", 2, True, 4),
+        ("process", 2, True, 2),
+    ],
 )
 def test_batches_of_one_entry_share_the_cores(
-    placement: str, num_workers: int, num_threads: int, monkeypatch: pytest.MonkeyPatch
+    placement: str, num_workers: int, brief: bool, num_threads: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They compute at the same time, so together they have a thread for each core."""
+    """They compute at the same time, unless their steps are brief: then they take turns."""
     asked: list[int] = []
 
     class Counted(Simulations):
@@ -434,6 +440,7 @@ def test_batches_of_one_entry_share_the_cores(
 
     monkeypatch.setattr("rlightning_aio.envs.mujoco_batch.Simulations", Counted)
     monkeypatch.setattr("rlightning_aio.envs.gymnasium.num_cores", lambda: 4)
+    monkeypatch.setattr("rlightning_aio.envs.mujoco_batch.is_brief", lambda *_: brief)
     config = EnvConfig.model_validate(
         {
             "name": "x", "backend": "mujoco", "task": "Hopper-v5", "num_envs": 2,

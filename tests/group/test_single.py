@@ -1,4 +1,4 @@
-"""A group of one inline env executes its steps at once, and otherwise behaves as any group."""
+"""A group of inline envs executes its steps at once, and otherwise behaves as any group."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from rlightning_aio.group.conditions import FIRST_RESULTS, UNLIKE_ENVS
 from rlightning_aio.group.core import Core
 
 PROBE = HALVED | {"backend": "probe"}
+TWO = {"num_workers": 2}
 CARTPOLE = HALVED | {"backend": "gymnasium", "task": "CartPole-v1"}
 
 
@@ -43,7 +44,8 @@ class Used:
         self.group = rlightning_aio.sync.build_env_group(entry)
         self.group.init()
         conditions = self.group._core._conditions
-        assert steps_at_once(self.group)
+        steps = self.group._core.steps
+        assert (steps._alone or steps._here) is not None
         self.group._core._first_observations.left.clear()
         conditions.note(FIRST_RESULTS, False)
         if not ordinary:
@@ -60,38 +62,43 @@ class Used:
 
     def _results(self, results: tuple[BatchedData, Any]) -> Any:
         self.batch, flags = results
-        (value,) = self.batch.values()
-        outcome = value.model_dump(exclude={"ts_env_sent_ns"})
+        values = self.batch.values()
+        outcome = [(one.model_dump(exclude={"ts_env_sent_ns"}), one._extra) for one in values]
         batch = self.batch
         columns = (batch.observation, batch.reward, batch.terminated, batch.done, batch.infos)
         rows = (batch.is_reset, batch.limit_reached, batch.restarted, batch.index)
         sent = {name: batch.sent[name] for name in batch.sent}
-        return repr((outcome, value._extra, columns, rows, sent, flags))
+        return repr((outcome, columns, rows, sent, flags))
+
+    def _action(self, number: int) -> Any:
+        return np.array([action_of(self.backend, number)] * len(self.batch))
 
     def step(self, number: int) -> Any:
-        action = np.array([action_of(self.backend, number)])
+        action = self._action(number)
         return self._results(self.group.step(self.batch.respond(action=action)))
 
     def step_with_extras(self, number: int) -> Any:
-        action = np.array([action_of(self.backend, number)])
-        return self._results(self.group.step(self.batch.respond(action=action, value=[number])))
+        response = self.batch.respond(action=self._action(number), value=[number] * len(self.batch))
+        return self._results(self.group.step(response))
 
     def step_by_hand(self, number: int) -> Any:
         response = PolicyResponse("one-0", action_of(self.backend, number), log_prob=0.5)
         return self._results(self.group.step(BatchedData(["one-0"], [response])))
 
     def send(self, number: int) -> Any:
-        action = np.array([action_of(self.backend, number)])
+        action = self._action(number)
         self.group.step_async(self.batch.respond(action=action))
 
     def collect(self, number: int) -> Any:
-        return self._results(self.group.collect_async())
+        return self._results(self.group.collect_async(max_results=1 + number % 2))
 
     def reset(self, number: int) -> Any:
         return self._results(self.group.reset(seed=number, options={"n": 1} if number else None))
 
     def misfit(self, number: int) -> Any:
-        return self._results(self.group.step(self.batch.respond(action=np.zeros((1, 3, 3)))))
+        return self._results(
+            self.group.step(self.batch.respond(action=np.zeros((len(self.batch), 3, 3))))
+        )
 
     def of_nobody(self, number: int) -> Any:
         return len(self.group.step(BatchedData())[0])
@@ -118,7 +125,11 @@ NUMBERS = st.sampled_from([number for number in range(10) if number not in INTER
 DEEDS = [name for name in vars(Used) if name[0] != "_" and name not in ("outcome", "close")]
 
 
-@pytest.mark.parametrize("entry", [HALVED, PROBE, CARTPOLE], ids=lambda entry: entry["backend"])
+@pytest.mark.parametrize(
+    "entry",
+    [HALVED, PROBE, CARTPOLE, HALVED | TWO, CARTPOLE | TWO],
+    ids=lambda entry: f"{entry.get('num_workers', 1)} {entry['backend']}",
+)
 @given(deeds=st.lists(st.tuples(st.sampled_from(["step", *DEEDS]), NUMBERS), max_size=25))
 def test_nothing_but_the_time_is_different(
     entry: dict[str, Any], deeds: list[tuple[str, int]]
@@ -145,7 +156,7 @@ def test_it_is_used_for_one_inline_env_alone() -> None:
     """Not for two envs, nor for an env in a worker."""
     for fields, at_once in (
         ({}, True),
-        ({"num_workers": 2}, False),
+        (TWO, False),
         ({"placement": "process"}, False),
     ):
         with rlightning_aio.sync.build_env_group(HALVED | fields) as group:

@@ -94,6 +94,8 @@ class BaseEnv(abc.ABC):
             ``options["task"]``, and switches to it until the next such reset.
         fresh_results: `bare_step` returns new arrays and dicts, and keeps no reference to them.
             With inline placement, observation and info are then passed on without a copy.
+        steps_briefly: a step takes so little time that it isn't worth a switch of threads. An env
+            with `bare_step_async` is then stepped when its result is collected.
     """
 
     transforms_actions: ClassVar[bool] = False
@@ -104,6 +106,7 @@ class BaseEnv(abc.ABC):
     autoreset: Autoreset = "disabled"
     switches_task: bool = False
     fresh_results: bool = False
+    steps_briefly: bool = False
 
     def __init__(
         self,

@@ -112,6 +112,10 @@ class GymnasiumEnv(BaseEnv):
         releases_gil = getattr(self.env.unwrapped, "releases_gil", False)
         return Background(step) if step is not None and releases_gil else None
 
+    @property
+    def steps_briefly(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return getattr(self.env, "steps_briefly", False)
+
     def on_stepped(self, notify: Callable[[], None]) -> bool:
         if self._background is None:
             return False
@@ -169,10 +173,7 @@ class MujocoEnv(GymnasiumEnv):
     def _make(self) -> Any:
         num_threads = self.config.env_kwargs.pop("num_threads", None)
         randomize = self.config.env_kwargs.pop("randomize", None)
-        if num_threads is None:
-            # The envs of an entry compute at the same time, in this process and in workers.
-            num_threads = max(1, num_cores() // self.config.num_workers)
-        elif type(num_threads) is not int or num_threads < 1:
+        if num_threads is not None and (type(num_threads) is not int or num_threads < 1):
             raise ConfigError(
                 f"env {self.env_id!r}: env_kwargs.num_threads is {num_threads!r}, but must be an "
                 "int above 0"
@@ -186,9 +187,14 @@ class MujocoEnv(GymnasiumEnv):
             if self.config.num_envs == 1:
                 return super()._make()
             # Not at the top: few workers need it.
-            from rlightning_aio.envs.mujoco_batch import MujocoBatch
+            from rlightning_aio.envs.mujoco_batch import MujocoBatch, is_brief
 
             one = self._make_one()
+            if num_threads is None:
+                num_threads, config = num_cores(), self.config
+                if config.placement != "inline" or not is_brief(one, config.num_envs, num_threads):
+                    # The envs of an entry compute at the same time, here and in workers.
+                    num_threads = max(1, num_threads // config.num_workers)
             try:
                 return MujocoBatch(
                     one, self.config.num_envs, num_threads=num_threads, randomize=randomize

@@ -8,6 +8,7 @@ all simulations (`mujoco_threads`), and rewards and observations are computed as
 
 from __future__ import annotations
 
+import time
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, cast
 
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-__all__ = ["FAILED", "MujocoBatch"]
+__all__ = ["FAILED", "MujocoBatch", "is_brief"]
 
 # Its stubs are incomplete.
 mujoco: Any = import_module("mujoco")
@@ -42,8 +43,19 @@ _FIXED: Final = (*_OWN, "data", "model", "np_random", "_elapsed_steps")
 """Attributes that can't be set from outside."""
 _NEXT_STEP: Final = AutoresetMode.NEXT_STEP
 _SAME_STEP: Final = AutoresetMode.SAME_STEP
+_BRIEF_NS: Final = 500_000
 _STATE: Final = ("_num_steps", "_before", "_substeps", "_observations", "_ended")
 """Attributes that are part of the state, in addition to the simulations."""
+
+
+def is_brief(env: gym.Env[Any, Any], num_envs: int, num_threads: int) -> bool:
+    """Return True if a step of so many simulations seems to be too short to switch threads for."""
+    inner: Any = env.unwrapped
+    data = mujoco.MjData(inner.model)
+    mujoco.mj_step(inner.model, data, inner.frame_skip)  # The first one is slower.
+    began = time.monotonic_ns()
+    mujoco.mj_step(inner.model, data, inner.frame_skip)
+    return (time.monotonic_ns() - began) * num_envs < _BRIEF_NS * num_threads
 
 
 class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
@@ -65,6 +77,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         takes_masks: True, as it can reset only some simulations.
         fresh_results: see `BaseEnv`.
         releases_gil: True, as steps may be computed in a thread.
+        steps_briefly: see `BaseEnv`.
 
     Raises:
         NotImplementedError: the task isn't one of Gymnasium's v5 tasks, or is wrapped; or MuJoCo is
@@ -192,6 +205,10 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         self._substeps[k] = 0
 
     # -- steps --------------------------------------------------------------------------
+
+    @property
+    def steps_briefly(self) -> bool:
+        return self._simulations.busy_ns < _BRIEF_NS
 
     def step(
         self, actions: NDArray[Any]

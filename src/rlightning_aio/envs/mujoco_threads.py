@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import time
 import weakref
 from ctypes import POINTER, byref, c_bool, c_char_p, c_int, c_void_p
 from functools import cache
@@ -97,6 +98,7 @@ class Simulations:
 
     Attributes:
         rows: states of the simulations, ``[count, ...]`` float64.
+        busy_ns: duration of the last call of `step`; 0 before the first.
 
     Raises:
         NotImplementedError: MuJoCo is older than 3.17.
@@ -138,6 +140,7 @@ class Simulations:
         self._status = _array(library.mjb_status(self._batch), np.int32, (count,))
         self._template = mujoco.MjData(model)
         self._expanded: dict[str, NDArray[Any]] = {}
+        self.busy_ns = 0
 
     def __getattr__(self, name: str) -> NDArray[Any]:
         if name.startswith("_"):
@@ -216,7 +219,7 @@ class Simulations:
             Reasons of failures by simulation. After an error of MuJoCo the simulation is in its
             previous state; if it became unstable, MuJoCo resets it to the defaults of the model.
         """
-        library = self._library
+        library, began = self._library, time.monotonic_ns()
         chosen, count = _chosen(ids)
         num_failed = library.mjb_step(self._batch, chosen, count, num_steps, 0)
         failures = self._failures() if num_failed or np.count_nonzero(self._warnings) else {}
@@ -225,6 +228,7 @@ class Simulations:
             library.mjb_apply(self._batch, chosen, count, forces, None, False)
             # Computes nothing, but copies the outputs.
             library.mjb_forward(self._batch, chosen, count, 0)
+        self.busy_ns = time.monotonic_ns() - began
         return failures
 
     def _failures(self) -> dict[int, str]:

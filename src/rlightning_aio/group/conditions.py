@@ -24,7 +24,7 @@ __all__ = [
 CLOSED: Final = 1 << 0
 """The group is not open: before `init`, and after `close`."""
 UNLIKE_ENVS: Final = 1 << 1
-"""The envs are not all in workers of this machine (or alone in this process), have different
+"""The envs are not all in workers of this machine (or in one host in this process), have different
 layouts, or need more than what fits in a row."""
 DEATH: Final = 1 << 2
 """A worker was replaced and has not shown that it works, or was given up."""

@@ -23,6 +23,7 @@ from rlightning_aio.group.supervisor import LOOK_SECONDS
 from rlightning_aio.group.wait import ANY, TURN, Procedure
 from rlightning_aio.hosts.messages import ErrorText
 from rlightning_aio.protocol import exchange, kernel
+from rlightning_aio.protocol.entries import Operation, slot_of
 from rlightning_aio.protocol.slab import TRUNCATED
 
 if TYPE_CHECKING:
@@ -40,16 +41,31 @@ if TYPE_CHECKING:
 
 __all__ = ["Steps", "StepsAtOnce"]
 
+_STEP: Final = int(Operation.STEP)
 _IDLE: Final = 0
 """The state of `Requests` as its array holds it."""
 
 
 @runtime_checkable
 class StepsAtOnce(Protocol):
-    """A host that can step its first env without a request."""
+    """A host that executes steps in the calls of the group."""
 
     def step_now(self) -> OutOfBand | None:
-        """Step with the action in the row; what of the result is out of band."""
+        """Step the first env, without a request, with the action in the row; what of the result is
+        out of band.
+        """
+        ...
+
+    def submit(self, entries: NDArray[np.int64]) -> None:
+        """Accept steps and resets; see `hosts.base.Host`."""
+        ...
+
+    def step_next(self) -> tuple[int, OutOfBand | None] | None:
+        """Execute the next step or reset: its entry, and what of the result is out of band.
+
+        None if the next request is none of these or there is none, or after an error, which is in
+        the queue of completions.
+        """
         ...
 
 
@@ -130,18 +146,23 @@ class Steps:
         self._waiting = waiting
         self._shares_thread = shares_thread
         self._fence = exchange.new_fence()
+        # The host of the only env of a synchronous group, and of all envs of another group.
         self._alone: StepsAtOnce | None = None
+        self._here: StepsAtOnce | None = None
 
     def begin(self) -> None:
         """All envs have their rows: find out whether their steps can be ordinary."""
-        envs, slabs, host = self._envs, self._layout.slabs, self._supervisor.hosts[0]
-        if not self._shares_thread and len(envs) == 1 and isinstance(host, StepsAtOnce):
-            self._alone = host
+        envs, slabs, hosts = self._envs, self._layout.slabs, self._supervisor.hosts
+        if len(hosts) == 1 and isinstance(hosts[0], StepsAtOnce):
+            if self._shares_thread or len(envs) > 1:
+                self._here = hosts[0]
+            else:
+                self._alone = hosts[0]
         in_rings = None not in self._rings
         in_one_slab = len(slabs) == 1 and len(envs) == len(envs.all) > 0
         ordinary = (
             in_one_slab
-            and (in_rings or self._alone is not None)
+            and (in_rings or self._alone is not None or self._here is not None)
             and not envs.any_out_of_band
             and slabs[0].action is not None
         )
@@ -271,6 +292,9 @@ class Steps:
     def _publish(self, slots: NDArray[np.intp], now: float) -> None:
         """Number the requests and give them to their workers."""
         requests = self._requests
+        if self._here is not None:
+            self._publish_here(self._here, slots, now)
+            return
         asleep = kernel.submit(
             slots,
             self._continuity.due[slots],
@@ -285,6 +309,17 @@ class Steps:
         )
         for ring in asleep:
             ring.wake()
+
+    def _publish_here(self, host: StepsAtOnce, slots: NDArray[np.intp], now: float) -> None:
+        """Number the requests and give them to the host of all envs."""
+        requests, resets = self._requests, self._continuity.due[slots]
+        entries = requests.numbering.renew(slots, _STEP)
+        if np.count_nonzero(resets):
+            requests.numbering.into_resets(slots, entries, resets)
+        requests.state[slots] = exchange.BUSY
+        requests.sent_ns[slots] = int(now * 1e9)
+        requests.in_flight[0] += len(slots)
+        host.submit(entries)
 
     def _step_at_once(self, host: StepsAtOnce, now: float) -> None:
         """Step the only env here and now: there is nobody to wait for."""
@@ -301,10 +336,29 @@ class Steps:
         if self._completions:
             self._intake.drain()  # An info has come in a new form.
 
+    def _step_next(self, host: StepsAtOnce) -> bool:
+        """Execute the next request here; True if there was one, and it raised no error."""
+        found = host.step_next()
+        if found is None:
+            return False
+        entry, out_of_band = found
+        if out_of_band:
+            self._results.keep_at_once(slot_of(entry), out_of_band)
+        self._requests.complete_one(0, entry)
+        self._requests.answered = False
+        if len(self._waiting.wanted) > 0:
+            self._watcher.wake()  # Another call may have what it waits for.
+        return True
+
     # -- wait -------------------------------------------------------------------------
 
     def _turn(self, wanted: int) -> Procedure[None]:
         """One turn of waiting for `wanted` more results; see `Waiting.turn`."""
+        if self._here is not None and (self._step_next(self._here) or self._completions):
+            yield TURN
+            if self._completions:
+                self._intake.drain()  # An error, with which an ordinary step ends.
+            return
         waiting, supervisor, in_flight = self._waiting, self._supervisor, self._requests.in_flight
         at_work = len(in_flight) - in_flight.count(0)
         if at_work < self._poller.num_cores or supervisor.detector.timed or not at_work:
@@ -376,7 +430,7 @@ class Steps:
             batch = batch_of_results(parts, self._core, slots, part.names, results.sources(slots))
             self._stats.account(parts, synchronous=synchronous)
             continuity.returned(slots, flagged, verdict)
-            if self._alone is not None:
+            if self._alone is not None or self._here is not None:
                 results.let_go(slots)
             requests.state[slots] = _IDLE
         except BaseException:

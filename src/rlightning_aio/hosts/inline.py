@@ -105,7 +105,11 @@ class InlineHost:
             runner = self._runners[index]
             if arguments is not None:
                 execute = partial(runner.execute, op_of(entry), arguments[position])
-            elif op_of(entry) == _STEP and runner.begin_step is not None:
+            elif op_of(entry) != _STEP:
+                execute = runner.reset_from_row
+            elif runner.begin_step is None or runner.env.steps_briefly:
+                execute = runner.step
+            else:
                 try:
                     execute = runner.begin_step()
                 except BaseException as error:
@@ -115,10 +119,6 @@ class InlineHost:
                     if self._threads is not None and index in self._threads.indices:
                         self._threads.unfinished[index] = entry, execute
                         continue
-            elif op_of(entry) == _STEP:
-                execute = runner.step
-            else:
-                execute = runner.reset_from_row
             self._queue.append((entry, execute))
 
     def execute_next(self) -> bool:
@@ -128,10 +128,7 @@ class InlineHost:
         try:
             outcome = execute()
         except BaseException as error:
-            self.poll()  # Earlier results come first.
-            self._post(Raised(self.host_id, entry, ErrorText.of(error)))
-            if isinstance(error, KeyboardInterrupt):
-                raise  # It is meant for the program, but the request ends, too.
+            self._raised(entry, error)
             return True
         if outcome is None and not answers_with_value(op_of(entry)):
             self._done.append(entry)
@@ -143,6 +140,12 @@ class InlineHost:
             self._post(Result(self.host_id, entry, outcome or {}))
         return True
 
+    def _raised(self, entry: int, error: BaseException) -> None:
+        self.poll()  # Earlier results come first.
+        self._post(Raised(self.host_id, entry, ErrorText.of(error)))
+        if isinstance(error, KeyboardInterrupt):
+            raise error  # It is meant for the program, but the request ends, too.
+
     def poll(self) -> None:
         if self._done:
             self._post(Reported(self.host_id, np.array(self._done, np.int64)))
@@ -151,6 +154,21 @@ class InlineHost:
     def step_now(self) -> OutOfBand | None:
         """Step env 0 with the action in its row; the queue must have no request to it."""
         return self._runners[0].step()
+
+    def step_next(self) -> tuple[int, OutOfBand | None] | None:
+        """Execute the next request if it is a step or a reset, without a completion.
+
+        Returns its entry, and what of the result is out of band. None if there is no such request,
+        or after an error, which is posted.
+        """
+        if not self._queue or self._done or answers_with_value(op_of(self._queue[0][0])):
+            return None
+        entry, execute = self._queue.popleft()
+        try:
+            return entry, execute()
+        except BaseException as error:
+            self._raised(entry, error)
+            return None
 
     def close(self) -> None:
         """Close the envs immediately."""
