@@ -45,4 +45,14 @@ def broken(batch: Any) -> list[int]:
     raise LookupError("no such weights")
 
 
+breaks = False
+
+
+def breaks_later(batch: Any) -> list[int]:
+    """Act until a test lets it break."""
+    if breaks:
+        raise LookupError("as asked for")
+    return [0] * len(batch)
+
+
 print("policies that print when they are imported")  # noqa: T201

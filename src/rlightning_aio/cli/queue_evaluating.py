@@ -8,6 +8,7 @@ import json
 import math
 import time
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
 import typer
@@ -18,6 +19,7 @@ from rlightning_aio.cli.collecting import Roster, default_min_results, resetting
 from rlightning_aio.cli.evaluation_file import queue_subject
 from rlightning_aio.cli.figures import estimates, with_interval
 from rlightning_aio.cli.films import rendering
+from rlightning_aio.cli.option_files import naming_option
 from rlightning_aio.cli.plots import check_plot, draw_evaluation
 from rlightning_aio.cli.sb3_policies import SB3Policy
 from rlightning_aio.cli.terminal import (
@@ -34,10 +36,10 @@ from rlightning_aio.cli.terminal import (
 )
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.evaluation import EpisodeRecord, QueueEvaluation, ResultsFile, evaluate
+from rlightning_aio.files import check_folder
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
-    from pathlib import Path
 
     from rich.table import Table
 
@@ -46,6 +48,7 @@ if TYPE_CHECKING:
     from rlightning_aio.cli.queue_options import QueueOptions
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.evaluation import EpisodeSpec, EpisodeVideo
+    from rlightning_aio.evaluation.records import EpisodeKey
     from rlightning_aio.group.aio import EnvGroup
 
 __all__ = ["QueueOrder", "evaluate_queue"]
@@ -78,6 +81,9 @@ def evaluate_queue(configs: Sequence[EnvConfig], options: QueueOptions, order: Q
     check_plot(order.plot)
     specs = options.specs(configs)
     video = options.films(specs)
+    if video is not None:
+        with naming_option("--video", Path(video.folder)):
+            check_folder(video.folder)
     about = queue_subject(configs, order.named)
     if video is not None:
         configs = [rendering(config) for config in configs]
@@ -86,7 +92,7 @@ def evaluate_queue(configs: Sequence[EnvConfig], options: QueueOptions, order: Q
         if order.resume is not None:
             results = stack.enter_context(ResultsFile(order.resume, about, label="--resume"))
         group = rlightning_aio.build_env_group(configs, mixed_actions=True)
-        watch = stack.enter_context(_Watch(len(group), len(specs), results))
+        watch = stack.enter_context(_Watch(len(group), specs, results))
         play = _Play(group, configs, specs, options.max_attempts, video, results, watch)
         interrupted = stopped = False
         try:
@@ -146,9 +152,13 @@ async def _evaluate(play: _Play, order: QueueOrder) -> None:
 class _Watch:
     """The episodes so far, and the live table on stderr."""
 
-    def __init__(self, num_envs: int, total: int, results: ResultsFile | None) -> None:
-        self.found = QueueEvaluation([] if results is None else [*results.played])
-        self._total = total
+    def __init__(
+        self, num_envs: int, specs: Sequence[EpisodeSpec], results: ResultsFile | None
+    ) -> None:
+        played = [] if results is None else results.played
+        wanted = {spec.key for spec in specs}
+        self.found = QueueEvaluation([one for one in played if not wanted.isdisjoint(_keys(one))])
+        self._total = len(specs)
         self._begun, self._before = time.monotonic(), len(self.found.records)
         self._console = err()
         self._live = Live(console=self._console, auto_refresh=False, transient=True)
@@ -209,6 +219,12 @@ class _Watch:
         recent = {task: by_task[task] for task in by_task if task in [*self._recent][-rows:]}
         title = f"{count(done)} of {counted(self._total, 'episode')}{left}"
         return _table(title, recent, self.found)
+
+
+def _keys(record: EpisodeRecord) -> set[EpisodeKey]:
+    """Return the keys that an episode may have before its entry and task are filled in."""
+    entry, task, seed, options = record.key
+    return {(one, other, seed, options) for one in ("", entry) for other in ("", task)}
 
 
 # -- output ------------------------------------------------------------------------------

@@ -178,8 +178,6 @@ def _in_file(path: Path) -> list[EpisodeSpec]:
                 f"--episodes-file {path}, line {number}: {error}; a line should look like "
                 '{"task": "reach-v3", "seed": 0}, with options and entry if needed'
             ) from None
-        if type(spec.seed) is not int or spec.seed < 0:
-            raise ConfigError(f"--episodes-file {path}, line {number}: seed should be an int >= 0")
         specs.append(spec)
     if not specs:
         raise ConfigError(f"--episodes-file {path}: has no episodes")

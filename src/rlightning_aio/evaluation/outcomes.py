@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 import numpy as np
 
 from rlightning_aio.batch import BatchedData
+from rlightning_aio.errors import BadAction
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -17,14 +18,25 @@ _VERDICTS: Final = ("success", "is_success")
 
 
 def responses(batch: BatchedData, answer: Any) -> list[BatchedData]:
-    """Convert a policy's answer to batches of responses."""
+    """Convert a policy's answer to batches of responses.
+
+    Raises:
+        BadAction: it doesn't answer all results.
+    """
     if isinstance(answer, BatchedData):
-        return [answer]
-    if isinstance(answer, list):
-        listed = cast("list[Any]", answer)
-        if listed and all(isinstance(one, BatchedData) for one in listed):
-            return listed
-    return [batch.respond(action=answer)]
+        parts = [answer]
+    elif isinstance(answer, list) and _are_batches(cast("list[Any]", answer)):
+        parts = cast("list[BatchedData]", answer)
+    else:
+        parts = [batch.respond(action=answer)]
+    answered = sum(map(len, parts))
+    if answered != len(batch):
+        raise BadAction(f"the policy has answered {answered} of {len(batch)} results")
+    return parts
+
+
+def _are_batches(answer: list[Any]) -> bool:
+    return bool(answer) and all(isinstance(one, BatchedData) for one in answer)
 
 
 def summed_rewards(reward: Any) -> NDArray[np.float64]:

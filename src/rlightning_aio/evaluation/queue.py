@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -80,7 +80,6 @@ class QueuePlay:
         self._task_of = {meta.env_id: meta.task for meta in metas}
         """The task that each env has, or has begun to switch to."""
         self._waiting = {entry: WaitingEpisodes() for entry in self._entry_of.values()}
-        self._fill(episodes)
         self._playing: dict[str, Attempts] = {}
         self._idle = dict.fromkeys(self._metas)
         """Envs that may begin an episode, in order."""
@@ -90,6 +89,7 @@ class QueuePlay:
         """Envs whose worker is not replaced."""
         self._ended = deque[EpisodeRecord]()
         """Episodes that the last results ended, to be recorded."""
+        self._fill(episodes)
         self._filming = None if rules.video is None else Filming(group, rules.video)
 
     # -- the queue --------------------------------------------------------------------
@@ -107,10 +107,20 @@ class QueuePlay:
         self._found.records += [record for key, record in played.items() if key in by_key]
         for key, spec in by_key.items():
             if key not in played:
-                self._waiting[spec.entry].add(Attempts(spec, [*lost.get(key, ())]))
+                attempts = Attempts(spec, [*lost.get(key, ())])
+                if len(attempts.lost) < self._rules.max_attempts:
+                    self._waiting[spec.entry].add(attempts)
+                else:
+                    self._fail("", attempts)
 
     def _assigned(self, spec: EpisodeSpec) -> EpisodeSpec:
         """Return an episode with the entry that plays it."""
+        if not isinstance(cast("Any", spec), EpisodeSpec):
+            raise TypeError(f"episodes should be EpisodeSpec, not {spec!r}")
+        if spec.entry not in ("", *self._waiting):
+            raise ValueError(
+                f"there is no entry {spec.entry!r}; entries are {', '.join(self._waiting)}"
+            )
         able = {
             entry: self._metas[env_id]
             for env_id, entry in self._entry_of.items()
@@ -126,6 +136,8 @@ class QueuePlay:
         if len(found) > 1:
             raise ValueError(f"entries {', '.join(found)} can play {spec}; name one as its entry")
         ((entry, meta),) = found.items()
+        if meta.switches_task and "task" in (spec.options or {}):
+            raise ValueError(f"the options of an episode must not name a task: {spec}")
         return replace(spec, entry=entry, task=spec.task or meta.task)
 
     def _can_play(self, env_id: str, task: str) -> bool:
@@ -284,7 +296,11 @@ class QueuePlay:
         if len(attempts.lost) < self._rules.max_attempts:
             self._waiting[attempts.spec.entry].add(attempts)
         else:
-            self._ended.append(replace(self._outcome(env_id, attempts), cause=cause))
+            self._fail(env_id, attempts)
+
+    def _fail(self, env_id: str, attempts: Attempts) -> None:
+        """Note that an episode was lost as often as it may be."""
+        self._ended.append(replace(self._outcome(env_id, attempts), cause=attempts.lost[-1]))
 
     # -- faults -----------------------------------------------------------------------
 
@@ -293,7 +309,8 @@ class QueuePlay:
         self._fault = fault
         struck = {fault.env_id}
         if isinstance(fault, WorkerDied):
-            struck.update(fault.env_ids)
+            # The env at fault may be another one, whose own request a replacement answers.
+            struck = {*fault.env_ids}
             for worker in self._group.get_workers():
                 self._gone.update(worker["given_up"])
         self._pending -= struck

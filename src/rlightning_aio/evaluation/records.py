@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from rlightning_aio.evaluation.episodes import Figures
+from rlightning_aio.group.seeds import checked_seed
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
 __all__ = ["EpisodeKey", "EpisodeRecord", "EpisodeSpec", "QueueEvaluation"]
 
@@ -32,12 +34,33 @@ class EpisodeSpec:
         seed: of the reset.
         options: further options of the reset, such as the number of an initial state.
         entry: name of the config entry; empty for the one whose envs can play the task.
+
+    Raises:
+        ValueError: `seed` is no int from 0 to 2**62 - 1, a name is no str, or `options` are no dict
+            or can't be written as JSON. Numbers and arrays of NumPy can.
     """
 
     task: str
     seed: int
     options: Mapping[str, Any] | None = None
     entry: str = ""
+
+    def __post_init__(self) -> None:
+        """Check the fields, and convert the seed, which may be a number of NumPy."""
+        object.__setattr__(self, "seed", checked_seed(self.seed))
+        names: dict[str, Any] = {"task": self.task, "entry": self.entry}
+        for what, name in names.items():
+            if not isinstance(name, str):
+                raise ValueError(f"the {what} of an episode should be a str, not {name!r}")
+        options: Any = self.options
+        if not isinstance(options, Mapping | None):
+            raise ValueError(f"the options of an episode should be a dict, not {options!r}")
+        try:
+            _written(self.options)
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"the options of an episode can't be written as JSON: {error}"
+            ) from error
 
     @property
     def key(self) -> EpisodeKey:
@@ -115,7 +138,13 @@ class EpisodeRecord:
 
 
 def _written(options: Mapping[str, Any] | None) -> str:
-    return "" if options is None else json.dumps(options, sort_keys=True, default=repr)
+    if options is None:
+        return ""
+    return json.dumps(options, sort_keys=True, default=_plain, allow_nan=False)
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if hasattr(value, "tolist") else repr(value)
 
 
 @dataclass(slots=True)

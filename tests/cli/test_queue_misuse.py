@@ -1,0 +1,61 @@
+"""``rlightning-aio eval`` with a queue: wrong files and folders, and figures after an error."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+from cli.command import CARTPOLE, invoke, invoke_json, write_config
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+POLE = {**CARTPOLE, "placement": "inline", "num_workers": 2, "max_episode_steps": 4}
+
+
+def test_a_folder_that_can_not_be_written_is_named(tmp_path: Path) -> None:
+    """Before anything starts."""
+    config, file = write_config(tmp_path, POLE), tmp_path / "file"
+    file.touch()
+    for folder in (file, "/proc/films"):
+        done = invoke("eval", config, "--seeds", "0:2", "--video", folder)
+        assert done.exit_code == 2
+        assert f"--video {folder}: can't be written" in done.stderr
+        assert "starting" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ('{"task": 3, "seed": 0}', "the task of an episode should be a str"),
+        ('{"task": "CartPole-v1", "seed": 0, "options": [1]}', "should be a dict"),
+        ('{"task": "CartPole-v1", "seed": 99999999999999999999}', "the seed must be an int"),
+        ('{"task": "CartPole-v1", "seed": -1}', "the seed must be an int"),
+        ('{"task": "CartPole-v1"}', "seed"),
+        ('{"task": "CartPole-v1", "seed": 0, "entry": null}', "the entry of an episode"),
+        ('{"task": "CartPole-v1", "seed": 0, "sead": 1}', "sead"),
+        ("[1, 2]", "line"),
+    ],
+)
+def test_a_wrong_line_is_named(line: str, message: str, tmp_path: Path) -> None:
+    """Before anything starts."""
+    file = tmp_path / "episodes.jsonl"
+    file.write_text(f'{{"task": "CartPole-v1", "seed": 0}}\n{line}\n')
+    done = invoke("eval", write_config(tmp_path, POLE), "--episodes-file", file)
+    assert done.exit_code == 2
+    assert "line 2: " in done.stderr
+    assert message in done.stderr
+    assert "starting" not in done.stderr
+
+
+def test_after_an_error_only_episodes_of_the_queue_are_reported(tmp_path: Path) -> None:
+    """The results file has others besides."""
+    config, file = write_config(tmp_path, POLE), tmp_path / "results.jsonl"
+    policy = "cli.stub_policies:breaks_later"
+    words = ("eval", config, "--policy", policy, "--resume", file)
+    assert invoke_json(*words, "--seeds", "0:6")["episodes"] == 6
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("cli.stub_policies.breaks", True)
+        done = invoke(*words, "--seeds", "4:8")
+    assert done.exit_code == 1
+    assert "2 episodes of 4" in " ".join(done.stdout.split())

@@ -1,0 +1,129 @@
+"""`evaluate` with a queue: wrong episodes, policies that leave envs out, and rare losses."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from test_evaluation_queue import ROWS, Tasks, evaluated, group_of, rows
+
+import rlightning_aio as rl
+from rlightning_aio.evaluation import EpisodeSpec, EpisodeVideo, ResultsFile
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"seed": -1}, "the seed must be an int from 0"),
+        ({"seed": 1 << 62}, "the seed must be an int from 0"),
+        ({"seed": "3"}, "the seed must be an int from 0"),
+        ({"seed": 1.5}, "the seed must be an int from 0"),
+        ({"task": 3}, "the task of an episode should be a str, not 3"),
+        ({"entry": None}, "the entry of an episode should be a str, not None"),
+        ({"options": [1]}, r"the options of an episode should be a dict, not \[1\]"),
+        ({"options": {"x": float("nan")}}, "the options of an episode can't be written as JSON"),
+    ],
+)
+def test_an_episode_that_can_not_be_is_refused(fields: dict[str, Any], message: str) -> None:
+    """When it is made, so that the line of a file can be named."""
+    with pytest.raises(ValueError, match=message):
+        EpisodeSpec(**{"task": "1", "seed": 0, **fields})
+
+
+def test_numbers_of_numpy_are_saved_and_found_again(tmp_path: Path) -> None:
+    """As seeds and in options, where they are values and not texts."""
+    queue = [EpisodeSpec("1", seed, {"longer": np.int64(2)}) for seed in np.arange(3)]
+    for _ in range(2):
+        with ResultsFile(tmp_path / "results.jsonl") as results:
+            found = evaluated(group_of(), queue, results=results)
+        assert sorted((one.seed, one.length) for one in found.records) == [(0, 3), (1, 4), (2, 5)]
+    lines = (tmp_path / "results.jsonl").read_text().splitlines()
+    assert [json.loads(line)["options"] for line in lines[1:]] == [{"longer": 2}] * 3
+
+
+def test_the_options_can_not_name_another_task() -> None:
+    """The record would be that of a task that was not played."""
+    queue = [EpisodeSpec("1", 0, {"task": "3"})]
+    with pytest.raises(ValueError, match=r"options .*name a task.*task='1'"):
+        evaluated(group_of(), queue)
+
+
+def test_an_entry_that_is_missing_is_named() -> None:
+    """The message lists those that are there."""
+    with pytest.raises(ValueError, match="there is no entry 'other'; entries are env"):
+        evaluated(group_of(), [EpisodeSpec("1", 0, entry="other")])
+
+
+def test_what_is_no_episode_is_refused() -> None:
+    """A tuple of task and seed is none."""
+    with pytest.raises(TypeError, match=r"should be EpisodeSpec, not \('1', 0\)"):
+        evaluated(group_of(), [("1", 0)])
+
+
+@pytest.mark.parametrize("as_list", [True, False])
+def test_a_policy_must_answer_all_results(as_list: bool) -> None:
+    """The episodes of the others would never end."""
+
+    def policy(batch: rl.BatchedData) -> Any:
+        answer = batch.take([0]).respond(action=[0])
+        return [answer] if as_list else answer
+
+    with pytest.raises(rl.BadAction, match="has answered 1 of 3 results"):
+        evaluated(group_of(), policy=policy, min_results=3)
+
+
+def test_an_episode_that_was_lost_often_enough_before_is_not_played(tmp_path: Path) -> None:
+    """An evaluation may be killed between the last loss of an episode and its record."""
+    path = tmp_path / "results.jsonl"
+    with ResultsFile(path) as results:
+        for _ in range(2):
+            results.add_lost(EpisodeSpec("1", 0, entry="env"), "it died")
+    for _ in range(2):
+        with ResultsFile(path) as results:
+            found = evaluated(group_of(), [EpisodeSpec("1", 0)], results=results, max_attempts=2)
+        (record,) = found.records
+        assert (record.cause, record.lost, record.length) == ("it died", ("it died",) * 2, None)
+
+
+class Dies(Tasks):
+    """The third step of seed 9 ends the process, once.
+
+    It takes long enough for the trainer to ask another env of the process for a film, usually.
+    """
+
+    def __init__(self, folder: str) -> None:
+        super().__init__()
+        self._folder = folder
+
+    def step(self, action: Any) -> Any:
+        flag = Path(self._folder, "died")
+        if self._seed == 9 and self._left == 8 and not flag.exists():
+            flag.touch()
+            time.sleep(0.3)
+            os._exit(3)
+        return super().step(action)
+
+
+def test_a_process_that_ends_while_a_film_begins_is_replaced(tmp_path: Path) -> None:
+    """The film is of another env of the process than the one that ended it."""
+    queue = [EpisodeSpec("1", seed) for seed in (2, 9, 1, 0, 3)]
+    fields = {"make_env": Dies, "env_kwargs": {"folder": str(tmp_path)}, "envs_per_process": 2}
+    video = EpisodeVideo(tmp_path / "films")
+    found = evaluated(group_of(2, placement="process", **fields), queue, video=video)
+    assert rows(found) == [("1", seed, seed + 1.0, seed + 1) for seed in (0, 1, 2, 3, 9)]
+    assert found.failed == []
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [{"placement": "split"}, {"placement": "process", "envs_per_process": 3}],
+    ids=lambda fields: fields["placement"],
+)
+def test_each_placement_plays_the_same(fields: dict[str, Any]) -> None:
+    """So do envs that share a process."""
+    assert rows(evaluated(group_of(**fields))) == ROWS
