@@ -56,7 +56,7 @@ test-simulators: environments ## the tests of every backend, on the real simulat
 	$(ISAAC)/bin/python -m pytest -m simulators -rs tests/envs/test_isaac.py
 	$(SIMULATORS)/bin/python -m pytest --numprocesses 3 --dist worksteal -m simulators -rs tests/benchmarks tests/cli tests/envs tests/examples tests/policies tests/vector tests/test_docs.py tests/test_wheel.py
 	$(RLLIB)/bin/python -m pytest -m simulators -rs tests/vector/test_pages.py
-	MUJOCO_GL=egl $(ROBOTS)/bin/python -m pytest -m simulators -rs tests/cli/test_robots_page.py tests/envs/test_metaworld.py tests/envs/test_lerobot_tasks.py tests/policies/test_real_servers.py
+	MUJOCO_GL=egl $(ROBOTS)/bin/python -m pytest -m simulators -rs tests/cli/test_robots_page.py tests/envs/test_metaworld.py tests/envs/test_lerobot_tasks.py tests/envs/test_rendering.py tests/policies/test_real_servers.py
 
 # With -rs, each test that is skipped says what it lacks.
 test-gpu: export WARP_CACHE_PATH := $(CURDIR)/$(ISAAC)/warp-cache

@@ -44,7 +44,7 @@ def by_program(written: str) -> dict[str, str]:
     return dict(part.split("\n", 1) for part in written.split("\0")[1:])
 
 
-NEEDS_MORE = r"^(import (torch|aiohttp)$|from (metaworld|stable_baselines3))"
+NEEDS_MORE = r"^(import (torch|aiohttp)$|from (libero|metaworld|stable_baselines3))"
 PAGES = sorted(page for page in DOCS.rglob("*.md") if page.stem not in ELSEWHERE)
 
 

@@ -281,7 +281,7 @@ def test_a_file_names_the_episodes(tmp_path: Path) -> None:
     for text, words in (
         ("[1]\n", "line 1: "),
         ('\n{"task": "any"}\n', "line 2: "),
-        ('{"seed": "1"}\n', "seed should be an int"),
+        ('{"seed": "1"}\n', "the seed must be an int"),
         ("", "has no episodes"),
     ):
         file.write_text(text)

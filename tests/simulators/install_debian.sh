@@ -2,12 +2,13 @@
 # The Debian packages that the simulators' tests use beside Python's:
 #   mesa-vulkan-drivers, libvulkan1   a software Vulkan, for ManiSkill's images. SAPIEN wants
 #                                     Mesa 24 or later; Debian 12 has that in its backports.
+#   libegl1                           EGL with Mesa's driver, for MuJoCo's images.
 #   libgl1, libglib2.0-0, libx11-6    what OpenCV and SAPIEN are linked to.
 # It installs what is missing, as root. Without apt or without root it says what would be
 # missed and succeeds: the tests that need it are skipped then.
 set -euo pipefail
 
-libraries=(libgl1 libglib2.0-0 libx11-6)
+libraries=(libegl1 libgl1 libglib2.0-0 libx11-6)
 vulkan=(mesa-vulkan-drivers libvulkan1)
 oldest_mesa=24
 backports=/etc/apt/sources.list.d/backports-for-mesa.sources
