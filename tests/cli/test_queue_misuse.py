@@ -59,3 +59,19 @@ def test_after_an_error_only_episodes_of_the_queue_are_reported(tmp_path: Path) 
         done = invoke(*words, "--seeds", "4:8")
     assert done.exit_code == 1
     assert "2 episodes of 4" in " ".join(done.stdout.split())
+
+
+@pytest.mark.parametrize("words", [[], ["--video-episode", "CartPole-v1:1"]], ids=["all", "one"])
+@pytest.mark.parametrize("from_file", [False, True], ids=["seeds", "file"])
+def test_episodes_without_a_task_are_filmed(
+    words: list[str], from_file: bool, tmp_path: Path
+) -> None:
+    """They have the task of the config, by which they are chosen, too."""
+    render = {"env_kwargs": {"render_mode": "rgb_array"}}
+    config, file = write_config(tmp_path, {**POLE, **render}), tmp_path / "episodes.jsonl"
+    file.write_text('{"seed": 0}\n{"seed": 1}\n')
+    queue = ["--episodes-file", file] if from_file else ["--seeds", "0:2"]
+    done = invoke("eval", config, *queue, "--video", tmp_path / "films", *words)
+    assert done.exit_code == 0, done.stderr
+    films = sorted(path.name for path in (tmp_path / "films").iterdir())
+    assert films == [f"pole-CartPole-v1-seed-{seed}.mp4" for seed in ([1] if words else [0, 1])]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
@@ -111,11 +111,19 @@ class QueueOptions:
             if names:
                 return [EpisodeSpec(name, seed) for name in names for seed in seeds]
             return [
-                EpisodeSpec("", seed, entry=config.name) for config in configs for seed in seeds
+                EpisodeSpec(config.task, seed, entry=config.name)
+                for config in configs
+                for seed in seeds
             ]
         if self.tasks or self.seeds is not None:
             raise ConfigError("--episodes-file names the episodes; leave --tasks and --seeds out")
-        return _in_file(self.episodes_file)
+        task_of = {config.name: config.task for config in configs}
+        if len(configs) == 1:
+            task_of[""] = configs[0].task
+        return [
+            spec if spec.task else replace(spec, task=task_of.get(spec.entry, ""))
+            for spec in _in_file(self.episodes_file)
+        ]
 
     def films(self, specs: Sequence[EpisodeSpec]) -> EpisodeVideo | None:
         """Return the episodes to film.
