@@ -117,13 +117,7 @@ class QueueOptions:
             ]
         if self.tasks or self.seeds is not None:
             raise ConfigError("--episodes-file names the episodes; leave --tasks and --seeds out")
-        task_of = {config.name: config.task for config in configs}
-        if len(configs) == 1:
-            task_of[""] = configs[0].task
-        return [
-            spec if spec.task else replace(spec, task=task_of.get(spec.entry, ""))
-            for spec in _in_file(self.episodes_file)
-        ]
+        return _with_tasks(_in_file(self.episodes_file), configs)
 
     def films(self, specs: Sequence[EpisodeSpec]) -> EpisodeVideo | None:
         """Return the episodes to film.
@@ -167,6 +161,16 @@ def _seeds(text: str) -> list[int]:
     if not seeds or min(seeds) < 0:
         raise ConfigError(f"--seeds {text!r}: should look like 0:50 or 1,2,5")
     return seeds
+
+
+def _with_tasks(specs: list[EpisodeSpec], configs: Sequence[EnvConfig]) -> list[EpisodeSpec]:
+    """Give episodes without a task that of their entry."""
+    task_of = {config.name: config.task for config in configs}
+    if len(configs) == 1:
+        task_of[""] = configs[0].task
+    return [
+        spec if spec.task else replace(spec, task=task_of.get(spec.entry, "")) for spec in specs
+    ]
 
 
 def _in_file(path: Path) -> list[EpisodeSpec]:
