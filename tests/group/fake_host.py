@@ -46,10 +46,16 @@ from rlightning_aio.hosts.messages import (
     Result,
     Value,
 )
-from rlightning_aio.protocol.bell import TrainerBell, WorkerBell, bell_size
 from rlightning_aio.protocol.entries import Operation, op_of, slot_of
 from rlightning_aio.protocol.info import NO_INFO, PICKLED
-from rlightning_aio.protocol.rings import TrainerRings, WorkerRings, rings_size
+from rlightning_aio.protocol.rings import (
+    TrainerBell,
+    TrainerRings,
+    WorkerBell,
+    WorkerRings,
+    bell_size,
+    rings_size,
+)
 from rlightning_aio.protocol.slab import RowLayout, Slab
 from rlightning_aio.types import EnvMeta
 

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from rlightning_aio.group.poller import Poller
 from rlightning_aio.group.request_states import COLLECTOR
 from rlightning_aio.group.requests import Requests
-from rlightning_aio.protocol.bell import TrainerBell, WorkerBell, bell_size
 from rlightning_aio.protocol.entries import Operation
+from rlightning_aio.protocol.rings import TrainerBell, WorkerBell, bell_size
 
 
 @dataclass(eq=False)

@@ -31,11 +31,16 @@ from rlightning_aio.hosts.messages import (
     Value,
 )
 from rlightning_aio.hosts.process import ForkServer, ProcessHost, _surroundings
-from rlightning_aio.protocol.bell import TrainerBell, WorkerBell, bell_size
 from rlightning_aio.protocol.entries import Operation, entry
 from rlightning_aio.protocol.frames import BELL, FrameKind, FrameReader, encode
 from rlightning_aio.protocol.info import InfoSchema
-from rlightning_aio.protocol.rings import WorkerRings, rings_size
+from rlightning_aio.protocol.rings import (
+    TrainerBell,
+    WorkerBell,
+    WorkerRings,
+    bell_size,
+    rings_size,
+)
 
 if TYPE_CHECKING:
     import socket

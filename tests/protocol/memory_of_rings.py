@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
-from rlightning_aio.protocol.bell import TrainerBell, WorkerBell, bell_size
-from rlightning_aio.protocol.rings import TrainerRings, WorkerRings, rings_size
+from rlightning_aio.protocol.rings import (
+    TrainerBell,
+    TrainerRings,
+    WorkerBell,
+    WorkerRings,
+    bell_size,
+    rings_size,
+)
 
 
 def both_sides(

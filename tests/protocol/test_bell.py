@@ -24,9 +24,15 @@ from hypothesis.stateful import (
 )
 from protocol.memory_of_rings import unused
 
-from rlightning_aio.protocol.bell import TrainerBell, WorkerBell, bell_size
 from rlightning_aio.protocol.entries import Operation, entry
-from rlightning_aio.protocol.rings import TrainerRings, WorkerRings, rings_size
+from rlightning_aio.protocol.rings import (
+    TrainerBell,
+    TrainerRings,
+    WorkerBell,
+    WorkerRings,
+    bell_size,
+    rings_size,
+)
 
 pytestmark = pytest.mark.usefixtures("implementation")
 

@@ -25,7 +25,6 @@ from hypothesis.stateful import (
 )
 from protocol.memory_of_rings import both_sides, memory_size, unused
 
-from rlightning_aio.protocol.bell import bell_size
 from rlightning_aio.protocol.entries import (
     NUMBER_SHIFT,
     SLOT_MASK,
@@ -36,6 +35,7 @@ from rlightning_aio.protocol.entries import (
     slot_of,
 )
 from rlightning_aio.protocol.exchange import REQUESTS_SENT
+from rlightning_aio.protocol.rings import bell_size
 
 if TYPE_CHECKING:
     from types import FrameType

@@ -25,7 +25,7 @@ from rlightning_aio.group.supervisor import Supervisor
 from rlightning_aio.group.tables import Tables
 from rlightning_aio.hosts.arena import Arena, map_shared
 from rlightning_aio.hosts.base import Wiring
-from rlightning_aio.protocol.bell import TrainerBell, bell_size
+from rlightning_aio.protocol.rings import TrainerBell, bell_size
 from rlightning_aio.sharing import num_cores
 
 if TYPE_CHECKING:

@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from rlightning_aio.group.tables import Tables
     from rlightning_aio.hosts.base import Watcher
     from rlightning_aio.hosts.messages import Completions
-    from rlightning_aio.protocol.bell import TrainerBell
     from rlightning_aio.protocol.exchange import Ring
+    from rlightning_aio.protocol.rings import TrainerBell
 
 __all__ = ["Parts"]
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from rlightning_aio.group.requests import Requests
     from rlightning_aio.hosts.base import Host
-    from rlightning_aio.protocol.bell import TrainerBell
+    from rlightning_aio.protocol.rings import TrainerBell
 
 __all__ = ["Poller"]
 

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.hosts.arena import Arena
     from rlightning_aio.hosts.messages import AttachOrder, Completions, StartOrder
-    from rlightning_aio.protocol.bell import TrainerBell
     from rlightning_aio.protocol.exchange import Ring
+    from rlightning_aio.protocol.rings import TrainerBell
     from rlightning_aio.types import EnvMeta
 
 __all__ = [

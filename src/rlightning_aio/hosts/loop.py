@@ -27,8 +27,8 @@ from rlightning_aio.hosts.messages import (
     Saved,
 )
 from rlightning_aio.hosts.runner import attach_all
-from rlightning_aio.protocol.bell import WorkerBell, bell_size
 from rlightning_aio.protocol.info import InfoSchemas
+from rlightning_aio.protocol.rings import WorkerBell, bell_size
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine, Sequence

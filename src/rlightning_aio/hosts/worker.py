@@ -24,7 +24,6 @@ from rlightning_aio.hosts.messages import ErrorText
 from rlightning_aio.hosts.pickling import dumped, dumped_with_code
 from rlightning_aio.hosts.runner import attach_all, close_all
 from rlightning_aio.hosts.spinner import Spinner
-from rlightning_aio.protocol.bell import WorkerBell, bell_size
 from rlightning_aio.protocol.entries import (
     Operation,
     answers_with_value,
@@ -35,7 +34,7 @@ from rlightning_aio.protocol.entries import (
 from rlightning_aio.protocol.exchange import CAREFUL
 from rlightning_aio.protocol.frames import BELL, CHUNK_BYTES, Frame, FrameKind, FrameReader, encode
 from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
-from rlightning_aio.protocol.rings import WorkerRings, rings_size
+from rlightning_aio.protocol.rings import WorkerBell, WorkerRings, bell_size, rings_size
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
