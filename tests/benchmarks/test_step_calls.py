@@ -14,12 +14,12 @@ from pathlib import Path
 from rlightning_aio.protocol import kernel
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "step_calls.py"
-# The Python twins of the compiled kernel are in a file of their own.
-FILES = 10 if kernel.selected == "c" else 11
+# The Python twins of the compiled kernel are functions that count, in a file of their own.
+FILES, FUNCTIONS = (10, 45) if kernel.selected == "c" else (11, 47)
 MOST = {
-    "step_async and collect_async": {"calls": 60, "functions": 45, "files": FILES},
-    "the same, asynchronous": {"calls": 60, "functions": 45, "files": FILES},
-    "step": {"calls": 60, "functions": 45, "files": FILES},
+    "step_async and collect_async": {"calls": 60, "functions": FUNCTIONS, "files": FILES},
+    "the same, asynchronous": {"calls": 60, "functions": FUNCTIONS, "files": FILES},
+    "step": {"calls": 60, "functions": FUNCTIONS, "files": FILES},
     "VectorEnv.step": {"calls": 80},
     "Collector.collect, 16 transitions": {"calls": 400},
     "death with resume: files": {"files of src": 20},
