@@ -48,7 +48,8 @@ class Served:
         _, self.trainer, rings = both_sides(NUM_ENVS)
         self.channel, theirs = socket.socketpair()
         self.worker = Worker(theirs, -1, rings, 0)
-        self.worker._runners, self.worker._steps = runners, [runner.step for runner in runners]
+        # As a worker has them after its start.
+        vars(self.worker).update(_runners=runners, _steps=[runner.step for runner in runners])
         self.number = 0
         self.served(Operation.RESET)
 
