@@ -20,7 +20,7 @@
 #include <string.h>
 #include <time.h>
 
-/* ---- words shared with `exchange` and `exchange` ------------------------------------- */
+/* ---- words shared with the twins in `exchange` ---------------------------------------- */
 
 enum {
     LINE = 8,
