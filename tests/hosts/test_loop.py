@@ -281,6 +281,7 @@ async def test_an_env_that_is_not_rebuilt_raises_from_then_on(
         batch, _ = await group.reset()
         with pytest.raises(EnvHung, match=rf"'e-1' took longer than {SOON} s for a step") as raised:
             await group.step(steps(e_0=STEP, e_1=HANG))
+        assert raised.value.env_ids == ("e-1",)
         assert raised.value.results.ids() == ["e-0"]
         with pytest.raises(EnvHung, match="is not rebuilt"):
             await group.step(steps(e_1=STEP))

@@ -379,6 +379,7 @@ class AwaitedEnvs:
             log.warning("%s; %s, in %g s", message, count, restart_pause(env.losses))
             return False
         env.fault = kind(f"{message}; {outcome}", env_id=env.name, exit_code=None, stderr_tail="")
+        env.fault.env_ids = (env.name,)
         return True
 
 
