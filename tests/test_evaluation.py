@@ -191,7 +191,16 @@ def test_an_episode_that_is_lost_with_its_worker_is_repeated() -> None:
 def test_an_env_whose_worker_always_ends_is_an_error() -> None:
     """It would never finish its episodes."""
     group = group_of(scripted(lambda _: True), placement="process", max_restarts=10)
-    with pytest.raises(rl.RLightningError, match=r"'env-0' has lost .* 3 times in a row"):
+    with pytest.raises(rl.RLightningError, match=r"'env-0' has lost .* 3 times in a row") as raised:
+        evaluated(group, 1, policy=lambda batch: np.ones(len(batch), np.int64))
+    assert "its worker has" not in str(raised.value)
+
+
+def test_envs_whose_worker_always_ends_may_not_be_the_cause() -> None:
+    """The error names those that share the worker."""
+    env = scripted(lambda _: True)
+    group = group_of(env, env, placement="process", envs_per_process=2, max_restarts=10)
+    with pytest.raises(rl.RLightningError, match=r"'env-0' .*worker has env-1 as well"):
         evaluated(group, 1, policy=lambda batch: np.ones(len(batch), np.int64))
 
 

@@ -356,5 +356,18 @@ class _Play:
                 cause = info.get("worker_restarted", "its worker ended")
                 raise RLightningError(
                     f"env {env_id!r} has lost an episode with its worker {_LOSSES_IN_A_ROW} times "
-                    f"in a row, and finishes none: {cause}"
+                    f"in a row, and finishes none: {cause}{self._neighbours(env_id)}. Episodes "
+                    "start again with their seed, so a crash that depends on it repeats: a list of "
+                    "EpisodeSpec gives such an episode up, and plays the others"
                 )
+
+    def _neighbours(self, env_id: str) -> str:
+        """Name the envs that may have ended an env's worker."""
+        for worker in self._group.get_workers():
+            others = [other for other in worker["env_ids"] if other != env_id]
+            if env_id in worker["env_ids"] and others:
+                return (
+                    f" (its worker has {', '.join(others)} as well, one of which may be the cause; "
+                    "envs_per_process: 1 separates them)"
+                )
+        return ""
