@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 import signal
@@ -190,8 +191,9 @@ def resumption(use: Use) -> None:
 def kill_a_worker(use: Use) -> None:
     """End the first process that has envs."""
     pid = next(worker["pid"] for worker in use.group.get_workers() if worker["pid"] != os.getpid())
-    if pid is not None:  # It has not died since.
-        os.kill(pid, signal.SIGKILL)
+    if pid is not None:
+        with contextlib.suppress(ProcessLookupError):  # It died just now, which nobody has noticed.
+            os.kill(pid, signal.SIGKILL)
 
 
 # -- the rest
