@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
@@ -211,6 +211,15 @@ def test_gather_copies_rows(columns: list[Any], rows: list[int], last: int) -> N
     careful=st.booleans(),
     frames=st.integers(0, 1),
     child_after=st.integers(0, 9),
+)
+@example(  # the sum of these counters has more than 64 bits
+    sent=1,
+    entries=[entry(3, 0, Operation.STEP)] * 8,
+    armed=1,
+    counters=[1, (1 << 63) - 1],
+    careful=False,
+    frames=0,
+    child_after=0,
 )
 def test_serve_survives_any_contents_of_the_rings(
     sent: int,

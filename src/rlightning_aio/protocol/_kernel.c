@@ -613,13 +613,14 @@ kernel_gather(PyObject *module, PyObject *args)
 
 /* ---- the bell ------------------------------------------------------------------------------------ */
 
-static int64_t
+/* Wide, so that impossible counters do not wrap around: the twin's integers do not, either. */
+static __int128
 sum_of_counters(const Py_buffer *words)
 {
-    uint64_t sum = 0;
+    __int128 sum = 0;
     for (Py_ssize_t k = LINE; k < length(words); k += LINE)
-        sum += (uint64_t)load(words_of(words) + k);
-    return (int64_t)sum;
+        sum += load(words_of(words) + k);
+    return sum;
 }
 
 static inline int64_t
