@@ -188,20 +188,17 @@ def test_an_episode_that_is_lost_with_its_worker_is_repeated() -> None:
     assert [one.length for one in found.episodes] == [SHORT, LONG, SHORT]
 
 
-def test_an_env_whose_worker_always_ends_is_an_error() -> None:
-    """It would never finish its episodes."""
-    group = group_of(scripted(lambda _: True), placement="process", max_restarts=10)
-    with pytest.raises(rl.RLightningError, match=r"'env-0' has lost .* 3 times in a row") as raised:
-        evaluated(group, 1, policy=lambda batch: np.ones(len(batch), np.int64))
-    assert "its worker has" not in str(raised.value)
-
-
-def test_envs_whose_worker_always_ends_may_not_be_the_cause() -> None:
-    """The error names those that share the worker."""
+@pytest.mark.parametrize("together", [1, 2])
+def test_an_env_that_always_ends_its_worker_is_an_error(together: int) -> None:
+    """It would never finish its episodes. Another env of its worker is not blamed."""
     env = scripted(lambda _: True)
-    group = group_of(env, env, placement="process", envs_per_process=2, max_restarts=10)
-    with pytest.raises(rl.RLightningError, match=r"'env-0' .*worker has env-1 as well"):
-        evaluated(group, 1, policy=lambda batch: np.ones(len(batch), np.int64))
+    group = group_of(env, env, placement="process", envs_per_process=together, max_restarts=10)
+
+    def ends_the_second(batch: rl.BatchedData) -> Any:
+        return np.array([env_id == "env-1" for env_id in batch.env_ids()], np.int64)
+
+    with pytest.raises(rl.RLightningError, match=r"'env-1' has lost .* 3 times in a row"):
+        evaluated(group, 3, policy=ends_the_second)
 
 
 def test_entries_may_differ() -> None:

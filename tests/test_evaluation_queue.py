@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import time
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from patience import HANG
 
 import rlightning_aio as rl
 from rlightning_aio import sync
@@ -54,6 +56,8 @@ class Tasks(gym.Env[Any, Any]):
                 raise ValueError("as asked for")
             case "exit":
                 os._exit(3)
+            case "hang":
+                time.sleep(HANG)
         self._left -= 1
         over = self._left == 0
         info = {"is_success": self._seed % 2 == 0} if over else {}
@@ -202,6 +206,21 @@ def test_an_episode_whose_worker_always_ends_fails() -> None:
         ("1", 1),
         ("3", 6),
     ]
+
+
+@pytest.mark.parametrize("breaks", ["exit", "hang"])
+def test_only_the_env_at_fault_is_charged_an_attempt(breaks: str) -> None:
+    """The others of its worker lose their episodes as well, and play them again."""
+    fields = {
+        "env_kwargs": {"breaks": {"2": breaks}}, "placement": "process", "envs_per_process": 3,
+        "step_timeout": 1.0,
+    }  # fmt: skip
+    queue = [EpisodeSpec("2", 3), *(EpisodeSpec(task, seed) for seed in (8, 9) for task in "13")]
+    found = evaluated(group_of(3, **fields), queue, max_attempts=1)
+    assert [one.task for one in found.failed] == ["2"]
+    assert found.lost == 1
+    played = sorted((one.task, one.seed) for one in found.records if one.cause is None)
+    assert played == [("1", 8), ("1", 9), ("3", 8), ("3", 9)]
 
 
 @pytest.mark.parametrize("together", [1, 2])

@@ -111,11 +111,11 @@ def test_a_lost_episode_resumes_from_its_last_valid_checkpoint() -> None:
         continuity.returned(SLOT, (), continuity.judge(SLOT, ()))
     continuity.save(0, b"sixth", 6, before=False, is_step=True)
     continuity.drop_unanswered([0], [6])
-    continuity.lose([0], "was killed")
+    continuity.lose([0], "was killed", "env-1")
     assert continuity.checkpoints([0]) == (b"third",)
     reports, seeds = continuity.report_losses(SLOT, STEP)
     assert (reports.tolist(), seeds.tolist()) == ([True], [AS_RESTORED])
-    assert continuity.answered(SLOT) == [Report(0, "was killed", 2)]
+    assert continuity.answered(SLOT) == [Report(0, "was killed", "env-1", 2)]
     shown = part_of([0], [True], [False])
     continuity.returned(SLOT, [shown], continuity.judge(SLOT, [shown]))
     assert continuity.positions(SLOT) == [Position(3, is_cut=False)]
@@ -126,7 +126,7 @@ def test_an_env_that_is_being_reset_or_due_does_not_resume() -> None:
     continuity = in_phase(LossPhase.LOST)
     reports, seeds = continuity.report_losses(SLOT, ~STEP)
     assert (reports.tolist(), seeds.tolist()) == ([True], [NO_SEED])
-    assert continuity.answered(SLOT) == [Report(0, "was killed", None)]
+    assert continuity.answered(SLOT) == [Report(0, "was killed", None, None)]
 
 
 def test_an_env_that_dies_while_it_resumes_resumes_again() -> None:
@@ -135,7 +135,7 @@ def test_an_env_that_dies_while_it_resumes_resumes_again() -> None:
     continuity.lose([0], "was killed again")
     _, seeds = continuity.report_losses(SLOT, ~STEP)
     assert seeds.tolist() == [AS_RESTORED]
-    assert continuity.answered(SLOT) == [Report(0, "was killed again", 0)]
+    assert continuity.answered(SLOT) == [Report(0, "was killed again", None, 0)]
 
 
 @dataclass

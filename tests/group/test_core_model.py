@@ -70,7 +70,7 @@ class Request:
     Attributes:
         op: ``step``, ``reset`` or ``call``; a step that auto-reset replaces is a ``reset``.
         owner: the operation that waits for it; None for `collect_async`.
-        restarts: its worker died before it replied.
+        restarts: its worker died before it replied; at_fault: the env that was being executed.
         value: the extra that was attached to the step.
     """
 
@@ -81,6 +81,7 @@ class Request:
     owner: Running | None = None
     answer: Answer | None = None
     restarts: bool = False
+    at_fault: str | None = None
     abandoned: bool = False
 
 
@@ -91,6 +92,7 @@ class ModelEnv:
     Attributes:
         count: number of steps since the last reset.
         cut: its last result reached the limit of auto-reset; ended: the episode ended by itself.
+        lost: its worker died, which no result has told; at_fault: the env that was being executed.
     """
 
     env: FakeEnv
@@ -100,6 +102,10 @@ class ModelEnv:
     ended: bool = False
     over: bool = False
     lost: bool = False
+    at_fault: str | None = None
+
+    def owes(self) -> bool:
+        return self.request is not None and self.request.answer is None
 
 
 @dataclass
@@ -181,7 +187,7 @@ class CoreMachine(RuleBasedStateMachine):
             if self.limit is not None and (env.cut or (self.on_done and env.ended)):
                 request = Request("reset", value=value)
             if env.lost:
-                request = Request("reset", value=value, restarts=True)
+                request = Request("reset", value=value, restarts=True, at_fault=env.at_fault)
                 env.lost = False
             env.request = request
             requests.append(request)
@@ -229,6 +235,8 @@ class CoreMachine(RuleBasedStateMachine):
         if request.restarts:
             request.answer.truncated = True
             request.answer.info["worker_restarted"] = "was killed by SIGKILL"
+            if request.at_fault is not None:
+                request.answer.info["env_at_fault"] = request.at_fault
 
     def waits(self) -> bool:
         return bool(self.operations) or self.collector is not None
@@ -430,10 +438,13 @@ class CoreMachine(RuleBasedStateMachine):
         """
         host = data.draw(st.sampled_from(self.alive()))
         host.refusals = refusals
-        for slot in range(host.first_slot, host.first_slot + host.num_envs):
+        slots = range(host.first_slot, host.first_slot + host.num_envs)
+        # Fake workers don't say what they were executing, so the first env that owes is taken.
+        at_fault = next((f"fake-{slot}" for slot in slots if self.envs[slot].owes()), None)
+        for slot in slots:
             model = self.envs[slot]
             model.env = FakeEnv(slot, host.life + 1)
-            model.lost = True
+            model.lost, model.at_fault = True, at_fault
             request = model.request
             if request is None or request.answer is not None:
                 continue
@@ -443,6 +454,7 @@ class CoreMachine(RuleBasedStateMachine):
                     model.request = None
             else:
                 request.op, request.seed, request.restarts = "reset", None, True
+                request.at_fault = at_fault
                 model.lost = False
         host.die()
         self.group.wake()

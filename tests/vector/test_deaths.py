@@ -57,6 +57,12 @@ def mortals(mode: AutoresetMode, *, dies: bool, **entry: Any) -> Any:
 def plainly(stepped: Any, mode: AutoresetMode) -> Any:
     """Results without causes of deaths and without times."""
     infos = stepped[-1]
+    for found in (infos, infos.get("final_info", {})):
+        if "env_at_fault" in found:
+            mask, at_fault = found.pop("_env_at_fault"), found.pop("env_at_fault")
+            assert [at_fault[k] for k in np.flatnonzero(mask)] == [
+                f"env-{k}" for k in np.flatnonzero(mask)
+            ]
     if "worker_restarted" in infos:
         assert all(infos["worker_restarted"][infos["_worker_restarted"]])
         if mode == AutoresetMode.SAME_STEP:  # There the info of the reset has it too.

@@ -139,8 +139,8 @@ def evaluate(
         ValueError: a number is below 1, the group has an env_server, or `played` has duplicates or
             episodes of other envs. Of a queue: an episode is there twice, no entry of the group or
             more than one can play it, or an env has sub-environments.
-        RLightningError: an env has lost an episode with its worker three times in a row, and
-            `episodes` is a number.
+        RLightningError: an env has ended its worker three times in a row, and so finishes no
+            episode, and `episodes` is a number.
         BadAction: the policy's actions don't fit; nothing was sent.
         EnvRaised, WorkerDied, EnvHung: as for `EnvGroup.collect_async`; for a queue, only if no env
             is left that could play an episode.
@@ -350,24 +350,15 @@ class _Play:
         for row, info in zip(rows.tolist(), infos, strict=True):
             env_id = env_ids[row]
             self._found.lost += int(self._open[self._places(env_id)].sum())
-            self._losses[env_id] += 1
             self._lost.add(env_id)
+            if info.get("env_at_fault", env_id) != env_id:
+                continue  # Another env of its worker is at fault, and reports so.
+            self._losses[env_id] += 1
             if self._losses[env_id] == _LOSSES_IN_A_ROW:
                 cause = info.get("worker_restarted", "its worker ended")
                 raise RLightningError(
                     f"env {env_id!r} has lost an episode with its worker {_LOSSES_IN_A_ROW} times "
-                    f"in a row, and finishes none: {cause}{self._neighbours(env_id)}. Episodes "
-                    "start again with their seed, so a crash that depends on it repeats: a list of "
-                    "EpisodeSpec gives such an episode up, and plays the others"
+                    f"in a row, and finishes none: {cause}. Episodes start again with their seed, "
+                    "so a crash that depends on it repeats: a list of EpisodeSpec gives such an "
+                    "episode up, and plays the others"
                 )
-
-    def _neighbours(self, env_id: str) -> str:
-        """Name the envs that may have ended an env's worker."""
-        for worker in self._group.get_workers():
-            others = [other for other in worker["env_ids"] if other != env_id]
-            if env_id in worker["env_ids"] and others:
-                return (
-                    f" (its worker has {', '.join(others)} as well, one of which may be the cause; "
-                    "envs_per_process: 1 separates them)"
-                )
-        return ""

@@ -261,7 +261,8 @@ class QueuePlay:
             for row, info in zip(rows, batch.take(rows).info(), strict=True):
                 env_id = env_ids[row]
                 if restarted[row]:
-                    self._lose(env_id, info.get("worker_restarted", "its worker ended"))
+                    at_fault = info.get("env_at_fault", env_id)
+                    self._lose(env_id, info.get("worker_restarted", "its worker ended"), at_fault)
                 else:
                     self._end(env_id, info)
                 if env_id not in self._gone:
@@ -283,16 +284,20 @@ class QueuePlay:
             total_reward=None, length=None, success=None, lost=tuple(attempts.lost),
         )  # fmt: skip
 
-    def _lose(self, env_id: str, cause: str) -> None:
-        """Queue the lost episode of an env again, or note that it failed."""
+    def _lose(self, env_id: str, cause: str, at_fault: str) -> None:
+        """Queue the lost episode of an env again, or note that it failed.
+
+        It was an attempt only if the env itself is at fault, not a neighbour in its worker.
+        """
         attempts = self._playing.pop(env_id, None)
         if self._filming is not None:
             self._filming.drop(env_id)
         if attempts is None:
             return
-        attempts.lost.append(cause)
-        if self._rules.results is not None:
-            self._rules.results.add_lost(attempts.spec, cause)
+        if env_id == at_fault:
+            attempts.lost.append(cause)
+            if self._rules.results is not None:
+                self._rules.results.add_lost(attempts.spec, cause)
         if len(attempts.lost) < self._rules.max_attempts:
             self._waiting[attempts.spec.entry].add(attempts)
         else:
@@ -316,7 +321,7 @@ class QueuePlay:
         self._pending -= struck
         # A ready result of an env that is gone can still be collected.
         for env_id in (struck | self._gone) - self._pending:
-            self._lose(env_id, _cause(fault))
+            self._lose(env_id, _cause(fault), fault.env_id)
             if env_id not in self._gone:
                 self._idle[env_id] = None
         for env_id in self._gone:

@@ -105,11 +105,13 @@ class Report(NamedTuple):
 
     Attributes:
         cause: what ended the worker.
+        at_fault: the id of the env that the worker was executing; None if unknown.
         steps_lost: steps to repeat where the env resumes; None where it begins a new episode.
     """
 
     slot: int
     cause: str
+    at_fault: str | None
     steps_lost: int | None
 
 
@@ -140,6 +142,7 @@ class _Loss:
 
     phase: LossPhase
     cause: str = "could not show the state that was restored"
+    at_fault: str | None = None
     steps_lost: int | None = None
     position: Position | None = None
     resumes: bool = False
@@ -318,11 +321,11 @@ class Continuity:
 
     # -- replies ----------------------------------------------------------------------
 
-    def lose(self, slots: Iterable[int], cause: str) -> None:
+    def lose(self, slots: Iterable[int], cause: str, at_fault: str | None = None) -> None:
         """Record that the episodes of `slots` are lost; nothing is in flight there."""
         for slot in slots:
             loss = self._move(slot, LossEvent.EPISODE_LOST)
-            loss.cause = cause
+            loss.cause, loss.at_fault = cause, at_fault
 
     def answered(self, slots: NDArray[np.intp]) -> list[Report]:
         """Record that results of `slots` arrived, and return the losses that they report."""
@@ -332,7 +335,7 @@ class Continuity:
             if loss is None or loss.phase is LossPhase.LOST:
                 continue
             if loss.phase in (LossPhase.REPORTING, LossPhase.RESUMING):
-                reports.append(Report(slot, loss.cause, loss.steps_lost))
+                reports.append(Report(slot, loss.cause, loss.at_fault, loss.steps_lost))
             if loss.position is not None:
                 self._restored[slot] = loss.position
             self._move(slot, LossEvent.ANSWERED)

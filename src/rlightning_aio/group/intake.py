@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from rlightning_aio.errors import EnvAway, EnvRaised, WorkerDied
+from rlightning_aio.group.continuity import Report
 from rlightning_aio.group.request_states import COLLECTOR
 from rlightning_aio.group.supervisor import GivenUp, Replaced
 from rlightning_aio.hosts.messages import (
@@ -109,7 +110,8 @@ class Intake:
                 self._results.mark_lost(slot)
             if completion.restarted:
                 self._supervisor.note_rebuilt(completion.host_id, slot, completion.restarted)
-                self._results.mark_restarted(slot, completion.restarted, None)
+                env_id = self._envs.env_ids[slot]
+                self._results.mark_restarted(Report(slot, completion.restarted, env_id, None))
             self._note_answered(self._requests.alone(slot))
 
     def _on_value(self, completion: Value) -> None:
@@ -205,7 +207,7 @@ class Intake:
         if not verdict.resets:
             self._fail(owed, verdict.error_for)
             return
-        self._continuity.lose(slots, verdict.cause)
+        self._continuity.lose(slots, verdict.cause, verdict.at_fault)
         # A replacement answers steps and resets, but not calls.
         calls = self._requests.numbering.awaits_value(owed)
         self._fail(owed[calls], verdict.error_for)
@@ -221,7 +223,7 @@ class Intake:
         """Mark results that report a loss, and let steps show that a replacement works."""
         if self._continuity.exceptional:
             for report in self._continuity.answered(slots):
-                self._results.mark_restarted(report.slot, report.cause, report.steps_lost)
+                self._results.mark_restarted(report)
         if self._supervisor.any_deaths:
             for slot in slots.tolist():
                 if self._requests.numbering.op(slot) == Operation.STEP:

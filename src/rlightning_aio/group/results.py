@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from rlightning_aio.batch.sent import Sources
     from rlightning_aio.group.conditions import Conditions
+    from rlightning_aio.group.continuity import Report
     from rlightning_aio.group.env_table import EnvTable
     from rlightning_aio.group.slab_layout import SlabLayout
     from rlightning_aio.hosts.messages import OutOfBand
@@ -122,21 +123,18 @@ class Results:
         self._schemas[first_slot][number] = schema
         self._info_width = max(self._info_width, schema.size, 1)
 
-    def mark_restarted(self, slot: int, cause: str, steps_lost: int | None) -> None:
-        """Mark a result as the first of a replaced worker.
-
-        Args:
-            slot: of the env.
-            cause: of its worker's end.
-            steps_lost: where the env goes on with its episode.
-        """
-        self.detach_info(slot)
-        found = self._out_of_band.get(slot)
+    def mark_restarted(self, report: Report) -> None:
+        """Mark a result as the first of a replaced worker, and note in its info what it reports."""
+        self.detach_info(report.slot)
+        found = self._out_of_band.get(report.slot)
         if isinstance(found, dict):
-            found["info"]["worker_restarted"] = cause
-            if steps_lost is not None:
-                found["info"]["worker_resumed"] = steps_lost
-        self.mark_lost(slot)
+            info = cast("dict[str, Any]", found["info"])
+            info["worker_restarted"] = report.cause
+            if report.at_fault is not None:
+                info["env_at_fault"] = report.at_fault
+            if report.steps_lost is not None:
+                info["worker_resumed"] = report.steps_lost
+        self.mark_lost(report.slot)
 
     def mark_lost(self, slot: int) -> None:
         """Mark a result as one whose episode before was lost; it will be truncated."""

@@ -92,12 +92,16 @@ class Replaced:
 
     Only the user sets hardware in motion: unless the host `resets`, all its outstanding requests
     end in errors. New requests wait until a replacement is up.
+
+    Attributes:
+        at_fault: the id of the env that the worker was executing; None if unknown.
     """
 
     host: Host
     owed: NDArray[np.intp]
     error_for: ErrorFor
     cause: str
+    at_fault: str | None
     resets: bool
 
 
@@ -388,7 +392,8 @@ class Supervisor:
             return None
         self._requests.lose_host(exited.host_id)
         resets = not record.is_hardware
-        return Replaced(record.host, owed, report.error, cause, resets)
+        at_fault = None if record.culprit is None else self._envs.env_ids[record.culprit]
+        return Replaced(record.host, owed, report.error, cause, at_fault, resets)
 
     def _schedule_restart(self, record: HostRecord) -> None:
         """Restart immediately after the first death in a row, later after further ones."""

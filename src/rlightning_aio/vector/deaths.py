@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Deaths", "Stepped", "cause_and_rest"]
 
-_CAUSE: Final = ("worker_restarted", "worker_resumed")
-"""Keys of an info that say why its env was restarted, and how far back it was resumed."""
+_CAUSE: Final = ("worker_restarted", "env_at_fault", "worker_resumed")
+"""Keys of an info that say why its env was restarted, who was at fault, and how much was lost."""
 
 
 class Stepped(NamedTuple):
