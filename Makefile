@@ -26,7 +26,7 @@ PEERS ?= peers
 PIP_INSTALL = $(@D)/bin/python -m pip install --quiet --disable-pip-version-check
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-sanitized test-aarch64 test-ray environments test-simulators test-gpu test-lerobot test-peers test-pythons test-site check prose format docs dist bench clean
+.PHONY: help run test test-programs test-sanitized test-aarch64 test-ray environments test-simulators test-gpu test-lerobot test-peers test-pythons test-site check prose format docs dist bench clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 24
@@ -34,10 +34,18 @@ help: ## this list
 run: $(VENV)/installed ## 32 HalfCheetahs, by AsyncVectorEnv and by make_vec: how much faster on this machine
 	@$(PY) benchmarks/demo.py
 
-# Most tests wait for processes that they start, so six at a time keep two cores busy. A process
+# Tests that run programs take a third of the time, so they have a target of their own.
+PROGRAMS := tests/benchmarks tests/cli tests/examples tests/legacy/test_scripts.py tests/peers tests/test_docs.py tests/test_examples.py
+
+# Most tests wait for processes that they start, so four at a time keep two cores busy. A process
 # without tests takes some from another; until then it has whole files, whose tests share fixtures.
-test: $(VENV)/installed-test ## the tests
-	$(PY) -m pytest --numprocesses 6 --dist worksteal
+PYTEST := $(PY) -m pytest --numprocesses 4 --dist worksteal
+
+test: $(VENV)/installed-test ## the tests of the library
+	$(PYTEST) $(PROGRAMS:%=--ignore=%)
+
+test-programs: $(VENV)/installed-test ## the tests of the command line, benchmarks, examples and pages
+	$(PYTEST) $(PROGRAMS)
 
 # What is said of every place where envs may live, and what only Ray can be asked.
 test-ray: $(VENV)/installed-ray ## the tests of `placement: ray`, on clusters of this machine
