@@ -96,6 +96,31 @@ def test_halves_of_a_call_belong_together(tmp_path: Path) -> None:
         env.reset()
 
 
+class Awaitable:
+    """Gymnasium's methods as coroutine functions."""
+
+    observation_space = action_space = spaces.Discrete(2)
+
+    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        return 0, {}
+
+    async def step(self, action: Any) -> Any:
+        return 0, 0.0, False, False, {}
+
+
+@pytest.mark.parametrize(
+    ("mode", "why"),
+    [
+        (AutoresetMode.NEXT_STEP, "'env-0' is awaitable .* step it through build_env_group"),
+        (AutoresetMode.DISABLED, "'env-0' is awaitable .* step it through build_env_group"),
+        (AutoresetMode.SAME_STEP, "'env-0' .* Expected env to be a `gymnasium.Env`"),
+    ],
+)
+def test_an_awaitable_env_is_refused(mode: AutoresetMode, why: str) -> None:
+    with pytest.raises((EnvRaised, StartFailed), match=why):
+        VectorEnv([Awaitable, Awaitable], autoreset_mode=mode)
+
+
 @pytest.mark.parametrize(
     ("seed", "whose"),
     [

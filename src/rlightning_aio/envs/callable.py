@@ -128,6 +128,14 @@ class _AwaitableEnv(BaseEnv):
         # Looked up anew: a restore replaces an object that has slots only.
         return self.env.step(action)
 
+    def call_wrapped(self, name: str, /, *args: object, **kwargs: object) -> Any:
+        """Say why the vector interfaces, which ask for attributes, can't have this env."""
+        del name, args, kwargs
+        raise TypeError(
+            f"env {self.env_id!r} is awaitable (its step is `async def`), and the vector "
+            "interfaces take gymnasium.Env only; step it through build_env_group"
+        )
+
     def close(self) -> Awaitable[None] | None:
         close = getattr(self.env, "close", None)
         return None if close is None else close()
