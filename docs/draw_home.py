@@ -29,8 +29,8 @@ TASKS: tuple[tuple[str, dict[str, Any], float], ...] = (
     ("Acrobot-v1", {}, 0.12),
     ("Pendulum-v1", {}, 0.06),
 )
-ENVS_OF_TASK, FRAMES, BEFORE = 4, 60, 30
-WIDTH, HEIGHT, GAP = 150, 112, 6
+ENVS_OF_TASK, FRAMES, BEFORE = 4, 36, 30
+WIDTH, HEIGHT, GAP = 132, 99, 6
 READY, IDLE = (255, 167, 38), (222, 224, 232)
 
 
@@ -108,7 +108,7 @@ def main() -> None:
         group.collect_async(wait_all=True)
     FILM.parent.mkdir(exist_ok=True)
     frames[0].save(
-        FILM, save_all=True, append_images=frames[1:], duration=120, loop=0, quality=55, method=6
+        FILM, save_all=True, append_images=frames[1:], duration=120, loop=0, quality=45, method=6
     )
 
 
