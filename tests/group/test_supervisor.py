@@ -54,7 +54,7 @@ class StandIn:
         post: takes its completions; log: its orders.
         builds, closes: at once; otherwise not before it is killed.
         dies: a kill ends it.
-        refusal: the error of a start.
+        refusal: the error of a start; refused_later: by the fork server, not by this process.
         asked: its entries.
         close_errors: of its envs.
         current: the entry that it executes, and since when (ns).
@@ -71,6 +71,7 @@ class StandIn:
     closes: bool = True
     dies: bool = True
     refusal: OSError | None = None
+    refused_later: bool = False
     close_errors: list[tuple[int, ErrorText]] = field(default_factory=list)
     current: tuple[int, int] = (0, 0)
     traffic: int = 0
@@ -80,12 +81,16 @@ class StandIn:
     asked: list[int] = field(default_factory=list[int])
 
     def start(self) -> None:
-        if self.refusal is not None:
-            raise self.refusal
-        self.log.append(f"start {self.host_id}")
         self.built = False
-        if self.builds:
-            self.build()
+        if self.refusal is None:
+            self.log.append(f"start {self.host_id}")
+            if self.builds:
+                self.build()
+        elif self.refused_later:
+            cause = f"could not be forked: {self.refusal}"
+            self.post(Died(self.host_id, Death(cause, refused=True)))
+        else:
+            raise self.refusal
 
     def build(self) -> None:
         self.built = True
@@ -619,12 +624,16 @@ def test_restarts_are_counted_for_each_culprit(fleet: Callable[..., Fleet]) -> N
     assert isinstance(ours.die(0, entry), GivenUp)
 
 
-def test_a_shortage_of_half_a_minute_costs_no_restarts(fleet: Callable[..., Fleet]) -> None:
+@pytest.mark.parametrize("later", [False, True])
+def test_a_shortage_of_half_a_minute_costs_no_restarts(
+    fleet: Callable[..., Fleet], later: bool
+) -> None:
     """Attempts become rarer, other hosts continue, and only then it counts as a death."""
     ours = fleet(max_restarts=2)
-    ours.hosts[0].refusal = OSError("too many open files")
+    ours.hosts[0].refusal, ours.hosts[0].refused_later = OSError("too many open files"), later
     ours.ask(0, 1)
-    assert isinstance(ours.die(0), Replaced)
+    ours.die(0)
+    assert isinstance(ours.verdicts[0], Replaced)
     pauses = []
     for _ in range(10):
         ours.reply(1)
@@ -633,26 +642,30 @@ def test_a_shortage_of_half_a_minute_costs_no_restarts(fleet: Callable[..., Flee
         ours.check()
         pauses.append(round(ours.wait() + 1e-3, 6))
     assert pauses == [0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0, 5.0, 5.0]
-    assert len(ours.verdicts) == 1 + 1, "the last attempt was one too many"
+    attempts = 11 if later else 0
+    assert len(ours.verdicts) == 1 + attempts + 1, "the last attempt was one too many"
     assert ours.verdicts[-1] is None, "a replacement that was never up owes nothing"
     assert round(ours.wait(), 6) == 0.1, "this must be the second restart in a row"
     verdict = ours.verdicts[-1]
     assert isinstance(verdict, GivenUp)
     assert verdict.owed.tolist() == [0]
     error = str(verdict.error_for(verdict.owed))
-    assert "could not be replaced: can't start a worker for entry 'e': too many open" in error
+    why = "it could not be forked: too many open" if later else "too many open"
+    assert f"could not be replaced: can't start a worker for entry 'e': {why}" in error
     assert "after 2 restarts in a row" in error
     assert ours.requests.in_flight == [0, 1]
     assert ours.supervisor.next_check() is None
 
 
-def test_each_shortage_has_its_own_half_minute(fleet: Callable[..., Fleet]) -> None:
+@pytest.mark.parametrize("later", [False, True])
+def test_each_shortage_has_its_own_half_minute(fleet: Callable[..., Fleet], later: bool) -> None:
     """A replacement that could be started ends the previous shortage."""
     ours = fleet(max_restarts=1)
+    ours.hosts[0].refused_later = later
     for _ in range(3):
         ours.hosts[0].refusal = OSError("too many open files")
         (entry,) = ours.ask(0)
-        assert isinstance(ours.die(0, entry), Replaced)
+        ours.die(0, entry)
         while ours.now < ours.supervisor._records[0].refused_since + 20:
             ours.wait()
         ours.hosts[0].refusal = None

@@ -14,7 +14,14 @@ import pytest
 from patience import HANG
 
 import rlightning_aio
-from rlightning_aio.hosts.fork_messages import Exited, Fork, MessageSocket, Preload, Ready
+from rlightning_aio.hosts.fork_messages import (
+    Exited,
+    Fork,
+    MessageSocket,
+    NotForked,
+    Preload,
+    Ready,
+)
 from rlightning_aio.hosts.fork_server import BOOTSTRAP
 from rlightning_aio.hosts.messages import WorkerPlace
 
@@ -139,9 +146,9 @@ def test_fork_server_serves_a_trainer_that_does_not_read() -> None:
             trainer.flush()
         for host_id in range(count):
             message = next_message(trainer).message
-            assert isinstance(message, Exited)
+            assert isinstance(message, NotForked)
             assert message.host_id == host_id
-            assert "no worker could be forked" in message.stderr_tail
+            assert "descriptors didn't arrive" in message.why
     finally:
         trainer.close()
         process.wait(HANG)

@@ -375,6 +375,12 @@ class Supervisor:
             record.stage = Stage.CLOSED
             self._fail_start(start_fault(self._envs, record, death))
             return None
+        if death.refused:
+            record.restarts -= 1
+            self._on_refused(record, f"it {death.cause}", self._clock())
+            return None
+        if record.stage is not Stage.DOWN:
+            record.refusals, record.refused_since = 0, None  # It had started.
         owed = self._requests.owed(np.array(record.slots, np.intp))
         self._continuity.drop_unanswered(
             owed.tolist(), self._requests.numbering.entry[owed].tolist()
@@ -411,17 +417,17 @@ class Supervisor:
         try:
             self._launch(record, now)
         except OSError as error:
-            self._on_refused(record, _refusal(record, error), now)
+            self._on_refused(record, error, now)
             return
         record.restarts += 1
         record.lost_slots.clear()
-        record.refusals, record.refused_since = 0, None
         assert record.order is not None
         checkpoints = self._continuity.checkpoints(record.slots)
         record.host.attach(replace(record.order, checkpoints=checkpoints))
 
-    def _on_refused(self, record: HostRecord, refusal: str, now: float) -> None:
+    def _on_refused(self, record: HostRecord, why: OSError | str, now: float) -> None:
         """Schedule another attempt, because the system refused to start a replacement."""
+        refusal = _refusal(record, why)
         record.stage = Stage.DOWN
         record.start_by = None
         if record.refused_since is None:
@@ -498,8 +504,8 @@ class Supervisor:
         self._conditions.note(DEATH, any_deaths or self._any_given_up)
 
 
-def _refusal(record: HostRecord, error: OSError) -> str:
-    refusal = f"can't start a worker for entry {record.config.name!r}: {error}"
-    if isinstance(error, ConnectionError):
+def _refusal(record: HostRecord, why: OSError | str) -> str:
+    refusal = f"can't start a worker for entry {record.config.name!r}: {why}"
+    if isinstance(why, ConnectionError):
         return refusal
     return f"{refusal}; check its `interpreter` and this machine's process and memory limits"

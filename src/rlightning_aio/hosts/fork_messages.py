@@ -29,6 +29,7 @@ __all__ = [
     "Kill",
     "Message",
     "MessageSocket",
+    "NotForked",
     "Preload",
     "Ready",
     "Received",
@@ -82,7 +83,15 @@ class Exited:
     stderr_tail: str
 
 
-Message: TypeAlias = Preload | Ready | Fork | Forked | Kill | Exited
+@dataclass(frozen=True)
+class NotForked:
+    """The system did not let worker `host_id` be forked."""
+
+    host_id: int
+    why: str
+
+
+Message: TypeAlias = Preload | Ready | Fork | Forked | NotForked | Kill | Exited
 
 FAILED: Final = b"!"
 """First byte of the only packet of a fork server that can't import its code; a text follows."""

@@ -32,6 +32,7 @@ from rlightning_aio.hosts.fork_messages import (
     Forked,
     Kill,
     MessageSocket,
+    NotForked,
     Preload,
     Ready,
 )
@@ -241,8 +242,7 @@ class _ForkServer:
         except OSError as error:
             for descriptor in (*pipe, *descriptors):
                 os.close(descriptor)
-            why = f"no worker could be forked: {error}"
-            self._trainer.send(Exited(order.place.host_id, 1, why))
+            self._trainer.send(NotForked(order.place.host_id, str(error)))
             return
         reader, writer = pipe
         channel, arena = descriptors

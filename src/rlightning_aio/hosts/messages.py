@@ -194,12 +194,14 @@ class Death:
         stderr_tail: its last lines on stderr.
         requests: entries, beginning with those that it may have been executing; they may be
             answered already, or be 0.
+        refused: the system did not let it start.
     """
 
     cause: str
     exit_code: int | None = None
     stderr_tail: str = ""
     requests: tuple[int, ...] = ()
+    refused: bool = False
 
 
 class Built(NamedTuple):

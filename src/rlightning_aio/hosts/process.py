@@ -23,6 +23,7 @@ from rlightning_aio.hosts.fork_messages import (
     Forked,
     Kill,
     MessageSocket,
+    NotForked,
     Preload,
     Ready,
 )
@@ -199,6 +200,8 @@ class ForkServer:
         elif isinstance(message, Exited):
             host = self._hosts.pop(message.host_id)
             host.on_exit(message.exit_code, message.stderr_tail)
+        elif isinstance(message, NotForked):
+            self._hosts.pop(message.host_id).on_refused(message.why)
 
     def _lost(self) -> None:
         """Handle the exit of the fork server; the kernel killed its workers."""
@@ -332,11 +335,17 @@ class ProcessHost:
         by_us = self._killed and exit_code == -signal.SIGKILL
         self._ended(self._killed if by_us else _ending(exit_code), exit_code, stderr_tail)
 
+    def on_refused(self, why: str) -> None:
+        """Handle that the worker could not be forked."""
+        self._ended(f"could not be forked: {why}", None, "", refused=True)
+
     def on_fork_server_lost(self, why: str) -> None:
         """Handle the exit of the fork server, which ended the worker, too."""
         self._ended(f"ended with its fork server: {why}", None, "")
 
-    def _ended(self, cause: str, exit_code: int | None, stderr_tail: str) -> None:
+    def _ended(
+        self, cause: str, exit_code: int | None, stderr_tail: str, *, refused: bool = False
+    ) -> None:
         link, post = self._link, self._wiring.completions.append
         if link is None:
             return
@@ -345,7 +354,7 @@ class ProcessHost:
         self._hang_up()
         self.pid = None
         if not self._closing:
-            post(Died(self.host_id, Death(cause, exit_code, stderr_tail, requests)))
+            post(Died(self.host_id, Death(cause, exit_code, stderr_tail, requests, refused)))
             return
         errors = link.close_errors
         if errors is None:
