@@ -82,7 +82,7 @@ def leaves(value: Any) -> list[Any]:
 async def test_six_simulators_are_collected_as_they_answer(overrides: list[str]) -> None:
     """Results go to their entries; slow ones delay no other, and all take part."""
     counts: Counter[str] = Counter(dict.fromkeys(NAMES, 0))
-    together: set[tuple[str, ...]] = set()
+    partial = 0
     group = rl.build_env_group(rl.load_config(ZOO, overrides), mixed_actions=True)
     async with group:
         spaces = dict(zip(group.env_ids, group.get_observation_spaces(), strict=True))
@@ -95,7 +95,8 @@ async def test_six_simulators_are_collected_as_they_answer(overrides: list[str])
             while counts.total() < RESULTS or min(counts.values()) < LEAST:
                 batch, _ = await group.collect_async()
                 parts = batch.by_name()
-                together.add(tuple(sorted(parts)))
+                # In lockstep every collect returns results of all, until the first entry rests.
+                partial += len(parts) < len(NAMES) and max(counts.values()) < MOST
                 for name, part in parts.items():
                     assert {id_.rpartition("-")[0] for id_ in part.ids()} == {name}
                     check(part, spaces)
@@ -103,8 +104,7 @@ async def test_six_simulators_are_collected_as_they_answer(overrides: list[str])
                     if counts[name] < MOST:
                         group.step_async(part.respond(action=actions(part, action_spaces)))
     assert list(counts) == NAMES
-    # In lockstep every collect would return results of all.
-    assert ("cheetah",) in together
+    assert partial
 
 
 def test_each_entry_has_its_own_columns(overrides: list[str]) -> None:
