@@ -377,3 +377,18 @@ def test_bench_traces_the_fastest_contender(tmp_path: Path) -> None:
     document = invoke_json("bench", config, *QUICK, "--trace", tmp_path / "run.json")
     assert all(len(c["rounds"]) == 2 for c in document["contenders"])
     assert Seen(tmp_path / "run.json").called("step")
+
+
+@pytest.mark.parametrize("command", ["bench", "tune"])
+def test_an_env_that_ends_this_process_is_named_as_a_possible_cause(
+    tmp_path: Path, command: str
+) -> None:
+    """Nothing in the process can say so."""
+    entry = {"name": "dying", "backend": "dying", "task": "any"}
+    done = run(command, write_config(tmp_path, entry), "--rounds", 1, "--seconds", 0.05)
+    assert (done.returncode, done.stdout) == (7, "")
+    assert "stepped itself crashed or called os._exit" in done.stderr
+    entry = {"name": "stub", "backend": "stub", "task": "any"}
+    done = run(command, write_config(tmp_path, entry), "--rounds", 1, "--seconds", 0.05)
+    assert done.returncode == 0
+    assert "error" not in done.stderr

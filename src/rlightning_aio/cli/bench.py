@@ -31,6 +31,7 @@ from rlightning_aio.cli.plots import check_plot, draw_contenders
 from rlightning_aio.cli.policies import Policy, load_policy
 from rlightning_aio.cli.publishing import check_publish, publish
 from rlightning_aio.cli.settings import Setting, possible_settings
+from rlightning_aio.cli.sudden_end import explained_sudden_end
 from rlightning_aio.cli.surroundings import surroundings
 from rlightning_aio.cli.terminal import (
     INTERRUPTED,
@@ -248,7 +249,7 @@ def _rules(num_envs: int) -> list[Rule]:
 
 
 async def _measure(order: _Bench, watch: Watch) -> None:
-    with contextlib.ExitStack() as stack:
+    with explained_sudden_end(), contextlib.ExitStack() as stack:
         # Before the groups start, because Gymnasium forks this process.
         plain: dict[Place, Measurable | str] = {}
         for baseline in order.baselines:

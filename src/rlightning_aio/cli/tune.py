@@ -14,6 +14,7 @@ from rlightning_aio.cli.contender_table import print_contenders
 from rlightning_aio.cli.measuring import Contender, Limits, Rule, Stand, opened, take_turns
 from rlightning_aio.cli.options import Config, MeasuringSeconds, Overrides, Rounds
 from rlightning_aio.cli.settings import Setting, possible_settings
+from rlightning_aio.cli.sudden_end import explained_sudden_end
 from rlightning_aio.cli.terminal import (
     INTERRUPTED,
     count,
@@ -124,7 +125,7 @@ def tune(
     measurements = rounds * (len(settings) + _FINALISTS * len(_least(search.num_envs)))
     interrupted = False
     try:
-        with Watch(len(settings), measurements) as watch:
+        with explained_sudden_end(), Watch(len(settings), measurements) as watch:
             run_interruptible(_search(search, settings, watch))
     except KeyboardInterrupt:
         interrupted = True
