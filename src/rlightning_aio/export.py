@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from rlightning_aio.protocol.columns import mapped, paired
+from rlightning_aio.batch.stacking import concatenated
+from rlightning_aio.protocol.columns import mapped
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -105,15 +106,9 @@ def _part(rollout: Rollout, rows: NDArray[np.intp]) -> dict[str, Any]:
 
 
 def _joined(parts: list[dict[str, Any]], last: Any) -> WholeEpisode:
-    columns = parts[0]
-    for part in parts[1:]:
-        columns = {name: _appended(columns[name], part[name]) for name in columns}
-    columns["observation"] = _appended(columns["observation"], last)
-    return WholeEpisode(**columns)
-
-
-def _appended(tree: Any, more: Any) -> Any:
-    return paired(lambda one, other: np.concatenate([one, other]), tree, more)
+    columns = {name: [part[name] for part in parts] for name in parts[0]}
+    columns["observation"].append(last)
+    return WholeEpisode(**{name: concatenated(trees) for name, trees in columns.items()})
 
 
 # -- Minari -------------------------------------------------------------------------------

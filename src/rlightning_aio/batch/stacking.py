@@ -65,7 +65,7 @@ def columns_where_possible(values: list[Any]) -> Any:
         return values
 
 
-def concatenated(trees: list[Any], order: NDArray[np.intp]) -> Any:
+def concatenated(trees: list[Any], order: NDArray[np.intp] | slice = slice(None)) -> Any:
     """Concatenate trees with the same structure, and reorder their rows."""
     first = trees[0]
     if isinstance(first, dict):
@@ -76,7 +76,7 @@ def concatenated(trees: list[Any], order: NDArray[np.intp]) -> Any:
         return tuple(concatenated([tree[k] for tree in trees], order) for k in range(count))
     if isinstance(first, list):
         rows = [row for tree in trees for row in tree]
-        return [rows[k] for k in order.tolist()]
+        return [rows[k] for k in np.arange(len(rows))[order].tolist()]
     if isinstance(first, np.ndarray):
         return np.concatenate(trees)[order]
     # A process that holds a tensor has imported torch.
