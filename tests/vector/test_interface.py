@@ -117,8 +117,9 @@ class Awaitable:
     ],
 )
 def test_an_awaitable_env_is_refused(mode: AutoresetMode, why: str) -> None:
+    """One worker has both, so the first is always built first."""
     with pytest.raises((EnvRaised, StartFailed), match=why):
-        VectorEnv([Awaitable, Awaitable], autoreset_mode=mode)
+        VectorEnv([Awaitable, Awaitable], autoreset_mode=mode, envs_per_process=2)
 
 
 @pytest.mark.parametrize(
