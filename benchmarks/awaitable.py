@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from harness import (
     Contender,
+    Load,
     arguments,
     machine_facts,
     machine_text,
@@ -220,10 +221,10 @@ WAYS: tuple[Contender, ...] = (
 TARGETS = ((OURS, SHARE, "≥", 0.95), (OURS, TRAINER, "≤", 40), (OURS_MANY, START, "≤", 10))
 
 
-def figures_of(rounds: list[tuple[dict[str, float], float]]) -> dict[str, Any]:
+def figures_of(rounds: list[tuple[dict[str, float], Load]]) -> dict[str, Any]:
     """Return the median, lowest and highest of each figure of a way."""
-    for values, cores in rounds:
-        values[ALL] *= cores
+    for values, load in rounds:
+        values[ALL] *= load.cores
     columns = {name: [values[name] for values, _ in rounds] for name in COLUMNS}
     return {
         name: {"median": statistics.median(found), "low": min(found), "high": max(found)}

@@ -3,8 +3,9 @@
 The bare exchange has only what a group can't omit: forked workers, one pinned to each core, arrays
 that they share with the trainer, an eventfd in each direction, one copy in and one copy out. Its
 envs are those of `gymnasium.make`. It has no request numbers, errors, infos, and deaths. Rounds of
-contenders alternate in one run. The processor time per step, of all processes, is given in addition
-to the rate; it depends less on other work on the machine. *Python twins* are the same group
+contenders alternate in one run. The processor time per step and the context switches per batch of
+all envs, both of all processes, are given in addition to the rate; they depend less on other work
+on the machine. *Python twins* are the same group
 without the compiled kernel, as after an installation without a C compiler.
 """
 
@@ -145,6 +146,7 @@ def question(
         targets=[Target(ours.name, bare.name, bound) for ours, bare, bound in pairs],
         rounds=7,
         seconds=1.5,
+        batch=work.num_envs,
     )
 
 

@@ -25,7 +25,7 @@ from dataclasses import asdict, dataclass, field
 from functools import cache
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -100,6 +100,8 @@ class Question:
         seconds: length of a round; None where the work itself gives the length.
         counts_steps: the figures are env steps per second, so processor time can be reported by
             env step, too.
+        batch: the number of env steps in a batch, for context switches by batch; None if they are
+            not reported.
     """
 
     name: str
@@ -110,19 +112,28 @@ class Question:
     rounds: int = 7
     seconds: float | None = 1.5
     counts_steps: bool = True
+    batch: int | None = None
+
+
+class Load(NamedTuple):
+    """What all processes of a contender asked of the machine in a round.
+
+    Attributes:
+        cores: number of processors that they kept busy. If it is well below the possible number,
+            the contender waited, for others or for itself.
+        switches: context switches per second.
+    """
+
+    cores: float
+    switches: float
 
 
 @dataclass
 class Figures:
-    """The measured values, one for each round, in order.
-
-    Attributes:
-        cores: number of processors that all processes of the contender kept busy. If it is well
-            below the possible number, the contender waited, for others or for itself.
-    """
+    """The measured values, one for each round, in order."""
 
     values: list[float] = field(default_factory=list)
-    cores: list[float] = field(default_factory=list)
+    loads: list[Load] = field(default_factory=list)
 
     @property
     def median(self) -> float:
@@ -136,15 +147,19 @@ class Figures:
             "values": self.values,
         }
 
-    def processor_time(self) -> dict[str, float]:
-        """Return the processor time of all processes for a step, and the number of busy
-        processors.
+    def load_by_step(self, batch: int | None) -> dict[str, float]:
+        """Return the processor time of all processes for a step, the number of busy processors,
+        and the context switches for a batch of `batch` steps.
         """
-        pairs = zip(self.cores, self.values, strict=True)
-        return {
-            "cpu_us_per_step": statistics.median(1e6 * cores / rate for cores, rate in pairs),
-            "cores_used": statistics.median(self.cores),
+        pairs = list(zip(self.loads, self.values, strict=True))
+        found = {
+            "cpu_us_per_step": statistics.median(1e6 * load.cores / rate for load, rate in pairs),
+            "cores_used": statistics.median(load.cores for load in self.loads),
         }
+        if batch is not None:
+            switches = (batch * load.switches / rate for load, rate in pairs)
+            found["switches_per_batch"] = statistics.median(switches)
+        return found
 
 
 def throughput(step: Callable[[], int], seconds: float) -> float:
@@ -181,18 +196,24 @@ class Stage:
         self._answer()
         return self
 
-    def round(self, seconds: float) -> tuple[Any, float]:
-        """Run a round; return its value, and the number of busy processors."""
-        busy, began = self._busy_seconds(), time.perf_counter()
+    def round(self, seconds: float) -> tuple[Any, Load]:
+        """Run a round; return its value, and what it asked of the machine."""
+        before, began = self._used(), time.perf_counter()
         self._connection.send(seconds)
         value = self._answer()
         wall = time.perf_counter() - began
-        return value, (self._busy_seconds() - busy) / wall
+        busy, switches = (
+            after - earlier for after, earlier in zip(self._used(), before, strict=True)
+        )
+        return value, Load(busy / wall, switches / wall)
 
-    def _busy_seconds(self) -> float:
-        """Return the processor time of the contender's processes so far."""
+    def _used(self) -> tuple[float, int]:
+        """Return the seconds of processor time and the context switches of the contender's
+        processes so far.
+        """
         assert self._process.pid is not None
-        return sum(_busy_ns(thread) for pid in family(self._process.pid) for thread in pid) / 1e9
+        threads = [thread for pid in family(self._process.pid) for thread in pid]
+        return sum(map(_busy_ns, threads)) / 1e9, sum(map(_switches, threads))
 
     def _answer(self) -> Any:
         try:
@@ -229,6 +250,14 @@ def _busy_ns(thread: Path) -> int:
         return int(thread.joinpath("schedstat").read_text().split()[0])
     except (FileNotFoundError, ProcessLookupError):
         return 0
+
+
+def _switches(thread: Path) -> int:
+    try:
+        lines = thread.joinpath("status").read_text().splitlines()
+    except (FileNotFoundError, ProcessLookupError):
+        return 0
+    return sum(int(line.split()[1]) for line in lines if "ctxt_switches" in line)
 
 
 def shared_memory() -> set[str]:
@@ -280,7 +309,7 @@ def measure(question: Question, rounds: int, seconds: float, only: Sequence[str]
     machine = machine_facts(modules_of(question.contenders))
     turns, skipped = take_turns(question.contenders, rounds, seconds, only)
     figures = {
-        name: Figures([value for value, _ in found], [cores for _, cores in found])
+        name: Figures([value for value, _ in found], [load for _, load in found])
         for name, found in turns.items()
     }
     return {
@@ -291,7 +320,8 @@ def measure(question: Question, rounds: int, seconds: float, only: Sequence[str]
         "seconds": question.seconds and seconds,
         "machine": machine,
         "results": {
-            name: found.as_json() | (found.processor_time() if question.counts_steps else {})
+            name: found.as_json()
+            | (found.load_by_step(question.batch) if question.counts_steps else {})
             for name, found in figures.items()
         },
         "targets": [
@@ -309,7 +339,7 @@ def take_turns(
     seconds: float,
     only: Sequence[str],
     text_of: Callable[[Any], str] | None = None,
-) -> tuple[dict[str, list[tuple[Any, float]]], dict[str, str]]:
+) -> tuple[dict[str, list[tuple[Any, Load]]], dict[str, str]]:
     """Let contenders take turns, each in its own process.
 
     Args:
@@ -319,10 +349,10 @@ def take_turns(
         only: parts of the names of those that take part; all if empty.
         text_of: returns the value of a round as text.
 
-    Returns the values and busy processors of each contender's rounds, and the reasons why others
-    were left out.
+    Returns the values and loads of each contender's rounds, and the reasons why others were left
+    out.
     """
-    found: dict[str, list[tuple[Any, float]]] = {}
+    found: dict[str, list[tuple[Any, Load]]] = {}
     skipped: dict[str, str] = {}
     with ExitStack() as stack:
         stages = _stages(contenders, only, stack, skipped)
@@ -330,13 +360,13 @@ def take_turns(
             for stage in list(stages):
                 name = stage.contender.name
                 try:
-                    value, cores = stage.round(seconds)
+                    value, load = stage.round(seconds)
                 except ContenderFailed as error:
                     stages.remove(stage)
                     found.pop(name, None)
                     skipped[name] = _last_line(name, error)
                     continue
-                found.setdefault(name, []).append((value, cores))
+                found.setdefault(name, []).append((value, load))
                 text = (text_of or number_text)(value)
                 say(f"  round {number + 1}/{rounds}  {name:{NAME_WIDTH}} {text}")
     return found, skipped
@@ -434,18 +464,24 @@ def number_text(value: float) -> str:
 def tables(report: dict[str, Any]) -> str:
     """Return the report as Markdown."""
     results = report["results"]
-    counts_steps = any("cores_used" in found for found in results.values())
+    more = [
+        (heading, name, text)
+        for heading, name, text in (
+            ("CPU time, µs/step", "cpu_us_per_step", number_text),
+            ("cores used", "cores_used", "{:.2f}".format),
+            ("context switches/batch", "switches_per_batch", number_text),
+        )
+        if any(name in found for found in results.values())
+    ]
     lines = [
         f"| {report['title']} | median, {report['unit']} | lowest to highest |"
-        + (" CPU time, µs/step | cores used |" if counts_steps else ""),
-        "|---|---:|---:|" + ("---:|---:|" if counts_steps else ""),
+        + "".join(f" {heading} |" for heading, _, _ in more),
+        "|---|---:|---:|" + "---:|" * len(more),
     ]
     for name, found in results.items():
         spread = f"{number_text(found['low'])} to {number_text(found['high'])}"
         row = f"| {name} | {number_text(found['median'])} | {spread} |"
-        if counts_steps:
-            row += f" {number_text(found['cpu_us_per_step'])} | {found['cores_used']:.2f} |"
-        lines.append(row)
+        lines.append(row + "".join(f" {text(found[key])} |" for _, key, text in more))
     if report["targets"]:
         lines += [
             "",

@@ -27,6 +27,7 @@ import numpy as np
 from contenders import Limit, OursAsync, OursSync, Work
 from harness import (
     Contender,
+    Load,
     Question,
     arguments,
     machine_facts,
@@ -390,7 +391,7 @@ def _p99_text(brought: Any) -> str:
     return "p99 " + ", ".join(number_text(summary(late)["p99"]) for late in found.values()) + " ms"
 
 
-def rows_of(mixture: Mixture, turns: dict[str, list[tuple[Any, float]]]) -> list[dict[str, Any]]:
+def rows_of(mixture: Mixture, turns: dict[str, list[tuple[Any, Load]]]) -> list[dict[str, Any]]:
     """Return the report's rows of one mixture: one for each `min_results`, with what took part."""
     brought = {name: [value for value, _ in found] for name, found in turns.items()}
     pipe = brought.get(f"{PIPE}, {mixture.name}")

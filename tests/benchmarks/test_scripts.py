@@ -81,6 +81,17 @@ def short_round(script: str, folder: Path) -> list[str]:
     return [script, "--rounds", "1", *seconds, "--json", str(folder / f"{script}.json"), *only]
 
 
+def test_context_switches_of_all_processes(tmp_path: Path) -> None:
+    """Trainer and workers wait for each other in each batch, which takes at least one switch."""
+    only = ("--only", "rlightning_aio sync", "--only", "bare exchange")
+    path = tmp_path / "exchange.json"
+    arguments = ("--rounds", "1", "--seconds", "0.2", "--json", str(path), *only)
+    output_of(BENCHMARKS / "exchange.py", *arguments, folder=tmp_path)
+    report = json.loads(path.read_text())
+    assert "context switches/batch" in report["tables"]
+    assert all(found["switches_per_batch"] > 1 for found in report["results"].values())
+
+
 def test_a_script_run_by_itself(tmp_path: Path) -> None:
     """Contenders have processes of their own then, and their figures come from there."""
     script, *arguments = short_round("cartpole", tmp_path)
