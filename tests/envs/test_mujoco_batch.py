@@ -22,7 +22,7 @@ from rlightning_aio.envs import mujoco_threads
 from rlightning_aio.envs.gymnasium import MujocoEnv, outdated_assets_accepted
 from rlightning_aio.envs.mujoco_batch import MujocoBatch
 from rlightning_aio.envs.mujoco_threads import Simulations
-from rlightning_aio.errors import ConfigError
+from rlightning_aio.errors import ConfigError, EnvRaised
 from rlightning_aio.vector import make_vec
 
 if TYPE_CHECKING:
@@ -226,6 +226,28 @@ def test_a_simulation_that_fails_ends_its_own_episode(
     alone.close()
 
 
+def test_a_failure_and_an_end_in_one_step_have_infos_of_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With `AutoresetMode.SAME_STEP`: a cause for the one that failed, a reward for the other."""
+    monkeypatch.chdir(tmp_path)  # MuJoCo logs there.
+    batch = MujocoBatch(make("Hopper-v5", {})(), 3, AutoresetMode.SAME_STEP)
+    batch.reset(seed=0)
+    lying, still = batch.env.init_qpos.copy(), batch.env.init_qvel
+    lying[1] = 0.3
+    batch.call_one(0, "set_state", batch.env.init_qpos, still + 1e11)
+    batch.call_one(1, "set_state", lying, still)
+    _, _, terminated, truncated, infos = batch.step(np.zeros((3, 3), np.float32))
+    assert (terminated.tolist(), truncated.tolist()) == ([False, True, False], [True, False, False])
+    last = infos["final_info"]
+    assert last["_simulation_failed"].tolist() == [True, False, False]
+    assert last["simulation_failed"].tolist()[1:] == [None, None]
+    assert last["_x_position"].tolist() == [False, True, False]
+    assert infos["_x_position"].all()
+    assert "simulation_failed" not in infos
+    batch.close()
+
+
 RANGES = {
     "body_mass": [0.7, 1.3],
     "geom_friction": [0.5, 1.5],
@@ -296,6 +318,29 @@ def test_a_snapshot_has_the_randomized_fields() -> None:
         expected = steps(one, one.restore(snapshot)[0], actions[2:])
         other.reset(seed=5)
         assert_alike(steps(other, other.restore(snapshot)[0], actions[2:]), expected)
+
+
+@pytest.mark.parametrize(
+    ("saved", "here", "message"),
+    [
+        ({"randomize": RANGES}, {}, "are randomized, and this env's are not"),
+        ({}, {"randomize": RANGES}, "randomize of the snapshot's simulations is None"),
+    ],
+)
+def test_a_snapshot_of_other_simulations_is_refused(saved: Any, here: Any, message: str) -> None:
+    """Those of `make_vec` have no config to compare; nothing is changed."""
+    actions = np.ones((2, 3), np.float32)
+    one, other = make_vec("Hopper-v5", 2, **saved), make_vec("Hopper-v5", 2, **here)
+    one.reset(seed=0)
+    other.reset(seed=0)
+    with pytest.raises(EnvRaised, match=message):
+        other.group.restore(one.group.snapshot())
+    one.close()
+    alike = make_vec("Hopper-v5", 2, **here)
+    alike.reset(seed=0)
+    assert_alike(other.step(actions), alike.step(actions))
+    alike.close()
+    other.close()
 
 
 @pytest.mark.parametrize(

@@ -158,7 +158,7 @@ def test_the_value_of_a_cancelled_call_is_dropped(new_group: NewGroup, name: str
     group.cancel(running)
     with pytest.raises(NothingPending):
         collect(group).result()
-    with pytest.raises(EnvBusy):
+    with pytest.raises(EnvBusy, match="a call that was cancelled still runs"):
         group.core.steps.step_async(steps(0), group.now)
     group.hosts[0].finish()
     group.hosts[0].on_readable()

@@ -34,7 +34,7 @@ from patience import HANG as LONG
 
 import rlightning_aio as rl
 import rlightning_aio.sync
-from rlightning_aio.errors import ConfigError, EnvHung, EnvRaised, StartFailed, WorkerDied
+from rlightning_aio.errors import ConfigError, EnvBusy, EnvHung, EnvRaised, StartFailed, WorkerDied
 from rlightning_aio.evaluation import EpisodeSpec, evaluate
 
 if TYPE_CHECKING:
@@ -187,6 +187,21 @@ async def test_an_episode_that_is_cancelled_leaves_its_env_idle() -> None:
             await running
         batch, _ = await group.reset()
         assert batch.observation[:, 1].tolist() == [2, 1]
+
+
+async def test_a_step_that_is_cancelled_and_tried_again_leaves_its_env_idle() -> None:
+    """The second one is refused; the end of the episode waits for the first."""
+    async with rl.build_env_group(entry(num_workers=1)) as group:
+        gate = Scripted.gates["e-0"] = asyncio.Event()
+        async with group.episode("e-0") as env:
+            first = asyncio.ensure_future(env.step(GATE))
+            await until_at_gate("e-0")
+            first.cancel()
+            with pytest.raises(EnvBusy, match="has not replied yet"):
+                await env.step(STEP)
+            asyncio.get_running_loop().call_soon(gate.set)
+        async with group.episode("e-0") as env:
+            await env.step(STEP)
 
 
 async def test_an_episode_that_is_cancelled_in_its_reset_leaves_its_env_idle() -> None:

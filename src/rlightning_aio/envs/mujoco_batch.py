@@ -19,9 +19,9 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from rlightning_aio.envs.mujoco_randomize import Randomizer
-from rlightning_aio.envs.mujoco_state import load_model, save_model
 from rlightning_aio.envs.mujoco_tasks import task_of
 from rlightning_aio.envs.mujoco_threads import Simulations, state_of
+from rlightning_aio.envs.state import load_state, save_state
 from rlightning_aio.envs.wrappers import ClassName, has_wrapper, wrappers_of
 from rlightning_aio.sharing import num_cores
 
@@ -351,8 +351,13 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         if name in _FIXED or any(different):
             raise _shared(name)
         self._made.set_wrapper_attr(name, values)
+        self._note_options(self._task.positions)
+
+    def _note_options(self, positions: Any) -> None:
+        """Read the options of the env, which may have changed; the positions are the last ones."""
         self._read_options()
         self._task = type(self._task)(self.env, self._simulations)
+        self._task.positions = positions
 
     def is_wrapped(self, name: ClassName) -> bool:
         """Return True if the env has a wrapper of the class `name`."""
@@ -363,7 +368,8 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
     def save_state(self) -> dict[str, Any]:
         """Save the state of all simulations; see `BaseEnv.save_state`."""
         return {
-            "model": save_model(self.env.model),
+            # With the model and all options.
+            "env": save_state(self._made),
             "rows": self._simulations.rows.copy(),
             "positions": self._task.positions,
             "own": self._own,
@@ -372,15 +378,25 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Restore the state of all simulations."""
-        load_model(self.env.model, state["model"])
+        """Restore the state of all simulations.
+
+        Raises:
+            ValueError: it is that of another model, or of simulations with another `randomize`;
+                nothing was changed.
+        """
+        drawn = state["randomizer"]
+        if self._randomizer is not None:
+            self._randomizer.check_fits(drawn)
+        elif drawn is not None:
+            raise ValueError("the snapshot's simulations are randomized, and this env's are not")
+        load_state(self._made, state["env"])
         self._simulations.rows[:] = state["rows"]
-        self._task.positions = state["positions"]
         self._own = [dict(own) for own in state["own"]]
         if self._randomizer is not None:
-            self._randomizer.load_state(state["randomizer"])
+            self._randomizer.load_state(drawn)
         for name in _STATE:
             setattr(self, name, state[name])
+        self._note_options(state["positions"])
 
     def render(self) -> tuple[Any, ...]:
         """Render a frame of each simulation."""
@@ -404,15 +420,16 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
 
 
 def _only(infos: dict[str, Any], chosen: NDArray[np.bool_]) -> dict[str, Any]:
-    """Copy the columns for the simulations `chosen`, with masks as in Gymnasium."""
-    if not chosen.any():
-        return {}
+    """Copy what the columns have for the simulations `chosen`, with masks as in Gymnasium."""
     found: dict[str, Any] = {}
     for name, column in infos.items():
-        if not name.startswith("_"):
+        if name.startswith("_"):
+            continue
+        mask = infos["_" + name] & chosen
+        if mask.any():
             found[name] = column.copy()
-            found[name][~chosen] = 0
-            found["_" + name] = chosen.copy()
+            found[name][~mask] = None if column.dtype == object else 0
+            found["_" + name] = mask
     return found
 
 

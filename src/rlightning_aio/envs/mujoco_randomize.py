@@ -71,12 +71,21 @@ class Randomizer:
         return factors
 
     def save_state(self) -> Any:
-        """Return generators and fields."""
-        return self._generators, {name: values.copy() for name, values in self._values.items()}
+        """Return ranges, generators and fields."""
+        fields = {name: values.copy() for name, values in self._values.items()}
+        return self._ranges, self._generators, fields
+
+    def check_fits(self, state: Any) -> None:
+        """Raise `ValueError` if a state is not that of simulations with the same ranges."""
+        ranges = None if state is None else state[0]
+        if ranges != self._ranges:
+            raise ValueError(
+                f"randomize of the snapshot's simulations is {ranges}, and here {self._ranges}"
+            )
 
     def load_state(self, state: Any) -> None:
-        """Restore what `save_state` returned."""
-        self._generators, fields = state
+        """Restore what `save_state` returned, if it fits."""
+        _, self._generators, fields = state
         for name, values in self._values.items():
             values[:] = fields[name]
         self._simulations.set_const()

@@ -253,8 +253,10 @@ class Simulations:
         data = mujoco.MjData(self._model)
         mujoco.mj_setState(self._model, data, before, _INTEGRATION)
         if not num_steps:
+            warmstart = data.qacc_warmstart.copy()
             data.qacc_warmstart[:] = 0  # As in the reset.
             mujoco.mj_forward(self._model, data)
+            data.qacc_warmstart[:] = warmstart  # The state itself stays as it is.
             return data
         data.ctrl[:] = self.ctrl[k]
         mujoco.mj_step(self._model, data, num_steps)

@@ -317,7 +317,7 @@ def save_state(env: Any) -> SavedState:
     for path, part in parts.items():
         if part.kind.is_layer and type(part.value).__basicsize__ > _Plain.__basicsize__:
             raise NotImplementedError(
-                f"{path} of env {env.env_id!r} is a {type(part.value).__name__}, whose state is "
+                f"{path} of {_described(env)} is a {type(part.value).__name__}, whose state is "
                 f"in a library that gives no access to it; {_WAY_OUT}"
             )
     paths = {id(part.value): path for path, part in parts.items()}
@@ -327,6 +327,12 @@ def save_state(env: Any) -> SavedState:
     except Exception as error:
         raise NotImplementedError(_culprit(env, states, paths, error)) from error
     return SavedState(tuple((path, _name_of(part)) for path, part in parts.items()), pickled)
+
+
+def _described(env: Any) -> str:
+    """An env in an error: by its id, or by its type if it is a simulator within an env."""
+    env_id = getattr(env, "env_id", None)
+    return f"a {type(env).__name__}" if env_id is None else f"env {env_id!r}"
 
 
 def _name_of(part: _Part) -> str:
@@ -355,10 +361,10 @@ def _culprit(
                 _pickled(value, paths)
             except Exception as own:  # noqa: BLE001  # An object may raise anything.
                 return (
-                    f"{path}.{name} of env {env.env_id!r}, a {type(value).__name__}, can't be "
+                    f"{path}.{name} of {_described(env)}, a {type(value).__name__}, can't be "
                     f"saved: {own}; {_WAY_OUT}"
                 )
-    return f"env {env.env_id!r} can't be saved: {error}; {_WAY_OUT}"
+    return f"{_described(env)} can't be saved: {error}; {_WAY_OUT}"
 
 
 def load_state(env: Any, state: SavedState) -> None:
@@ -372,7 +378,7 @@ def load_state(env: Any, state: SavedState) -> None:
         here = _name_of(parts[path]) if path in parts else "missing"
         if here != name:
             raise ValueError(
-                f"{path} is a {name} in the snapshot, and {here} in env {env.env_id!r}: it is "
+                f"{path} is a {name} in the snapshot, and {here} in {_described(env)}: it is "
                 "another env, or has not been reset yet"
             )
     states = _Unpickler(io.BytesIO(state.pickled), parts).load()

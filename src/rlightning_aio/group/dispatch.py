@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from rlightning_aio.errors import BadAction, EnvBusy
-from rlightning_aio.group.request_states import State
+from rlightning_aio.group.request_states import NOBODY, State
 from rlightning_aio.protocol.slab import NO_SEED
 
 if TYPE_CHECKING:
@@ -49,12 +49,12 @@ class Dispatch:
         self._supervisor.check_usable(slots)
         slot = self._requests.first_not_idle(slots)
         if slot is not None:
-            busy = self._requests.state[slot] == State.BUSY
-            state = "has not replied yet" if busy else "was not collected"
-            raise EnvBusy(
-                f"can't {what} {self._envs.describe(slot)}: its last request {state}; collect it "
-                "first; nothing was sent"
-            )
+            why = "its last request was not collected; collect it first"
+            if self._requests.owner[slot] == NOBODY:
+                why = "a call that was cancelled still runs in it; try again when that has ended"
+            elif self._requests.state[slot] == State.BUSY:
+                why = "its last request has not replied yet; collect it first"
+            raise EnvBusy(f"can't {what} {self._envs.describe(slot)}: {why}; nothing was sent")
 
     def check_local(self, slots: NDArray[np.intp], what: str) -> None:
         """Raise `NotImplementedError` if any of `slots` belongs to a member."""

@@ -33,7 +33,8 @@ class EnvEpisode:
     ) -> None:
         self.env = env
         self._seed, self._options = seed, options
-        self._running: asyncio.Task[EnvRet | MultiAgentEnvRet] | None = None
+        # The newest call, and earlier ones that were cancelled or raised.
+        self._tasks: list[asyncio.Task[EnvRet | MultiAgentEnvRet]] = []
 
     async def __aenter__(self) -> Self:
         try:
@@ -44,11 +45,11 @@ class EnvEpisode:
         return self
 
     async def __aexit__(self, *exc: object) -> None:
-        running, self._running = self._running, None
-        if running is not None:
-            await asyncio.wait({running})
+        tasks, self._tasks = self._tasks, []
+        for task in tasks:
+            await asyncio.wait({task})
             # Read, so that asyncio doesn't log an error that nobody asks for.
-            _ = running.cancelled() or running.exception()
+            _ = task.cancelled() or task.exception()
 
     @property
     def is_over(self) -> bool:
@@ -58,15 +59,16 @@ class EnvEpisode:
     async def step(self, response: PolicyResponse | Any) -> EnvRet | MultiAgentEnvRet:
         """Step with a `PolicyResponse`, or with a bare action, and wait for the result.
 
-        Cancelled, it leaves the result to the end of the episode. Errors are those of
-        `EnvHandle.step`.
+        Cancelled, it leaves the result to the end of the episode; until the env has replied,
+        further steps raise `EnvBusy`. Other errors are those of `EnvHandle.step`.
         """
         return await self._wait_for(self.env.step(response))
 
     async def _wait_for(
         self, answer: Coroutine[Any, Any, EnvRet | MultiAgentEnvRet]
     ) -> EnvRet | MultiAgentEnvRet:
-        self._running = running = asyncio.ensure_future(answer)
-        self.last = await asyncio.shield(running)
-        self._running = None
+        task = asyncio.ensure_future(answer)
+        self._tasks.append(task)
+        self.last = await asyncio.shield(task)
+        self._tasks.remove(task)
         return self.last
