@@ -93,6 +93,15 @@ class AioDriver:
         if running is not ours and (running or ours.is_running() or ours.is_closed()):
             raise self._elsewhere(ours)
 
+    def call(self, function: Callable[..., None], *args: Any) -> None:
+        """Call a function that doesn't wait, after `check_caller`."""
+        self.check_caller()
+        function(*args)
+
+    def run_env(self, execute: Callable[[], T]) -> T:
+        """Call a function that runs an env; asyncio handles Ctrl-C."""
+        return execute()
+
     def move(self) -> None:
         """Bind the driver to the running loop, if its own loop is not running.
 

@@ -95,6 +95,10 @@ class Driver(Watcher, Protocol):
         """Raise `RLightningError` if another thread uses the group, or another loop owns it."""
         ...
 
+    def call(self, function: Callable[..., None], *args: Any) -> None:
+        """Call a function of the group that doesn't wait, after `check_caller`."""
+        ...
+
     def forget(self) -> None:
         """Forget all sources without unregistering them, as the parent still watches them."""
         ...
@@ -203,8 +207,7 @@ class Facade:
             GroupClosed: the group was not initialised, or is closed.
             RLightningError: another thread is using the group, or it belongs to another loop.
         """
-        self._driver.check_caller()
-        self._steps.step_async(batch, time.monotonic())
+        self._driver.call(self._steps.step_async, batch, time.monotonic())
 
     def reset_async(
         self,
@@ -230,8 +233,7 @@ class Facade:
             GroupClosed: the group was not initialised, or is closed.
             RLightningError: another thread is using the group, or it belongs to another loop.
         """
-        self._driver.check_caller()
-        self._core.reset_async(time.monotonic(), seed, options, env_ids)
+        self._driver.call(self._core.reset_async, time.monotonic(), seed, options, env_ids)
 
     def call_async(
         self, name: str, /, *args: Any, env_ids: Sequence[str] | None = None, **kwargs: Any
@@ -249,8 +251,8 @@ class Facade:
             GroupClosed: the group was not initialised, or is closed.
             RLightningError: another thread is using the group, or it belongs to another loop.
         """
-        self._driver.check_caller()
-        self._core.calls.call_async(time.monotonic(), env_ids, (name, args, kwargs))
+        call = (name, args, kwargs)
+        self._driver.call(self._core.calls.call_async, time.monotonic(), env_ids, call)
 
     def _collect_calls(self, deadline: float | None) -> Procedure[list[Any]]:
         _check_seconds("deadline", deadline)

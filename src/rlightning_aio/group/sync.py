@@ -2,15 +2,21 @@
 
 It runs the same core as the asynchronous group, without an event loop and without a thread, so it
 works in a script, in a thread, and in a notebook cell whose loop is running.
+
+Rule: Ctrl-C never stops a call between two changes of the group's state. It is raised where the
+call waits or runs an env in this process, or else once the call has done what it can without
+waiting; a second one is raised at once.
 """
 
 from __future__ import annotations
 
 import os
 import select
+import signal
 import threading
 import time
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
 
 from rlightning_aio.errors import RLightningError
 from rlightning_aio.group.facade import forked_from, only_result, steps_of, this_process
@@ -24,7 +30,7 @@ from rlightning_aio.group.wait import TURN
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence, Sized
-    from types import TracebackType
+    from types import FrameType, TracebackType
 
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.group.wait import Procedure
@@ -34,6 +40,11 @@ if TYPE_CHECKING:
 __all__ = ["EnvGroup", "EnvHandle", "ServerHandle", "SyncDriver"]
 
 T = TypeVar("T")
+
+# The functions of `signal` take ten times as long, because they make enums.
+_signal: Any = import_module("_signal")
+_SIGINT: Final = int(signal.SIGINT)
+_MAIN_THREAD: Final = threading.main_thread().ident
 
 
 def _nothing() -> None: ...
@@ -52,6 +63,8 @@ class SyncDriver:
         self._pid = os.getpid()
         # The thread that is in a call now; 0 if none is.
         self._thread = 0
+        # Ctrl-C may be raised; there was one when it could not be.
+        self._is_interruptible = self._is_interrupted = False
 
     def check_caller(self) -> None:
         """Check the thread as `facade.Driver` says; signal handlers of the waiting thread pass."""
@@ -106,16 +119,13 @@ class SyncDriver:
         Raises:
             RLightningError: another thread is using the group, or it belongs to another process.
         """
-        me = threading.get_ident()
-        # No function call before the assignment, so no other thread can run in between.
-        if this_process[0] != self._pid or self._thread not in (0, me):
-            raise self._refusal()
-        outermost = not self._thread
-        self._thread = me
+        outermost, holds_back = self._enter()
         try:
             wait = procedure.send(None)  # pyright: ignore[reportArgumentType]
             while True:
                 try:
+                    if self._is_interrupted:
+                        self._raise_interrupt()
                     if wait is not TURN:  # No other procedure can run.
                         self._block(wait.until)
                         if self.completions:
@@ -128,22 +138,91 @@ class SyncDriver:
         except StopIteration as stop:
             return stop.value
         finally:
+            self._leave(outermost, holds_back)
+
+    def call(self, function: Callable[..., None], *args: Any) -> None:
+        """Call a function that doesn't wait; errors are those of `run`."""
+        outermost, holds_back = self._enter()
+        try:
+            function(*args)
+        finally:
+            self._leave(outermost, holds_back)
+
+    # -- one thread at a time, and Ctrl-C ---------------------------------------------
+
+    def _enter(self) -> tuple[bool, bool]:
+        """Begin a call. Return True if it is no call within another, and True if it holds back
+        Ctrl-C; a program that handles SIGINT in its own way goes on doing so.
+        """
+        me = threading.get_ident()
+        # No function call before the assignment, so no other thread can run in between.
+        if this_process[0] != self._pid or self._thread not in (0, me):
+            raise self._refusal()
+        outermost = not self._thread
+        try:
+            self._thread = me
+            holds_back = (
+                outermost
+                and me == _MAIN_THREAD
+                and _signal.getsignal(_SIGINT) is signal.default_int_handler
+            )
+            if holds_back:
+                self._is_interruptible = self._is_interrupted = False
+                _signal.signal(_SIGINT, self._on_interrupt)
+        except BaseException:  # Ctrl-C, just before it is held back.
             if outermost:
                 self._thread = 0
+            raise
+        return outermost, holds_back
+
+    def _leave(self, outermost: bool, holds_back: bool) -> None:
+        if outermost:
+            self._thread = 0
+        if holds_back:
+            if _signal.getsignal(_SIGINT) == self._on_interrupt:  # An env may have set another.
+                _signal.signal(_SIGINT, signal.default_int_handler)
+            if self._is_interrupted:
+                self._raise_interrupt()
+
+    def _on_interrupt(self, number: int, frame: FrameType | None) -> None:
+        """Handle Ctrl-C during a call."""
+        del number, frame
+        if self._is_interruptible or self._is_interrupted:
+            self._raise_interrupt()
+        self._is_interrupted = True
+
+    def _raise_interrupt(self) -> None:
+        self._is_interrupted = False
+        raise KeyboardInterrupt
+
+    # -- waiting ----------------------------------------------------------------------
+
+    def run_env(self, execute: Callable[[], T]) -> T:
+        self._is_interruptible = True
+        try:
+            if self._is_interrupted:  # A moment ago.
+                self._raise_interrupt()
+            return execute()
+        finally:
+            self._is_interruptible = False
 
     def _block(self, until: float | None) -> None:
-        if self._epoll is None:
-            if until:
-                time.sleep(max(0.0, until - time.monotonic()))
-            return
-        timeout = -1.0 if until is None else max(0.0, until - time.monotonic())
         epoll = self._epoll
+        self._is_interruptible = True
         try:
-            found = epoll.poll(timeout)
+            if self._is_interrupted:  # A moment ago.
+                self._raise_interrupt()
+            if epoll is None:
+                if until:
+                    time.sleep(max(0.0, until - time.monotonic()))
+                return
+            found = epoll.poll(-1.0 if until is None else max(0.0, until - time.monotonic()))
         except OSError:
-            if not epoll.closed:
+            if epoll is None or not epoll.closed:
                 raise
             return  # A signal handler closed the group.
+        finally:
+            self._is_interruptible = False
         for descriptor, events in found:
             source = self._sources.get(descriptor)
             if source is not None and events & select.EPOLLOUT:
@@ -161,10 +240,10 @@ class EnvGroup(GroupInterface):
         with build_env_group(load_config("configs/halfcheetah.yaml")) as group:
             batch, _ = group.reset(seed=0)
 
-    Each method blocks the calling thread until it is done. Ctrl-C during a wait raises
-    KeyboardInterrupt and leaves the results to `collect_async`; Ctrl-C while a request is being
-    sent leaves only `close` (docs/faults.md). Any thread may use the group, one at a time: a call
-    while another thread is in one raises RLightningError.
+    Each method blocks the calling thread until it is done. Ctrl-C raises KeyboardInterrupt, leaves
+    outstanding results to `collect_async`, and the group remains usable (docs/faults.md). Any
+    thread may use the group, one at a time: a call while another thread is in one raises
+    RLightningError.
     """
 
     _driver: SyncDriver

@@ -11,7 +11,7 @@ Left out on purpose: waiting. Neither side ever waits.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar, runtime_checkable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -38,6 +38,8 @@ __all__ = [
     "Watcher",
     "Wiring",
 ]
+
+T = TypeVar("T")
 
 
 class Source(Protocol):
@@ -73,6 +75,10 @@ class Watcher(Protocol):
 
     def wake(self) -> None:
         """Wake all waiters, as if a source had posted a completion."""
+        ...
+
+    def run_env(self, execute: Callable[[], T]) -> T:
+        """Call a function that runs an env in this thread; Ctrl-C may interrupt it."""
         ...
 
 

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio.hosts.base import Watcher, Wiring
-    from rlightning_aio.hosts.messages import AttachOrder, OutOfBand, StartOrder
+    from rlightning_aio.hosts.messages import AttachOrder, EnvStarted, OutOfBand, StartOrder
     from rlightning_aio.hosts.runner import EnvRunner
 
 __all__ = ["InlineHost"]
@@ -65,24 +65,28 @@ class InlineHost:
         # Entries of results in rows that were not reported yet.
         self._done: list[int] = []
         self._schemas = InfoSchemas(self._announce)
-        self._watcher = wiring.watcher if wiring.shares_thread else None
+        self._watcher = wiring.watcher
+        self._shares_thread = wiring.shares_thread
         self._threads: _Threads | None = None
 
     def start(self) -> None:
         """Build the envs immediately."""
         try:
-            for runner in built_envs(self._order, inline=True):
-                self._runners.append(runner)
-            started = [runner.started() for runner in self._runners]
+            started = self._watcher.run_env(self._built)
         except KeyboardInterrupt:
             raise
         except BaseException as error:
             index = min(len(self._runners), self.num_envs - 1)
             self._post(NotBuilt(self.host_id, index, ErrorText.of(error)))
             return
-        if self._watcher is not None:
+        if self._shares_thread:
             self._threads = _Threads(self._runners, self._queue, self._watcher)
         self._post(Built(self.host_id, started))
+
+    def _built(self) -> list[EnvStarted]:
+        for runner in built_envs(self._order, inline=True):
+            self._runners.append(runner)
+        return [runner.started() for runner in self._runners]
 
     def attach(self, order: AttachOrder) -> None:
         map_part = partial(map_shared, self._arena.descriptor)
@@ -126,7 +130,7 @@ class InlineHost:
             return False
         entry, execute = self._queue.popleft()
         try:
-            outcome = execute()
+            outcome = self._watcher.run_env(execute)
         except BaseException as error:
             self._raised(entry, error)
             return True
@@ -153,7 +157,7 @@ class InlineHost:
 
     def step_now(self) -> OutOfBand | None:
         """Step env 0 with the action in its row; the queue must have no request to it."""
-        return self._runners[0].step()
+        return self._watcher.run_env(self._runners[0].step)
 
     def step_next(self) -> tuple[int, OutOfBand | None] | None:
         """Execute the next request if it is a step or a reset, without a completion.
@@ -165,7 +169,7 @@ class InlineHost:
             return None
         entry, execute = self._queue.popleft()
         try:
-            return entry, execute()
+            return entry, self._watcher.run_env(execute)
         except BaseException as error:
             self._raised(entry, error)
             return None

@@ -1,0 +1,136 @@
+"""Ctrl-C at any moment of a call of a synchronous group: the group goes on afterwards."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import rlightning_aio.sync
+from rlightning_aio.vector.leftovers import drop_outstanding
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import FrameType
+
+    from rlightning_aio.batch import BatchedData
+
+ENTRY = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1"}
+PLACES = {
+    "alone": {"placement": "inline"},
+    "inline": {"placement": "inline", "num_workers": 3},
+    "workers": {"num_workers": 3, "envs_per_process": 2},
+}
+NUM_LINES = 3000
+"""More lines than any of the calls below executes."""
+
+
+class Strike:
+    """A trace function that sends Ctrl-C at the n-th line of this library."""
+
+    def __init__(self, line: int) -> None:
+        self.left = line
+
+    def __call__(self, frame: FrameType, event: str, arg: Any) -> Any:
+        return self._line if "/rlightning_aio/" in frame.f_code.co_filename else None
+
+    def _line(self, frame: FrameType, event: str, arg: Any) -> Any:
+        if event == "line":
+            self.left -= 1
+            if self.left == 0:
+                signal.raise_signal(signal.SIGINT)
+        return self._line
+
+
+def struck(line: int, call: Callable[[], object]) -> bool:
+    """Make a call with Ctrl-C at that line; return True if the line was reached."""
+    strike, interrupted = Strike(line), False
+    sys.settrace(strike)
+    try:
+        call()
+    except KeyboardInterrupt:
+        interrupted = True
+    finally:
+        sys.settrace(None)
+    assert interrupted == (strike.left <= 0)
+    return interrupted
+
+
+def step(group: Any, batch: BatchedData) -> None:
+    group.step(batch.respond(action=np.ones(len(batch), int)))
+
+
+def step_async(group: Any, batch: BatchedData) -> None:
+    group.step_async(batch.respond(action=np.ones(len(batch), int)))
+    group.collect_async(wait_all=True)
+
+
+def reset(group: Any, batch: BatchedData) -> None:
+    del batch
+    group.reset(seed=4)
+
+
+def call(group: Any, batch: BatchedData) -> None:
+    del batch
+    group.call_async("call_wrapped", "get_wrapper_attr", "render_mode")
+    group.collect_calls()
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("use", [step, step_async, reset, call], ids=lambda use: use.__name__)
+def test_a_group_goes_on_wherever_a_call_was_interrupted(
+    use: Callable[[Any, BatchedData], None], place: str
+) -> None:
+    """The next reset and step give what they give without the interrupt."""
+    alone = gym.make("CartPole-v1")
+    with rlightning_aio.sync.build_env_group({**ENTRY, **PLACES[place]}) as group:
+        count = len(group.env_ids)
+        expected = np.array([alone.reset(seed=7 + k)[0] for k in range(count)])
+        batch, _ = group.reset(seed=7)
+        for line in range(1, NUM_LINES, 23):
+            reached = struck(line, lambda last=batch: use(group, last))
+            drop_outstanding(group)
+            batch, _ = group.reset(seed=7)
+            np.testing.assert_array_equal(batch.observation, expected)
+            batch, _ = group.step(batch.respond(action=np.zeros(count, int)))
+            assert batch.reward.tolist() == [1.0] * count
+            if not reached:
+                break
+        else:
+            pytest.fail(f"a call executes more than {NUM_LINES} lines")
+    alone.close()
+
+
+class Pressing(gym.Env[Any, Any]):
+    """Presses Ctrl-C in each step."""
+
+    observation_space = gym.spaces.Discrete(2)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        return 0, {}
+
+    def step(self, action: Any) -> Any:
+        signal.raise_signal(signal.SIGINT)
+        return 1, 1.0, False, False, {}
+
+
+def test_a_program_that_handles_ctrl_c_itself_goes_on_doing_so() -> None:
+    """Its handler is called at once, and is there afterwards; without one, nothing is left."""
+    heard: list[int] = []
+    before = signal.getsignal(signal.SIGINT)
+    entry = {"name": "a", "make_env": Pressing, "placement": "inline"}
+    with rlightning_aio.sync.build_env_group(entry) as group:
+        batch, _ = group.reset()
+        assert signal.getsignal(signal.SIGINT) is before
+        own = signal.signal(signal.SIGINT, lambda number, _: heard.append(number))
+        try:
+            batch, _ = group.step(batch.respond(action=np.ones(1, int)))
+        finally:
+            assert signal.signal(signal.SIGINT, own) is not before
+        assert heard == [signal.SIGINT]
+        assert batch.observation.tolist() == [1]
