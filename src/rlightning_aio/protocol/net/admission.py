@@ -153,7 +153,7 @@ class Admission:
         announced = self._announcement(hello)
         record = self._registry.reserve(hello.name, announced.num_bytes)
         session = record.session = Session(
-            self._new_token(), hello.nonce, record, announced, peer.route, peer.user, now
+            self._new_token(), hello.nonce, record, announced, peer.route, peer.user, now, now
         )
         self._registry.sessions[session.token] = session
         self._monitor.start(now)

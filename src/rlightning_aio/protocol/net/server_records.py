@@ -121,65 +121,38 @@ class LastObservation(NamedTuple):
     observation: Any
 
 
+@dataclass(slots=True, eq=False)
 class Session:
     """One session of a client.
 
-    Args:
+    Attributes:
         token: number that the client puts into its messages.
         nonce: number of the hello that opened the session.
         record: of the client.
         announced: contents of that hello.
         route: address of the client's connection.
         user: name of the client's key; None without keys.
-        now: monotonic seconds.
-
-    Attributes:
+        received_at, pinged_at: times of the last message and the last ping (monotonic seconds).
         joined: the first result has arrived.
-        received_at, pinged_at: times of the last message and the last ping.
         unanswered_since: time of the first ping since the last message.
         unreachable_since: time of the first message that found no connection.
         last_number: wire number of the last request.
         num_malformed: malformed answers to the current request.
     """
 
-    __slots__ = (
-        "announced",
-        "joined",
-        "last_number",
-        "nonce",
-        "num_malformed",
-        "pinged_at",
-        "received_at",
-        "record",
-        "route",
-        "token",
-        "unanswered_since",
-        "unreachable_since",
-        "user",
-    )
-
-    def __init__(
-        self,
-        token: int,
-        nonce: int,
-        record: ClientRecord,
-        announced: Announcement,
-        route: bytes,
-        user: str | None,
-        now: float,
-    ) -> None:
-        self.token = token
-        self.nonce = nonce
-        self.record = record
-        self.announced = announced
-        self.route = route
-        self.user = user
-        self.received_at = self.pinged_at = now
-        self.joined = False
-        self.unanswered_since: float | None = None
-        self.unreachable_since: float | None = None
-        self.last_number = 0
-        self.num_malformed = 0
+    token: int
+    nonce: int
+    record: ClientRecord
+    announced: Announcement
+    route: bytes
+    user: str | None
+    received_at: float
+    pinged_at: float
+    joined: bool = False
+    unanswered_since: float | None = None
+    unreachable_since: float | None = None
+    last_number: int = 0
+    num_malformed: int = 0
 
     @property
     def request(self) -> PendingRequest | None:
