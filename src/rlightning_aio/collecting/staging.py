@@ -8,7 +8,7 @@ results. Incomplete places of a full rollout are carried over to the next one.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
@@ -31,7 +31,7 @@ _NO_PLACE: Final = -1
 _NO_ROWS: Final = np.zeros(0, np.intp)
 
 
-class Full:
+class Full(NamedTuple):
     """The order of the transitions of a rollout.
 
     Attributes:
@@ -41,19 +41,10 @@ class Full:
         num_chains: number of envs with transitions.
     """
 
-    __slots__ = ("end_rows", "ends", "num_chains", "order")
-
-    def __init__(
-        self,
-        order: NDArray[np.intp],
-        ends: NDArray[np.intp],
-        end_rows: NDArray[np.intp],
-        num_chains: int,
-    ) -> None:
-        self.order = order
-        self.ends = ends
-        self.end_rows = end_rows
-        self.num_chains = num_chains
+    order: NDArray[np.intp]
+    ends: NDArray[np.intp]
+    end_rows: NDArray[np.intp]
+    num_chains: int
 
 
 class Staging:
