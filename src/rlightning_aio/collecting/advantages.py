@@ -41,7 +41,7 @@ class Segments:
             number of envs in a ``[T, N]`` block.
     """
 
-    def __init__(self, ends: NDArray[np.intp], count: int, stride: int = 1) -> None:
+    def __init__(self, ends: NDArray[np.intp], count: int, stride: int) -> None:
         self.ends = ends
         self.count = count
         self.stride = stride

@@ -88,7 +88,7 @@ class EnvKind:
         policy: Callable[[BatchedData], Any],
         quota: int,
         meta_of: Callable[[str], EnvMeta | None],
-        infos: Sequence[str] = (),
+        infos: Sequence[str],
     ) -> None:
         self.policy = policy
         self._meta_of = meta_of
@@ -96,7 +96,7 @@ class EnvKind:
         self.num_steps = 0
         self.held: Part | None = None
         self._acts_in_arrays = False
-        self.staging = Staging(quota, 0, infos)
+        self.staging = Staging(quota, infos)
         self._taken = OWN_NAMES.union(infos)
         # Two sets, so that one rollout can be read while the next one is collected.
         self._sets: list[dict[str, Tree]] = [{}, {}]

@@ -52,7 +52,6 @@ class Staging:
 
     Args:
         quota: maximum number of transitions of a rollout.
-        num_envs: expected number of envs, counting sub-environments; it may grow.
         infos: names of numbers in infos that become columns.
 
     Attributes:
@@ -62,7 +61,7 @@ class Staging:
         episodes: those that ended with these transitions.
     """
 
-    def __init__(self, quota: int, num_envs: int, infos: Sequence[str] = ()) -> None:
+    def __init__(self, quota: int, infos: Sequence[str]) -> None:
         self._quota = quota
         self._infos = infos
         self.episodes: list[EndedEpisode] = []
@@ -74,24 +73,23 @@ class Staging:
         self._is_settled = False
         # True once a transition was completed; the columns of resets may be incomplete.
         self._knows_results = False
-        # By place.
-        size = quota + num_envs
-        self._env = np.zeros(size, np.int64)
-        self._first = np.zeros(size, np.bool_)
-        self._version = np.zeros(size, np.int64)
-        self._is_complete = np.zeros(size, np.bool_)
+        # By place; `_make_room` adds one for each env.
+        self._env = np.zeros(quota, np.int64)
+        self._first = np.zeros(quota, np.bool_)
+        self._version = np.zeros(quota, np.int64)
+        self._is_complete = np.zeros(quota, np.bool_)
         self._used = 0
         # By env: the place of its step in flight, and of its last transition; True if the next one
         # begins a chain; True if its episode is over and waits for a reset.
-        self.made = np.zeros(num_envs, np.int64)
-        self._place = np.full(num_envs, _NO_PLACE, np.intp)
-        self._last = np.full(num_envs, _NO_PLACE, np.intp)
-        self._fresh = np.ones(num_envs, np.bool_)
-        self._over = np.zeros(num_envs, np.bool_)
-        self._known = np.zeros(num_envs, np.bool_)
-        self._resets_in_same_step = np.zeros(num_envs, np.bool_)
+        self.made = np.zeros(0, np.int64)
+        self._place = np.zeros(0, np.intp)
+        self._last = np.zeros(0, np.intp)
+        self._fresh = np.zeros(0, np.bool_)
+        self._over = np.zeros(0, np.bool_)
+        self._known = np.zeros(0, np.bool_)
+        self._resets_in_same_step = np.zeros(0, np.bool_)
         # The place of each end; the observation after it is in the same row of `end_observation`.
-        self._end_place = np.zeros(size, np.intp)
+        self._end_place = np.zeros(quota, np.intp)
         self._num_ends = self._end_room = 0
 
     # -- envs -------------------------------------------------------------------------
@@ -108,27 +106,17 @@ class Staging:
         return new
 
     def _make_room(self, index: NDArray[np.int64]) -> None:
-        needed = int(index.max(initial=-1)) + 1
         known = len(self._place)
-        if needed <= known:
-            return
-        count = max(needed, 2 * known)
+        count = max(int(index.max()) + 1, 2 * known)
         size = self._quota + count
         for name in ("_env", "_first", "_version", "_is_complete", "_end_place"):
             setattr(self, name, grown(getattr(self, name), size))
         self.columns = {name: grown(column, size) for name, column in self.columns.items()}
         self.made = grown(self.made, count)
-        for name, value in (
-            ("_place", _NO_PLACE),
-            ("_last", _NO_PLACE),
-            ("_fresh", True),
-            ("_over", False),
-            ("_known", False),
-            ("_resets_in_same_step", False),
-        ):
-            column = grown(getattr(self, name), count)
-            column[known:] = value
-            setattr(self, name, column)
+        for name in ("_place", "_last", "_fresh", "_over", "_known", "_resets_in_same_step"):
+            setattr(self, name, grown(getattr(self, name), count))
+        self._place[known:] = self._last[known:] = _NO_PLACE
+        self._fresh[known:] = True
 
     def note_same_step(self, envs: Any) -> None:
         """Record that these envs begin their next episode in the step that ends one."""
