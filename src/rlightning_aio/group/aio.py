@@ -22,7 +22,6 @@ from rlightning_aio.group.plan import PreprocessFn, plan_group
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Mapping, Sequence, Sized
-    from types import TracebackType
 
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.group.wait import Procedure
@@ -301,12 +300,7 @@ class EnvGroup(GroupInterface):
         await self.init()
         return self
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *error: object) -> None:
         if not self._disowned:
             await self.close()
 

@@ -30,7 +30,7 @@ from rlightning_aio.group.wait import TURN
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence, Sized
-    from types import FrameType, TracebackType
+    from types import FrameType
 
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.group.wait import Procedure
@@ -262,12 +262,7 @@ class EnvGroup(GroupInterface):
         self.init()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         if not self._disowned:
             self.close()
 

@@ -48,8 +48,6 @@ from rlightning_aio.remote.keys import read_client_keys
 from rlightning_aio.remote.zmq_messages import next_frame, receive_parts, send_parts
 
 if TYPE_CHECKING:
-    from types import TracebackType
-
     from rlightning_aio.envs.base import BaseEnv
     from rlightning_aio.protocol.net.client_session import Event
 
@@ -209,12 +207,7 @@ class RemoteEnvClient:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        exc_traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     # -- connection -----------------------------------------------------------------
