@@ -33,9 +33,6 @@ __all__ = ["AioDriver", "EnvEpisode", "EnvGroup", "EnvHandle", "ServerHandle"]
 T = TypeVar("T")
 
 
-def _nothing() -> None: ...
-
-
 def _wake(woken: asyncio.Future[None]) -> None:
     if not woken.done():
         woken.set_result(None)
@@ -54,7 +51,7 @@ class AioDriver:
     def __init__(self) -> None:
         # The queue of completions, and the function that applies them; set by the group.
         self.completions: Sized = ()
-        self.drain: Callable[[], None] = _nothing
+        self.drain: Callable[[], None]
         # The future of each waiting call, until it is woken.
         self._waiting: list[asyncio.Future[None]] = []
         self._loop: asyncio.AbstractEventLoop | None = None

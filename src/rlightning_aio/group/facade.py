@@ -136,11 +136,6 @@ class Facade:
     def _new_driver(self) -> Driver:
         raise NotImplementedError
 
-    @property
-    def _metas(self) -> list[EnvMeta]:
-        self._core.lifetime.check_open()
-        return self._core.supervisor.metas
-
     # -- envs ---------------------------------------------------------------------
 
     def __repr__(self) -> str:
@@ -167,7 +162,8 @@ class Facade:
         Raises:
             GroupClosed: the group was not initialised, or is closed.
         """
-        return self._metas
+        self._core.lifetime.check_open()
+        return self._core.supervisor.metas
 
     def get_observation_spaces(self) -> list[gym.Space[Any] | None]:
         """Observation space of each env, in the order of `env_ids`; None for an env_server.
@@ -175,7 +171,7 @@ class Facade:
         Raises:
             GroupClosed: the group was not initialised, or is closed.
         """
-        return [meta.observation_space for meta in self._metas]
+        return [meta.observation_space for meta in self.metas]
 
     def get_action_spaces(self) -> list[gym.Space[Any] | None]:
         """Action space of each env, in the order of `env_ids`; None for an env_server.
@@ -183,7 +179,7 @@ class Facade:
         Raises:
             GroupClosed: the group was not initialised, or is closed.
         """
-        return [meta.action_space for meta in self._metas]
+        return [meta.action_space for meta in self.metas]
 
     # -- requests -----------------------------------------------------------------
 
@@ -433,7 +429,8 @@ class Facade:
         close_errors = self._core.supervisor.close_errors
         errors = list(close_errors)
         close_errors.clear()  # Warn once, however often `close` is called.
-        _warn_of(errors)
+        for env_id, error in errors:
+            warnings.warn(f"close() of env {env_id!r} raised {error.summary}", stacklevel=3)
 
 
 _groups: weakref.WeakSet[Facade] = weakref.WeakSet()
@@ -447,11 +444,6 @@ def _disown_all() -> None:
 
 
 os.register_at_fork(after_in_child=_disown_all)
-
-
-def _warn_of(errors: Sequence[tuple[str, Any]]) -> None:
-    for env_id, error in errors:
-        warnings.warn(f"close() of env {env_id!r} raised {error.summary}", stacklevel=4)
 
 
 def _check_seconds(name: str, seconds: float | None) -> None:

@@ -47,16 +47,13 @@ _SIGINT: Final = int(signal.SIGINT)
 _MAIN_THREAD: Final = threading.main_thread().ident
 
 
-def _nothing() -> None: ...
-
-
 class SyncDriver:
     """Watches sources with one persistent epoll, and runs procedures until they return."""
 
     def __init__(self) -> None:
         # The queue of completions, and the function that applies them; set by the group.
         self.completions: Sized = ()
-        self.drain: Callable[[], None] = _nothing
+        self.drain: Callable[[], None]
         self._epoll: select.epoll | None = None
         self._sources: dict[int, Source] = {}
         self._descriptors: dict[Source, int] = {}
