@@ -13,26 +13,21 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
 
 import numpy as np
 
-from rlightning_aio.hosts.arena import map_shared
 from rlightning_aio.hosts.build_env import built_envs
 from rlightning_aio.hosts.copied import copied
 from rlightning_aio.hosts.inbox import Inbox
 from rlightning_aio.hosts.messages import (
-    Attached,
     Built,
     Closed,
     ErrorText,
-    NewSchema,
     NotBuilt,
     Raised,
     Reported,
     Result,
-    Saved,
     Value,
 )
-from rlightning_aio.hosts.runner import attach_all, close_all
+from rlightning_aio.hosts.runner import attach_here, close_all
 from rlightning_aio.protocol.entries import Operation, answers_with_value, op_of, slot_of
-from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -64,7 +59,6 @@ class InlineHost:
         self._queue: deque[_Waiting] = deque()
         # Entries of results in rows that were not reported yet.
         self._done: list[int] = []
-        self._schemas = InfoSchemas(self._announce)
         self._watcher = wiring.watcher
         self._shares_thread = wiring.shares_thread
         self._threads: _Threads | None = None
@@ -89,15 +83,7 @@ class InlineHost:
         return [runner.started() for runner in self._runners]
 
     def attach(self, order: AttachOrder) -> None:
-        map_part = partial(map_shared, self._arena.descriptor)
-        attach_all(self._runners, order, map_part, self._schemas.announce, self._save)
-        self._post(Attached(self.host_id))
-
-    def _announce(self, number: int, schema: InfoSchema) -> None:
-        self._post(NewSchema(self.host_id, number, schema))
-
-    def _save(self, index: int, checkpoint: bytes, before: bool) -> None:
-        self._post(Saved(self.host_id, index, checkpoint, before))
+        attach_here(self._runners, order, self._arena, self.host_id, self._post)
 
     def packed(self, arguments: Any) -> Any:
         return copied(arguments)

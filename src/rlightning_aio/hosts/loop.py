@@ -8,7 +8,6 @@ Left out: what becomes of a request (see `AwaitedEnvs`).
 from __future__ import annotations
 
 import asyncio
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,17 +16,8 @@ from rlightning_aio.hosts.arena import map_shared
 from rlightning_aio.hosts.awaited_envs import AwaitedEnvs
 from rlightning_aio.hosts.copied import copied
 from rlightning_aio.hosts.event_loop import new_task
-from rlightning_aio.hosts.messages import (
-    Attached,
-    Built,
-    Closed,
-    NewSchema,
-    Reported,
-    Result,
-    Saved,
-)
-from rlightning_aio.hosts.runner import attach_all
-from rlightning_aio.protocol.info import InfoSchemas
+from rlightning_aio.hosts.messages import Built, Closed, Reported, Result
+from rlightning_aio.hosts.runner import attach_here
 from rlightning_aio.protocol.rings import WorkerBell, bell_size
 
 if TYPE_CHECKING:
@@ -37,7 +27,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio.hosts.base import Wiring
     from rlightning_aio.hosts.messages import AttachOrder, Completion, StartOrder
-    from rlightning_aio.protocol.info import InfoSchema
 
 __all__ = ["LoopHost"]
 
@@ -55,7 +44,6 @@ class LoopHost:
         self._envs = AwaitedEnvs(
             host_id, first_slot, order, inline=True, post=self._post, done=self._note_done
         )
-        self._schemas = InfoSchemas(self._announce)
         offset, size = wiring.bell_offset, bell_size(wiring.num_hosts)
         memory = map_shared(wiring.arena.descriptor, offset, size)
         self._bell: WorkerBell | None = WorkerBell(memory, wiring.num_hosts, host_id)
@@ -78,15 +66,7 @@ class LoopHost:
             self._post(Built(self.host_id, started))
 
     def attach(self, order: AttachOrder) -> None:
-        map_part = partial(map_shared, self._wiring.arena.descriptor)
-        attach_all(self._envs.runners, order, map_part, self._schemas.announce, self._keep)
-        self._post(Attached(self.host_id))
-
-    def _announce(self, number: int, schema: InfoSchema) -> None:
-        self._post(NewSchema(self.host_id, number, schema))
-
-    def _keep(self, index: int, state: bytes, before: bool) -> None:
-        self._post(Saved(self.host_id, index, state, before))
+        attach_here(self._envs.runners, order, self._wiring.arena, self.host_id, self._post)
 
     def close(self) -> None:
         """See `base.Host.close`. Requests that are being executed are cancelled."""

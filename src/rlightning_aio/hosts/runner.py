@@ -20,13 +20,24 @@ from rlightning_aio.envs.results import (
 )
 from rlightning_aio.envs.state import versions_of
 from rlightning_aio.envs.tensors import as_numpy, holds_tensor
+from rlightning_aio.hosts.arena import map_shared
 from rlightning_aio.hosts.checkpoint import Checkpoints, Saver
 from rlightning_aio.hosts.env_calls import call_env
 from rlightning_aio.hosts.env_steps import ShortWay, followed, step_in_halves, view
-from rlightning_aio.hosts.messages import NO_ACTION, RECORD_VIDEO, EnvStarted, ErrorText, OutOfBand
+from rlightning_aio.hosts.messages import (
+    NO_ACTION,
+    RECORD_VIDEO,
+    Attached,
+    EnvStarted,
+    ErrorText,
+    NewSchema,
+    OutOfBand,
+    Saved,
+)
 from rlightning_aio.hosts.row_writer import RowWriter
 from rlightning_aio.protocol.columns import leaves, row_reader
 from rlightning_aio.protocol.entries import Operation
+from rlightning_aio.protocol.info import InfoSchemas
 from rlightning_aio.protocol.slab import RowLayout, Slab
 
 if TYPE_CHECKING:
@@ -34,14 +45,15 @@ if TYPE_CHECKING:
 
     from rlightning_aio.config import VideoConfig
     from rlightning_aio.envs.base import BareResult, BareStep, BaseEnv
+    from rlightning_aio.hosts.arena import Arena
     from rlightning_aio.hosts.checkpoint import Send
     from rlightning_aio.hosts.env_steps import Execute, GetInput, StepWith
-    from rlightning_aio.hosts.messages import AttachOrder
+    from rlightning_aio.hosts.messages import AttachOrder, Completion
     from rlightning_aio.hosts.recording import Camera
     from rlightning_aio.protocol.info import InfoSchema
     from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet
 
-__all__ = ["EnvRunner", "attach_all", "close_all", "placed", "resume_all"]
+__all__ = ["EnvRunner", "attach_all", "attach_here", "close_all", "placed", "resume_all"]
 
 
 class EnvRunner:
@@ -378,6 +390,25 @@ def attach_all(
     for index, (runner, slab, row) in enumerate(placed(runners, order, map_part)):
         runner.attach(slab, row, announce, partial(send_checkpoint, index))
     resume_all(runners, order.checkpoints)
+
+
+def attach_here(
+    runners: Sequence[EnvRunner],
+    order: AttachOrder,
+    arena: Arena,
+    host_id: int,
+    post: Callable[[Completion], None],
+) -> None:
+    """Do as `attach_all` for a host in the trainer's process, whose completions `post` gets."""
+    schemas = InfoSchemas(lambda number, schema: post(NewSchema(host_id, number, schema)))
+    attach_all(
+        runners,
+        order,
+        partial(map_shared, arena.descriptor),
+        schemas.announce,
+        lambda index, checkpoint, before: post(Saved(host_id, index, checkpoint, before)),
+    )
+    post(Attached(host_id))
 
 
 def resume_all(runners: Sequence[EnvRunner], checkpoints: Sequence[bytes | None]) -> None:
