@@ -19,6 +19,7 @@ from rlightning_aio.group.interface import (
     ServerHandleInterface,
 )
 from rlightning_aio.group.plan import PreprocessFn, plan_group
+from rlightning_aio.hosts.event_loop import run_loop
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Mapping, Sequence, Sized
@@ -471,11 +472,7 @@ def run(main: Coroutine[Any, Any, T]) -> T:
             "an event loop runs here already, as in a notebook: `await` the coroutine instead of "
             "giving it to rlightning_aio.run"
         )
-    try:
-        import uvloop  # noqa: PLC0415  # There is none for Windows.
-    except ImportError:
-        return asyncio.run(main)
-    return uvloop.run(main)
+    return run_loop(main)
 
 
 def _is_loop_running() -> bool:

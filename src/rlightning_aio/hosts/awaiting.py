@@ -12,6 +12,7 @@ import pickle
 from typing import TYPE_CHECKING, Any, cast
 
 from rlightning_aio.hosts.awaited_envs import AwaitedEnvs
+from rlightning_aio.hosts.event_loop import run_loop
 from rlightning_aio.hosts.messages import ErrorText, Failed, Raised, Result, Value
 from rlightning_aio.hosts.pickling import dumped
 from rlightning_aio.protocol.frames import FrameKind
@@ -82,7 +83,7 @@ class Awaiting:
 
         Returns what closing has raised, with the env's index.
         """
-        return _run(self._serve(channel, take_requests, disconnect))
+        return run_loop(self._serve(channel, take_requests, disconnect))
 
     async def _serve(
         self,
@@ -149,11 +150,3 @@ class Awaiting:
         except Exception as error:
             kind, payload = FrameKind.ERROR, pickle.dumps(ErrorText.of(error))
         self._send(kind, completion.entry, payload)
-
-
-def _run(main: Any) -> Any:
-    try:
-        import uvloop  # noqa: PLC0415  # There is none for Windows.
-    except ImportError:
-        return asyncio.run(main)
-    return uvloop.run(main)

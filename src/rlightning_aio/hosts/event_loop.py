@@ -14,7 +14,7 @@ import time
 from collections import deque
 from contextvars import Context, ContextVar
 from types import coroutine
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Coroutine, Generator, Mapping
@@ -28,6 +28,7 @@ __all__ = [
     "log",
     "new_task",
     "place_of",
+    "run_loop",
     "tasks_of",
     "watched",
 ]
@@ -37,6 +38,17 @@ LONG_TURN_SECONDS: Final = 0.1
 OWNER: Final[ContextVar[object]] = ContextVar("rlightning_aio_env", default=None)
 """The env on whose behalf code runs, also in tasks that the env has started."""
 log = logging.getLogger("rlightning_aio")
+
+T = TypeVar("T")
+
+
+def run_loop(main: Coroutine[Any, Any, T]) -> T:
+    """Run `main` to its end on a uvloop event loop, or on asyncio's if uvloop is missing."""
+    try:
+        import uvloop  # noqa: PLC0415  # There is none for Windows.
+    except ImportError:
+        return asyncio.run(main)
+    return uvloop.run(main)
 
 
 @coroutine
