@@ -11,7 +11,7 @@ from __future__ import annotations
 import mmap
 import time
 from functools import partial
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
@@ -48,6 +48,8 @@ if TYPE_CHECKING:
     from rlightning_aio.types import EnvMeta
 
 __all__ = ["EnvServerHost"]
+
+_IN_ROW: Final[tuple[Any, dict[str, Any]]] = (NO_ACTION, {})
 
 
 class _ClientRow:
@@ -124,6 +126,7 @@ class EnvServerHost:
             reset_timeout=config.reset_timeout,
             objection=wiring.objection,
         )
+        self._requests = self._sessions.requests
         self._listener = Listener(self.server_id, self._settings, self._sessions)
         self._post = wiring.completions.append
         self._watcher = wiring.watcher
@@ -162,37 +165,26 @@ class EnvServerHost:
     # -- clients ------------------------------------------------------------------
 
     def address(self) -> str:
-        """Return the address for clients."""
         return self._listener.address
 
     def members(self) -> Mapping[str, EnvMeta]:
-        """Return the envs of the clients that are present, by name."""
         return self._sessions.clients
 
     def member_indices(self) -> list[int]:
-        """Return the indices of the clients that are present, by name."""
         # A client that has joined this very moment may not have its row yet.
         return [self._index_of[name] for name in sorted(self.members()) if name in self._index_of]
 
     def num_sub_envs(self, index: int) -> int:
-        """Return the number of sub-environments of a client."""
         return self.members()[self._rows[index].name].num_envs
 
     def check_step(self, index: int, action: Any, extras: dict[str, Any]) -> None:
-        """Raise `BadAction` if a step can't be sent to a client that is present."""
         row = self._rows[index]
-        self._sessions.requests.check_step(row.name, row.action(action), extras)
+        self._requests.check_step(row.name, row.action(action), extras)
 
     def check_reset(self, index: int, seed: int | None, options: dict[str, Any]) -> None:
-        """Raise `ValueError` if a reset can't be sent to a client that is present."""
-        self._sessions.requests.check_reset(self._rows[index].name, seed, options)
+        self._requests.check_reset(self._rows[index].name, seed, options)
 
     def missing(self, waited: float) -> float | None:
-        """Return the limit of the wait for clients; None if enough are present.
-
-        Raises:
-            TimeoutError: too few came in time.
-        """
         settings = self._settings
         if len(self.members()) >= settings.min_clients:
             return None
@@ -236,7 +228,6 @@ class EnvServerHost:
         return arguments
 
     def submit(self, entries: NDArray[np.int64], arguments: Sequence[Any] | None = None) -> None:
-        """Send requests to clients."""
         now = time.monotonic()
         try:
             self._submit(entries, arguments, now)
@@ -257,55 +248,38 @@ class EnvServerHost:
                 self._post(Withdrawn(self.host_id, entry))
 
     def _request(self, entry: int, given: Any, now: float) -> bool:
-        index = slot_of(entry) - self.first_slot
+        """Send one request; return False if its client is absent and the trainer knows that."""
+        index, number, requests = slot_of(entry) - self.first_slot, number_of(entry), self._requests
         row = self._rows[index]
         row.entry = entry
         if op_of(entry) == Operation.STEP:
-            return self._step(row, entry, given, now)
-        return self._reset(row, index, entry, given, now)
-
-    def _step(
-        self, row: _ClientRow, entry: int, given: tuple[Any, dict[str, Any]] | None, now: float
-    ) -> bool:
-        action, extras = given or (NO_ACTION, {})
-        requests = self._sessions.requests
-        return requests.step(row.name, number_of(entry), row.action(action), extras, now)
-
-    def _reset(
-        self, row: _ClientRow, index: int, entry: int, given: tuple[Any, Any] | None, now: float
-    ) -> bool:
-        slab = cast("Slab", self._slab)
-        seed, options = given or (slab.take_seed(index), None)
-        return self._sessions.requests.reset(row.name, number_of(entry), seed, options, now)
+            action, extras = given or _IN_ROW
+            return requests.step(row.name, number, row.action(action), extras, now)
+        seed, options = given or (cast("Slab", self._slab).take_seed(index), None)
+        return requests.reset(row.name, number, seed, options, now)
 
     # -- replies ------------------------------------------------------------------
 
     def fileno(self) -> int:
-        """Return the descriptor to watch."""
         return self._listener.fileno()
 
     def on_readable(self) -> None:
-        """Read messages and post results."""
         self.tick(time.monotonic())
 
     def on_writable(self) -> None:
         """Do nothing: ZMQ sends by itself, so no driver calls this."""
 
     def is_readable(self) -> bool:
-        """Return True if a message may be waiting."""
         return self._listener.is_readable()
 
     def poll(self) -> None:
-        """Read messages and post results, if any may be waiting."""
         if self._open and self._listener.is_readable():
             self.tick(time.monotonic())
 
     def deadline(self) -> float | None:
-        """Return the time at which `tick` is due (monotonic seconds); None if never."""
         return self._listener.deadline()
 
     def tick(self, now: float) -> None:
-        """Exchange messages with the clients, and post their results."""
         self._listener.pump(now)
         results = self._sessions.take()
         if results:
@@ -343,7 +317,7 @@ class EnvServerHost:
             self._sessions.dismiss(name, "the server has no room for another client")
             return
         slab = self._slab if known is None else None
-        traits = self._sessions.requests.traits(name)
+        traits = self._requests.traits(name)
         write = partial(self._rows[index].write_first, result)
         self._post(Joined(self.host_id, index, meta, traits, slab, write))
 
