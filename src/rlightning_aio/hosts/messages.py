@@ -9,10 +9,11 @@ Left out on purpose: transport (see `link`), and the effects of messages (see `g
 from __future__ import annotations
 
 import os
-import traceback
 from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
+
+from rlightning_aio.protocol.error_text import ErrorText
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -138,50 +139,6 @@ class EnvStarted:
     layout: RowLayout
     reads_extras: bool
     transforms_actions: bool
-
-
-@dataclass(frozen=True)
-class ErrorText:
-    """An exception as text, which any process can read, whatever its class."""
-
-    type_name: str
-    text: str
-    traceback: str
-
-    @property
-    def summary(self) -> str:
-        """The last line of the traceback: the type, and the text if there is one."""
-        return f"{self.type_name}: {self.text}" if self.text else self.type_name
-
-    @classmethod
-    def of(cls, error: BaseException) -> ErrorText:
-        """Describe `error` in plain text, even if methods of its class raise."""
-        kind = type(error)
-        name = _plain(_NAME.__get__(kind))
-        module = _MODULE.__get__(kind)
-        if isinstance(module, str) and module != "builtins":
-            name = f"{_plain(module)}.{name}"
-        try:
-            text = _plain(str(error))
-        except BaseException as broken:
-            text = f"<its __str__ raised {_plain(_NAME.__get__(type(broken)))}>"
-        try:
-            lines = _plain("".join(traceback.format_exception(error)))
-        except BaseException:
-            frames = traceback.format_tb(_TRACEBACK.__get__(error))
-            lines = "".join(frames) + f"{name}: {text}\n"
-        return cls(name, text, lines)
-
-
-_NAME: Final[Any] = vars(type)["__qualname__"]
-_MODULE: Final[Any] = vars(type)["__module__"]
-_TRACEBACK: Final[Any] = vars(BaseException)["__traceback__"]
-"""Descriptors of Python itself, because classes may redefine these attributes."""
-
-
-def _plain(text: str) -> str:
-    """Return `text` as a plain `str`: other processes may lack its subclass."""
-    return str.__str__(text)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ import logging
 import os
 import socket
 import time
-import traceback
 from math import ceil
 from threading import Thread
 from typing import TYPE_CHECKING, Any, Final, Self
@@ -28,6 +27,7 @@ from rlightning_aio.envs.results import (
     step_of,
 )
 from rlightning_aio.errors import ClientRefused, ConfigError
+from rlightning_aio.protocol.error_text import ErrorText
 from rlightning_aio.protocol.net.client_session import (
     ClientSession,
     Ended,
@@ -340,7 +340,8 @@ class RemoteEnvClient:
             else:
                 self._step(request)
         except Exception as error:  # noqa: BLE001  # Any error of the env goes to the trainer.
-            self._session.fail(request.number, *_texts_of(error))
+            text = ErrorText.of(error)
+            self._session.fail(request.number, text.type_name, text.text, text.traceback)
             self._flush()
 
     def _reset(self, request: ResetRequest) -> None:
@@ -372,18 +373,6 @@ def _earliest(one: float | None, other: float | None) -> float | None:
     if one is None or other is None:
         return other if one is None else one
     return min(one, other)
-
-
-def _texts_of(error: Exception) -> tuple[str, str, str]:
-    """Return type, text and traceback of `error`, even if its ``__str__`` raises."""
-    kind = type(error)
-    name = f"{kind.__module__}.{kind.__qualname__}".removeprefix("builtins.")
-    try:
-        text, lines = str(error), "".join(traceback.format_exception(error))
-    except Exception as broken:  # noqa: BLE001  # It is the env author's code.
-        text = f"<its __str__ raised {type(broken).__name__}>"
-        lines = "".join(traceback.format_tb(error.__traceback__)) + f"{name}: {text}\n"
-    return name, text, lines
 
 
 _REFUSED_HANDSHAKES: Final[dict[int, str]] = {
