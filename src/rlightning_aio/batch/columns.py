@@ -96,14 +96,9 @@ class ResultColumns:
         return self.flags[..., TRUNCATED]
 
     @property
-    def ended(self) -> NDArray[np.bool_]:
-        """``[n, *head]``, terminated or truncated."""
-        return self.terminated | self.truncated
-
-    @property
     def done(self) -> NDArray[np.bool_]:
         """``[n, *head]``, terminated, truncated or cut by the step limit."""
-        ended = self.ended
+        ended = self.terminated | self.truncated
         return ended if self.limit_reached is None else ended | self._spread(self.limit_reached)
 
     @property

@@ -43,7 +43,6 @@ class Segments:
 
     def __init__(self, ends: NDArray[np.intp], count: int, stride: int) -> None:
         self.ends = ends
-        self.count = count
         self.stride = stride
         steps = count // stride
         # Positions as if the transitions of each env were contiguous.

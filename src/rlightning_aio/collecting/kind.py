@@ -11,7 +11,7 @@ from rlightning_aio.batch import joined
 from rlightning_aio.collecting.results import ResultRows, result_rows
 from rlightning_aio.collecting.rollout import Ends, Lag, Rollout, Seconds
 from rlightning_aio.collecting.staging import Staging
-from rlightning_aio.collecting.trees import allocated, rows_of
+from rlightning_aio.collecting.trees import allocated, gathered, rows_of
 from rlightning_aio.protocol.columns import gather, is_array, mapped, paired
 
 if TYPE_CHECKING:
@@ -198,7 +198,7 @@ class EnvKind:
 
         if not outs:
             outs |= allocated(staging.columns, self.quota)
-        staging.read(order, outs)
+        gathered(staging.columns, order, outs)
         columns = mapped(shaped, outs)
         columns["done"] = paired(np.bitwise_or, columns["terminated"], columns["truncated"])
         for name, column in staging.of_places(order).items():

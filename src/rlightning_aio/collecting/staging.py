@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from rlightning_aio.batch.contents import has_ended
-from rlightning_aio.collecting.trees import allocated, check_alike, gathered, grown, scattered
+from rlightning_aio.collecting.trees import allocated, check_alike, grown, scattered
 from rlightning_aio.protocol.columns import gather, mapped
 
 if TYPE_CHECKING:
@@ -312,10 +312,6 @@ class Staging:
             row = np.zeros(len(self._place), np.intp)
             row[held.index] = np.arange(len(held.index))
             self._note_ends(self._last[idle], gather(held.observation, row[idle]))
-
-    def read(self, order: NDArray[np.intp], outs: dict[str, Tree]) -> None:
-        """Copy all columns, in `order`, to those of `outs`."""
-        gathered(self.columns, order, outs)
 
     def of_places(self, order: NDArray[np.intp]) -> dict[str, NDArray[Any]]:
         """Return the properties of places that are in no column, as new arrays."""

@@ -99,6 +99,9 @@ class AwaitedEnvs:
         post: gets every completion.
         done: gets the entries of requests whose results are all in their rows.
         enter: gets an entry whenever the code of its env is about to run; None: nobody needs it.
+
+    Attributes:
+        num_busy: how many envs execute a request now.
     """
 
     def __init__(
@@ -122,7 +125,7 @@ class AwaitedEnvs:
         self._loop: asyncio.AbstractEventLoop
         self._all: list[_Env] = []
         self._queue: deque[tuple[_Env, int, Any]] = deque()
-        self._num_busy = 0
+        self.num_busy = 0
         self._most_busy = order.config.max_concurrency or len(order.worker_indices)
         self._ending = False
         config = order.config
@@ -140,11 +143,6 @@ class AwaitedEnvs:
     def runners(self) -> list[AwaitedRunner]:
         """The envs' runners, by index."""
         return [env.runner for env in self._all]
-
-    @property
-    def num_busy(self) -> int:
-        """The number of envs that execute a request now."""
-        return self._num_busy
 
     # -- life ---------------------------------------------------------------------
 
@@ -233,14 +231,14 @@ class AwaitedEnvs:
         self._begin_queued()
 
     def _begin_queued(self) -> None:
-        while self._queue and self._num_busy < self._most_busy:
+        while self._queue and self.num_busy < self._most_busy:
             env, entry, arguments = self._queue.popleft()
             if env.fault is not None:
                 # Not at once: a completion never comes before its request was handed over.
                 fault = Failed(self._host_id, entry, copy(env.fault))
                 self._loop.call_soon(self._post_unless_ending, fault)
                 continue
-            self._num_busy += 1
+            self.num_busy += 1
             env.entry = entry
             op = op_of(entry)
             execution = self._execute(env, env.runner, entry, op, arguments)
@@ -298,7 +296,7 @@ class AwaitedEnvs:
             return
         env.task = env.answering = None
         env.entry = 0
-        self._num_busy -= 1
+        self.num_busy -= 1
         if isinstance(what, int):
             self._done(what)
         else:
