@@ -171,10 +171,8 @@ class Listener:
 
     def deadline(self) -> float | None:
         """Return the time at which `pump` is due even without a message; None if never."""
-        due = self._sessions.deadline()
-        if due is None or self._update_at is None:
-            return self._update_at if due is None else due
-        return min(due, self._update_at)
+        times = [self._sessions.deadline(), self._update_at]
+        return min([time for time in times if time is not None], default=None)
 
     def _call_back(self) -> None:
         """Make the driver pump once more, though no change will wake it."""

@@ -28,6 +28,7 @@ __all__ = [
     "array_of_tensor",
     "as_array",
     "assemble",
+    "check_keys",
     "fitted",
     "fitted_tree",
     "gather",
@@ -220,7 +221,7 @@ def fitted_tree(
     if type(value) is np.ndarray and value.shape == space.shape and value.dtype == space.dtype:
         return value
     if is_dict(space):
-        _check_keys(value, space.spaces.keys(), what, path)
+        check_keys(value, space.spaces.keys(), what, path)
         parts = space.spaces.items()
         return {key: fitted_tree(inner, value[key], what, (*path, key)) for key, inner in parts}
     if is_tuple(space):
@@ -233,7 +234,10 @@ def fitted_tree(
     return fitted(value, Leaf(path, space.shape, space.dtype), what).astype(space.dtype)
 
 
-def _check_keys(value: Any, keys: Collection[str], what: str, path: tuple[str | int, ...]) -> None:
+def check_keys(
+    value: Any, keys: Collection[str], what: str, path: tuple[str | int, ...] = ()
+) -> None:
+    """Raise `Misfit` if `value` is no dict with these keys."""
     if not hasattr(value, "keys") or value.keys() != keys:
         raise _misplaced(what, path, f"a dict with keys {sorted(map(str, keys))}", value)
 
@@ -293,7 +297,7 @@ def _dict_writer(
     }
 
     def write(value: Any) -> None:
-        _check_keys(value, writers.keys(), what, path)
+        check_keys(value, writers.keys(), what, path)
         for key, writer in writers.items():
             writer(value[key])
 

@@ -248,7 +248,8 @@ class RemoteEnvClient:
 
     def _wait(self, until: float | None) -> None:
         """Wait for messages and events, at most `until`, and process them."""
-        due = _earliest(_earliest(until, self._session.deadline()), self._redial_at)
+        times = [until, self._session.deadline(), self._redial_at]
+        due = min([moment for moment in times if moment is not None], default=None)
         wait_ms = None if due is None else ceil(1000 * max(0.0, due - time.monotonic()))
         for source, _ in self._poller.poll(wait_ms):
             if source is self._monitor:
@@ -367,12 +368,6 @@ class RemoteEnvClient:
     def _answer(self, number: int, method: str, returned: Any, busy_ns: int) -> None:
         self._session.finish(number, one_result(self._env, method, returned), busy_ns)
         self._flush()
-
-
-def _earliest(one: float | None, other: float | None) -> float | None:
-    if one is None or other is None:
-        return other if one is None else one
-    return min(one, other)
 
 
 _REFUSED_HANDSHAKES: Final[dict[int, str]] = {

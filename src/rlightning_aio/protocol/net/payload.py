@@ -9,13 +9,13 @@ messages (`wire`).
 from __future__ import annotations
 
 from math import prod
-from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from rlightning_aio.protocol.columns import Leaf, Misfit, as_array, fitted
+from rlightning_aio.protocol.columns import Leaf, Misfit, as_array, check_keys, fitted
 from rlightning_aio.protocol.net.wire import DTYPES, ArrayForm, Part, WireError
 
 if TYPE_CHECKING:
@@ -160,19 +160,10 @@ class _Parts(_Node):
         self.num_texts = sum(node.num_texts for node in nodes.values())
         self.num_bytes = sum(node.num_bytes for node in nodes.values())
 
-    def _refuse(self, expected: str, found: str) -> NoReturn:
-        raise Misfit(f"{self._what} doesn't fit its space: expected {expected}, found {found}")
-
 
 class _Dict(_Parts):
     def pack(self, value: Any, packed: Packed) -> None:
-        if not hasattr(value, "keys") or value.keys() != self._nodes.keys():
-            found = (
-                f"keys {sorted(map(str, value))}"
-                if hasattr(value, "keys")
-                else (type(value).__name__)
-            )
-            self._refuse(f"a dict with keys {sorted(self._nodes)}", found)
+        check_keys(value, self._nodes.keys(), self._what)
         for key, node in self._nodes.items():
             node.pack(value[key], packed)
 
@@ -183,12 +174,16 @@ class _Dict(_Parts):
 class _Tuple(_Parts):
     def pack(self, value: Any, packed: Packed) -> None:
         if not isinstance(value, tuple | list):
-            self._refuse(f"a tuple of {len(self._nodes)}", type(value).__name__)
+            raise self._misfit(type(value).__name__)
         parts = cast("Sequence[Any]", value)
         if len(parts) != len(self._nodes):
-            self._refuse(f"a tuple of {len(self._nodes)}", f"one of {len(parts)}")
+            raise self._misfit(f"one of {len(parts)}")
         for node, part in zip(self._nodes.values(), parts, strict=True):
             node.pack(part, packed)
+
+    def _misfit(self, found: str) -> Misfit:
+        expected = f"a tuple of {len(self._nodes)}"
+        return Misfit(f"{self._what} doesn't fit its space: expected {expected}, found {found}")
 
     def unpack(self, arriving: _Arriving) -> Any:
         return tuple(node.unpack(arriving) for node in self._nodes.values())
