@@ -110,7 +110,7 @@ class Held:
     """The workers of a group, stopped until the trainer waits."""
 
     def __init__(self, group: Any) -> None:
-        steps = vars(vars(group)["_core"].steps)
+        steps = vars(vars(group)["_steps"])
         self._rings = steps["_rings"]
         steps["_poller"].num_cores = 0
         self._pids = [worker["pid"] for worker in group.get_workers()]

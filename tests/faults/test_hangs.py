@@ -155,7 +155,7 @@ def test_hang_is_found_while_others_leave_the_trainer_no_time_to_wait(start: Sta
     while "faulty-0" not in found and time.monotonic() < until:
         group.step_async(tokens.steps(["faulty-2", "faulty-3"]))
         while group.group._core.requests.in_flight[1]:
-            group.group._core._waiting.poll()  # With this, the collect finds enough results.
+            group.group._core.waiting.poll()  # With this, the collect finds enough results.
         batch, _ = group.collect_async(min_results=2)
         found = dict(batch.items())
     assert marked(found["faulty-0"])

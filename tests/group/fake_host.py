@@ -17,14 +17,13 @@ import pytest
 from gymnasium import spaces
 
 from rlightning_aio.config import EnvConfig
-from rlightning_aio.group.checked import CheckedRequests
+from rlightning_aio.group.checked import CheckedRequests, CheckedSteps
 from rlightning_aio.group.conditions import FIRST_RESULTS, Conditions
 from rlightning_aio.group.continuity import Continuity
-from rlightning_aio.group.core import Core
+from rlightning_aio.group.core import Core, Parts
 from rlightning_aio.group.env_table import EnvTable
 from rlightning_aio.group.lifetime import Lifetime
 from rlightning_aio.group.observed import Observed
-from rlightning_aio.group.parts import Parts
 from rlightning_aio.group.poller import Poller
 from rlightning_aio.group.slab_layout import SlabLayout
 from rlightning_aio.group.supervisor import Supervisor
@@ -448,9 +447,10 @@ class FakeGroup:
             supervisor.add(host, self.config)
             poller.add(host)
         parts = Parts(tables, supervisor, poller, bell, rings, completions, self)
-        self.core = Core(parts, zero_copy=False, shares_thread=True)
+        self.core = Core(parts, zero_copy=False)
+        self.steps = CheckedSteps(self.core, shares_thread=True)
         self.running: list[Running] = []
-        opened = self.begin(self.core.start(self.now))
+        opened = self.begin(self.steps.start(self.now))
         self.turn()
         assert opened.done, "fake hosts start at once"
 

@@ -42,7 +42,7 @@ def steps(*slots: int, action: int = PLAIN) -> BatchedData:
 
 
 def collect(group: FakeGroup, **rules: Any) -> Running:
-    return group.begin(group.core.steps.collect(group.now, CollectRules(**rules)))
+    return group.begin(group.steps.collect(group.now, CollectRules(**rules)))
 
 
 def ids_of(running: Running) -> list[str]:
@@ -52,7 +52,7 @@ def ids_of(running: Running) -> list[str]:
 def test_the_window_ends_for_results_that_joined_unnoticed(new_group: NewGroup) -> None:
     """After the window, a collect returns once it has the minimum."""
     group = new_group(8)
-    group.core.steps.step_async(steps(*range(8)), group.now)
+    group.steps.step_async(steps(*range(8)), group.now)
     running = collect(group, timeout=1.0, min_results=3)
     group.finish(0)
     group.pass_time(0.5)
@@ -73,7 +73,7 @@ def test_the_window_opens_when_an_inline_result_is_there(new_group: NewGroup) ->
         return execute_next()
 
     group.hosts[0].execute_next = run_slowly
-    group.core.steps.step_async(steps(0, 1), group.now)
+    group.steps.step_async(steps(0, 1), group.now)
     running = collect(group, timeout=1.0)
     group.pass_time(0.5)
     assert not running.done
@@ -95,7 +95,7 @@ def test_inline_envs_are_not_executed_past_a_deadline_or_a_window(
         return execute_next()
 
     host.execute_next = execute_slowly
-    group.core.steps.step_async(steps(*range(5)), group.now)
+    group.steps.step_async(steps(*range(5)), group.now)
     running = collect(group, min_results=5 if "deadline" in rules else 1, **rules)
     if "deadline" in rules:
         with pytest.raises(TimeoutError, match="2 of the 5"):
@@ -111,8 +111,8 @@ def test_inline_envs_are_not_executed_past_a_deadline_or_a_window(
 def test_one_callers_slow_env_does_not_hold_up_another_caller(new_group: NewGroup) -> None:
     """Of two calls on envs of one worker, each returns when its own envs have replied."""
     group = new_group(3)
-    quick = group.begin(group.core.steps.step(steps(0), group.now))
-    slow = group.begin(group.core.steps.step(steps(1, 2), group.now))
+    quick = group.begin(group.steps.step(steps(0), group.now))
+    slow = group.begin(group.steps.step(steps(1, 2), group.now))
     group.finish(0)
     assert ids_of(quick) == ["fake-0"]
     assert not slow.done
@@ -124,7 +124,7 @@ def test_one_callers_slow_env_does_not_hold_up_another_caller(new_group: NewGrou
 def test_a_step_cancelled_after_its_last_reply_loses_nothing(new_group: NewGroup) -> None:
     """The next collect returns the results."""
     group = new_group(2)
-    running = group.begin(group.core.steps.step(steps(0, 1), group.now))
+    running = group.begin(group.steps.step(steps(0, 1), group.now))
     host = group.hosts[0]
     host.finish()
     host.finish()
@@ -137,7 +137,7 @@ def test_a_step_cancelled_after_its_last_reply_loses_nothing(new_group: NewGroup
 def test_an_error_of_a_cancelled_step_reaches_the_collector(new_group: NewGroup) -> None:
     """An error answers a request, too."""
     group = new_group(2)
-    running = group.begin(group.core.steps.step(steps(0, 1, action=RAISES), group.now))
+    running = group.begin(group.steps.step(steps(0, 1, action=RAISES), group.now))
     group.finish(1)
     group.cancel(running)
     with pytest.raises(EnvRaised, match="fake-1"):
@@ -159,10 +159,10 @@ def test_the_value_of_a_cancelled_call_is_dropped(new_group: NewGroup, name: str
     with pytest.raises(NothingPending):
         collect(group).result()
     with pytest.raises(EnvBusy, match="a call that was cancelled still runs"):
-        group.core.steps.step_async(steps(0), group.now)
+        group.steps.step_async(steps(0), group.now)
     group.hosts[0].finish()
     group.hosts[0].on_readable()
-    stepped = group.begin(group.core.steps.step(steps(0), group.now))
+    stepped = group.begin(group.steps.step(steps(0), group.now))
     group.finish(0)
     assert ids_of(stepped) == ["fake-0"]
 
@@ -179,8 +179,8 @@ def test_an_env_is_reset_once_in_one_call(new_group: NewGroup) -> None:
 def test_empty_batches_do_nothing(new_group: NewGroup) -> None:
     """Only a collect of nothing is refused."""
     group = new_group(2)
-    group.core.steps.step_async(BatchedData(), group.now)
-    batch, flags = group.begin(group.core.steps.step(BatchedData(), group.now)).result()
+    group.steps.step_async(BatchedData(), group.now)
+    batch, flags = group.begin(group.steps.step(BatchedData(), group.now)).result()
     assert (len(batch), batch.values(), flags) == (0, [], None)
     batch, flags = group.begin(group.core.reset(group.now, 0, None, [])).result()
     assert (len(batch), flags) == (0, [])
@@ -214,14 +214,14 @@ def test_a_group_that_is_not_open_says_so(moment: str) -> None:
     if moment == "before init":
         group.core.lifetime.open = False
     else:
-        group.core.steps.step_async(steps(0), group.now)
+        group.steps.step_async(steps(0), group.now)
         group.finish(0)
         group.close()
     hint = "init" if moment == "before init" else "build a new one"
     with pytest.raises(GroupClosed, match=hint):
         collect(group).result()
     with pytest.raises(GroupClosed, match=hint):
-        group.core.steps.step_async(steps(0), group.now)
+        group.steps.step_async(steps(0), group.now)
     with pytest.raises(GroupClosed, match=hint):
         group.begin(group.core.reset(group.now, None, None, None)).result()
     with pytest.raises(GroupClosed, match=hint):
@@ -240,15 +240,15 @@ def test_values_that_cannot_be_pickled_are_refused_before_anything_is_sent(
         [PolicyResponse("fake-0", 0, good=1), PolicyResponse("fake-1", 0, bad=unpicklable)],
     )
     with pytest.raises(BadAction, match=r"'fake-1'.*nothing was sent"):
-        group.core.steps.step_async(batch, group.now)
+        group.steps.step_async(batch, group.now)
     with pytest.raises(BadAction, match="'fake-1'"):
-        group.begin(group.core.steps.step(batch, group.now)).result()
+        group.begin(group.steps.step(batch, group.now)).result()
     with pytest.raises(TypeError, match="options for env 'fake-0'"):
         group.begin(group.core.reset(group.now, 0, {"bad": unpicklable}, None)).result()
     with pytest.raises(TypeError, match=r"arguments of who\(\)"):
         group.begin(group.core.calls.call(group.now, 0, ("who", (unpicklable,), {}))).result()
     assert not any(host.waiting for host in group.hosts)
-    running = group.begin(group.core.steps.step(steps(0, 1), group.now))
+    running = group.begin(group.steps.step(steps(0, 1), group.now))
     group.finish(0)
     group.finish(1)
     assert ids_of(running) == ["fake-0", "fake-1"]
@@ -262,7 +262,7 @@ def test_extras_for_some_envs_of_a_batch_leave_the_others_in_their_rows(
     batch = BatchedData(
         ["fake-0", "fake-1"], [PolicyResponse(f"fake-{k}", 0, value=k) for k in range(2)]
     )
-    running = group.begin(group.core.steps.step(batch, group.now))
+    running = group.begin(group.steps.step(batch, group.now))
     group.finish(1)
     group.finish(0)
     assert ids_of(running) == ["fake-0", "fake-1"]
@@ -273,22 +273,22 @@ def test_extras_for_some_envs_of_a_batch_leave_the_others_in_their_rows(
 def test_an_env_whose_error_was_not_raised_yet_is_busy(new_group: NewGroup) -> None:
     """Its caller still waits for other envs; a request in between would be mixed up with them."""
     group = new_group(2)
-    running = group.begin(group.core.steps.step(steps(0, 1, action=RAISES), group.now))
+    running = group.begin(group.steps.step(steps(0, 1, action=RAISES), group.now))
     group.finish(0)
     with pytest.raises(EnvBusy, match="was not collected"):
-        group.core.steps.step_async(steps(0), group.now)
+        group.steps.step_async(steps(0), group.now)
     group.finish(1)
     with pytest.raises(EnvRaised):
         running.result()
-    group.core.steps.step_async(steps(0, 1), group.now)
+    group.steps.step_async(steps(0, 1), group.now)
 
 
 def test_a_collect_also_waits_for_requests_sent_meanwhile(new_group: NewGroup) -> None:
     """It armed the bell for one worker; another worker now has the first result."""
     group = new_group(1, 1)
-    group.core.steps.step_async(steps(0), group.now)
+    group.steps.step_async(steps(0), group.now)
     waiting = collect(group)
-    group.core.steps.step_async(steps(1), group.now)
+    group.steps.step_async(steps(1), group.now)
     group.turn()
     group.finish(1)
     assert ids_of(waiting) == ["fake-1"]
@@ -297,8 +297,8 @@ def test_a_collect_also_waits_for_requests_sent_meanwhile(new_group: NewGroup) -
 def test_a_collect_returns_results_of_a_cancelled_call(new_group: NewGroup) -> None:
     """Results that are ready wake it."""
     group = new_group(3)
-    group.core.steps.step_async(steps(2), group.now)
-    stepping = group.begin(group.core.steps.step(steps(0, 1), group.now))
+    group.steps.step_async(steps(2), group.now)
+    stepping = group.begin(group.steps.step(steps(0, 1), group.now))
     waiting = collect(group)
     group.finish(0)
     group.cancel(stepping)

@@ -261,7 +261,7 @@ class CoreMachine(RuleBasedStateMachine):
     def step_async(self, data: st.DataObject) -> None:
         slots = self.some(data, self.idle())
         batch, actions = self.responses(data, slots)
-        self.core.steps.step_async(batch, self.group.now)
+        self.group.steps.step_async(batch, self.group.now)
         self.requests_for(slots, actions)
         self.group.turn()
         self.settle()
@@ -272,7 +272,7 @@ class CoreMachine(RuleBasedStateMachine):
         slots = self.some(data, self.idle())
         batch, actions = self.responses(data, slots)
         requests = self.requests_for(slots, actions)
-        self.operate(self.core.steps.step(batch, self.group.now), slots, requests)
+        self.operate(self.group.steps.step(batch, self.group.now), slots, requests)
 
     @precondition(lambda self: self.idle())
     @rule(data=st.data(), seeds=st.sampled_from(("none", "int", "list", "mapping")))
@@ -341,7 +341,7 @@ class CoreMachine(RuleBasedStateMachine):
             fault, BadAction if self.idle() else EnvBusy
         )
         with pytest.raises(expected):
-            self.core.steps.step_async(BatchedData(ids, values), self.group.now)
+            self.group.steps.step_async(BatchedData(ids, values), self.group.now)
         self.settle()
 
     @precondition(lambda self: self.collector is not None)
@@ -362,7 +362,7 @@ class CoreMachine(RuleBasedStateMachine):
         max_results: int | None,
         deadline: float | None,
     ) -> Any:
-        return self.core.steps.collect(
+        return self.group.steps.collect(
             self.group.now,
             CollectRules(
                 timeout=timeout,

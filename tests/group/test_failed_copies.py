@@ -76,7 +76,7 @@ def steps(*deeds: int) -> BatchedData:
 
 
 def collected(group: FakeGroup) -> tuple[BatchedData, Any]:
-    return group.begin(group.core.steps.collect(group.now, CollectRules(wait_all=True))).result()
+    return group.begin(group.steps.collect(group.now, CollectRules(wait_all=True))).result()
 
 
 def finish_all(group: FakeGroup) -> None:
@@ -93,7 +93,7 @@ def hard_to_collect() -> FakeGroup:
         if deeds[0] == SENDS_INFO:
             group.hosts[1].die()
             group.turn()
-        group.core.steps.step_async(steps(*deeds), group.now)
+        group.steps.step_async(steps(*deeds), group.now)
         finish_all(group)
         if deeds[0] == PLAIN:
             collected(group)
@@ -118,7 +118,7 @@ def test_a_failed_collect_leaves_all_results_to_the_next() -> None:
     assert line > 20
     assert content(results) == expected
     assert group.core.pending() == 0
-    group.core.steps.step_async(steps(PLAIN, PLAIN, PLAIN, PLAIN), group.now)
+    group.steps.step_async(steps(PLAIN, PLAIN, PLAIN, PLAIN), group.now)
     finish_all(group)
     assert len(collected(group)[0]) == 4
     group.close()
@@ -127,7 +127,7 @@ def test_a_failed_collect_leaves_all_results_to_the_next() -> None:
 def test_a_failed_step_leaves_its_results_to_collect() -> None:
     """And its errors, which a collect raises first."""
     group = FakeGroup([2])
-    running = group.begin(group.core.steps.step(steps(SENDS_INFO, RAISES), group.now))
+    running = group.begin(group.steps.step(steps(SENDS_INFO, RAISES), group.now))
     with out_of_memory(1):
         finish_all(group)
     with pytest.raises(MemoryError):
@@ -144,7 +144,7 @@ def test_an_unreadable_info_raises_only_when_it_is_read() -> None:
     group = FakeGroup([1])
     (host,) = group.hosts
     host._reply = lambda entry, *_, **__: host.answer(Result(host.host_id, entry, b"no pickle"))
-    group.core.steps.step_async(steps(TERMINATES), group.now)
+    group.steps.step_async(steps(TERMINATES), group.now)
     host.slab.episode_length[0] = 1
     finish_all(group)
     batch, _ = collected(group)

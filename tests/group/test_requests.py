@@ -332,8 +332,7 @@ def test_the_debug_mode_is_on_where_the_variable_says_so(value: str, checked: bo
         "from rlightning_aio.sync import build_env_group\n"
         "group = build_env_group({'name': 'pole', 'backend': 'gymnasium',"
         " 'task': 'CartPole-v1', 'placement': 'inline'})\n"
-        "core = group._core\n"
-        "print(type(core.requests).__name__, type(core.steps).__name__)\n"
+        "print(type(group._core.requests).__name__, type(group._steps).__name__)\n"
         "group.close()\n"
     )
     command = [sys.executable, "-c", program]

@@ -34,7 +34,7 @@ def action_of(backend: str, number: int) -> Any:
 
 def steps_at_once(group: rlightning_aio.sync.EnvGroup) -> bool:
     """Return True if the only env of a group is stepped without a request."""
-    return group._core.steps._alone is not None
+    return group._steps._alone is not None
 
 
 class Used:
@@ -44,7 +44,7 @@ class Used:
         self.group = rlightning_aio.sync.build_env_group(entry)
         self.group.init()
         conditions = self.group._core._conditions
-        steps = self.group._core.steps
+        steps = self.group._steps
         assert (steps._alone or steps._here) is not None
         self.group._core._first_observations.left.clear()
         conditions.note(FIRST_RESULTS, False)

@@ -133,15 +133,13 @@ class Twins(RuleBasedStateMachine):
     @rule(data=st.data())
     def step_async(self, data: st.DataObject) -> None:
         respond = self.batch(data)
-        self.both(lambda group, first: group.core.steps.step_async(respond(first), group.now))
+        self.both(lambda group, first: group.steps.step_async(respond(first), group.now))
 
     @rule(data=st.data())
     def step(self, data: st.DataObject) -> None:
         respond = self.batch(data)
         self.operations.append(
-            self.both(
-                lambda group, first: group.begin(group.core.steps.step(respond(first), group.now))
-            )
+            self.both(lambda group, first: group.begin(group.steps.step(respond(first), group.now)))
         )
 
     @precondition(lambda self: not self.collectors)
@@ -153,7 +151,7 @@ class Twins(RuleBasedStateMachine):
     )
     def collect(self, **rules: Any) -> None:
         self.collectors = self.both(
-            lambda group, _: group.begin(group.core.steps.collect(group.now, CollectRules(**rules)))
+            lambda group, _: group.begin(group.steps.collect(group.now, CollectRules(**rules)))
         )
 
     @rule(slot=st.integers(0, 8))
@@ -301,7 +299,7 @@ def test_steps_are_ordinary_before_and_after_a_death() -> None:
     def turn() -> None:
         nonlocal batch
         with patch.object(kernel, "submit", wraps=kernel.submit) as submit:
-            step = group.core.steps.step(batch.respond(action=np.full(4, PLAIN)), group.now)
+            step = group.steps.step(batch.respond(action=np.full(4, PLAIN)), group.now)
             running = group.begin(step)
         published.append(submit.called)
         Twins.finish_all(group)

@@ -11,11 +11,10 @@ from rlightning_aio.errors import ConfigError
 from rlightning_aio.group.checked import DEBUG, CheckedRequests
 from rlightning_aio.group.conditions import Conditions
 from rlightning_aio.group.continuity import Continuity
-from rlightning_aio.group.core import Core
+from rlightning_aio.group.core import Core, Parts
 from rlightning_aio.group.env_table import EnvTable
 from rlightning_aio.group.lifetime import Lifetime
 from rlightning_aio.group.observed import Observed
-from rlightning_aio.group.parts import Parts
 from rlightning_aio.group.plan import host_class, place_of
 from rlightning_aio.group.poller import Poller
 from rlightning_aio.group.requests import Requests
@@ -100,7 +99,7 @@ def _assembled(plan: Plan, watcher: Watcher, arena: Arena, *, shares_thread: boo
         poller.add(host)
         first_slot += host.num_envs
     parts = Parts(tables, supervisor, poller, bell, rings, completions, watcher)
-    return Core(parts, zero_copy=plan.zero_copy, shares_thread=shares_thread)
+    return Core(parts, zero_copy=plan.zero_copy)
 
 
 def _tables(plan: Plan, orders: Sequence[StartOrder]) -> Tables:

@@ -8,6 +8,7 @@ Rule: no I/O beyond passing bytes to hosts, no clock, no event loop.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -22,7 +23,6 @@ from rlightning_aio.errors import (
 from rlightning_aio.group.actions import response_columns, write_actions
 from rlightning_aio.group.arrivals import Arrivals
 from rlightning_aio.group.calls import Calls
-from rlightning_aio.group.checked import CheckedRequests, CheckedSteps
 from rlightning_aio.group.conditions import FIRST_RESULTS
 from rlightning_aio.group.dispatch import Dispatch
 from rlightning_aio.group.first_observations import FirstObservations
@@ -33,7 +33,6 @@ from rlightning_aio.group.resets import Resets
 from rlightning_aio.group.results import Results
 from rlightning_aio.group.snapshots import Snapshots
 from rlightning_aio.group.stats import Stats
-from rlightning_aio.group.steps import Steps
 from rlightning_aio.group.wait import Procedure, earliest
 from rlightning_aio.group.waiting import Waiting
 from rlightning_aio.protocol.entries import Operation
@@ -45,16 +44,43 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio.batch.columns import ResultColumns
-    from rlightning_aio.group.parts import Parts
+    from rlightning_aio.group.poller import Poller
     from rlightning_aio.group.requests import Ticket
     from rlightning_aio.group.seeds import Seeds
+    from rlightning_aio.group.supervisor import Supervisor
+    from rlightning_aio.group.tables import Tables
     from rlightning_aio.group.wait import CollectRules
-    from rlightning_aio.hosts.base import Host, Membership
+    from rlightning_aio.hosts.base import Host, Membership, Watcher
+    from rlightning_aio.hosts.messages import Completions
+    from rlightning_aio.protocol.exchange import Ring
+    from rlightning_aio.protocol.rings import TrainerBell
     from rlightning_aio.types import EnvMeta
 
-__all__ = ["Core", "Flags"]
+__all__ = ["Core", "Flags", "Parts"]
 
 Flags: TypeAlias = "list[bool]"
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What a core is built from.
+
+    Attributes:
+        tables: the state of the group.
+        supervisor, poller: of the hosts.
+        bell, rings: shared memory; workers post replies in rings, and the bell announces them.
+        completions: queue of the outcomes of requests, posted by hosts; a driver applies them
+            before it resumes a procedure.
+        watcher: the driver.
+    """
+
+    tables: Tables
+    supervisor: Supervisor
+    poller: Poller
+    bell: TrainerBell
+    rings: list[Ring | None]
+    completions: Completions
+    watcher: Watcher
 
 
 class Core:
@@ -63,20 +89,14 @@ class Core:
     Args:
         parts: of the group.
         zero_copy: return observations as views if their rows are contiguous.
-        shares_thread: other tasks may use the group while a procedure waits.
 
     Attributes:
-        steps: the ordinary step, which callers try first.
+        parts: as given; results, intake, waiting, stats: made of them.
         collecting: a call of `collect` waits.
     """
 
-    def __init__(
-        self,
-        parts: Parts,
-        *,
-        zero_copy: bool,
-        shares_thread: bool,
-    ) -> None:
+    def __init__(self, parts: Parts, *, zero_copy: bool) -> None:
+        self.parts = parts
         tables, supervisor = parts.tables, parts.supervisor
         envs, requests, layout = tables.envs, tables.requests, tables.layout
         continuity, conditions = tables.continuity, tables.conditions
@@ -89,50 +109,35 @@ class Core:
         self.lifetime = tables.lifetime
         self.stats = Stats(envs, requests)
         self._layout = layout
-        self._num_cores = parts.poller.num_cores
-        self._results = Results(envs, layout, conditions, zero_copy=zero_copy)
+        self.results = Results(envs, layout, conditions, zero_copy=zero_copy)
         self._first_observations = FirstObservations(envs)
         self._dispatch = Dispatch(tables, supervisor)
-        self._arrivals = Arrivals(tables, self._results, self.stats)
-        self._intake = Intake(parts.completions, tables, supervisor, self._results, self._arrivals)
-        # The queue of completions; a driver applies them before it resumes a procedure.
-        self.completions = parts.completions
-        self.drain = self._intake.drain
-        self._waiting = Waiting(requests, supervisor, parts.poller, self._intake, parts.watcher)
+        self._arrivals = Arrivals(tables, self.results, self.stats)
+        self.intake = Intake(parts.completions, tables, supervisor, self.results, self._arrivals)
+        self.drain = self.intake.drain
+        self.waiting = Waiting(requests, supervisor, parts.poller, self.intake, parts.watcher)
         self.calls = Calls(
             tables,
             self._dispatch,
-            self._intake,
-            self._waiting,
+            self.intake,
+            self.waiting,
         )
         self._snapshots = Snapshots(
-            envs, supervisor, self._dispatch, self.calls, continuity, self._waiting
+            envs, supervisor, self._dispatch, self.calls, continuity, self.waiting
         )
         self._resets = Resets(
-            tables, supervisor, self._dispatch, self._results, self._intake, self._waiting
+            tables, supervisor, self._dispatch, self.results, self.intake, self.waiting
         )
         self.collecting = False
-        steps = CheckedSteps if isinstance(requests, CheckedRequests) else Steps
-        self.steps = steps(
-            self,
-            parts,
-            self._results,
-            self.stats,
-            self._intake,
-            self._waiting,
-            shares_thread=shares_thread,
-        )
 
     # -- life -------------------------------------------------------------------------
 
     def start(self, now: float) -> Procedure[list[EnvMeta]]:
-        """Start the hosts and make the ordinary step ready."""
+        """Start the hosts."""
         for host in self.supervisor.hosts:
-            self._results.begin_schemas(range(host.first_slot, host.first_slot + host.num_envs))
+            self.results.begin_schemas(range(host.first_slot, host.first_slot + host.num_envs))
         with self.observed.call("init", now):
-            metas = yield from self.supervisor.start(now)
-        self.steps.begin()
-        return metas
+            return (yield from self.supervisor.start(now))
 
     def close(self, now: float) -> Procedure[None]:
         """Close the hosts."""
@@ -141,7 +146,7 @@ class Core:
     def describe_workers(self, now_ns: int) -> list[dict[str, Any]]:
         """Describe each host and its outstanding requests."""
         if self.lifetime.open:
-            self._waiting.poll()  # Results that are ready are no longer outstanding.
+            self.waiting.poll()  # Results that are ready are no longer outstanding.
         return self.supervisor.workers.describe(now_ns)
 
     # -- requests ---------------------------------------------------------------------
@@ -151,7 +156,7 @@ class Core:
         with self.observed.call("step_async", now):
             self._send_steps(batch, self._slots_of(batch), None, now)
         # A waiting collector has not armed the bell for these results.
-        self._waiting.wake()
+        self.waiting.wake()
 
     def _slots_of(self, batch: BatchedData) -> NDArray[np.intp]:
         """Return the slots of a batch's envs; a batch that answers our results knows them."""
@@ -166,8 +171,8 @@ class Core:
     def _send_steps(
         self, batch: BatchedData, slots: NDArray[np.intp], ticket: Ticket | None, now: float
     ) -> None:
-        self._intake.now = now
-        self._intake.drain()
+        self.intake.now = now
+        self.intake.drain()
         if self.supervisor.members.possible:
             batch, slots = self._arrivals.without_gone(batch, slots)
             if not len(slots):
@@ -175,7 +180,7 @@ class Core:
         self._dispatch.check_sendable(slots, "step")
         out_of_band = write_actions(batch, slots, self.envs, self._layout)
         packed = [] if out_of_band is None else self._dispatch.packed_steps(slots, out_of_band)
-        self._results.note_sent(slots, response_columns(batch, slots, self._layout))
+        self.results.note_sent(slots, response_columns(batch, slots, self._layout))
         resets = self.continuity.resets(slots)
         if self.continuity.exceptional:
             reports, seeds = self.continuity.report_losses(slots, ~resets)
@@ -191,7 +196,7 @@ class Core:
                 slots, entries, out_of_band.positions, packed, resets
             )
         if self.supervisor.members.possible:
-            self._intake.drain()  # Requests to absent envs are withdrawn immediately.
+            self.intake.drain()  # Requests to absent envs are withdrawn immediately.
 
     # -- collect ----------------------------------------------------------------------
 
@@ -212,7 +217,7 @@ class Core:
         try:
             end = None if deadline is None else now + deadline
             window = None
-            now = yield from self._waiting.check_liveness(now)
+            now = yield from self.waiting.check_liveness(now)
             while True:
                 ready, most, need = self._counts(rules, among)
                 if ready and timeout is not None and window is None:
@@ -228,10 +233,10 @@ class Core:
                 few = 1 if timeout is not None else max(need - ready, 1)
                 wanted = most - ready if ready and open_window else few
                 until = earliest(end, window if open_window else None)
-                now = yield from self._waiting.turn(wanted, until)
+                now = yield from self.waiting.turn(wanted, until)
         finally:
             self.collecting = False
-            self._waiting.end()
+            self.waiting.end()
         slots = self.requests.collector.take(most, among)
         return self.hand_out(np.sort(slots) if rules.ordered else slots, synchronous=False)
 
@@ -242,7 +247,7 @@ class Core:
             EnvFault: an env of these slots ended in an error.
             NothingPending: no result can come.
         """
-        self._waiting.poll()
+        self.waiting.poll()
         if self.requests.collector.faults:
             self._raise_fault(among)
         ready, total = self.requests.pending(among)
@@ -270,7 +275,7 @@ class Core:
         observer = self.observed.observer
         noted = None if observer is None else observer.before_results(slots)
         try:
-            parts = self._results.gather(slots)
+            parts = self.results.gather(slots)
             flagged = [part for part in parts if np.count_nonzero(part.flags)]
             verdict = self.continuity.judge(slots, flagged)
             batch = self._batch(slots, parts, flagged, verdict.is_cut)
@@ -280,7 +285,7 @@ class Core:
             flags = [False] * len(slots) if verdict.is_cut is None else verdict.is_cut.tolist()
             self.stats.account(parts, synchronous=synchronous)
             self.continuity.returned(slots, flagged, verdict)
-            self._results.let_go(slots)
+            self.results.let_go(slots)
             self.requests.hand_out(slots)
         except BaseException:
             self.requests.put_back(slots)
@@ -290,13 +295,13 @@ class Core:
         if observer is not None:
             observer.after_results(noted, parts)
         if self._arrivals.held_back:
-            self._arrivals.admit(slots, self._intake.now)
+            self._arrivals.admit(slots, self.intake.now)
         return batch, flags
 
     def give_hint(self) -> None:
         """Log if the measured times suggest other settings."""
         latency_us = self.stats.summary()["latency_us"]
-        self.supervisor.workers.give_hint(self._num_cores, latency_us)
+        self.supervisor.workers.give_hint(self.parts.poller.num_cores, latency_us)
 
     def _batch(
         self,
@@ -306,7 +311,7 @@ class Core:
         is_cut: NDArray[np.bool_] | None,
     ) -> BatchedData:
         """Make a batch of `parts`, and mark where the step limit cuts an episode."""
-        results = self._results
+        results = self.results
         for part in flagged if is_cut is None else parts:
             if is_cut is not None:
                 part.limit_reached = is_cut if part.positions is None else is_cut[part.positions]
@@ -329,7 +334,7 @@ class Core:
         except BaseException:
             self.requests.tickets.drop(ticket)
             raise
-        yield from self._waiting.until_replied(ticket)
+        yield from self.waiting.until_replied(ticket)
         results, flags = self.settled(ticket, slots)
         return results, flags if self.continuity.active else None
 
@@ -385,7 +390,7 @@ class Core:
         """Send resets, whose results `collect` returns."""
         with self.observed.call("reset_async", now):
             self._resets.reset_async(now, seed, options, env_ids)
-        self._waiting.wake()
+        self.waiting.wake()
 
     # -- states of envs ---------------------------------------------------------------
 
@@ -405,7 +410,7 @@ class Core:
 
     def pending(self) -> int:
         """Return the number of requests that `collect_async` has to answer, ready or not."""
-        self._intake.drain()
+        self.intake.drain()
         return self.requests.pending()[1]
 
 

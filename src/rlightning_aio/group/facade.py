@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import BadAction, RLightningError
 from rlightning_aio.group.build import assemble
+from rlightning_aio.group.checked import DEBUG, CheckedSteps
 from rlightning_aio.group.observed import NO_SPAN
 from rlightning_aio.group.scope import Scope
+from rlightning_aio.group.steps import Steps
 from rlightning_aio.group.trace import Trace
 from rlightning_aio.group.wait import CollectRules
 from rlightning_aio.hosts.base import Watcher
@@ -122,8 +124,9 @@ class Facade:
     def __init__(self, plan: Plan) -> None:
         self._driver = self._new_driver()
         self._core = assemble(plan, self._driver, shares_thread=self._shares_thread)
-        self._steps = self._core.steps
-        self._driver.completions = self._core.completions
+        steps = CheckedSteps if DEBUG else Steps
+        self._steps = steps(self._core, shares_thread=self._shares_thread)
+        self._driver.completions = self._core.parts.completions
         self._driver.drain = self._core.drain
         self._finalizer = weakref.finalize(self, self._core.supervisor.shutdown.abandon)
         self._disowned = False

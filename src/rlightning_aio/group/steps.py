@@ -29,15 +29,11 @@ from rlightning_aio.protocol.slab import TRUNCATED
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from rlightning_aio.group.intake import Intake
-    from rlightning_aio.group.parts import Parts
-    from rlightning_aio.group.requests import Ticket
-    from rlightning_aio.group.results import Results
-    from rlightning_aio.group.stats import Stats
+    from rlightning_aio.group.core import Core
     from rlightning_aio.group.wait import CollectRules
-    from rlightning_aio.group.waiting import Waiting
     from rlightning_aio.hosts.messages import OutOfBand
     from rlightning_aio.protocol.columns import Rows
+    from rlightning_aio.types import EnvMeta
 
 __all__ = ["Steps", "StepsAtOnce"]
 
@@ -69,66 +65,17 @@ class StepsAtOnce(Protocol):
         ...
 
 
-class GeneralPath(Protocol):
-    """The operations of `Core` that `Steps` falls back to.
-
-    Attributes:
-        collecting: a call of `collect` waits.
-    """
-
-    collecting: bool
-
-    def step_async(self, batch: BatchedData, now: float) -> None:
-        """Send a batch of steps."""
-        ...
-
-    def step(
-        self, batch: BatchedData, now: float
-    ) -> Procedure[tuple[BatchedData, list[bool] | None]]:
-        """Send a batch of steps and wait for all of them."""
-        ...
-
-    def collect(self, now: float, rules: CollectRules) -> Procedure[tuple[BatchedData, list[bool]]]:
-        """Wait for results and return them."""
-        ...
-
-    def settled(self, ticket: Ticket, slots: NDArray[np.intp]) -> tuple[BatchedData, list[bool]]:
-        """The results of a call that has all that it waited for, or its errors."""
-        ...
-
-    def hand_out(
-        self, slots: NDArray[np.intp], *, synchronous: bool
-    ) -> tuple[BatchedData, list[bool]]:
-        """The results of `slots`, all ready."""
-        ...
-
-    def give_hint(self) -> None:
-        """Log what the measured times say of the group's settings."""
-        ...
-
-
 class Steps:
     """See the module.
 
     Args:
         core: the general path.
-        parts, results, stats, intake, waiting: of the group.
         shares_thread: other tasks may use the group while a procedure waits.
     """
 
-    def __init__(
-        self,
-        core: GeneralPath,
-        parts: Parts,
-        results: Results,
-        stats: Stats,
-        intake: Intake,
-        waiting: Waiting,
-        *,
-        shares_thread: bool,
-    ) -> None:
+    def __init__(self, core: Core, *, shares_thread: bool) -> None:
         self._core = core
-        tables = parts.tables
+        parts, tables = core.parts, core.parts.tables
         self._layout = tables.layout
         self._conditions = tables.conditions
         self._envs = tables.envs
@@ -139,19 +86,24 @@ class Steps:
         self._rings = parts.rings
         self._completions = parts.completions
         self._watcher = parts.watcher
-        self._results = results
+        self._results = core.results
         self._continuity = tables.continuity
-        self._stats = stats
-        self._intake = intake
-        self._waiting = waiting
+        self._stats = core.stats
+        self._intake = core.intake
+        self._waiting = core.waiting
         self._shares_thread = shares_thread
         self._fence = exchange.new_fence()
         # The host of the only env of a synchronous group, and of all envs of another group.
         self._alone: StepsAtOnce | None = None
         self._here: StepsAtOnce | None = None
 
-    def begin(self) -> None:
-        """All envs have their rows: find out whether their steps can be ordinary."""
+    def start(self, now: float) -> Procedure[list[EnvMeta]]:
+        """Start the hosts, and find out whether steps of their envs can be ordinary."""
+        metas = yield from self._core.start(now)
+        self._begin()
+        return metas
+
+    def _begin(self) -> None:
         envs, slabs, hosts = self._envs, self._layout.slabs, self._supervisor.hosts
         if len(hosts) == 1 and isinstance(hosts[0], StepsAtOnce):
             if self._shares_thread or len(envs) > 1:
