@@ -15,11 +15,7 @@ import numpy as np
 
 from rlightning_aio.batch.contents import slots_of
 from rlightning_aio.batch.data import BatchedData, batch_of_results
-from rlightning_aio.errors import (
-    BadAction,
-    NothingPending,
-    RLightningError,
-)
+from rlightning_aio.errors import BadAction, NothingPending, RLightningError
 from rlightning_aio.group.actions import response_columns, write_actions
 from rlightning_aio.group.arrivals import Arrivals
 from rlightning_aio.group.calls import Calls
@@ -116,12 +112,7 @@ class Core:
         self.intake = Intake(parts.completions, tables, supervisor, self.results, self._arrivals)
         self.drain = self.intake.drain
         self.waiting = Waiting(requests, supervisor, parts.poller, self.intake, parts.watcher)
-        self.calls = Calls(
-            tables,
-            self._dispatch,
-            self.intake,
-            self.waiting,
-        )
+        self.calls = Calls(tables, self._dispatch, self.intake, self.waiting)
         self._snapshots = Snapshots(
             envs, supervisor, self._dispatch, self.calls, continuity, self.waiting
         )
@@ -186,7 +177,8 @@ class Core:
             reports, seeds = self.continuity.report_losses(slots, ~resets)
             self._layout.write_seeds(slots[reports], seeds[reports])
             resets = resets | reports
-        entries = self.requests.submit(slots, Operation.STEP, _owner(ticket), now)
+        owner = COLLECTOR if ticket is None else ticket.owner
+        entries = self.requests.submit(slots, Operation.STEP, owner, now)
         if np.count_nonzero(resets):
             self.requests.numbering.into_resets(slots, entries, resets)
         if out_of_band is None:
@@ -412,10 +404,6 @@ class Core:
         """Return the number of requests that `collect_async` has to answer, ready or not."""
         self.intake.drain()
         return self.requests.pending()[1]
-
-
-def _owner(ticket: Ticket | None) -> int:
-    return COLLECTOR if ticket is None else ticket.owner
 
 
 def _answered(batch: BatchedData) -> list[str]:

@@ -236,10 +236,7 @@ class GroupInterface(Facade):
 
 
 class EnvHandleInterface:
-    """One env of a group.
-
-    Each method raises `EnvBusy` while an earlier reply of the env is outstanding.
-    """
+    """The methods of a handle on one env."""
 
     def __init__(self, group: Any, core: Core, driver: Any, env_id: str) -> None:
         self._group = group
@@ -317,11 +314,7 @@ class EnvHandleInterface:
 
 
 class ServerHandleInterface(EnvHandleInterface):
-    """An env_server of a group; its clients' envs have handles of their own.
-
-    Methods of remote envs can't be called: `call`, `get_attr`, `set_attr`, `render`, `offload`
-    and `reload` raise NotImplementedError.
-    """
+    """The methods of a handle on one env_server."""
 
     def __init__(
         self, group: Any, core: Core, driver: Any, server: tuple[Host, Membership]

@@ -54,9 +54,11 @@ def plan_group(
     check_videos(configs)
     fns = _preprocess_fns(configs, preprocess_fn)
     for config, own in zip(configs, fns, strict=True):
+        place = place_of(config)
         host_class(config)
-        _check_place(config)
-        if place_of(config).max_members and own[0] not in (None, default_env_preprocess_fn):
+        if place.check:
+            load(place.check)(config)
+        if place.max_members and own[0] not in (None, default_env_preprocess_fn):
             warnings.warn(
                 f"entry {config.name!r}: preprocess_fn is ignored for an {config.backend}; it "
                 "runs at the client",
@@ -88,13 +90,6 @@ def host_class(config: EnvConfig) -> HostFactory:
             f"entry {config.name!r}: placement {config.placement!r} needs a package that is not "
             f"installed ({error}): pip install 'rlightning-aio[{place.extra}]'"
         ) from error
-
-
-def _check_place(config: EnvConfig) -> None:
-    """Raise `ConfigError` if the envs of an entry can't be where it places them."""
-    check = place_of(config).check
-    if check:
-        load(check)(config)
 
 
 def _preprocess_fns(

@@ -222,7 +222,7 @@ class Requests:
     """See the module.
 
     Args:
-        size: of the table; host_of: the host of each slot, in runs.
+        host_of: the host of each slot, in runs.
         num_hosts: numbered from 0.
         conditions: of the group.
 

@@ -130,11 +130,6 @@ class ClientRegistry:
         session.record.last = LastObservation(session.announced.results, result.observation)
         self.results.append(result)
 
-    def take_results(self) -> list[RemoteResult]:
-        """Return all queued results, oldest first, and clear the queue."""
-        results, self.results = self.results, []
-        return results
-
     def drop_first_result(self, record: ClientRecord) -> bool:
         """Remove a client's first result from the queue. Return False if there was none."""
         kept = [r for r in self.results if r.client != record.name or r.number is not None]

@@ -8,7 +8,7 @@ argument. Deliberately left out: sockets, keys, and the env itself.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, Any, Final, cast
 
@@ -81,7 +81,7 @@ class ResetRequest:
 
     number: int
     seed: int | list[int] | None = None
-    options: dict[str, Any] | None = field(default=None)
+    options: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -103,7 +103,8 @@ class ServerSessions:
 
     def take(self) -> list[RemoteResult]:
         """Return all queued results, oldest first; each is returned once."""
-        return self._registry.take_results()
+        results, self._registry.results = self._registry.results, []
+        return results
 
     def routes(self) -> set[bytes]:
         """Return the routes that clients used last, one for each session."""
