@@ -139,10 +139,9 @@ class _Events:
     def _slices(self, pid: int, tid: int, slices: Iterable[_Slice]) -> Iterator[str]:
         head, base = f'"ph":"X","pid":{pid},"tid":{tid}', self._base
         for name, began, ended, text in slices:
-            args = f',"args":{{"cause":{json.dumps(text)}}}' if text else ""
             yield (
                 f'{{"name":{json.dumps(name)},{head},"ts":{(began - base) / 1e3},'
-                f'"dur":{(ended - began) / 1e3}{args}}}'
+                f'"dur":{(ended - began) / 1e3}{_cause(text)}}}'
             )
 
     def _times(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -194,23 +193,18 @@ class _Events:
         ]
 
     def _marks(self) -> Iterator[str]:
+        """Marks without a duration, and those of envs with one; `_host_slices` has the rest."""
         for mark in self._kept_marks():
-            pid = _pid(mark.host_id)
-            if mark.slot < 0:
-                tid = self._host_tracks[mark.host_id]
-            else:
-                tid = int(self._track_of[mark.slot])
-                if mark.began:
-                    yield from self._slices(
-                        pid, tid, [_Slice(mark.name, mark.began, mark.at, mark.text)]
-                    )
-            if mark.began:
-                continue
-            args = f',"args":{{"cause":{json.dumps(mark.text)}}}' if mark.text else ""
-            yield (
-                f'{{"name":"{mark.name}","ph":"i","s":"t","pid":{pid},"tid":{tid},'
-                f'"ts":{(mark.at - self._base) / 1e3}{args}}}'
-            )
+            pid, on_env = _pid(mark.host_id), mark.slot >= 0
+            tid = int(self._track_of[mark.slot]) if on_env else self._host_tracks[mark.host_id]
+            if not mark.began:
+                yield (
+                    f'{{"name":"{mark.name}","ph":"i","s":"t","pid":{pid},"tid":{tid},'
+                    f'"ts":{(mark.at - self._base) / 1e3}{_cause(mark.text)}}}'
+                )
+            elif on_env:
+                one = _Slice(mark.name, mark.began, mark.at, mark.text)
+                yield from self._slices(pid, tid, [one])
 
     def _flows(self, spans: dict[int, list[_Slice]]) -> Iterator[str]:
         """The flows from requests to results; requests outside any known span have none."""
@@ -251,6 +245,10 @@ class _Events:
 
 def _pid(host_id: Any) -> Any:
     return host_id + _TRAINER + 1
+
+
+def _cause(text: str) -> str:
+    return f',"args":{{"cause":{json.dumps(text)}}}' if text else ""
 
 
 def _process(pid: int, name: str) -> Iterator[str]:
