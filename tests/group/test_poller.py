@@ -33,6 +33,7 @@ class Server(Worker):
     """The part of an env_server that a poller uses."""
 
     server_id, address, members = "server-0", "tcp://nowhere", ()
+    first_slot = num_envs = 0
 
     def __init__(self, host_id: int) -> None:
         super().__init__(host_id)
@@ -46,6 +47,7 @@ class Server(Worker):
     def _not_asked(self, *args: Any) -> Any:
         raise AssertionError
 
+    start = attach = packed = submit = close = release = _not_asked
     member_indices = num_sub_envs = check_step = check_reset = _not_asked
     missing = deadline = tick = _not_asked
 

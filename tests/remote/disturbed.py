@@ -50,7 +50,7 @@ def disturbed(
                     *(["curve"] if curve else []),
                 )  # fmt: skip
                 try:
-                    yield group, group["robots-0"]._server[0]._listener, peers
+                    yield group, group["robots-0"]._server._listener, peers
                 finally:
                     peers.kill()
                     peers.wait()

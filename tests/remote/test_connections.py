@@ -88,7 +88,7 @@ def with_a_client() -> Iterator[tuple[Any, Any, ClientThread, Any]]:
     with sync.build_env_group(ENTRY) as group:
         friend = ClientThread(group["robots-0"].address, "arm")
         batch, _ = group.reset()
-        yield group, group["robots-0"]._server[0]._listener, friend, batch
+        yield group, group["robots-0"]._server._listener, friend, batch
         group.close()
         friend.join()
 
@@ -119,7 +119,7 @@ def test_a_message_of_too_many_parts_is_dropped_and_its_sender_cut_off() -> None
 def test_protocols_before_zmtp_3_are_turned_away_at_their_greeting(greeting: bytes) -> None:
     """A greeting that arrives while the socket closes would end the process (libzmq assertion)."""
     with sync.build_env_group(ENTRY) as group:
-        listener = group["robots-0"]._server[0]._listener
+        listener = group["robots-0"]._server._listener
         (peer,) = dial(group["robots-0"].address, 1)
         with peer:
             peer.settimeout(HANG)
@@ -235,7 +235,7 @@ def test_unauthenticated_peers_wait_when_their_budget_is_used_up(
         batch, _ = group.reset()
         while len(group["robots-0"].clients) < 3:
             batch = step(group, batch)
-        spend_everything(address, group, group["robots-0"]._server[0]._listener)
+        spend_everything(address, group, group["robots-0"]._server._listener)
         errors: list[str] = []
         late = threading.Thread(target=try_to_connect, args=(address, errors))
         late.start()

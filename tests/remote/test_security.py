@@ -337,7 +337,7 @@ def test_nonsense_and_pickles_of_unauthenticated_peers_do_no_harm(tmp_path: Path
     )
     with sync.build_env_group(entry()) as group:
         address = group["robots-0"].address
-        remote = group["robots-0"]._server[0]._listener
+        remote = group["robots-0"]._server._listener
         friend = ClientThread(address, "arm")
         batch, _ = group.reset()
         with zmq.Context() as context, context.socket(zmq.DEALER) as peer:
@@ -379,7 +379,7 @@ def test_a_frame_beyond_the_limit_is_not_read() -> None:
                 batch, _ = group.collect_async(deadline=HANG)
             peer.disable_monitor()
             monitor.close()
-        assert group["robots-0"]._server[0]._listener._sessions.num_malformed == 0
+        assert group["robots-0"]._server._listener._sessions.num_malformed == 0
         group.close()
         friend.join()
 

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from rlightning_aio.group.supervisor import Supervisor
     from rlightning_aio.group.tables import Tables
     from rlightning_aio.group.wait import CollectRules
-    from rlightning_aio.hosts.base import Host, Membership, Watcher
+    from rlightning_aio.hosts.base import Membership, Watcher
     from rlightning_aio.hosts.messages import Completions
     from rlightning_aio.protocol.exchange import Ring
     from rlightning_aio.protocol.rings import TrainerBell
@@ -363,7 +363,7 @@ class Core:
     def reset_members(
         self,
         now: float,
-        server: tuple[Host, Membership],
+        server: Membership,
         seed: int | None,
         options: dict[str, Any] | None,
     ) -> Procedure[tuple[BatchedData, Flags]]:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.group.core import Core
-    from rlightning_aio.hosts.base import Host, Membership
+    from rlightning_aio.hosts.base import Membership
     from rlightning_aio.types import EnvMeta, PolicyResponse
 
 __all__ = ["EnvHandleInterface", "GroupInterface", "ServerHandleInterface"]
@@ -316,12 +316,9 @@ class EnvHandleInterface:
 class ServerHandleInterface(EnvHandleInterface):
     """The methods of a handle on one env_server."""
 
-    def __init__(
-        self, group: Any, core: Core, driver: Any, server: tuple[Host, Membership]
-    ) -> None:
-        super().__init__(group, core, driver, server[1].server_id)
+    def __init__(self, group: Any, core: Core, driver: Any, server: Membership) -> None:
+        super().__init__(group, core, driver, server.server_id)
         self._server = server
-        self._membership = server[1]
 
     @property
     def address(self) -> str:
@@ -330,17 +327,17 @@ class ServerHandleInterface(EnvHandleInterface):
         Raises:
             RuntimeError: it does not listen yet, before `init`.
         """
-        return self._membership.address()
+        return self._server.address()
 
     @property
     def clients(self) -> list[str]:
         """Ids of the envs of connected clients, ``<server id>/<client name>``."""
-        return [f"{self.env_id}/{name}" for name in self._membership.members()]
+        return [f"{self.env_id}/{name}" for name in self._server.members()]
 
     @property
     def metas(self) -> list[EnvMeta]:
         """Metadata of these clients' envs, in the same order."""
-        return list(self._membership.members().values())
+        return list(self._server.members().values())
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         """Reset all clients and wait for them; each env_server must have ``min_clients`` first.

@@ -30,37 +30,37 @@ class Members:
     def __init__(self, envs: EnvTable, *, mixed_actions: bool) -> None:
         self._envs = envs
         self._mixed_actions = mixed_actions
-        self._servers: list[tuple[Host, Membership]] = []
+        self._servers: list[Membership] = []
         self.possible = False
 
     def add(self, host: Host) -> None:
         """Add a host, if envs join it."""
         if isinstance(host, Membership):
-            self._servers.append((host, host))
+            self._servers.append(host)
             self.possible = True
 
     @property
     def server_ids(self) -> list[str]:
-        return [server.server_id for _, server in self._servers]
+        return [server.server_id for server in self._servers]
 
-    def server(self, server_id: str) -> tuple[Host, Membership] | None:
+    def server(self, server_id: str) -> Membership | None:
         """Return the host with that id that envs join, or None."""
-        return next((pair for pair in self._servers if pair[1].server_id == server_id), None)
+        return next((one for one in self._servers if one.server_id == server_id), None)
 
     def slots(self) -> list[int]:
         """Return the slots of the members that are present, by host and name."""
         return [
-            host.first_slot + index
-            for host, server in self._servers
+            server.first_slot + index
+            for server in self._servers
             for index in server.member_indices()
         ]
 
     def rank(self) -> None:
         """Number the members' seeds after those of the local envs, in the order of `slots`."""
         offset = self._envs.num_seeds
-        for host, server in self._servers:
+        for server in self._servers:
             for index in server.member_indices():
-                self._envs.seed_offset[host.first_slot + index] = offset
+                self._envs.seed_offset[server.first_slot + index] = offset
                 offset += server.num_sub_envs(index)
 
     def missing(self, waited: float) -> float | None:
@@ -69,7 +69,7 @@ class Members:
         Raises:
             TimeoutError: it has waited for longer than a host's ``connect_timeout``.
         """
-        return earliest(*(server.missing(waited) for _, server in self._servers))
+        return earliest(*(server.missing(waited) for server in self._servers))
 
     def objection(self, meta: EnvMeta, local: Sequence[EnvMeta]) -> str | None:
         """Return the reason why an env may not join, or None.
@@ -81,7 +81,7 @@ class Members:
             local: metadata of the group's own envs.
         """
         known = [one for one in local if one.action_space is not None]
-        known += [one for _, server in self._servers for one in server.members().values()]
+        known += [one for server in self._servers for one in server.members().values()]
         try:
             if not self._mixed_actions:
                 check_actions([*known[:1], meta])
@@ -91,11 +91,11 @@ class Members:
 
     def next_deadline(self) -> float | None:
         """Return the time when `tick` must be called at the latest."""
-        return earliest(*(server.deadline() for _, server in self._servers))
+        return earliest(*(server.deadline() for server in self._servers))
 
     def tick(self, now: float) -> None:
         """Let hosts find members that have been silent for too long."""
-        for _, server in self._servers:
+        for server in self._servers:
             due = server.deadline()
             if due is not None and due <= now:
                 server.tick(now)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from rlightning_aio.group.supervisor import Supervisor
     from rlightning_aio.group.tables import Tables
     from rlightning_aio.group.waiting import Waiting
-    from rlightning_aio.hosts.base import Host, Membership
+    from rlightning_aio.hosts.base import Membership
 
 __all__ = ["Resets"]
 
@@ -73,14 +73,13 @@ class Resets:
     def reset_members(
         self,
         now: float,
-        server: tuple[Host, Membership],
+        server: Membership,
         seed: int | None,
         options: dict[str, Any] | None,
     ) -> Procedure[tuple[Ticket, NDArray[np.intp]]]:
         """Reset all envs that have joined a host, and wait for them."""
         now = yield from self._await_members(now)
-        host, membership = server
-        slots = np.array(membership.member_indices(), np.intp) + host.first_slot
+        slots = np.array(server.member_indices(), np.intp) + server.first_slot
         seeds = None
         if seed is not None:
             self._members.rank()

@@ -213,7 +213,7 @@ class Executing(Protocol):
 
 
 @runtime_checkable
-class Membership(Protocol):
+class Membership(Host, Protocol):
     """A host whose envs join and leave (an env_server).
 
     It also posts results that answer no request (`Joined`), and its results wake the driver.
