@@ -34,7 +34,6 @@ from rlightning_aio.cli.settings import Setting, possible_settings
 from rlightning_aio.cli.sudden_end import explained_sudden_end
 from rlightning_aio.cli.surroundings import surroundings
 from rlightning_aio.cli.terminal import (
-    INTERRUPTED,
     count,
     counted,
     err,
@@ -234,7 +233,7 @@ def bench(
             run_interruptible(_measure(order, watch))
     except KeyboardInterrupt:
         interrupted = True
-        raise typer.Exit(INTERRUPTED) from None
+        raise
     finally:
         if any(contender.rounds for contender in order.contenders):
             slower = output.report(configs, order.contenders, interrupted=interrupted)

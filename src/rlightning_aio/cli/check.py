@@ -12,13 +12,7 @@ import typer
 import rlightning_aio
 from rlightning_aio.cli.collecting import Roster, resetting, respond_to_all, responder
 from rlightning_aio.cli.options import Config, Overrides
-from rlightning_aio.cli.terminal import (
-    INTERRUPTED,
-    counted,
-    out,
-    print_json,
-    run_interruptible,
-)
+from rlightning_aio.cli.terminal import counted, out, print_json, run_interruptible
 from rlightning_aio.config import check_installed, load_config
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.registry import ENVS
@@ -76,10 +70,7 @@ def check(
     configs = load_config(config, overrides or ())
     check_installed(configs)
     findings: list[_Finding] = []
-    try:
-        run_interruptible(_look(configs, findings))
-    except KeyboardInterrupt:
-        raise typer.Exit(INTERRUPTED) from None
+    run_interruptible(_look(configs, findings))
     if as_json:
         print_json({"config": str(config), "entries": [asdict(found) for found in findings]})
         return

@@ -35,7 +35,6 @@ from rlightning_aio.cli.queue_options import (
 )
 from rlightning_aio.cli.sb3_policies import SB3Policy, digest_of
 from rlightning_aio.cli.terminal import (
-    INTERRUPTED,
     count,
     counted,
     err,
@@ -248,15 +247,13 @@ def _refuse(given: dict[str, Any]) -> None:
 def _play(order: _Order, kept: EvaluationFile | None, output: _Output) -> None:
     """Play a number of episodes of each env, and report them."""
     group = rlightning_aio.build_env_group(order.configs, mixed_actions=True)
-    interrupted = stopped = False
+    interrupted, stopped = True, False
     with _Watch(group, order, kept) as watch:
         try:
             run_interruptible(_evaluate(group, order, watch))
+            interrupted = False
         except KeyboardInterrupt:
-            interrupted = stopped = True
-            raise typer.Exit(INTERRUPTED) from None
-        except BaseException:
-            interrupted = True
+            stopped = True
             raise
         finally:
             # After an error, too: the episodes until then may be useful.

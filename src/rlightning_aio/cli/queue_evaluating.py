@@ -23,7 +23,6 @@ from rlightning_aio.cli.option_files import naming_option
 from rlightning_aio.cli.plots import check_plot, draw_evaluation
 from rlightning_aio.cli.sb3_policies import SB3Policy
 from rlightning_aio.cli.terminal import (
-    INTERRUPTED,
     count,
     counted,
     err,
@@ -94,14 +93,12 @@ def evaluate_queue(configs: Sequence[EnvConfig], options: QueueOptions, order: Q
         group = rlightning_aio.build_env_group(configs, mixed_actions=True)
         watch = stack.enter_context(_Watch(len(group), specs, results))
         play = _Play(group, configs, specs, options.max_attempts, video, results, watch)
-        interrupted = stopped = False
+        interrupted, stopped = True, False
         try:
             run_interruptible(_evaluate(play, order))
+            interrupted = False
         except KeyboardInterrupt:
-            interrupted = stopped = True
-            raise typer.Exit(INTERRUPTED) from None
-        except BaseException:
-            interrupted = True
+            stopped = True
             raise
         finally:
             # After an error, too: the episodes until then may be useful.

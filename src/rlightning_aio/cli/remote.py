@@ -17,7 +17,6 @@ from rich.spinner import Spinner
 from rich.text import Text
 
 from rlightning_aio.cli.terminal import (
-    INTERRUPTED,
     connections_logged,
     count,
     counted,
@@ -89,7 +88,7 @@ def client(
                 served.run()
     except KeyboardInterrupt:
         interrupted = True
-        raise typer.Exit(INTERRUPTED) from None
+        raise
     finally:
         if served is not None:
             _report(served, interrupted=interrupted, as_json=as_json)

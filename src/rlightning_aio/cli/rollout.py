@@ -36,7 +36,6 @@ from rlightning_aio.cli.plots import check_plot, draw_rollout
 from rlightning_aio.cli.policies import Policy, load_policy
 from rlightning_aio.cli.rollout_statistics import EntryFigures, RolloutStatistics
 from rlightning_aio.cli.terminal import (
-    INTERRUPTED,
     count,
     duration,
     named_columns,
@@ -160,7 +159,7 @@ def rollout(
         completed = True
     except KeyboardInterrupt:
         interrupted = True
-        raise typer.Exit(INTERRUPTED) from None
+        raise
     finally:
         # After an error, too: the statistics until then may be useful.
         if completed or interrupted or statistics.steps:

@@ -9,7 +9,7 @@ import typer
 
 import rlightning_aio
 from rlightning_aio.cli.options import Config, Overrides
-from rlightning_aio.cli.terminal import INTERRUPTED, counted, interruptible, out
+from rlightning_aio.cli.terminal import counted, out, run_interruptible
 from rlightning_aio.config import check_installed, load_config
 from rlightning_aio.errors import ConfigError
 
@@ -44,11 +44,7 @@ def serve(
             "env_server's; serve other entries at other ports"
         )
     check_installed(configs)
-    try:
-        with interruptible():
-            rlightning_aio.run(_serve(configs[0], host, port))
-    except KeyboardInterrupt:
-        raise typer.Exit(INTERRUPTED) from None
+    run_interruptible(_serve(configs[0], host, port))
 
 
 async def _serve(config: EnvConfig, host: str, port: int) -> None:

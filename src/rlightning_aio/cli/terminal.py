@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Generator, Iterable, Sequence
 
 __all__ = [
-    "INTERRUPTED",
     "ResultStream",
     "connections_logged",
     "count",
@@ -50,7 +49,7 @@ __all__ = [
     "run_interruptible",
 ]
 
-INTERRUPTED = 130
+_INTERRUPTED = 130
 """Exit code after Ctrl-C, as in shells."""
 
 
@@ -169,7 +168,7 @@ def _prints_on_stderr() -> Generator[None]:
 
 
 def guarded(command: Callable[..., None]) -> Callable[..., None]:
-    """Return `command` with the library's errors turned into messages and exit codes."""
+    """Return `command` with the library's errors and Ctrl-C turned into messages and exit codes."""
 
     @functools.wraps(command)
     def run(*args: Any, **kwargs: Any) -> None:
@@ -183,7 +182,7 @@ def guarded(command: Callable[..., None]) -> Callable[..., None]:
             typer.echo(f"error: {error}", err=True)
             raise typer.Exit(1) from None
         except KeyboardInterrupt:
-            raise typer.Exit(INTERRUPTED) from None
+            raise typer.Exit(_INTERRUPTED) from None
 
     return run
 

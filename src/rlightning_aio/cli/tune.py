@@ -16,7 +16,6 @@ from rlightning_aio.cli.options import Config, MeasuringSeconds, Overrides, Roun
 from rlightning_aio.cli.settings import Setting, possible_settings
 from rlightning_aio.cli.sudden_end import explained_sudden_end
 from rlightning_aio.cli.terminal import (
-    INTERRUPTED,
     count,
     counted,
     duration,
@@ -129,7 +128,7 @@ def tune(
             run_interruptible(_search(search, settings, watch))
     except KeyboardInterrupt:
         interrupted = True
-        raise typer.Exit(INTERRUPTED) from None
+        raise
     finally:
         if any(contender.rounds for contender in search.places):
             _report(config, search, interrupted=interrupted, as_json=as_json)
