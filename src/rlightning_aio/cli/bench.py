@@ -29,7 +29,7 @@ from rlightning_aio.cli.options import (
 )
 from rlightning_aio.cli.plots import check_plot, draw_contenders
 from rlightning_aio.cli.policies import Policy, load_policy
-from rlightning_aio.cli.publishing import check_publish, publish
+from rlightning_aio.cli.publishing import publish
 from rlightning_aio.cli.settings import Setting, possible_settings
 from rlightning_aio.cli.sudden_end import explained_sudden_end
 from rlightning_aio.cli.surroundings import surroundings
@@ -104,7 +104,7 @@ class _Output:
         check_name(self.save_as, must_exist=False)
         check_name(self.compare, must_exist=True)
         check_save(self.save_as)
-        check_publish(self.publish)
+        check_option_file("--publish", self.publish)
 
     def report(
         self, configs: Sequence[EnvConfig], contenders: Sequence[Contender], *, interrupted: bool

@@ -11,7 +11,7 @@ import datetime as dt
 from typing import TYPE_CHECKING, Any
 
 from rlightning_aio.cli.contender_table import as_markdown
-from rlightning_aio.cli.option_files import check_option_file, naming_option
+from rlightning_aio.cli.option_files import naming_option
 from rlightning_aio.cli.terminal import counted
 from rlightning_aio.files import write_file
 
@@ -21,16 +21,7 @@ if TYPE_CHECKING:
 
     from rlightning_aio.cli.measuring import Contender
 
-__all__ = ["check_publish", "publish"]
-
-
-def check_publish(path: Path | None) -> None:
-    """Check before anything is measured that the page can be written.
-
-    Raises:
-        ConfigError: it can't.
-    """
-    check_option_file("--publish", path)
+__all__ = ["publish"]
 
 
 def publish(
