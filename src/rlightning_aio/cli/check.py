@@ -115,7 +115,7 @@ async def _try(config: EnvConfig, found: _Finding) -> None:
         found.action_space = str(meta.action_space)
         found.num_envs = meta.num_envs
         found.max_episode_steps = config.max_episode_steps or meta.max_episode_steps
-        respond = responder(group, Roster(group, [meta]), None, 0)
+        respond = responder(group, Roster(group), None, 0)
         batch, _ = await group.reset(seed=0)
         if _has_no_samples(meta.action_space):
             return

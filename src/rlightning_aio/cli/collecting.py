@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import math
+import time
 import warnings
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio.cli.option_files import naming_option
 from rlightning_aio.cli.policies import Policy, RandomPolicy, Responder
+from rlightning_aio.cli.sb3_policies import SB3Policy
 from rlightning_aio.group.aio import ServerHandle
 from rlightning_aio.types import EnvMeta
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncGenerator, Generator, Sequence
+    from collections.abc import AsyncGenerator, Callable, Generator, Sequence
     from pathlib import Path
 
     import gymnasium as gym
@@ -22,7 +25,17 @@ if TYPE_CHECKING:
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.group.aio import EnvGroup
 
-__all__ = ["Roster", "default_min_results", "resetting", "respond_to_all", "responder", "traced"]
+__all__ = [
+    "Roster",
+    "default_min_results",
+    "playing",
+    "resetting",
+    "respond_to_all",
+    "responder",
+    "traced",
+]
+
+_REFRESH_SECONDS: Final = 0.2
 
 
 class Roster:
@@ -30,11 +43,10 @@ class Roster:
 
     Args:
         group: an initialised group.
-        metas: the return value of its `init`.
     """
 
-    def __init__(self, group: EnvGroup, metas: Sequence[EnvMeta]) -> None:
-        self._known = {meta.env_id: meta for meta in metas}
+    def __init__(self, group: EnvGroup) -> None:
+        self._known = {meta.env_id: meta for meta in group.metas}
         handles = (group[env_id] for env_id in group.env_ids)
         self.servers = [handle for handle in handles if isinstance(handle, ServerHandle)]
 
@@ -109,3 +121,36 @@ def resetting(group: EnvGroup, configs: Sequence[EnvConfig]) -> Generator[None]:
             warnings.filterwarnings("ignore", message="auto_reset.*overrides")
             stack.enter_context(group.auto_reset(limit))
         yield
+
+
+@contextlib.asynccontextmanager
+async def playing(
+    group: EnvGroup,
+    configs: Sequence[EnvConfig],
+    policy: Policy | None,
+    seed: int | None,
+    trace: Path | None,
+    draw: Callable[[], None],
+) -> AsyncGenerator[Callable[[BatchedData], Any]]:
+    """Start a group whose episodes are to be evaluated, and close it at the end.
+
+    Yields what `evaluate` takes as a policy. It calls `draw` from time to time.
+    """
+    async with group, traced(group, trace):
+        if isinstance(policy, SB3Policy):
+            policy.check(group.metas)
+        respond = responder(group, Roster(group), policy, seed)
+        next_at = 0.0
+
+        async def answer(batch: BatchedData) -> list[BatchedData]:
+            nonlocal next_at
+            if time.monotonic() >= next_at:
+                next_at = time.monotonic() + _REFRESH_SECONDS
+                draw()
+                # If results are always ready, nothing else would let Ctrl-C take effect.
+                await asyncio.sleep(0)
+            with group.span("policy"):
+                return await respond(batch)
+
+        with resetting(group, configs):
+            yield answer

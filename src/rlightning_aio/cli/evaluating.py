@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import math
-import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Self, TypeAlias
@@ -14,7 +12,7 @@ import typer
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
 import rlightning_aio
-from rlightning_aio.cli.collecting import Roster, default_min_results, resetting, responder, traced
+from rlightning_aio.cli.collecting import default_min_results, playing
 from rlightning_aio.cli.evaluation_file import EvaluationFile, subject
 from rlightning_aio.cli.figures import estimates, with_interval
 from rlightning_aio.cli.films import Video, VideoEnvs, VideoEvery, filmed
@@ -52,16 +50,14 @@ from rlightning_aio.evaluation import Episode, Evaluation, evaluate
 from rlightning_aio.policies import ActionChunks
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
-    from rlightning_aio.batch import BatchedData
-    from rlightning_aio.cli.policies import Policy, Responder
+    from rlightning_aio.cli.policies import Policy
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.group.aio import EnvGroup
 
 __all__ = ["evaluation"]
 
-_REFRESH_SECONDS: Final = 0.2
 _RANDOM: Final = "random"
 
 
@@ -300,24 +296,19 @@ def _within(played: Sequence[Episode], episodes: int) -> list[Episode]:
 
 
 async def _evaluate(group: EnvGroup, order: _Order, watch: _Watch) -> None:
-    async with group, traced(group, order.trace):
-        metas = await group.init()
-        if isinstance(order.policy, SB3Policy):
-            order.policy.check(metas)
-        # The random actions of the saved episodes must not be drawn again.
-        seed = None if order.seed is None else order.seed + len(order.played)
-        respond = responder(group, Roster(group, metas), order.policy, seed)
-        watch.ready(sum(meta.num_envs for meta in metas) * order.episodes)
-        with resetting(group, order.configs):
-            watch.found = await evaluate(
-                group,
-                watch.seeing(group, respond),
-                order.episodes,
-                seed=order.seed,
-                min_results=default_min_results(order.configs),
-                played=order.played,
-                on_episode=watch.note,
-            )
+    # The random actions of the saved episodes must not be drawn again.
+    seed = None if order.seed is None else order.seed + len(order.played)
+    async with playing(group, order.configs, order.policy, seed, order.trace, watch.draw) as policy:
+        watch.ready(sum(meta.num_envs for meta in group.metas) * order.episodes)
+        watch.found = await evaluate(
+            group,
+            policy,
+            order.episodes,
+            seed=order.seed,
+            min_results=default_min_results(order.configs),
+            played=order.played,
+            on_episode=watch.note,
+        )
 
 
 class _Watch:
@@ -343,7 +334,6 @@ class _Watch:
             starting, total=1, completed=len(order.played), figures=""
         )
         self._starting = starting
-        self._next_at = 0.0
 
     def __enter__(self) -> Self:
         if self._console.is_terminal:
@@ -376,21 +366,8 @@ class _Watch:
         if self._kept is not None:
             self._kept.add(episode)
 
-    def seeing(self, group: EnvGroup, respond: Responder) -> Callable[[BatchedData], Any]:
-        """Return `respond`, extended to draw the live line from time to time."""
-
-        async def answer(batch: BatchedData) -> list[BatchedData]:
-            if time.monotonic() >= self._next_at:
-                self._next_at = time.monotonic() + _REFRESH_SECONDS
-                self._show()
-                # If results are always ready, nothing else would let Ctrl-C take effect.
-                await asyncio.sleep(0)
-            with group.span("policy"):
-                return await respond(batch)
-
-        return answer
-
-    def _show(self) -> None:
+    def draw(self) -> None:
+        """Draw the live line."""
         if self._console.is_terminal:
             reward = self.found.total_reward
             figures = f"return {number(reward and reward.mean)}"

@@ -290,7 +290,7 @@ async def _open(
     began = time.monotonic()
     group = rlightning_aio.build_env_group(list(setting.configs), mixed_actions=True)
     await stack.enter_async_context(group)
-    roster = Roster(group, await group.init())
+    roster = Roster(group)
     started = time.monotonic()
     everyone, _ = await group.reset(seed=seed)
     reset = time.monotonic()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import json
 import math
@@ -15,13 +14,12 @@ import typer
 from rich.live import Live
 
 import rlightning_aio
-from rlightning_aio.cli.collecting import Roster, default_min_results, resetting, responder, traced
+from rlightning_aio.cli.collecting import default_min_results, playing
 from rlightning_aio.cli.evaluation_file import queue_subject
 from rlightning_aio.cli.figures import estimates, with_interval
 from rlightning_aio.cli.films import rendering
 from rlightning_aio.cli.option_files import naming_option
 from rlightning_aio.cli.plots import check_plot, draw_evaluation
-from rlightning_aio.cli.sb3_policies import SB3Policy
 from rlightning_aio.cli.terminal import (
     count,
     counted,
@@ -38,12 +36,11 @@ from rlightning_aio.evaluation import EpisodeRecord, QueueEvaluation, ResultsFil
 from rlightning_aio.files import check_folder
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from rich.table import Table
 
-    from rlightning_aio.batch import BatchedData
-    from rlightning_aio.cli.policies import Policy, Responder
+    from rlightning_aio.cli.policies import Policy
     from rlightning_aio.cli.queue_options import QueueOptions
     from rlightning_aio.config import EnvConfig
     from rlightning_aio.evaluation import EpisodeSpec, EpisodeVideo
@@ -52,7 +49,6 @@ if TYPE_CHECKING:
 
 __all__ = ["QueueOrder", "evaluate_queue"]
 
-_REFRESH_SECONDS: Final = 0.2
 _NAMED: Final = 5
 """Number of failed episodes that a message names."""
 
@@ -123,27 +119,22 @@ class _Play:
 
 async def _evaluate(play: _Play, order: QueueOrder) -> None:
     group, watch = play.group, play.watch
-    async with group, traced(group, order.trace):
-        metas = await group.init()
-        if isinstance(order.policy, SB3Policy):
-            order.policy.check(metas)
-        respond = responder(group, Roster(group, metas), order.policy, None)
+    async with playing(group, play.configs, order.policy, None, order.trace, watch.draw) as policy:
         watch.ready()
-        with resetting(group, play.configs):
-            try:
-                playing = evaluate(
-                    group,
-                    watch.seeing(group, respond),
-                    play.specs,
-                    min_results=default_min_results(play.configs),
-                    max_attempts=play.max_attempts,
-                    results=play.results,
-                    video=play.video,
-                    on_episode=watch.note,
-                )
-            except ValueError as error:
-                raise ConfigError(str(error)) from None
-            watch.found = await playing
+        try:
+            evaluated = evaluate(
+                group,
+                policy,
+                play.specs,
+                min_results=default_min_results(play.configs),
+                max_attempts=play.max_attempts,
+                results=play.results,
+                video=play.video,
+                on_episode=watch.note,
+            )
+        except ValueError as error:
+            raise ConfigError(str(error)) from None
+        watch.found = await evaluated
 
 
 class _Watch:
@@ -162,7 +153,6 @@ class _Watch:
         self._starting = f"starting {counted(num_envs, 'env')}"
         self._recent: dict[str, None] = {}
         """Tasks in the order of their last episodes."""
-        self._next_at = 0.0
 
     def __enter__(self) -> Self:
         self._console.print(self._starting)
@@ -190,23 +180,10 @@ class _Watch:
         self._recent.pop(record.task, None)
         self._recent[record.task] = None
 
-    def seeing(self, group: EnvGroup, respond: Responder) -> Callable[[BatchedData], Any]:
-        """Return `respond`, extended to draw the live table from time to time."""
-
-        async def answer(batch: BatchedData) -> list[BatchedData]:
-            if time.monotonic() >= self._next_at:
-                self._next_at = time.monotonic() + _REFRESH_SECONDS
-                if self._console.is_terminal:
-                    self._live.update(self._drawn(), refresh=True)
-                # If results are always ready, nothing else would let Ctrl-C take effect.
-                await asyncio.sleep(0)
-            with group.span("policy"):
-                return await respond(batch)
-
-        return answer
-
-    def _drawn(self) -> Table:
-        """Return the table, with the tasks that had the last episodes if there are many."""
+    def draw(self) -> None:
+        """Draw the live table, with the tasks that had the last episodes if there are many."""
+        if not self._console.is_terminal:
+            return
         done = len(self.found.records)
         new = done - self._before
         seconds = time.monotonic() - self._begun
@@ -215,7 +192,7 @@ class _Watch:
         rows = max(4, self._console.height - 6)
         recent = {task: by_task[task] for task in by_task if task in [*self._recent][-rows:]}
         title = f"{count(done)} of {counted(self._total, 'episode')}{left}"
-        return _table(title, recent, self.found)
+        self._live.update(_table(title, recent, self.found), refresh=True)
 
 
 def _keys(record: EpisodeRecord) -> set[EpisodeKey]:

@@ -174,7 +174,7 @@ async def _collect(
     display: Display,
 ) -> None:
     async with display.ticking(), group, traced(group, order.trace):
-        roster = Roster(group, await group.init())
+        roster = Roster(group)
         for server in roster.servers:
             display.say(f"{server.env_id} listens at {server.address}")
         display.resetting()
