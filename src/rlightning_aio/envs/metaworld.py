@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -16,10 +15,7 @@ from rlightning_aio.envs.gymnasium import GymnasiumEnv
 from rlightning_aio.envs.options import read_options
 from rlightning_aio.envs.switching import SwitchingEnv
 from rlightning_aio.errors import ConfigError
-
-if TYPE_CHECKING:
-    from rlightning_aio.config import EnvConfig
-    from rlightning_aio.envs.base import PreprocessFn
+from rlightning_aio.registry import did_you_mean
 
 __all__ = ["MetaworldEnv", "MetaworldTask"]
 
@@ -47,27 +43,19 @@ class MetaworldEnv(GymnasiumEnv):
     The seed of a reset determines where objects and goal are.
     """
 
-    def __init__(
-        self,
-        config: EnvConfig,
-        worker_index: int = 0,
-        preprocess_fn: PreprocessFn | None = None,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(config, worker_index, preprocess_fn, **kwargs)
-        # MetaWorld's own, which is the same for all tasks.
-        inner: Any = self.env.unwrapped
-        self.max_episode_steps = config.max_episode_steps or int(inner.env.max_path_length)
-
     def _make(self) -> Any:
         options = read_options(_Options, self.env_id, self.config.env_kwargs)
         if options.observations == "pixels":
             options.render_mode = "rgb_array"
-        env = SwitchingEnv(
+        env: Any = SwitchingEnv(
             partial(MetaworldTask, options=options), self.config.task, _space(options)
         )
         limit = self.config.max_episode_steps
-        return env if limit is None else TimeLimit(env, limit)
+        if limit is not None:
+            return TimeLimit(env, limit)
+        # MetaWorld's own, which is the same for all tasks.
+        self.max_episode_steps = int(env.env.max_path_length)
+        return env
 
 
 def _space(options: _Options) -> gym.Space[Any]:
@@ -99,9 +87,8 @@ class MetaworldTask(gym.Env[Any, Any]):
     def __init__(self, task: str, options: _Options) -> None:
         kinds: dict[str, Any] = importlib.import_module("metaworld.env_dict").ALL_V3_ENVIRONMENTS
         if task not in kinds:
-            near = difflib.get_close_matches(task, kinds, n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise ConfigError(f"MetaWorld has no task {task!r}{hint}")
+            hint = did_you_mean(task, kinds)
+            raise ConfigError(f"MetaWorld has no task {task!r}{hint and f'; {hint}'}")
         self._pixels = options.observations == "pixels"
         self._terminates = options.terminate_on_success
         self.render_mode = options.render_mode
