@@ -353,11 +353,8 @@ class _Received:
         return io.BytesIO(self._content)
 
 
-def get_json(url: str, path: str, timeout: float = 10.0) -> Any:
+def get_json(url: str, path: str) -> Any:
     """Return the answer of a server to GET `path`."""
-    with _opener().open(_address(url, "http", path), timeout=timeout) as reply:
+    opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+    with opener.open(_address(url, "http", path), timeout=_CONNECT_SECONDS) as reply:
         return json.load(reply)
-
-
-def _opener() -> urllib.request.OpenerDirector:
-    return urllib.request.build_opener(urllib.request.ProxyHandler({}))
