@@ -46,7 +46,7 @@ def _written(subject: dict[str, Any]) -> dict[str, Any]:
 
 
 class EvaluationFile(EpisodeFile[Episode]):
-    """The episodes of an evaluation with a number for each env; see `EpisodeFile`."""
+    """The episodes of an evaluation with a number for each env; see `ResultsFile`."""
 
     def __init__(self, path: Path, about: dict[str, Any]) -> None:
         super().__init__(path, about, label="--resume")

@@ -28,20 +28,7 @@ E = TypeVar("E")
 
 
 class EpisodeFile(abc.ABC, Generic[E]):
-    """Opens the file, or creates it, for this process alone.
-
-    Args:
-        path: the file; a link is followed.
-        subject: what is evaluated, as JSON values. A file with another subject is refused.
-        label: what messages call the file.
-
-    Attributes:
-        played: the episodes in the file.
-
-    Raises:
-        ConfigError: the file can't be read and written, another process has it open, it belongs
-            to another evaluation, or it is damaged.
-    """
+    """A file of episodes of one kind; arguments, `played` and errors are those of `ResultsFile`."""
 
     def __init__(
         self, path: str | os.PathLike[str], subject: Mapping[str, Any], *, label: str
