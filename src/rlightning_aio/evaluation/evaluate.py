@@ -167,6 +167,12 @@ def _check(group: Any, episodes: Any, min_results: int | None, max_attempts: int
         raise RuntimeError(
             "envs whose episode is over must be reset: evaluate inside `with group.auto_reset():`"
         )
+    for meta in group.metas:
+        if meta.action_space is None:
+            raise ValueError(
+                f"{meta.env_id} is an env_server, whose clients come and go; evaluate a group "
+                "without env_servers"
+            )
 
 
 class _Play:
@@ -183,12 +189,6 @@ class _Play:
         self._group, self._policy = group, policy
         self._episodes, self._seed, self._min_results = episodes, seed, min_results
         metas: list[EnvMeta] = group.metas
-        for meta in metas:
-            if meta.action_space is None:
-                raise ValueError(
-                    f"{meta.env_id} is an env_server, whose clients come and go; evaluate a group "
-                    "without env_servers"
-                )
         firsts = np.cumsum([0, *(meta.num_envs for meta in metas)]).tolist()
         self._first = {meta.env_id: first for meta, first in zip(metas, firsts, strict=False)}
         self._metas = {meta.env_id: meta for meta in metas}

@@ -64,7 +64,7 @@ class QueuePlay:
     ) -> None:
         self._group, self._policy, self._rules = group, policy, rules
         metas: list[EnvMeta] = group.metas
-        _check_envs(metas)
+        _check_single(metas)
         self._metas = {meta.env_id: meta for meta in metas}
         self._entry_of: dict[str, str] = {
             env_id: worker["entry"]
@@ -339,13 +339,8 @@ def _cause(fault: EnvFault) -> str:
     return str(fault).strip().partition("\n")[0]
 
 
-def _check_envs(metas: Sequence[EnvMeta]) -> None:
+def _check_single(metas: Sequence[EnvMeta]) -> None:
     for meta in metas:
-        if meta.action_space is None:
-            raise ValueError(
-                f"{meta.env_id} is an env_server, whose clients come and go; evaluate a group "
-                "without env_servers"
-            )
         if meta.num_envs > 1:
             raise ValueError(
                 f"{meta.env_id} has {meta.num_envs} sub-environments, but an env plays one episode "
