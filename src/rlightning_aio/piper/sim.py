@@ -17,34 +17,17 @@ import sys
 import threading
 import time
 import tty
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from rlightning_aio.piper.arm import CanFrame, SimulatedArm
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator
-    from types import FrameType
 
 __all__ = ["FEEDBACK_HZ", "SlcanPort", "VirtualBus", "VirtualPort", "run", "running"]
 
 FEEDBACK_HZ = 100.0
 """Rate of reports of joints, pose and status; that of motors is a fifth of it."""
-
-
-class Port(Protocol):
-    """The arm's end of a bus."""
-
-    def receive(self, timeout: float) -> CanFrame | None:
-        """Wait up to `timeout` seconds for the next frame."""
-        ...
-
-    def send(self, frames: list[CanFrame]) -> None:
-        """Send frames without waiting; drop them if they aren't read."""
-        ...
-
-    def close(self) -> None:
-        """Leave the bus."""
-        ...
 
 
 class VirtualPort:
@@ -55,13 +38,14 @@ class VirtualPort:
         self._end, self.bus = VirtualBus(ours), VirtualBus(theirs)
 
     def receive(self, timeout: float) -> CanFrame | None:
+        """Wait up to `timeout` seconds for the next frame."""
         if not select.select([self._end], [], [], timeout)[0]:
             return None
         frames = self._end.receive(most=1)
         return frames[0] if frames else None
 
     def send(self, frames: list[CanFrame]) -> None:
-        # A bus without a reader loses frames.
+        """Send frames without waiting; drop them if they aren't read, as on a real bus."""
         with contextlib.suppress(OSError):
             for frame in frames:
                 self._end.send(frame)
@@ -142,7 +126,12 @@ class SlcanPort:
         os.close(self._terminal)
 
 
-def run(arm: SimulatedArm, port: Port, feedback_hz: float, stopped: Callable[[], bool]) -> None:
+def run(
+    arm: SimulatedArm,
+    port: VirtualPort | SlcanPort,
+    feedback_hz: float,
+    stopped: Callable[[], bool],
+) -> None:
     """Run the arm on the port until `stopped` returns True."""
     last = due = time.monotonic()
     tick = 0
@@ -157,7 +146,7 @@ def run(arm: SimulatedArm, port: Port, feedback_hz: float, stopped: Callable[[],
 
 
 @contextlib.contextmanager
-def running(arm: SimulatedArm, port: Port) -> Generator[None]:
+def running(arm: SimulatedArm, port: VirtualPort | SlcanPort) -> Generator[None]:
     """Run the arm on `port` in a thread, during the block."""
     stop = threading.Event()
     thread = threading.Thread(
@@ -183,13 +172,8 @@ def main(arguments: list[str] | None = None) -> None:
     )
     feedback_hz: float = parser.parse_args(arguments).feedback_hz
     stop = threading.Event()
-
-    def on_signal(number: int, frame: FrameType | None) -> None:
-        del number, frame
-        stop.set()
-
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, on_signal)
+        signal.signal(number, lambda _number, _frame: stop.set())
     port = SlcanPort()
     sys.stdout.write(f"{port.path}\n")
     sys.stdout.flush()
