@@ -20,7 +20,7 @@ from rlightning_aio.cli.option_files import check_option_file
 from rlightning_aio.cli.options import AsJson, Config, Overrides, PlotFile, TraceFile, check_seed
 from rlightning_aio.cli.plots import check_plot, draw_evaluation
 from rlightning_aio.cli.policies import load_policy
-from rlightning_aio.cli.policy_servers import is_server, served_policy
+from rlightning_aio.cli.policy_servers import served_policy
 from rlightning_aio.cli.queue_evaluating import QueueOrder, evaluate_queue
 from rlightning_aio.cli.queue_options import (
     EpisodesFile,
@@ -283,7 +283,7 @@ def _policy(
         if steps is not None:
             raise ConfigError("--action-steps is for policies that return chunks, not 'random'")
         return None, name
-    policy = served_policy(name, stack) if is_server(name) else load_policy(name)
+    policy = served_policy(name, stack) if "://" in name else load_policy(name)
     if steps is None and not name.startswith("openpi://"):
         return policy, name
     played = "" if steps is None else f", {counted(steps, 'action')} of each chunk"

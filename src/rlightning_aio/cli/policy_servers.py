@@ -12,14 +12,9 @@ if TYPE_CHECKING:
 
     from rlightning_aio.cli.policies import Policy
 
-__all__ = ["is_server", "served_policy"]
+__all__ = ["served_policy"]
 
 _CLIENTS: Final = {"openpi": "OpenPiPolicy", "vla-eval": "VlaEvalPolicy"}
-
-
-def is_server(name: str) -> bool:
-    """Return True for the address of a policy server."""
-    return "://" in name
 
 
 def served_policy(name: str, stack: contextlib.ExitStack) -> Policy:
