@@ -63,18 +63,13 @@ _LISTS: Final[dict[str, Callable[[], Iterable[str]]]] = {
 }
 
 
-def _backends() -> list[str]:
-    """Return the completions for the shell."""
-    return list(_LISTS)
-
-
 def tasks(
     backend: Annotated[
         str,
         typer.Argument(
             help="A backend, as in an entry's `backend`.",
             show_default=False,
-            autocompletion=_backends,
+            autocompletion=lambda: list(_LISTS),
         ),
     ],
     as_json: Annotated[
