@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from typing import TYPE_CHECKING, Any, cast
 
 from gymnasium.spaces.utils import is_space_dtype_shape_equiv
@@ -33,7 +34,7 @@ def adopted_spaces(
     """
     observations, actions = zip(*spaces, strict=True)
     single, batched = _observed(list(observations), mode)
-    alike = _equal if mode == "same" else is_space_dtype_shape_equiv
+    alike = operator.eq if mode == "same" else is_space_dtype_shape_equiv
     for k, own in enumerate(observations):
         if own is not single and not alike(single, own):
             hint = "If this is intentional, use `observation_mode='different'` instead."
@@ -65,7 +66,3 @@ def _observed(
         "Invalid `observation_mode`, expected: 'same' or 'different' or tuple of single "
         f"and batch observation space, actual got {mode}"
     )
-
-
-def _equal(one: Space, other: Space) -> bool:
-    return one == other
