@@ -251,9 +251,8 @@ def _space_of(env_id: str, name: str, given: Any) -> gym.Space[Any]:
         dtype: Any = np.dtype(box.pop("dtype"))
         if dtype.kind in "iu":  # An integer has no infinity.
             limits = np.iinfo(dtype)
-            box = {"low": max(box["low"], limits.min), "high": min(box["high"], limits.max)} | {
-                key: value for key, value in box.items() if key not in ("low", "high")
-            }
+            box["low"] = max(box["low"], limits.min)
+            box["high"] = min(box["high"], limits.max)
         return spaces.Box(dtype=dtype.type, **box)
     except (TypeError, ValueError, AssertionError) as error:
         raise ConfigError(
