@@ -80,11 +80,6 @@ class RolloutStatistics:
         self.steps = 0
 
     @property
-    def began(self) -> bool:
-        """Return True if the rollout has begun."""
-        return self._began > 0
-
-    @property
     def seconds(self) -> float:
         """Return the seconds from the first step sent to the last result counted."""
         return self._ended - self._began
