@@ -12,6 +12,7 @@ import contextlib
 import os
 import time
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from statistics import median
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -212,17 +213,12 @@ class Stand:
 
     async def measure(self, rule: Rule, limits: Limits) -> Round:
         """Measure once, after a few steps that warm the caches."""
-        one_round = self._step if rule.min_results is None else self._collect
-        await one_round(rule.min_results or 0, Limits(limits.steps, limits.seconds / 10))
-        return await one_round(rule.min_results or 0, limits)
+        least = rule.min_results
+        one_round = self._step if least is None else partial(self._collect, least)
+        await one_round(Limits(limits.steps, limits.seconds / 10))
+        return await one_round(limits)
 
-    def _as_round(
-        self, steps: int, seconds: float, busy: float, latencies: NDArray[np.float64]
-    ) -> Round:
-        return as_round(steps, seconds, cpu_seconds(self._pids) - busy, latencies)
-
-    async def _step(self, ignored: int, limits: Limits) -> Round:
-        del ignored
+    async def _step(self, limits: Limits) -> Round:
         latencies: list[float] = []
         busy = cpu_seconds(self._pids)
         first, began = self.statistics.steps, time.monotonic()
@@ -235,7 +231,8 @@ class Stand:
             latencies.append(now - sent_at)
             self.statistics.add(batch)
         steps = self.statistics.steps - first
-        return self._as_round(steps, now - began, busy, np.array(latencies))
+        used = cpu_seconds(self._pids) - busy
+        return as_round(steps, now - began, used, np.array(latencies))
 
     async def _collect(self, min_results: int, limits: Limits) -> Round:
         latencies: list[NDArray[np.float64]] = []
@@ -253,9 +250,8 @@ class Stand:
                 latencies.append(now - sent_at[part.slots])
                 sent_at[part.slots] = now
             await respond_to_all(group, self._respond, batch)
-        done = self._as_round(
-            self.statistics.steps - first, now - began, busy, np.concatenate(latencies)
-        )
+        steps, used = self.statistics.steps - first, cpu_seconds(self._pids) - busy
+        done = as_round(steps, now - began, used, np.concatenate(latencies))
         batch, _ = await group.collect_async(wait_all=True)
         self.statistics.add(batch)
         return done
