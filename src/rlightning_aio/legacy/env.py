@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rlightning_aio.legacy.flags import InternalFlag
-from rlightning_aio.legacy.types import EnvMeta, EnvRet, PolicyResponse
+from rlightning_aio.legacy.types import EnvMeta, EnvRet
+from rlightning_aio.types import default_env_preprocess_fn
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -20,11 +21,6 @@ if TYPE_CHECKING:
     import gymnasium as gym
 
 __all__ = ["BaseEnv", "default_env_preprocess_fn"]
-
-
-def default_env_preprocess_fn(policy_resp: PolicyResponse) -> Any:
-    """Return the action of the response, unchanged."""
-    return policy_resp.action
 
 
 class BaseEnv(abc.ABC):
