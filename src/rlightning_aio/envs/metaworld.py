@@ -143,5 +143,4 @@ class MetaworldTask(gym.Env[Any, Any]):
         return np.ascontiguousarray(frame[::-1, ::-1]) if self._is_turned else frame
 
     def close(self) -> None:
-        """Close the simulator."""
         self._simulator.close()

@@ -63,13 +63,10 @@ class SwitchingEnv(gym.Env[Any, Any]):
         self.env, self.task = env, task
 
     def step(self, action: Any) -> Any:
-        """Step the simulator of the current task."""
         return self.env.step(action)
 
     def render(self) -> Any:
-        """Render the simulator of the current task."""
         return self.env.render()
 
     def close(self) -> None:
-        """Close the simulator of the current task."""
         self.env.close()
