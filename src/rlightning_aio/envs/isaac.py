@@ -59,6 +59,7 @@ class _IsaacEnv(BaseEnv):
             raise
         self._torch: Any = importlib.import_module("torch")
         self.max_episode_steps = int(self.env.max_episode_length)
+        self.agents = tuple(getattr(self.env, "possible_agents", ()))
 
     def _claim_process(self) -> None:
         if (other := _IsaacEnv.live_env_id) is not None:
@@ -181,16 +182,6 @@ class IsaacMarlEnv(_IsaacEnv):
     `IsaacManagerBasedEnv`. ``info["final_obs"]`` is by agent, and ``info[agent]`` holds the
     task's own report for that agent.
     """
-
-    def __init__(
-        self,
-        config: EnvConfig,
-        worker_index: int = 0,
-        preprocess_fn: PreprocessFn | None = None,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(config, worker_index, preprocess_fn, **kwargs)
-        self.agents = tuple(self.env.possible_agents)
 
     def get_observation_space(self) -> gym.Space[Any]:
         spaces: Mapping[str, gym.Space[Any]] = self.env.observation_spaces
