@@ -19,8 +19,7 @@ from rlightning_aio.cli.films import Video, VideoEnvs, VideoEvery, filmed
 from rlightning_aio.cli.option_files import check_option_file
 from rlightning_aio.cli.options import AsJson, Config, Overrides, PlotFile, TraceFile, check_seed
 from rlightning_aio.cli.plots import check_plot, draw_evaluation
-from rlightning_aio.cli.policies import load_policy
-from rlightning_aio.cli.policy_servers import served_policy
+from rlightning_aio.cli.policies import load_policy, served_policy
 from rlightning_aio.cli.queue_evaluating import QueueOrder, evaluate_queue
 from rlightning_aio.cli.queue_options import (
     EpisodesFile,

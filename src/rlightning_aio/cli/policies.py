@@ -1,4 +1,4 @@
-"""Sources of a rollout's actions: random sampling, or a callable that the user names.
+"""Sources of actions: random sampling, a callable that the user names, or a policy server.
 
 A policy is a callable or coroutine function that takes a `BatchedData` of results and returns
 actions (``[n, *action]``, in the order of the results), or a batch of responses made with
@@ -23,11 +23,20 @@ from rlightning_aio.errors import ConfigError, RLightningError
 from rlightning_aio.protocol.columns import index, stacked
 
 if TYPE_CHECKING:
+    import contextlib
     from types import TracebackType
 
     from numpy.typing import NDArray
 
-__all__ = ["Policy", "PolicyRaised", "RandomPolicy", "Responder", "load_policy", "sampler_of"]
+__all__ = [
+    "Policy",
+    "PolicyRaised",
+    "RandomPolicy",
+    "Responder",
+    "load_policy",
+    "sampler_of",
+    "served_policy",
+]
 
 Policy: TypeAlias = Callable[[BatchedData], Any]
 Sampler: TypeAlias = Callable[[int], Any]
@@ -36,6 +45,8 @@ _UNBOUNDED_SCALE = 0.1
 """Standard deviation for unbounded spaces. Their actions are usually in units of a joint's range,
 and larger ones would throw a robot about."""
 _PACKAGE: Final = str(Path(__file__).parents[1])
+_CLIENTS: Final = {"openpi": "OpenPiPolicy", "vla-eval": "VlaEvalPolicy"}
+"""Clients of policy servers, by the scheme of the address."""
 
 
 class PolicyRaised(RLightningError):
@@ -63,6 +74,25 @@ def load_policy(name: str) -> Policy:
     if not callable(found):
         raise ConfigError(f"--policy {name!r}: is a {type(found).__name__}, not a callable")
     return found
+
+
+def served_policy(name: str, stack: contextlib.ExitStack) -> Policy:
+    """Return a client of the policy server at an address, as ``openpi://localhost:8000``.
+
+    The client is closed by `stack`.
+
+    Raises:
+        ConfigError: it is no such address, or a package is missing.
+    """
+    scheme, _, place = name.partition("://")
+    if scheme not in _CLIENTS:
+        raise ConfigError(f"--policy {name}: should begin with openpi:// or vla-eval://")
+    try:
+        clients: Any = importlib.import_module("rlightning_aio.policy_servers")
+        client = getattr(clients, _CLIENTS[scheme])(f"ws://{place}")
+    except (ImportError, ConfigError) as error:
+        raise ConfigError(f"--policy {name}: {error}") from error
+    return stack.enter_context(client)
 
 
 class Responder:
