@@ -24,7 +24,6 @@ from rlightning_aio.types import PolicyResponse
 from rlightning_aio.vector.batching import batched, merged, spread
 from rlightning_aio.vector.deaths import Deaths, Stepped
 from rlightning_aio.vector.leftovers import drop_outstanding
-from rlightning_aio.vector.proxies import SubEnvProxy
 from rlightning_aio.vector.reset_arguments import checked_mask, seeds_of_envs
 from rlightning_aio.vector.rows import rows_of
 from rlightning_aio.vector.spaces import adopted_spaces
@@ -374,7 +373,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
     def envs(self) -> list[Any]:
         """A proxy of each env; it fetches attributes when they are read."""
         return [
-            SubEnvProxy(partial(self._look_up, place), partial(self._call_one, place))
+            _SubEnvProxy(partial(self._look_up, place), partial(self._call_one, place))
             for place in range(self.num_envs)
         ]
 
@@ -439,6 +438,36 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
                 stacklevel=3,
             )
         self.group.close()
+
+
+class _SubEnvProxy:
+    """Fetches an attribute of the env when it is read, and calls its methods.
+
+    Values are copies: changing one does not change the env.
+
+    Args:
+        look_up: returns True and None for a method's name, or False and the attribute's value.
+        call: calls a method of the env by name.
+    """
+
+    def __init__(
+        self, look_up: Callable[[str], tuple[bool, Any]], call: Callable[..., Any]
+    ) -> None:
+        vars(self).update(_look_up=look_up, _call=call)
+
+    @property
+    def unwrapped(self) -> _SubEnvProxy:
+        """The proxy itself: attributes are found through wrappers."""
+        return self
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") or "_look_up" not in vars(self):  # `copy` looks these up.
+            raise AttributeError(name)
+        is_method, value = self._look_up(name)
+        return partial(self._call, name) if is_method else value
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        self._call("set_wrapper_attr", name, value)
 
 
 def _check_name(name: str) -> None:
