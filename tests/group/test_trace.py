@@ -63,7 +63,8 @@ def test_a_timeline_agrees_with_what_was_collected(group: Any, tmp_path: Path) -
         reported = stats["latency_us"]["step"][f"p{percent}"]
         assert np.percentile(steps, percent) == pytest.approx(reported, rel=0.02)
     limits = [track for name, _, track, _ in seen.marks if name == "step limit"]
-    assert set(limits) == set(group.env_ids)
+    assert limits
+    assert set(limits) == {env_id for env_id, count in counted.items() if count >= 7}
     assert len(seen.called("policy")) == ROUNDS
     assert len(seen.called("collect_async")) == ROUNDS + 1
     assert seen.called("waiting for work")

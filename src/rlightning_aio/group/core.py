@@ -341,7 +341,7 @@ class Core:
             try:
                 fault.results = self.hand_out(done, synchronous=True)[0]
             except BaseException:
-                self.requests.collector.faults.extend(ticket.faults)
+                self.requests.collector.note_faults(ticket.faults)
                 raise
             fault.add_note(
                 f"{len(done)} other envs of the same call are done; their results are in "
