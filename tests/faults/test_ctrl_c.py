@@ -14,7 +14,7 @@ import rlightning_aio.sync
 from rlightning_aio.vector.leftovers import drop_outstanding
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
     from types import FrameType
 
     from rlightning_aio.batch import BatchedData
@@ -27,6 +27,14 @@ PLACES = {
 }
 NUM_LINES = 3000
 """More lines than any of the calls below executes."""
+
+
+@pytest.fixture(autouse=True)
+def python_raises() -> Iterator[None]:
+    """Have Ctrl-C raise KeyboardInterrupt, also where the shell has it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 class Strike:
