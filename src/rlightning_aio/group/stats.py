@@ -152,53 +152,23 @@ class Stats:
         ended &= lengths > 0
         if part.restarted is not None:
             ended[part.restarted] = False
-        if not len(ended.nonzero()[0]):
+        rows: NDArray[np.intp] = ended.nonzero()[0]
+        if not len(rows):
             return
+        slots = part.slots[rows]
+        outcomes = np.empty((len(rows), 3))
+        outcomes[:, 0], outcomes[:, 1], outcomes[:, 2] = 1, returns[ended], lengths[ended]
         with np.errstate(over="ignore", invalid="ignore"):  # The means show them.
-            if ended.ndim == 1:
-                rows = ended.nonzero()[0]
-                slots = part.slots[rows]
-                outcomes = np.empty((len(rows), 3))
-                outcomes[:, 0], outcomes[:, 1], outcomes[:, 2] = 1, returns[rows], lengths[rows]
-                self._sums[slots] += outcomes
-                self._last[slots] = outcomes[:, 1:]
-            else:
-                rows = self._note_several(part.slots, ended, returns, lengths)
-                slots = part.slots[rows]
+            # A result with sub-environments or agents may end several: its slot repeats.
+            np.add.at(self._sums, slots, outcomes)
+        self._last[slots] = outcomes[:, 1:]
         if part.info_marks is not None or part.out_of_band:
-            for slot, row in zip(slots.tolist(), rows.tolist(), strict=True):
+            for row in dict.fromkeys(rows.tolist()):
                 if part.may_hold(row, _VERDICTS):
                     with suppress(
                         Exception
                     ):  # The info may be malformed; its reader gets the error.
-                        self._note_verdicts(slot, part.info_of(row), ended[row])
-
-    def _note_several(
-        self,
-        slots: NDArray[np.intp],
-        ended: NDArray[np.bool_],
-        returns: NDArray[np.float64],
-        lengths: NDArray[np.int64],
-    ) -> NDArray[np.intp]:
-        """Count ended episodes of sub-environments or agents; a result may end several.
-
-        Returns the rows of results that end any.
-        """
-        flat = ended.reshape(-1).nonzero()[0]
-        owners = flat // (ended.size // len(ended))
-        own_returns, own_lengths = returns.reshape(-1)[flat], lengths.reshape(-1)[flat]
-        counts = np.bincount(owners, minlength=len(ended))
-        rows = counts.nonzero()[0]
-        chosen = slots[rows]
-        outcomes = np.empty((len(rows), 3))
-        outcomes[:, 0] = counts[rows]
-        outcomes[:, 1] = np.bincount(owners, own_returns)[rows]
-        outcomes[:, 2] = np.bincount(owners, own_lengths)[rows]
-        self._sums[chosen] += outcomes
-        # Episodes are ordered by row, so these are the last ones of each row.
-        ends = np.add.accumulate(counts[rows]) - 1
-        self._last[chosen, 0], self._last[chosen, 1] = own_returns[ends], own_lengths[ends]
-        return rows
+                        self._note_verdicts(part.slots.item(row), part.info_of(row), ended[row])
 
     def _note_verdicts(self, slot: int, info: dict[str, Any], ended: NDArray[np.bool_]) -> None:
         """Count the verdicts in `info` on the episodes that have `ended`."""
