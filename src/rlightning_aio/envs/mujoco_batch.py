@@ -237,12 +237,9 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         # `any` of an array takes four times as long as `count_nonzero`.
         due = ended if self._mode == _NEXT_STEP and np.count_nonzero(ended) else None
         failures = self._simulate(actions, due)
-        observations, (rewards, terminated, infos) = self._task.stepped(actions)
+        observations, (rewards, terminated, columns) = self._task.stepped(actions)
         self._num_steps += 1
         truncated = self._num_steps >= self._limit
-        masked, everywhere = dict[str, Any](), self._everywhere.copy()
-        for name, column in infos.items():
-            masked[name], masked["_" + name] = column, everywhere
         # Infos of simulations that were not stepped.
         apart = {k: {FAILED: cause} for k, cause in failures.items()}
         if due is not None:
@@ -253,12 +250,12 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             rewards[chosen] = 0.0
             terminated[chosen] = truncated[chosen] = False
             truncated[list(failures)] = True
-            masked = self._replaced(masked, apart)
+        infos = self._infos(columns, apart)
         self._observations[:] = observations
         self._ended = ended = terminated | truncated
         if self._mode == _SAME_STEP and np.count_nonzero(ended):
-            observations, masked = self._reset_ended(ended, observations, masked)
-        return observations, rewards, terminated, truncated, masked
+            observations, infos = self._reset_ended(ended, observations, infos)
+        return observations, rewards, terminated, truncated, infos
 
     def _simulate(self, actions: NDArray[Any], due: NDArray[np.bool_] | None) -> dict[int, str]:
         """Step all simulations except those due for a reset. Return failures with their reasons."""
@@ -272,6 +269,30 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
             self._before[k], self._substeps[k] = simulations.rows[k], 0
         return failures
 
+    def _infos(
+        self, columns: dict[str, NDArray[Any]], apart: dict[int, dict[str, Any]]
+    ) -> dict[str, Any]:
+        """Return the infos of a step with masks, as in Gymnasium.
+
+        Args:
+            columns: of all simulations, ``[num_envs, ...]``.
+            apart: the infos of simulations that were not stepped.
+        """
+        infos, stepped = dict[str, Any](), self._everywhere.copy()
+        if not apart:
+            for name, column in columns.items():
+                infos[name], infos["_" + name] = column, stepped
+            return infos
+        chosen = list(apart)
+        stepped[chosen] = False
+        if len(chosen) < self.num_envs:
+            for name, column in columns.items():
+                infos[name], infos["_" + name] = column.copy(), stepped.copy()
+                infos[name][chosen] = 0
+        for k, info in apart.items():
+            infos = self._add_info(infos, info, k)
+        return infos
+
     def _reset_ended(
         self, ended: NDArray[np.bool_], last: NDArray[Any], infos: dict[str, Any]
     ) -> tuple[NDArray[Any], dict[str, Any]]:
@@ -280,19 +301,12 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         for k in np.flatnonzero(ended).tolist():
             final[k] = last[k].copy()
         final_info = _only(infos, ended)
-        infos = self._replaced(infos, {k: self._reset(k) for k in np.flatnonzero(ended).tolist()})
+        infos = _only(infos, ~ended)
+        for k in np.flatnonzero(ended).tolist():
+            infos = self._add_info(infos, self._reset(k), k)
         infos.update(final_obs=final, _final_obs=ended.copy())
         infos.update(final_info=final_info, _final_info=ended.copy())
         return self._observations.copy(), infos
-
-    def _replaced(self, infos: dict[str, Any], others: dict[int, dict[str, Any]]) -> dict[str, Any]:
-        """Replace the infos of some simulations by `others`."""
-        chosen = self._everywhere.copy()
-        chosen[list(others)] = False
-        infos = _only(infos, chosen)
-        for k, info in others.items():
-            infos = self._add_info(infos, info, k)
-        return infos
 
     # -- calls --------------------------------------------------------------------------
 
