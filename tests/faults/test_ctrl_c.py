@@ -37,11 +37,22 @@ def python_raises() -> Iterator[None]:
     signal.signal(signal.SIGINT, before)
 
 
-class Strike:
-    """A trace function that sends Ctrl-C at the n-th line of this library."""
+def press() -> None:
+    """Press Ctrl-C."""
+    signal.raise_signal(signal.SIGINT)
 
-    def __init__(self, line: int) -> None:
+
+def interrupt() -> None:
+    """Raise what a second Ctrl-C raises at once, also where the first one is held back."""
+    raise KeyboardInterrupt
+
+
+class Strike:
+    """A trace function that calls `strike` at the n-th line of this library."""
+
+    def __init__(self, line: int, strike: Callable[[], None]) -> None:
         self.left = line
+        self.strike = strike
 
     def __call__(self, frame: FrameType, event: str, arg: Any) -> Any:
         return self._line if "/rlightning_aio/" in frame.f_code.co_filename else None
@@ -50,13 +61,13 @@ class Strike:
         if event == "line":
             self.left -= 1
             if self.left == 0:
-                signal.raise_signal(signal.SIGINT)
+                self.strike()
         return self._line
 
 
-def struck(line: int, call: Callable[[], object]) -> bool:
+def struck(line: int, call: Callable[[], object], how: Callable[[], None] = press) -> bool:
     """Make a call with Ctrl-C at that line; return True if the line was reached."""
-    strike, interrupted = Strike(line), False
+    strike, interrupted = Strike(line, how), False
     sys.settrace(strike)
     try:
         call()
@@ -113,6 +124,16 @@ def test_a_group_goes_on_wherever_a_call_was_interrupted(
     alone.close()
 
 
+# A step executes some 500 lines; these are a sample, and the last ones come after its end.
+@pytest.mark.parametrize("line", range(1, 800, 113))
+def test_a_group_can_be_closed_wherever_a_second_ctrl_c_interrupts_its_step(line: int) -> None:
+    """The interrupt reaches the program unchanged; the fixtures check that no worker is left."""
+    entry = {**ENTRY, "num_workers": 2, "envs_per_process": 1}
+    with rlightning_aio.sync.build_env_group(entry) as group:
+        batch, _ = group.reset(seed=0)
+        struck(line, lambda: step(group, batch), interrupt)
+
+
 class Pressing(gym.Env[Any, Any]):
     """Presses Ctrl-C in each step."""
 
@@ -123,7 +144,7 @@ class Pressing(gym.Env[Any, Any]):
         return 0, {}
 
     def step(self, action: Any) -> Any:
-        signal.raise_signal(signal.SIGINT)
+        press()
         return 1, 1.0, False, False, {}
 
 
