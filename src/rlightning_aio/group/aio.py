@@ -95,7 +95,7 @@ class AioDriver:
         self.check_caller()
         function(*args)
 
-    def run_env(self, execute: Callable[[], T]) -> T:
+    def interruptible(self, execute: Callable[[], T]) -> T:
         """Call a function that runs an env; asyncio handles Ctrl-C."""
         return execute()
 

@@ -15,6 +15,7 @@ import select
 import signal
 import threading
 import time
+from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
 
@@ -192,9 +193,7 @@ class SyncDriver:
         self._is_interrupted = False
         raise KeyboardInterrupt
 
-    # -- waiting ----------------------------------------------------------------------
-
-    def run_env(self, execute: Callable[[], T]) -> T:
+    def interruptible(self, execute: Callable[[], T]) -> T:
         self._is_interruptible = True
         try:
             if self._is_interrupted:  # A moment ago.
@@ -203,23 +202,21 @@ class SyncDriver:
         finally:
             self._is_interruptible = False
 
+    # -- waiting ----------------------------------------------------------------------
+
     def _block(self, until: float | None) -> None:
         epoll = self._epoll
-        self._is_interruptible = True
+        seconds = -1.0 if until is None else max(0.0, until - time.monotonic())
+        if epoll is None:
+            if until:
+                self.interruptible(partial(time.sleep, seconds))
+            return
         try:
-            if self._is_interrupted:  # A moment ago.
-                self._raise_interrupt()
-            if epoll is None:
-                if until:
-                    time.sleep(max(0.0, until - time.monotonic()))
-                return
-            found = epoll.poll(-1.0 if until is None else max(0.0, until - time.monotonic()))
+            found = self.interruptible(partial(epoll.poll, seconds))
         except OSError:
-            if epoll is None or not epoll.closed:
+            if not epoll.closed:
                 raise
             return  # A signal handler closed the group.
-        finally:
-            self._is_interruptible = False
         for descriptor, events in found:
             source = self._sources.get(descriptor)
             if source is not None and events & select.EPOLLOUT:

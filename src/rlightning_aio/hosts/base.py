@@ -77,8 +77,8 @@ class Watcher(Protocol):
         """Wake all waiters, as if a source had posted a completion."""
         ...
 
-    def run_env(self, execute: Callable[[], T]) -> T:
-        """Call a function that runs an env in this thread; Ctrl-C may interrupt it."""
+    def interruptible(self, execute: Callable[[], T]) -> T:
+        """Call a function that runs an env; Ctrl-C may interrupt it."""
         ...
 
 

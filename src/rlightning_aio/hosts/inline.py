@@ -66,7 +66,7 @@ class InlineHost:
     def start(self) -> None:
         """Build the envs immediately."""
         try:
-            started = self._watcher.run_env(self._built)
+            started = self._watcher.interruptible(self._built)
         except KeyboardInterrupt:
             raise
         except BaseException as error:
@@ -116,7 +116,7 @@ class InlineHost:
             return False
         entry, execute = self._queue.popleft()
         try:
-            outcome = self._watcher.run_env(execute)
+            outcome = self._watcher.interruptible(execute)
         except BaseException as error:
             self._raised(entry, error)
             return True
@@ -143,7 +143,7 @@ class InlineHost:
 
     def step_now(self) -> OutOfBand | None:
         """Step env 0 with the action in its row; the queue must have no request to it."""
-        return self._watcher.run_env(self._runners[0].step)
+        return self._watcher.interruptible(self._runners[0].step)
 
     def step_next(self) -> tuple[int, OutOfBand | None] | None:
         """Execute the next request if it is a step or a reset, without a completion.
@@ -155,7 +155,7 @@ class InlineHost:
             return None
         entry, execute = self._queue.popleft()
         try:
-            return entry, self._watcher.run_env(execute)
+            return entry, self._watcher.interruptible(execute)
         except BaseException as error:
             self._raised(entry, error)
             return None
