@@ -86,15 +86,17 @@ test-peers: $(PEERS_VENV)/installed ## Gymnasium's, SB3's and RLightning's own t
 test-sanitized: export PYTHONPATH := build/sanitized
 test-sanitized: export PYTHONMALLOC := malloc
 test-sanitized: export ASAN_OPTIONS := detect_leaks=0
-test-sanitized: $(VENV)/installed-test ## the compiled kernel under AddressSanitizer and UBSan
+test-sanitized: $(VENV)/installed-test ## the compiled modules under AddressSanitizer and UBSan
 	rm -rf build/sanitized && mkdir -p build && cp -r src build/sanitized
-	$(CC) -std=c11 -g -O1 -Wall -Wextra -Wno-missing-field-initializers -Wno-cast-function-type -Werror \
-	    -fsanitize=address,undefined -fno-sanitize-recover=all -fPIC -shared \
-	    -I$$($(PY) -c 'import sysconfig; print(sysconfig.get_path("include"))') \
-	    src/rlightning_aio/protocol/_kernel.c -o build/sanitized/rlightning_aio/protocol/_kernel.abi3.so
+	for module in protocol/_kernel envs/_mujoco_forces; do \
+	    $(CC) -std=c11 -g -O1 -Wall -Wextra -Wno-missing-field-initializers -Wno-cast-function-type -Werror \
+	        -fsanitize=address,undefined -fno-sanitize-recover=all -fPIC -shared \
+	        -I$$($(PY) -c 'import sysconfig; print(sysconfig.get_path("include"))') \
+	        src/rlightning_aio/$$module.c -o build/sanitized/rlightning_aio/$$module.abi3.so || exit; \
+	done
 	LD_PRELOAD="$$($(CC) -print-file-name=libasan.so) $$($(CC) -print-file-name=libubsan.so)" \
 	    $(PY) -m pytest tests/protocol tests/hosts/test_link.py tests/group/test_steps.py \
-	    tests/group/test_stepping.py
+	    tests/group/test_stepping.py tests/envs/test_mujoco_batch.py
 
 # The rings and the kernel on another processor's memory order: Debian's qemu runs Debian's Python.
 test-aarch64: $(VENV)/installed-test ## the compiled kernel on aarch64, emulated (Debian; 200 MB)
@@ -161,7 +163,7 @@ $(VENV)/installed-release: extras := [test,release]
 $(SIMULATORS)/installed: pages := skrl tianshou
 $(SIMULATORS)/installed: extras := [test,ale,envpool,examples,maniskill,notebook,openenv,pettingzoo,piper,sb3,torchrl]
 # What an installation is made from.
-SOURCES := pyproject.toml setup.py constraints.txt src/rlightning_aio/protocol/_kernel.c
+SOURCES := pyproject.toml setup.py constraints.txt $(wildcard src/rlightning_aio/*/*.c)
 STAMPS := $(VENV)/installed $(addprefix $(VENV)/installed-,test check docs bench ray release)
 $(STAMPS): | $(PY)
 $(SIMULATORS)/installed: | $(SIMULATORS)/bin/python

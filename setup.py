@@ -1,6 +1,6 @@
-"""Build the compiled kernel, where that is possible; everything else is in pyproject.toml.
+"""Build the compiled modules, where that is possible; everything else is in pyproject.toml.
 
-The kernel is optional: without a compiler, the Python twins of its functions are used.
+They are optional: without a compiler, their twins in Python are used.
 """
 
 import sysconfig
@@ -13,12 +13,13 @@ stable = not sysconfig.get_config_var("Py_GIL_DISABLED")
 setup(
     ext_modules=[
         Extension(
-            "rlightning_aio.protocol._kernel",
-            ["src/rlightning_aio/protocol/_kernel.c"],
+            f"rlightning_aio.{package}.{name}",
+            [f"src/rlightning_aio/{package}/{name}.c"],
             extra_compile_args=["-std=c11"],
             py_limited_api=stable,
             optional=True,
         )
+        for package, name in [("protocol", "_kernel"), ("envs", "_mujoco_forces")]
     ],
     options={"bdist_wheel": {"py_limited_api": "cp311"}} if stable else {},
 )

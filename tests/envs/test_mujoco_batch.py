@@ -21,6 +21,7 @@ from rlightning_aio.config import EnvConfig
 from rlightning_aio.envs import mujoco_threads
 from rlightning_aio.envs.gymnasium import MujocoEnv, outdated_assets_accepted
 from rlightning_aio.envs.mujoco_batch import MujocoBatch
+from rlightning_aio.envs.mujoco_forces import compiled
 from rlightning_aio.envs.mujoco_threads import Simulations
 from rlightning_aio.errors import ConfigError, EnvRaised
 from rlightning_aio.vector import make_vec
@@ -109,6 +110,7 @@ def compare(
     theirs.close()
 
 
+@pytest.mark.usefixtures("implementation")
 @pytest.mark.parametrize("task", TASKS)
 def test_every_task_equals_gymnasiums(task: str) -> None:
     """Without options, and with short episodes; with any number of threads."""
@@ -126,6 +128,7 @@ def compare_with_any_options(task: str, examples: int, num_steps: int) -> None:
     check()
 
 
+@pytest.mark.usefixtures("implementation")
 @pytest.mark.parametrize("task", TASKS)
 def test_options_have_the_same_effect_as_in_gymnasium(task: str) -> None:
     """All arguments of the constructor of a task."""
@@ -139,6 +142,7 @@ def test_a_thousand_steps_with_any_options(task: str) -> None:
     compare_with_any_options(task, 6, 1000)
 
 
+@pytest.mark.usefixtures("implementation")
 @pytest.mark.parametrize("task", ["Ant-v5", "Hopper-v5", "InvertedDoublePendulum-v5"])
 def test_all_data_of_a_simulation_equal_gymnasiums(task: str) -> None:
     """Positions of bodies, contacts and forces, after steps and after resets."""
@@ -163,6 +167,11 @@ def test_all_data_of_a_simulation_equal_gymnasiums(task: str) -> None:
     theirs.close()
 
 
+def test_contact_forces_are_compiled_where_the_kernel_is(implementation: str) -> None:
+    """So the tests of both implementations compare two ways to contact forces."""
+    assert (compiled() is None) == (implementation == "python")
+
+
 SMALL = "a simulation that runs out of memory"
 """MuJoCo raises an error for it when it has several contacts."""
 WILD = "a simulation that moves too fast"
@@ -180,6 +189,7 @@ def ants(reason: str, mode: AutoresetMode, folder: Path) -> MujocoBatch:
     return MujocoBatch(make("Ant-v5", options)(), 2, mode, num_threads=2)
 
 
+@pytest.mark.usefixtures("implementation")
 @pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.value)
 @pytest.mark.parametrize("reason", [SMALL, WILD])
 def test_a_simulation_that_fails_ends_its_own_episode(
@@ -266,6 +276,7 @@ def with_factors(env: Any, task: str, factors: dict[str, Any], k: int) -> None:
     mujoco.mj_setConst(own, mujoco.MjData(own))
 
 
+@pytest.mark.usefixtures("implementation")
 @pytest.mark.parametrize("task", ["Humanoid-v5", "Hopper-v5"])
 def test_randomized_simulations_equal_gymnasiums_with_the_same_models(task: str) -> None:
     """Each reset draws masses, friction, gravity and gears; its info has the factors."""

@@ -115,6 +115,7 @@ class Both:
         self.apart.close()
 
 
+@pytest.mark.usefixtures("implementation")
 @pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.value)
 @pytest.mark.parametrize("task", TASKS)
 def test_any_history_equals_that_of_separate_envs(task: str, mode: AutoresetMode) -> None:

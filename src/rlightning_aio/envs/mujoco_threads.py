@@ -1,7 +1,8 @@
 """Many MuJoCo simulations of one model, stepped by MuJoCo's own C++ threads.
 
 This is the C interface of `mujoco.batch` (mjbatch.h, MuJoCo 3.17 and later), called through ctypes:
-its Python class lacks `mjb_apply`, the only fast way to contact forces. Calls release the GIL.
+its Python class lacks `mjb_apply`, the only fast way to contact forces (`mujoco_forces`). Calls
+release the GIL.
 Rule: a simulation is a row of numbers, the integration state; everything else is an output that is
 valid after a call. Left out: which numbers a task observes (`mujoco_tasks`).
 """
@@ -19,6 +20,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+
+from rlightning_aio.envs.mujoco_forces import StepsWithForces, compiled
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -92,8 +95,7 @@ class Simulations:
         model: shared by all simulations, so changes of it take effect; copied if `own_models`.
         count: the number of simulations.
         num_threads: number of threads for steps, including the caller's.
-        forces: compute contact forces (``cfrc_ext``) after each step. Simulations then keep all of
-            their data, which takes more memory and time.
+        forces: compute contact forces (``cfrc_ext``) after each step.
         own_models: each simulation has its own values of fields passed to `expand`.
 
     Attributes:
@@ -114,8 +116,16 @@ class Simulations:
         own_models: bool = False,
     ) -> None:
         self._library = library = _library()
-        self.count, self._model, self._forces = count, model, forces
-        config, error = _Config(min(num_threads, count), forces), ctypes.create_string_buffer(1000)
+        self.count, self._model = count, model
+        self._template = mujoco.MjData(model)
+        function = compiled() if forces else None
+        self._with_forces: StepsWithForces | None = None
+        if function is not None:
+            self._with_forces = StepsWithForces(library, function, count, self._template)
+        # Without the compiled function, MuJoCo must keep what forces are computed from.
+        self._keeps_data = forces and function is None
+        config = _Config(min(num_threads, count), self._keeps_data)
+        error = ctypes.create_string_buffer(1000)
         address = library.mjb_makeBatch(
             c_void_p(model._address),  # noqa: SLF001  # Intended for this use.
             count,
@@ -138,7 +148,6 @@ class Simulations:
             library.mjb_warning(self._batch), np.int32, (count, num_warnings, 2)
         )[..., 1]
         self._status = _array(library.mjb_status(self._batch), np.int32, (count,))
-        self._template = mujoco.MjData(model)
         self._expanded: dict[str, NDArray[Any]] = {}
         self.busy_ns = 0
 
@@ -156,6 +165,8 @@ class Simulations:
             address = self._library.mjb_stateComponent(self._batch, int(bit), byref(size))
             first = (address - self.rows.ctypes.data) // self.rows.itemsize
             return self.rows[:, first : first + size.value]
+        if self._with_forces is not None:
+            return self._with_forces.output(name)
         address = self._library.mjb_output(self._batch, name.encode(), byref(size), byref(width))
         if not address:
             raise AttributeError(f"MuJoCo's batches have no field {name!r}")
@@ -221,9 +232,12 @@ class Simulations:
         """
         library, began = self._library, time.monotonic_ns()
         chosen, count = _chosen(ids)
-        num_failed = library.mjb_step(self._batch, chosen, count, num_steps, 0)
+        if self._with_forces is not None:
+            num_failed = self._with_forces.step(self._batch, chosen, count, num_steps)
+        else:
+            num_failed = library.mjb_step(self._batch, chosen, count, num_steps, 0)
         failures = self._failures() if num_failed or np.count_nonzero(self._warnings) else {}
-        if self._forces:
+        if self._keeps_data:
             forces = library.mj_rnePostConstraint  # It ignores the further arguments.
             library.mjb_apply(self._batch, chosen, count, forces, None, False)
             # Computes nothing, but copies the outputs.
