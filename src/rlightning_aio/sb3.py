@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.envs.gymnasium import spec_of
 from rlightning_aio.envs.sub_envs import adapted
-from rlightning_aio.errors import ConfigError
+from rlightning_aio.errors import BadAction, ConfigError
 from rlightning_aio.protocol.columns import index
 from rlightning_aio.sync import EnvGroup, build_env_group
 from rlightning_aio.types import PolicyResponse
@@ -143,6 +144,8 @@ class VecEnv(_Base):
             # The last results of all envs, in order; actions respond to them.
             self._answerable = BatchedData(self.group.env_ids, [None] * len(metas))
             self._unfinished = False
+            # Results of a step or reset were not returned, so no episode can go on.
+            self._has_lost = False
             _Base.__init__(self, self._rows.num_envs, *first)
             with contextlib.suppress(AttributeError):  # Some batches have none.
                 self.metadata: dict[str, Any] = {**self.get_attr("metadata", 0)[0], **self.metadata}
@@ -160,23 +163,43 @@ class VecEnv(_Base):
             EnvRaised, WorkerDied, EnvHung: an env failed; the results of the others are dropped.
         """
         with self._exchange(), self._dropping_the_rest():
+            self._has_lost = True
             self._rows.send_resets(self._seeds, self._options, range(self.num_envs))
             batch, _ = self.group.collect_async(wait_all=True, ordered=True)
         self.reset_infos = self._rows.info_list(batch)
         self._reset_seeds()
         self._reset_options()
-        return self._copied_observations(batch)
+        found = self._copied_observations(batch)
+        self._has_lost = False
+        return found
 
     def step_async(self, actions: Any) -> None:
-        """Send one action to each env: an array or a sequence, cast to the dtype of the space."""
+        """Send one action to each env: an array or a sequence, cast to the dtype of the space.
+
+        Raises:
+            BadAction: the actions don't fit; nothing was sent.
+            ResetNeeded: the results of the last step or reset were lost: an env failed, or Ctrl-C
+                interrupted it.
+        """
         self._begin()
+        if self._has_lost:
+            raise ResetNeeded(
+                "the results of the last step or reset were lost, as it failed or was interrupted; "
+                "call reset(), or model.set_env(env), after which learn() begins with a reset"
+            )
         if isinstance(self.action_space, gym.spaces.Dict | gym.spaces.Tuple):
             pairs = zip(self.group.env_ids, actions, strict=True)
-            responses = [PolicyResponse(env_id, action) for env_id, action in pairs]
-            self.group.step_async(BatchedData(self.group.env_ids, responses))
+            each = [PolicyResponse(env_id, action) for env_id, action in pairs]
+            responses = BatchedData(self.group.env_ids, each)
         else:
             columns = self._rows.actions(np.asarray(actions))
-            self.group.step_async(self._answerable.respond(action=columns))
+            responses = self._answerable.respond(action=columns)
+        self._has_lost = True  # Until they are returned.
+        try:
+            self.group.step_async(responses)
+        except BadAction:
+            self._has_lost = False
+            raise
 
     def step_wait(self) -> tuple[Any, NDArray[np.float64], NDArray[np.bool_], list[dict[str, Any]]]:
         """Wait for the steps.
@@ -199,7 +222,9 @@ class VecEnv(_Base):
             cut = infos[k].pop("TimeLimit.truncated")
             infos[k], self.reset_infos[k] = _last_and_first(infos[k], self._observations, k)
             infos[k]["TimeLimit.truncated"] = cut
-        return self._copied_observations(batch), rows.flat(batch.reward), done, infos
+        found = self._copied_observations(batch), rows.flat(batch.reward), done, infos
+        self._has_lost = False
+        return found
 
     def _copied_observations(self, batch: BatchedData) -> Any:
         """Copy the observations, and keep them: a death makes them an episode's last ones."""

@@ -289,7 +289,7 @@ def test_a_death_raises_if_configured() -> None:
     with pytest.raises(WorkerDied, match=r"env 'env-0'.*was killed by SIGKILL"):
         envs.step_wait()
     with pytest.raises(WorkerDied, match="env 'env-0'"):
-        envs.step(ACTIONS)
+        envs.reset()
     envs.close()
 
 

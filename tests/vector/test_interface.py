@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
+import signal
 import threading
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -12,14 +13,19 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
-from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
+from gymnasium.error import (
+    AlreadyPendingCallError,
+    ClosedEnvironmentError,
+    NoAsyncCallError,
+    ResetNeeded,
+)
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import vector as wrappers
 from patience import HANG
 from timelines import Seen
 from vector.toys import Toy, assert_alike, press_ctrl_c, toy
 
-from rlightning_aio.errors import EnvRaised, StartFailed
+from rlightning_aio.errors import BadAction, EnvRaised, StartFailed
 from rlightning_aio.vector import VectorEnv, make_vec, vector_entry_point
 
 if TYPE_CHECKING:
@@ -60,7 +66,7 @@ class Held(Plain):
 
 
 def test_halves_of_a_call_belong_together(tmp_path: Path) -> None:
-    """Each `wait` needs its own `async`; a timeout raises, and late results are dropped."""
+    """Each `wait` needs its own `async`; after a timeout or an error of a step, all are reset."""
     gate = tmp_path / "open"
     env = VectorEnv([lambda: Held(gate)] * 2, max_concurrency=1)
     assert len(set(env.call("worker"))) == 1
@@ -79,15 +85,27 @@ def test_halves_of_a_call_belong_together(tmp_path: Path) -> None:
     gate.touch()
     env.call_async("wait")
     assert env.call_wait(timeout=60) == (1, 1)
+    with pytest.raises(ResetNeeded, match=r"lost.*timed out"):
+        env.step(np.zeros(2, np.int64))
+    env.reset()
     gate.unlink()
     env.call_async("wait")
     with pytest.raises(multiprocessing.TimeoutError):
         env.call_wait(timeout=0.01)
     gate.touch()
-    assert env.step(np.zeros(2, np.int64))[4]["count"].tolist() == [2, 2]
+    assert env.step(np.zeros(2, np.int64))[4]["count"].tolist() == [1, 1]
     with pytest.raises(EnvRaised, match="no such action"):
         env.step(np.array([0, 2]))
-    assert env.step(np.zeros(2, np.int64))[4]["count"].tolist() == [4, 3]
+    with pytest.raises(ResetNeeded):
+        env.step_async(np.zeros(2, np.int64))
+    with pytest.raises(ResetNeeded, match="without a mask"):
+        env.reset(options={"reset_mask": np.array([False, True])})
+    env.reset(options={"reset_mask": np.array([True, True])})
+    with pytest.raises(ValueError, match="3"):
+        env.step(np.zeros(3, np.int64))
+    with pytest.raises(BadAction):
+        env.step(np.array([0.0, np.nan]))
+    assert env.step(np.zeros(2, np.int64))[4]["count"].tolist() == [1, 1]
     env.step_async(np.zeros(2, np.int64))
     with pytest.warns(UserWarning, match="pending call to `step`"):
         env.close()
@@ -337,23 +355,26 @@ class Interrupting(Plain):
         self.trainer = trainer
 
     def step(self, action: Any) -> Any:
-        if action == 1:
+        if action == 1 and self.trainer == os.getpid():
+            signal.raise_signal(signal.SIGINT)
+        elif action == 1:
             press_ctrl_c(self.trainer)
         return super().step(action)
 
 
-def test_after_ctrl_c_it_steps_and_resets() -> None:
-    """Results of the interrupted step are dropped."""
+@pytest.mark.parametrize("placement", ["inline", "process"])
+def test_after_ctrl_c_it_is_reset(placement: str) -> None:
+    """A step would hide from the program what the interrupted one returned: an end, for example."""
     trainer = os.getpid()
-    env = VectorEnv([lambda: Interrupting(trainer)] * 2)
+    env = VectorEnv([lambda: Interrupting(trainer)] * 2, placement=placement)
     first, _ = env.reset(seed=0)
-    for _ in range(2):
+    for actions in ([1, 0], [0, 1]):
         with pytest.raises(KeyboardInterrupt):
-            env.step([1, 0])
-        env.step([0, 0])
-    with pytest.raises(KeyboardInterrupt):
-        env.step([0, 1])
-    np.testing.assert_array_equal(env.reset(seed=0)[0], first)
+            env.step(actions)
+        with pytest.raises(ResetNeeded, match="interrupted"):
+            env.step([0, 0])
+        np.testing.assert_array_equal(env.reset(seed=0)[0], first)
+    env.step([0, 0])
     env.close()
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 from timelines import Seen
 from vector.toys import assert_alike, press_ctrl_c
@@ -115,7 +116,7 @@ class Stuck:
 
 def test_after_an_env_has_raised_all_are_reset() -> None:
     """In a reset or a step, or if a value can't be sent; no late results appear."""
-    from rlightning_aio.errors import EnvRaised
+    from rlightning_aio.errors import BadAction, EnvRaised
     from rlightning_aio.sb3 import VecEnv
 
     env = VecEnv([Choosy] * 3, envs_per_process=3)
@@ -129,7 +130,11 @@ def test_after_an_env_has_raised_all_are_reset() -> None:
     env.reset()
     with pytest.raises(EnvRaised, match="no such action"):
         env.step(np.array([1, 0, 1]))
+    with pytest.raises(ResetNeeded, match="set_env"):
+        env.step(np.zeros(3, np.int64))
     assert env.reset().tolist() == [0, 0, 0]
+    with pytest.raises(BadAction):
+        env.step(np.zeros(3))
     env.step(np.zeros(3, np.int64))
     env.close()
 
@@ -154,8 +159,8 @@ class Interrupting(gym.Env[Any, Any]):
         return self.count, 0.0, False, False, {}
 
 
-def test_after_ctrl_c_it_steps_and_resets() -> None:
-    """Results of the interrupted step appear neither in the next step nor in a reset."""
+def test_after_ctrl_c_it_is_reset() -> None:
+    """Results of the interrupted step appear nowhere; an interrupted call loses none."""
     from rlightning_aio.sb3 import VecEnv
 
     trainer = os.getpid()
@@ -163,14 +168,12 @@ def test_after_ctrl_c_it_steps_and_resets() -> None:
     env.reset()
     with pytest.raises(KeyboardInterrupt):
         env.step([1, 0])
-    assert env.step([0, 0])[0].tolist() == [2, 2]
-    with pytest.raises(KeyboardInterrupt):
-        env.step([0, 1])
-    assert env.reset().tolist() == [0, 0]
-    with pytest.raises(KeyboardInterrupt):
-        env.step([1, 0])
     assert env.env_is_wrapped(gym.wrappers.TimeLimit) == [False, False]
     assert env.get_attr("count") == [1, 1]
+    with pytest.raises(ResetNeeded, match="interrupted"):
+        env.step([0, 0])
+    assert env.reset().tolist() == [0, 0]
+    assert env.step([0, 0])[0].tolist() == [1, 1]
     with pytest.raises(KeyboardInterrupt):
         env.env_method("step", 1, indices=[0])
     assert env.get_attr("count", indices=[1]) == [1]

@@ -11,12 +11,17 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
+from gymnasium.error import (
+    AlreadyPendingCallError,
+    ClosedEnvironmentError,
+    NoAsyncCallError,
+    ResetNeeded,
+)
 from gymnasium.vector import AutoresetMode, utils
 
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.envs.sub_envs import adapted
-from rlightning_aio.errors import ConfigError, EnvFault
+from rlightning_aio.errors import BadAction, ConfigError, EnvFault
 from rlightning_aio.group.continuity import as_int
 from rlightning_aio.protocol.columns import leaves
 from rlightning_aio.sync import EnvGroup, build_env_group
@@ -100,6 +105,8 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         self._pending: str | None = None
         self._arguments: Any = None
         self._late = False
+        # Results of a step or reset were not returned, so no episode can go on.
+        self._has_lost = False
         if max_concurrency is not None:
             entry = {"envs_per_process": per_worker(max_concurrency, len(env_fns)), **entry}
         makers = adapted(env_fns, self.autoreset_mode, entry.pop("max_episode_steps", None))
@@ -184,7 +191,10 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
             options = dict(options)
             mask = checked_mask(options.pop("reset_mask"), self.num_envs)
         which = range(self.num_envs) if mask is None else np.flatnonzero(mask).tolist()
-        self._late = True  # A reset that can't be sent leaves those before it outstanding.
+        if mask is not None and not mask.all():
+            self._check_whole()
+        # A reset that can't be sent leaves those before it outstanding.
+        self._late = self._has_lost = True
         self._rows.send_resets(seeds, [options] * self.num_envs, which)
         self._pending, self._arguments, self._late = "reset", mask, False
 
@@ -199,11 +209,14 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         mask = self._arguments
         self._deaths.note_reset(... if mask is None else mask)
         if mask is None or mask.all():
-            return self._observed(self._rows.observation(batch)), self._rows.infos(batch)
-        chosen = np.flatnonzero(mask)
-        observations, infos = self._rows.of_mask(batch, mask)
-        observations = merged(self._observations, observations, chosen, self.num_envs)
-        return self._observed(observations), spread(infos, chosen, self.num_envs)
+            found = self._observed(self._rows.observation(batch)), self._rows.infos(batch)
+        else:
+            chosen = np.flatnonzero(mask)
+            observations, infos = self._rows.of_mask(batch, mask)
+            observations = merged(self._observations, observations, chosen, self.num_envs)
+            found = self._observed(observations), spread(infos, chosen, self.num_envs)
+        self._has_lost = False
+        return found
 
     # -- steps ------------------------------------------------------------------------
 
@@ -219,26 +232,38 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         Raises:
             ValueError, TypeError: the number of actions is wrong, or they don't fit the space.
             EnvRaised, WorkerDied, EnvHung: an env failed; nothing is left to collect.
+            ResetNeeded: the results of the last step or reset were lost: by such an error, a
+                timeout, or Ctrl-C.
             AlreadyPendingCallError: another call is pending.
             ClosedEnvironmentError: the vector env is closed.
         """
-        self._begin("step_async")
-        self._late = True  # Ctrl-C would leave steps outstanding.
-        responses = self._batch(actions)
         if self._deaths.unfinished:
-            self._deaths.send(responses)
-            self._answerable = self._deaths.collect(None)
-        else:
+            self.step_async(actions)
+            return self.step_wait()
+        responses = self._responses(actions)
+        self._late = self._has_lost = True  # Until they are returned.
+        try:
             self._answerable, _ = self.group.step(responses)
+        except BadAction:
+            self._has_lost = False  # Nothing was sent.
+            raise
         self._late = False
-        return self._stepped(self._answerable)
+        found = self._stepped(self._answerable)
+        self._has_lost = False
+        return found
 
     def step_async(self, actions: Any) -> None:
         """Send steps without waiting; `step_wait` returns their results."""
-        self._begin("step_async")
-        self._late = True  # As in `step`.
-        send = self._deaths.send if self._deaths.unfinished else self.group.step_async
-        send(self._batch(actions))
+        responses = self._responses(actions)
+        self._late = self._has_lost = True  # As in `step`.
+        try:
+            if self._deaths.unfinished:
+                self._deaths.send(responses)
+            else:
+                self.group.step_async(responses)
+        except BadAction:
+            self._has_lost = False
+            raise
         self._pending, self._late = "step", False
 
     def step_wait(
@@ -251,9 +276,14 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
             NoAsyncCallError: no step was sent.
         """
         collect = self._deaths.collect if self._deaths.unfinished else self._collect
-        return self._stepped(self._finish("step", timeout, collect))
+        found = self._stepped(self._finish("step", timeout, collect))
+        self._has_lost = False
+        return found
 
-    def _batch(self, actions: Any) -> BatchedData:
+    def _responses(self, actions: Any) -> BatchedData:
+        """Check that the envs may be stepped, and make responses of actions."""
+        self._begin("step_async")
+        self._check_whole()
         is_tree = isinstance(actions, dict | tuple) and isinstance(
             self.single_action_space, gym.spaces.Dict | gym.spaces.Tuple
         )
@@ -301,6 +331,13 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         if self._late:
             drop_outstanding(self.group)
             self._late = False
+
+    def _check_whole(self) -> None:
+        if self._has_lost:
+            raise ResetNeeded(
+                "the results of the last step or reset were lost, as it failed, timed out or was "
+                "interrupted; call reset() without a mask to begin new episodes"
+            )
 
     def _check_running(self) -> None:
         if self.closed:
