@@ -151,7 +151,7 @@ def _faults_of(entry: EnvConfig) -> Generator[None]:
         words, env_id = ErrorText.of(error), f"{entry.name}-0"
         fault = EnvRaised.of(
             f"{env_id} (backend {entry.backend!r}, task {entry.task!r}) raised "
-            f"{words.summary}; the remote traceback is above",
+            f"{words.summary}; its __cause__ is the remote traceback",
             env_id=env_id,
             exception_type=words.type_name,
             exception_text=words.text,

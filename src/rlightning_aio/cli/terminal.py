@@ -218,7 +218,7 @@ def _in_words(error: RLightningError) -> str:
     if isinstance(error.__cause__, RemoteTraceback):
         places = re.findall(r'^  File (".*", line \d+, in .*)$', error.__cause__.text, re.MULTILINE)
         where = f"it happened in {places[-1]}" if places else "its traceback was lost"
-        text = text.replace("the remote traceback is above", where)
+        text = text.replace("its __cause__ is the remote traceback", where)
     if isinstance(error, EnvFault) and error.others:
         text += f"\n(and {len(error.others)} more envs of the same call)"
     return text

@@ -135,8 +135,8 @@ class Intake:
             doing = f"the call of {self._requests.method(slot)}()"
             go_on = "the env is still usable"
         return EnvRaised.of(
-            f"{self._envs.describe(slot)} raised in {doing}: {error.summary}{after}; the remote "
-            f"traceback is above; {go_on}",
+            f"{self._envs.describe(slot)} raised in {doing}: {error.summary}{after}; its "
+            f"__cause__ is the remote traceback; {go_on}",
             env_id=self._envs.env_ids[slot],
             exception_type=error.type_name,
             exception_text=error.text,

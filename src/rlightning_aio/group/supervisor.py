@@ -303,8 +303,8 @@ class Supervisor:
             self._fail_start(ConfigError(error.text))
             return
         fault = StartFailed(
-            f"{self._envs.describe(slot)} could not be built: {error.summary}; the "
-            f"remote traceback is above",
+            f"{self._envs.describe(slot)} could not be built: {error.summary}; its "
+            f"__cause__ is the remote traceback",
             env_id=self._envs.env_ids[slot],
         )
         fault.__cause__ = RemoteTraceback(error.traceback)
