@@ -288,3 +288,14 @@ def test_chosen_or_failed_episodes_are_filmed(tmp_path: Path, failed_only: bool)
     seeds = (1, 3) if failed_only else range(4)
     names = sorted(path.name for path in tmp_path.iterdir())
     assert names == [f"env-2-seed-{seed}.mp4" for seed in seeds]
+
+
+@pytest.mark.parametrize("limit", [1, 2, 9])
+def test_episodes_that_a_step_limit_cuts_are_filmed(tmp_path: Path, limit: int) -> None:
+    """The limit is the trainer's, so the film is still open when the episode ends."""
+    with group_of() as group, group.auto_reset(limit):
+        found = evaluate(group, nothing, QUEUE[:4], video=EpisodeVideo(tmp_path))
+    lengths = sorted(record.length or 0 for record in found.records)
+    assert lengths == [min(k, limit) for k in (1, 2, 3, 4)]
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == [f"env-1-seed-{seed}.mp4" for seed in range(4)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -71,6 +72,46 @@ def test_rollouts_are_joined_to_whole_episodes(wait_all: bool) -> None:
         np.testing.assert_array_equal(episode.terminated, [False, False, True])
         assert not episode.truncated.any()
         assert episode.action.shape == (3, 1)
+
+
+class Dying(Counting):
+    """The worker that executes its second step for the first time dies."""
+
+    def __init__(self, marker: Path) -> None:
+        super().__init__()
+        self._marker = marker
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        if self._step == 1 and not self._marker.exists():
+            self._marker.touch()
+            os._exit(1)
+        return super().step(action)
+
+
+@pytest.mark.parametrize("snapshot_every", [None, 1])
+def test_an_episode_that_lost_its_begin_is_left_out(
+    tmp_path: Path, snapshot_every: int | None
+) -> None:
+    """With its worker, which was replaced by one that begins anew, or in the middle."""
+    entry: dict[str, Any] = {"name": "env", "make_env": lambda: Dying(tmp_path / "marker")}
+    if snapshot_every is not None:
+        entry |= {"on_worker_death": "resume", "snapshot_every": snapshot_every}
+    with sync.build_env_group(entry) as group, group.auto_reset(9):
+        rollout = Collector(group, halves, num_transitions=9, wait_all=True).collect()
+    episodes = EpisodeJoiner().add(rollout)
+    for episode in episodes:
+        np.testing.assert_array_equal(episode.observation["agent_pos"][:, 1], range(4))
+    assert len(episodes) == 2
+
+
+def test_an_episode_with_its_begin_in_a_rollout_that_was_not_added_is_left_out() -> None:
+    with sync.build_env_group({"name": "env", "make_env": Counting}) as group, group.auto_reset(9):
+        collector = Collector(group, halves, num_transitions=2, wait_all=True)
+        rollouts = [collector.collect() for _ in range(2)]
+        joiner = EpisodeJoiner()
+        assert joiner.add(rollouts[1]) == []
+        (episode,) = joiner.add(collector.collect())
+        assert episode.observation["agent_pos"][0].tolist() == [2.0, 0.0]
 
 
 @pytest.mark.simulators

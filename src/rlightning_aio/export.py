@@ -73,18 +73,22 @@ class EpisodeJoiner:
             raise ValueError("episodes of several agents can't be exported")
         done, first = rollout.done.reshape(-1), rollout.first.reshape(-1)
         ends = {int(position): k for k, position in enumerate(rollout.ends)}
+        lengths: dict[int, list[int]] = {}
+        for ended in rollout.episodes:
+            lengths.setdefault(ended.index, []).append(ended.length)
         found: list[WholeEpisode] = []
         for index, rows in _segments(rollout, ends):
             if first[rows[0]]:
                 self._open[index] = []
-            if index not in self._open:
-                continue  # Its begin is in no rollout.
-            parts = self._open[index]
+            parts = self._open.setdefault(index, [])
             parts.append(_part(rollout, rows))
             if done[rows[-1]]:
                 end = ends[int(rows[-1])]
                 last = mapped(lambda leaf, k=end: leaf[k : k + 1].copy(), rollout.end_observation)
-                found.append(_joined(self._open.pop(index), last))
+                episode = _joined(self._open.pop(index), last)
+                # Shorter if its begin is in no rollout, or a replaced worker resumed it.
+                if len(episode) == lengths[index].pop(0):
+                    found.append(episode)
         return found
 
 

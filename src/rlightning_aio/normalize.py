@@ -1,8 +1,10 @@
 """Running normalisation of observations and rewards, in the trainer.
 
-Each env has its own statistics, so results equal those of Gymnasium's `NormalizeObservation` and
-`NormalizeReward` around each env. A batch takes a few operations on whole arrays; workers do
-nothing. Left out: torch, whose CPU tensors share the arrays.
+Each env has its own statistics, by the formulas of Gymnasium's `NormalizeObservation` and
+`NormalizeReward` around each env. Unlike theirs, the discounted return starts again with each
+episode: Gymnasium's drops what was before a termination one step early, and never starts again
+after a truncation. A batch takes a few operations on whole arrays; workers do nothing. Left out:
+torch, whose CPU tensors share the arrays.
 """
 
 from __future__ import annotations

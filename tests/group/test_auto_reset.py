@@ -223,7 +223,7 @@ async def test_a_limit_counts_the_steps_of_one_episode(
             batch, flags = await group.step(batch.respond(action=0 * batch.observation))
             assert flags == [False]
             in_turn = turn % (3 if mode == AutoresetMode.SAME_STEP else 4)
-            assert batch.observation.tolist() == [[in_turn] * num_envs]
+            assert batch.observation.reshape(-1).tolist() == [in_turn] * num_envs
 
 
 def test_a_limit_is_a_positive_int_or_infinite() -> None:

@@ -7,9 +7,12 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import batch_space
 
 from rlightning_aio import ENVS, BaseEnv, BatchedData, EnvConfig, EnvRet, PolicyResponse, sync
+from rlightning_aio.evaluation.outcomes import success_of
+from rlightning_aio.vector import VectorEnv
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -98,3 +101,42 @@ def test_success_is_counted_where_an_episode_ends(backend: str, placement: str) 
         assert found["success_rate"] == 0.5
         assert found["fail_rate"] is None
         assert again[f"{config.name}-0"]["success_rate"] is None
+
+
+class Judged(gym.Env[Any, Any]):
+    """Its episodes have three steps. Each ends with success, and each reset reports a failure."""
+
+    observation_space = action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        self.count = 0
+        return 0, {"success": False}
+
+    def step(self, action: Any) -> Any:
+        self.count += 1
+        ended = self.count == 3
+        return 0, 1.0, ended, False, {"success": True} if ended else {}
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+@pytest.mark.parametrize("num_envs", [1, 2])
+def test_the_verdict_of_the_next_reset_does_not_count(mode: AutoresetMode, num_envs: int) -> None:
+    """For single envs and for envs that are stepped together."""
+    makers: list[Any] = [Judged]
+    if num_envs > 1:
+        makers = [lambda: SyncVectorEnv([Judged] * num_envs, autoreset_mode=mode)]
+    envs = VectorEnv(makers, autoreset_mode=mode, placement="inline")
+    envs.reset()
+    for _ in range(12):
+        envs.step(np.zeros(num_envs, np.int64))
+    assert envs.group.get_env_stats()["env-0"]["success_rate"] == 1.0
+    envs.close()
+
+
+def test_a_last_info_without_a_verdict_has_none() -> None:
+    """The first info of the next episode has none about the last one."""
+    both = {"success": False, "final_info": {"reward": 1.0}}
+    assert success_of(both) is None
+    masks = {"_final_info": np.array([True, False]), "_success": np.array([True, True])}
+    assert success_of({**both, **masks, "success": np.array([False, True])}, 0) is None
+    assert success_of({**both, **masks, "success": np.array([False, True])}, 1) is True

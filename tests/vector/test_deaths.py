@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from faults.driven import kill, stop
-from gymnasium.vector import AutoresetMode
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import vector as wrappers
 from vector.toys import Mortal, assert_alike
 
@@ -400,3 +403,63 @@ def test_a_rollout_buffer_begins_an_episode_after_a_death(sb3_mortals: Any) -> N
     episodes = model.ep_info_buffer
     ends = sum(int(action) < 4 for action in actions.flatten())
     assert len(episodes) == ends
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.value)
+def test_a_masked_reset_is_refused_where_a_death_has_ended_other_episodes(
+    mode: AutoresetMode,
+) -> None:
+    """The envs of a batch die together, between two calls, and one of them is to be reset."""
+    entry = {"placement": "process", "max_concurrency": 1, "autoreset_mode": mode}
+    envs = make_vec("Hopper-v5", 3, vector_kwargs=entry)
+    envs.reset(seed=0)
+    envs.step(np.zeros((3, 3), np.float32))
+    (worker,) = envs.group.get_workers()
+    os.kill(worker["pid"], signal.SIGKILL)
+    with pytest.raises(ResetNeeded, match="reset_mask leaves out"):
+        envs.reset(options={"reset_mask": np.array([False, True, False])})
+    with pytest.raises(ResetNeeded):
+        envs.step(np.zeros((3, 3), np.float32))
+    envs.reset()
+    envs.step(np.zeros((3, 3), np.float32))
+    envs.close()
+
+
+class Walk(gym.Env[Any, Any]):
+    """Observes its number of steps; action 2 ends the episode, and action 3 its worker."""
+
+    observation_space = gym.spaces.Box(-1, 99, (1,), np.float64)
+    action_space = gym.spaces.Discrete(4)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        self.count = 0
+        return np.zeros(1), {}
+
+    def step(self, action: Any) -> Any:
+        if action == 3:
+            os._exit(1)
+        self.count += 1
+        return np.array([float(self.count)]), 1.0, bool(action == 2), False, {}
+
+
+@pytest.mark.parametrize("on_worker_death", ["restart", "resume"])
+def test_a_masked_reset_is_refused_where_a_neighbour_has_taken_the_worker_along(
+    on_worker_death: str,
+) -> None:
+    """The batch to be reset had answered the step in which the other batch died."""
+    off = AutoresetMode.DISABLED
+    maker = lambda: SyncVectorEnv([Walk] * 2, autoreset_mode=off)  # noqa: E731
+    config: Any = {"on_worker_death": on_worker_death, "envs_per_process": 2}
+    if on_worker_death == "resume":
+        config["snapshot_every"] = 1
+    envs = VectorEnv([maker] * 2, autoreset_mode=off, **config)
+    envs.reset(seed=0)
+    envs.step(np.zeros(4, np.int64))
+    _, _, terminated, truncated, _ = envs.step(np.array([2, 0, 0, 3]))
+    mask = terminated | truncated
+    assert mask.tolist() == [True, False, True, True]
+    with pytest.raises(ResetNeeded, match="reset_mask leaves out"):
+        envs.reset(options={"reset_mask": mask})
+    assert envs.reset()[0].tolist() == [[0.0]] * 4
+    assert envs.step(np.zeros(4, np.int64))[0].tolist() == [[1.0]] * 4
+    envs.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import multiprocessing
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -13,6 +14,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from vector.toys import Toy, assert_alike
 
+from rlightning_aio import sync
 from rlightning_aio.envs import mujoco_tasks
 from rlightning_aio.errors import EnvRaised, StartFailed
 from rlightning_aio.vector import VectorEnv, make_vec
@@ -229,3 +231,104 @@ def test_results_after_a_timeout_are_dropped(tmp_path: Path) -> None:
     with pytest.raises(TypeError, match="not a scalar"):
         env.step(np.int64(0))
     env.close()
+
+
+@pytest.mark.parametrize("num_envs", [1, 2, 3, 5])
+def test_a_few_envs_of_a_vector_entry_point_have_the_shapes_of_gymnasiums(num_envs: int) -> None:
+    """Also where each core could have one of them."""
+    ours = make_vec("CartPole-v1", num_envs, "vector_entry_point")
+    theirs = gym.make_vec("CartPole-v1", num_envs, vectorization_mode="vector_entry_point")
+    assert ours.action_space == theirs.action_space
+    assert ours.reset(seed=0)[0].shape == theirs.reset(seed=0)[0].shape
+    ours.step(np.zeros(num_envs, np.int64))
+    ours.set_attr("gravity", 5.0)
+    assert ours.get_attr("gravity") == (5.0,) * num_envs
+    ours.close()
+    theirs.close()
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.value)
+def test_vector_environments_of_one_are_that_env(mode: AutoresetMode) -> None:
+    """Two of them return what a vector environment of two returns."""
+    theirs = SyncVectorEnv([Toy, Toy], autoreset_mode=mode)
+    maker = functools.partial(SyncVectorEnv, [Toy], autoreset_mode=mode)
+    ours = VectorEnv([maker, maker], autoreset_mode=mode, **INLINE)
+    assert_alike(ours.reset(seed=3), theirs.reset(seed=3))
+    for actions in np.random.default_rng(0).integers(0, 3, (40, 2)):
+        expected = theirs.step(actions)
+        assert_alike(ours.step(actions), expected)
+        ended = expected[2] | expected[3]
+        if mode == AutoresetMode.DISABLED and ended.any():
+            options = {"reset_mask": ended, "more": 1}
+            assert_alike(ours.reset(options=dict(options)), theirs.reset(options=options))
+    ours.set_attr("speed", [0.5, 2.0])
+    assert ours.get_attr("speed") == (0.5, 2.0)
+    assert ours.call("double", 3, plus=1) == theirs.call("double", 3, plus=1)
+    assert_alike(ours.render(), theirs.render())
+    ours.close()
+    theirs.close()
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.value)
+def test_an_entry_of_vector_environments_of_one_has_results_of_single_envs(
+    mode: AutoresetMode,
+) -> None:
+    """Results have no axis for the only sub-environment; a snapshot holds its state."""
+    makers: dict[str, Any] = {
+        "wrapped": lambda: SyncVectorEnv([lambda: gym.make("CartPole-v1")], autoreset_mode=mode),
+        "plain": lambda: gym.make("CartPole-v1"),
+    }
+    found: list[Any] = []
+    for make in makers.values():
+        config: Any = {"name": "e", "make_env": make}
+        with sync.build_env_group(config) as group, group.auto_reset(math.inf):
+            batch, _ = group.reset(seed=1)
+            rewards = 0
+            for _ in range(40):
+                batch, _ = group.step(batch.respond(action=np.ones(1, np.int64)))
+                rewards += batch.reward[0]
+            saved = group.snapshot()
+            group.step(batch.respond(action=np.zeros(1, np.int64)))
+            batch, _ = group.restore(saved)
+            found.append((batch.observation, rewards, group.get_env_stats()["e-0"]["episodes"]))
+    if mode == AutoresetMode.SAME_STEP:  # Its resets take no steps.
+        found = [one[2] > 3 for one in found]
+    assert_alike(found[0], found[1])
+
+
+class Talking(gym.vector.VectorEnv[Any, Any, Any]):
+    """Two envs that report `words` in each info."""
+
+    metadata: ClassVar = {"autoreset_mode": AutoresetMode.NEXT_STEP}
+    num_envs = 2
+    single_observation_space = single_action_space = gym.spaces.Discrete(3)
+    observation_space = action_space = gym.spaces.MultiDiscrete([3, 3])
+
+    def __init__(self, words: Any) -> None:
+        self._words = words
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        return np.zeros(2, np.int64), {"words": self._words}
+
+    def step(self, actions: Any) -> Any:
+        return (
+            np.zeros(2, np.int64),
+            np.zeros(2),
+            *np.zeros((2, 2), np.bool_),
+            {"words": self._words},
+        )
+
+
+@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [(["a", "b"], ["a", "b"]), (["a"], [["a"]] * 2), (("a", "b", "c"), [("a", "b", "c")] * 2)],
+)
+def test_a_list_in_infos_is_of_each_env_if_it_has_as_many_values(
+    words: Any, expected: list[Any], count: int
+) -> None:
+    envs = VectorEnv([lambda: Talking(words)] * count, **INLINE)
+    for infos in (envs.reset()[1], envs.step(np.zeros(2 * count, np.int64))[4]):
+        assert infos["words"].tolist() == expected * count
+        assert infos["_words"].all()
+    envs.close()

@@ -9,7 +9,7 @@ users.
 from __future__ import annotations
 
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from rlightning_aio.batch.sent import Sources
 
 __all__ = [
+    "all_agents",
     "columns_of_responses",
     "ended_episodes",
     "has_ended",
@@ -130,3 +131,10 @@ def names_of(batch: BatchedData) -> EnvNames | None:
 def columns_of_responses(batch: BatchedData) -> Mapping[str, Any] | None:
     """Columns of a batch made by `BatchedData.respond`; None for any other batch."""
     return batch._columns
+
+
+def all_agents(done: Any) -> NDArray[np.bool_]:
+    """Return True for episodes that are over for all of their agents."""
+    if isinstance(done, dict):
+        return np.logical_and.reduce(list(cast("dict[str, Any]", done).values()))
+    return done

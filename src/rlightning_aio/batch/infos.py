@@ -226,8 +226,12 @@ def _of_each(value: Any, num_envs: int) -> NDArray[Any]:
         return value
     if isinstance(value, np.ndarray):
         return np.stack([cast("NDArray[Any]", value)] * num_envs)
-    is_number = isinstance(value, int | float | np.generic)
-    return np.full(num_envs, value, None if is_number else object)
+    if isinstance(value, int | float | np.generic):
+        return np.full(num_envs, value)
+    each = cast("Sequence[Any]", value)
+    if not isinstance(value, list | tuple) or len(each) != num_envs:
+        each = [cast("Any", value)] * num_envs
+    return _filled(dict(enumerate(each)), num_envs, *_NOT_TYPED)
 
 
 def listed(columns: dict[str, Any], count: int) -> list[dict[str, Any]]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from rlightning_aio.batch.contents import ended_episodes, plain_columns
+from rlightning_aio.batch.contents import all_agents, ended_episodes, plain_columns
 from rlightning_aio.batch.infos import joined_infos, listed
 from rlightning_aio.collecting.rollout import EndedEpisode
 from rlightning_aio.collecting.trees import rows_of
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from rlightning_aio.batch import BatchedData
 
-__all__ = ["ResultRows", "all_agents", "result_rows"]
+__all__ = ["ResultRows", "result_rows"]
 
 
 @dataclass(slots=True)
@@ -170,10 +170,3 @@ def result_rows(batch: BatchedData) -> ResultRows:
     return ResultRows(
         head, index.reshape(-1), observation, outcome, done.reshape(-1), is_reset, batch
     )
-
-
-def all_agents(done: Any) -> NDArray[np.bool_]:
-    """Return True for episodes that are over for all of their agents."""
-    if isinstance(done, dict):
-        return np.logical_and.reduce(list(cast("dict[str, Any]", done).values()))
-    return done

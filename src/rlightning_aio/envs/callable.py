@@ -11,6 +11,7 @@ import gymnasium as gym
 
 from rlightning_aio.envs.base import BaseEnv, PreprocessFn, result_of
 from rlightning_aio.envs.gymnasium import GymnasiumEnv, outdated_assets_accepted
+from rlightning_aio.envs.only_sub_env import OnlySubEnv
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.registry import load
 
@@ -81,7 +82,7 @@ class _GivenEnv(GymnasiumEnv):
 
     def _make(self) -> Any:
         made, config = self._made, self.config
-        is_vector = isinstance(made, gym.vector.VectorEnv)
+        is_vector = isinstance(self._made, gym.vector.VectorEnv)
         if config.num_envs not in (1, made.num_envs if is_vector else 1):
             raise ConfigError(
                 f"entry {config.name!r}, num_envs: {config.num_envs}, but its callable returned "
@@ -89,7 +90,7 @@ class _GivenEnv(GymnasiumEnv):
                 "num_envs out"
             )
         if config.max_episode_steps is None:
-            return made
+            return OnlySubEnv(made) if is_vector and made.num_envs == 1 else made
         if is_vector:
             raise ConfigError(
                 f"entry {config.name!r}, max_episode_steps: a vector env keeps its own limits; set "

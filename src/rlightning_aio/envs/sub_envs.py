@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 import gymnasium as gym
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
+from rlightning_aio.envs.only_sub_env import OnlySubEnv
 from rlightning_aio.envs.same_step import SameStep
 from rlightning_aio.envs.wrappers import ClassName, autoreset_mode_of, has_wrapper
 from rlightning_aio.errors import ConfigError
@@ -64,7 +65,7 @@ class _Adapted:
                 f"{type(vector).__name__} has autoreset_mode {own}, not {self._mode}; use the same "
                 "mode for both"
             )
-        return SubEnvs(vector)
+        return OnlySubEnv(vector) if vector.num_envs == 1 else SubEnvs(vector)
 
 
 # In Gymnasium 1.2 this class takes no type parameters.

@@ -80,7 +80,8 @@ class Filming:
             self._filmed.remove(env_id)
             folder = self._folder(env_id)
             if not self.video.failed_only or record.success is False:
-                for film in folder.glob("*-episode-0.mp4"):
+                # A step limit of the group ends an episode, but not its film.
+                for film in folder.glob("*-episode-0*.mp4"):
                     finish_file(film, Path(self.video.folder, _name(record)))
             shutil.rmtree(folder, ignore_errors=True)
 

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar, overload
 
 import numpy as np
 
+from rlightning_aio.batch.contents import all_agents
 from rlightning_aio.collecting.procedure import Procedure, run
-from rlightning_aio.collecting.results import all_agents
 from rlightning_aio.errors import EnvBusy, RLightningError
 from rlightning_aio.evaluation.episodes import Episode, Evaluation, check_numbers
 from rlightning_aio.evaluation.outcomes import responses, success_of, summed_rewards

@@ -49,12 +49,13 @@ def summed_rewards(reward: Any) -> NDArray[np.float64]:
 def success_of(info: dict[str, Any], sub_env: int = 0) -> bool | None:
     """Read the success of an episode from its last info, or from the ``final_info`` in it."""
     final: Any = info.get("final_info")
-    places: list[Any] = [final, info] if isinstance(final, dict) else [info]
-    for found in places:
-        for key in _VERDICTS:
-            given, known = found.get(key), found.get(f"_{key}")
-            if given is not None and (known is None or known[sub_env]):
-                # It may be a tensor on another device.
-                array = np.asarray(given.tolist() if hasattr(given, "tolist") else given)
-                return bool(array.reshape(-1)[sub_env if array.size > 1 else 0])
+    marked: Any = info.get("_final_info")
+    if isinstance(final, dict) and (marked is None or marked[sub_env]):
+        info = cast("dict[str, Any]", final)  # The rest is about the next episode.
+    for key in _VERDICTS:
+        given, known = info.get(key), info.get(f"_{key}")
+        if given is not None and (known is None or known[sub_env]):
+            # It may be a tensor on another device.
+            array = np.asarray(given.tolist() if hasattr(given, "tolist") else given)
+            return bool(array.reshape(-1)[sub_env if array.size > 1 else 0])
     return None

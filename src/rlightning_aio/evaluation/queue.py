@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from rlightning_aio.collecting.results import all_agents
+from rlightning_aio.batch.contents import all_agents
 from rlightning_aio.errors import EnvFault, WorkerDied
 from rlightning_aio.evaluation.episode_video import EpisodeVideo, Filming
 from rlightning_aio.evaluation.outcomes import responses, success_of, summed_rewards

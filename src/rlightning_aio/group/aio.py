@@ -371,7 +371,7 @@ class EnvGroup(GroupInterface):
         Raises:
             UnknownEnv: no env of this group has that id.
         """
-        return EnvEpisode(self[env_id], seed, options)
+        return EnvEpisode(self, self[env_id], seed, options)
 
     async def offload(self) -> None:
         await self._driver.run(self._core.calls.call_all(time.monotonic(), "offload"))

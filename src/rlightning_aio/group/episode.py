@@ -9,11 +9,17 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any, Self
 
+from rlightning_aio.batch.contents import all_agents
+from rlightning_aio.group.facade import only_result, steps_of
+
 if TYPE_CHECKING:
     from collections.abc import Coroutine
 
-    from rlightning_aio.group.interface import EnvHandleInterface
+    from rlightning_aio.batch import BatchedData
+    from rlightning_aio.group.interface import EnvHandleInterface, GroupInterface
     from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
+
+    Answer = Coroutine[Any, Any, tuple[BatchedData, Any]]
 
 __all__ = ["EnvEpisode"]
 
@@ -24,21 +30,29 @@ class EnvEpisode:
     Attributes:
         env: the handle of the env.
         last: its newest result; after entry that of the reset.
+        is_over: the newest result has ended the episode, of all agents and sub-environments; a
+            step limit of `auto_reset` ends it, too.
     """
 
     last: EnvRet | MultiAgentEnvRet
+    is_over: bool
 
     def __init__(
-        self, env: EnvHandleInterface, seed: int | None, options: dict[str, Any] | None
+        self,
+        group: GroupInterface,
+        env: EnvHandleInterface,
+        seed: int | None,
+        options: dict[str, Any] | None,
     ) -> None:
-        self.env = env
+        self._group, self.env = group, env
         self._seed, self._options = seed, options
         # The newest call, and earlier ones that were cancelled or raised.
-        self._tasks: list[asyncio.Task[EnvRet | MultiAgentEnvRet]] = []
+        self._tasks: list[asyncio.Task[tuple[BatchedData, Any]]] = []
 
     async def __aenter__(self) -> Self:
         try:
-            await self._wait_for(self.env.reset(self._seed, self._options))
+            seeds = None if self._seed is None else [self._seed]
+            await self._wait_for(self._group.reset(seeds, self._options, [self.env.env_id]))
         except BaseException:
             await self.__aexit__()  # Nobody else calls it for a context that was not entered.
             raise
@@ -51,24 +65,19 @@ class EnvEpisode:
             # Read, so that asyncio doesn't log an error that nobody asks for.
             _ = task.cancelled() or task.exception()
 
-    @property
-    def is_over(self) -> bool:
-        """True if the newest result ended the episode."""
-        return bool(self.last.last_terminated or self.last.last_truncated)
-
     async def step(self, response: PolicyResponse | Any) -> EnvRet | MultiAgentEnvRet:
         """Step with a `PolicyResponse`, or with a bare action, and wait for the result.
 
         Cancelled, it leaves the result to the end of the episode; until the env has replied,
         further steps raise `EnvBusy`. Other errors are those of `EnvHandle.step`.
         """
-        return await self._wait_for(self.env.step(response))
+        await self._wait_for(self._group.step(steps_of(self.env.env_id, response)))
+        return self.last
 
-    async def _wait_for(
-        self, answer: Coroutine[Any, Any, EnvRet | MultiAgentEnvRet]
-    ) -> EnvRet | MultiAgentEnvRet:
+    async def _wait_for(self, answer: Answer) -> None:
         task = asyncio.ensure_future(answer)
         self._tasks.append(task)
-        self.last = await asyncio.shield(task)
+        found = await asyncio.shield(task)
         self._tasks.remove(task)
-        return self.last
+        self.last = only_result(found)
+        self.is_over = bool(all_agents(found[0].done).all())

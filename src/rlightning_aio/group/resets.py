@@ -99,8 +99,7 @@ class Resets:
         seeds = self._seeds_for(slots, seed, now)
         self._dispatch.check_sendable(slots, "reset")
         packed = self._packed_resets(slots, seeds, options)
-        self._continuity.note_resets(slots.tolist())
-        self._submit_resets(slots, seeds, packed, COLLECTOR, now)
+        self._send(slots, seeds, options, packed, COLLECTOR, now)
 
     def show_restored(
         self, now: float, slots: NDArray[np.intp]
@@ -131,7 +130,6 @@ class Resets:
         joined = self._requests.joined(slots)
         self._dispatch.check_sendable(slots[~joined], "reset")
         packed = self._packed_resets(slots, seeds, options)
-        self._continuity.note_resets(slots.tolist())
         ticket = self._requests.tickets.open(slots)
         asked = slots
         if joined.any():
@@ -139,7 +137,7 @@ class Resets:
             self._take_first_results(slots[joined], ticket, enough=enough)
             if enough:
                 asked, seeds = slots[~joined], seeds[~joined]
-        self._submit_resets(asked, seeds, packed, ticket.owner, now)
+        self._send(asked, seeds, options, packed, ticket.owner, now)
         yield from self._waiting.until_replied(ticket)
         return ticket, slots
 
@@ -155,6 +153,29 @@ class Resets:
         self, slots: NDArray[np.intp], seeds: NDArray[np.int64], options: dict[str, Any] | None
     ) -> list[Any] | None:
         return None if options is None else self._dispatch.packed_resets(slots, seeds, options)
+
+    def _send(
+        self,
+        slots: NDArray[np.intp],
+        seeds: NDArray[np.int64],
+        options: dict[str, Any] | None,
+        packed: list[Any] | None,
+        owner: int,
+        now: float,
+    ) -> None:
+        """Send resets.
+
+        A mask resets a part of an env, so it can't make up for a lost episode: such an env is
+        reset as a whole, and its result reports the loss.
+        """
+        if packed and "reset_mask" in (options or {}) and self._continuity.exceptional:
+            within_episode = np.zeros(len(slots), np.bool_)
+            lost, as_lost = self._continuity.report_losses(slots, within_episode)
+            self._submit_resets(slots[lost], as_lost[lost], None, owner, now)
+            slots, seeds = slots[~lost], seeds[~lost]
+            packed = [one for one, gone in zip(packed, lost.tolist(), strict=True) if not gone]
+        self._continuity.note_resets(slots.tolist())
+        self._submit_resets(slots, seeds, packed, owner, now)
 
     def _submit_resets(
         self,

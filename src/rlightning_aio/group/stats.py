@@ -10,7 +10,7 @@ import time
 from collections import Counter, deque
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
@@ -31,6 +31,8 @@ _WINDOW_SAMPLES: Final = 1024
 _WINDOW_SECONDS: Final = 10.0
 _VERDICTS: Final = ("success", "fail")
 """Keys of booleans in the info that ends an episode: the env's verdicts on it."""
+_HOLDERS: Final = (*_VERDICTS, "final_info")
+"""Keys of infos that may have them."""
 
 
 @dataclass(slots=True)
@@ -164,7 +166,7 @@ class Stats:
         self._last[slots] = outcomes[:, 1:]
         if part.info_marks is not None or part.out_of_band:
             for row in dict.fromkeys(rows.tolist()):
-                if part.may_hold(row, _VERDICTS):
+                if part.may_hold(row, _HOLDERS):
                     with suppress(
                         Exception
                     ):  # The info may be malformed; its reader gets the error.
@@ -172,13 +174,17 @@ class Stats:
 
     def _note_verdicts(self, slot: int, info: dict[str, Any], ended: NDArray[np.bool_]) -> None:
         """Count the verdicts in `info` on the episodes that have `ended`."""
+        final: Any = info.get("final_info")
+        if isinstance(final, dict):
+            info = cast("dict[str, Any]", final)  # The rest is about the next episode.
         for name, verdicts in self._verdicts.items():
             given: Any = info.get(name)
             # A tensor may be on another device, where NumPy can't read it.
             array = np.asarray(given.tolist() if hasattr(given, "tolist") else given)
             if array.dtype.kind == "b" and array.shape == ended.shape:
-                verdicts.count[slot] += np.count_nonzero(ended)
-                verdicts.true[slot] += np.count_nonzero(array & ended)
+                known = ended & info.get(f"_{name}", True)
+                verdicts.count[slot] += np.count_nonzero(known)
+                verdicts.true[slot] += np.count_nonzero(array & known)
 
     def summary(self) -> dict[str, Any]:
         """The figures that `EnvGroup.get_stats` documents, over the window."""

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio.types import EnvMeta
+    from rlightning_aio.vector.rows import Singles
 
 __all__ = ["VectorEnv", "per_worker"]
 
@@ -203,6 +204,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
 
         Raises:
             TimeoutError: the resets continue; their results will be dropped.
+            ResetNeeded: with a mask, other envs have lost their episodes; reset all.
             NoAsyncCallError: no reset was sent.
         """
         batch = self._finish("reset", timeout, self._collect)
@@ -211,6 +213,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         if mask is None or mask.all():
             found = self._observed(self._rows.observation(batch)), self._rows.infos(batch)
         else:
+            _check_spared(self._rows, batch, mask)
             chosen = np.flatnonzero(mask)
             observations, infos = self._rows.of_mask(batch, mask)
             observations = merged(self._observations, observations, chosen, self.num_envs)
@@ -518,6 +521,16 @@ def per_worker(max_concurrency: Any, num_envs: int) -> int:
     if count is None or count < 1:
         raise ValueError(f"max_concurrency must be an int above 0 or None, not {max_concurrency!r}")
     return -(-num_envs // count)
+
+
+def _check_spared(rows: Singles, batch: BatchedData, mask: NDArray[np.bool_]) -> None:
+    """Check that a reset of `mask` has not come with the loss of other envs of a batch."""
+    restarted = rows.flat(batch.index)[rows.flat(batch.restarted)]
+    if not mask[restarted].all():
+        raise ResetNeeded(
+            "a worker has died, and with it the episodes of envs that reset_mask leaves out; "
+            "call reset() without a mask to begin new episodes"
+        )
 
 
 def _seconds(timeout: float | None) -> float | None:
