@@ -19,12 +19,13 @@ ROWS = [*BACKENDS.values(), PIPER]
 
 
 def test_each_backend_has_a_line() -> None:
-    """The line has its name, version and install command in full."""
+    """The line has its name, package, version and install command in full."""
     lines = run("backends").stdout.splitlines()
     for backend in ROWS:
         (line,) = [line for line in lines if line.split()[:1] == [backend.name]]
         assert line.rstrip().endswith(backend.install_command)
-        assert (backend.installed_version() or "not installed") in line
+        version = backend.installed_version() or "not installed"
+        assert f" {backend.distribution} {version} " in line
 
 
 def test_json_has_one_object_for_each_backend() -> None:
@@ -45,7 +46,7 @@ def test_a_missing_simulator_is_listed_as_not_installed(monkeypatch: pytest.Monk
 
 
 def test_env_classes_of_other_packages_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Their lines have their package's version."""
+    """Their lines have their package and its version."""
     distribution = importlib.metadata.distribution("gymnasium")
     point = importlib.metadata.EntryPoint("theirs", "their.module:Env", ENTRY_POINT_GROUP)
     vars(point)["dist"] = distribution
@@ -58,6 +59,7 @@ def test_env_classes_of_other_packages_are_listed(monkeypatch: pytest.MonkeyPatc
     assert invoke_json("backends")[-1] == {
         "name": "theirs",
         "installed": True,
+        "package": "gymnasium",
         "version": distribution.version,
         "install": "pip install gymnasium",
     }

@@ -289,9 +289,9 @@ MISFITS: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "nothing": (
         {"observation": lambda: None},
-        r"expected shape \(5,\) and dtype float64, found shape \(\) and dtype object",
+        r"expected shape \(5,\) and dtype float64, found None",
     ),
-    "ragged": ({"observation": lambda: [[1], [1, 2]]}, "inhomogeneous"),
+    "ragged": ({"observation": lambda: [[1], [1, 2]]}, "found a value of type list"),
     "reward": ({"last_reward": lambda: np.zeros(3)}, r"reward .* shape \(3,\), expected \(\)"),
     "reward of no number": ({"last_reward": lambda: "much"}, "much"),
     "result": (

@@ -18,6 +18,7 @@ __all__ = ["backends"]
 class _Row:
     name: str
     installed: bool
+    package: str
     version: str | None
     install: str
 
@@ -25,7 +26,7 @@ class _Row:
 def backends(
     as_json: AsJson = False,
 ) -> None:
-    """List all backends: whether the simulator is installed here, and how to install it.
+    """List all backends: whether the package they need is installed here, and how to install it.
 
     Backends of plug-ins (entry points of the groups rlightning_aio.backends and
     rlightning_aio.envs) are listed after the built-in ones. Simulators that exclude each other
@@ -43,13 +44,13 @@ def backends(
     if as_json:
         print_json([asdict(row) for row in rows])
         return
-    table = named_columns("Backends", "backend", "version", "install")
+    table = named_columns("Backends", "backend", "package", "install")
     table.columns[1].justify = table.columns[2].justify = "left"
     for row in rows:
         # Texts, because Rich would take an extra's brackets for markup.
         table.add_row(
             row.name,
-            Text(row.version or "not installed", "" if row.version else "dim"),
+            Text(f"{row.package} {row.version or 'not installed'}", "" if row.version else "dim"),
             Text(row.install, "dim" if row.version else ""),
         )
     print_table(out(), table)
@@ -57,7 +58,8 @@ def backends(
 
 def _row(backend: Backend) -> _Row:
     version = backend.installed_version()
-    return _Row(backend.name, version is not None, version, backend.install_command)
+    package, command = backend.distribution, backend.install_command
+    return _Row(backend.name, version is not None, package, version, command)
 
 
 def _points(group: str) -> list[importlib.metadata.EntryPoint]:
@@ -70,7 +72,9 @@ def _plug_in_rows() -> list[Backend]:
 
 def _plug_in_classes(listed: set[str]) -> list[_Row]:
     return [
-        _Row(point.name, True, point.dist.version, f"pip install {point.dist.name}")
+        _Row(
+            point.name, True, point.dist.name, point.dist.version, f"pip install {point.dist.name}"
+        )
         for point in _points(ENTRY_POINT_GROUP)
         if point.dist is not None and point.name not in listed
     ]

@@ -86,7 +86,7 @@ def _row(contender: Contender) -> list[str]:
     return [
         *names,
         count(contender.steps_per_second),
-        f"{contender.spread:.0%}",
+        f"{contender.spread:.0%}" if len(contender.rounds) > 1 else "-",
         *map(duration, contender.latency_us),
         duration(costs.start_seconds * 1e6),
         duration(costs.reset_seconds * 1e6),

@@ -240,7 +240,8 @@ def _as_yaml(config: Path, best: Contender, *, interrupted: bool = False) -> str
     if interrupted:
         lines.insert(0, "Interrupted: not everything was tried.")
     if any(entry.num_envs > 1 for entry in setting.configs):
-        lines.append("With num_envs, one result covers that many sub-environments.")
+        lines.append("With num_envs, a result covers that many sub-environments: columns are")
+        lines.append("[results, num_envs, ...], such as batch.observation, and actions, too.")
     return ("".join(f"# {line}\n" for line in lines) + text).rstrip()
 
 

@@ -343,10 +343,8 @@ class Core:
             except BaseException:
                 self.requests.collector.note_faults(ticket.faults)
                 raise
-            fault.add_note(
-                f"{len(done)} other envs of the same call are done; their results are in "
-                "the error's `results`"
-            )
+            others = "1 other env" if len(done) == 1 else f"{len(done)} other envs"
+            fault.add_note(f"the results of {others} of the same call are in the error's `results`")
         raise fault
 
     def reset(

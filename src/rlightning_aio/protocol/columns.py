@@ -195,11 +195,17 @@ def fitted(value: Any, leaf: Leaf, what: str) -> NDArray[Any]:
     Raises:
         Misfit: it has another shape, another kind of dtype, or numbers out of range.
     """
-    array = np.asarray(value)
+    try:
+        array = np.asarray(value)
+    except ValueError:  # Parts of different shapes.
+        array = np.asarray(None)
     if array.shape != leaf.shape or not np.can_cast(array.dtype, leaf.dtype, "same_kind"):
+        found = f"shape {array.shape} and dtype {array.dtype}"
+        if array.dtype == object and type(value) is not np.ndarray:
+            found = "None" if value is None else f"a value of type {type(value).__name__}"
         raise Misfit(
             f"{what}{leaf.name} doesn't fit its space: expected shape {leaf.shape} and dtype "
-            f"{leaf.dtype}, found shape {array.shape} and dtype {array.dtype}"
+            f"{leaf.dtype}, found {found}"
         )
     beyond = out_of_range(array, leaf.dtype)
     if beyond is not None:
