@@ -669,6 +669,7 @@ def test_the_error_for_an_unknown_name_lists_the_sent_ones() -> None:
     sent = sent_for(1, {"action": np.zeros(1), "value": np.zeros(1)}, of_rows=[0], rows=[0])
     with pytest.raises(AttributeError, match=r"no 'logprob' was sent.*action, value"):
         sent.logprob  # noqa: B018
+    assert repr(sent) == "Sent(1 rows: action, value)"
     with pytest.raises(KeyError, match="nothing"):
         sent_for(1, None, of_rows=[0], rows=[0])["action"]
 

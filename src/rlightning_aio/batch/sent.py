@@ -95,6 +95,9 @@ class Sent:
         """Names of all columns."""
         return list(dict.fromkeys(name for columns, _ in self._groups() for name in columns or ()))
 
+    def __repr__(self) -> str:
+        return f"Sent({len(self._rows)} rows: {', '.join(self.keys()) or 'nothing'})"
+
     def __iter__(self) -> Iterator[str]:
         return iter(self.keys())
 
