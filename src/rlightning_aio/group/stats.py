@@ -167,10 +167,9 @@ class Stats:
         if part.info_marks is not None or part.out_of_band:
             for row in dict.fromkeys(rows.tolist()):
                 if part.may_hold(row, _HOLDERS):
-                    with suppress(
-                        Exception
-                    ):  # The info may be malformed; its reader gets the error.
-                        self._note_verdicts(part.slots.item(row), part.info_of(row), ended[row])
+                    slot = part.slots.item(row)
+                    with suppress(Exception):  # The info may be malformed; its reader gets it.
+                        self._note_verdicts(slot, part.reported_info_of(row), ended[row])
 
     def _note_verdicts(self, slot: int, info: dict[str, Any], ended: NDArray[np.bool_]) -> None:
         """Count the verdicts in `info` on the episodes that have `ended`."""
@@ -179,6 +178,8 @@ class Stats:
             info = cast("dict[str, Any]", final)  # The rest is about the next episode.
         for name, verdicts in self._verdicts.items():
             given: Any = info.get(name)
+            if given is None:
+                continue
             # A tensor may be on another device, where NumPy can't read it.
             array = np.asarray(given.tolist() if hasattr(given, "tolist") else given)
             if array.dtype.kind == "b" and array.shape == ended.shape:
