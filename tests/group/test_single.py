@@ -45,7 +45,7 @@ class Used:
         self.group.init()
         conditions = self.group._core._conditions
         steps = self.group._steps
-        assert (steps._alone or steps._here) is not None
+        assert steps._inline is not None
         self.group._core._first_observations.left.clear()
         conditions.note(FIRST_RESULTS, False)
         if not ordinary:

@@ -316,8 +316,8 @@ class Requests:
             start = end
         return parts
 
-    def step_answered_at_once(self, slot: int, now: float) -> None:
-        """Number a step that was executed without being submitted."""
+    def number_step_at_once(self, slot: int, now: float) -> None:
+        """Number a step that is about to be executed without being submitted."""
         self.numbering.renew(self.alone(slot), _STEP)
         self.sent_ns[slot] = int(now * 1e9)
 

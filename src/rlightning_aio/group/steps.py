@@ -1,10 +1,10 @@
 """`Steps`: the ordinary step, from the actions of a batch to the results of the next one.
 
 Ordinary is a batch that answers the group's own results and goes to envs in worker processes, or
-to the only env of a synchronous group, which lives in this process. Everything else takes the
-general path (`core`), which is correct for all cases. One attribute tells them apart:
-`Conditions.active`. It is asked at the start of each of the three parts (send, wait, hand out), so
-a death or an error in the middle of a step has the rest of it take the general path.
+to envs of one inline host. Everything else takes the general path (`core`), which is correct for
+all cases. One attribute tells them apart: `Conditions.active`. It is asked at the start of each of
+the three parts (send, wait, hand out), so a death or an error in the middle of a step has the rest
+of it take the general path.
 In reading order: validate, write actions, number and publish; wait; verify, gather.
 Absent on purpose: errors of the user's. What is refused is refused by the general path.
 """
@@ -93,9 +93,9 @@ class Steps:
         self._waiting = core.waiting
         self._shares_thread = shares_thread
         self._fence = exchange.new_fence()
-        # The host of the only env of a synchronous group, and of all envs of another group.
+        # The inline host of all envs; also the one of the only env, if the group is synchronous.
+        self._inline: StepsAtOnce | None = None
         self._alone: StepsAtOnce | None = None
-        self._here: StepsAtOnce | None = None
 
     def start(self, now: float) -> Procedure[list[EnvMeta]]:
         """Start the hosts, and find out whether steps of their envs can be ordinary."""
@@ -106,15 +106,14 @@ class Steps:
     def _begin(self) -> None:
         envs, slabs, hosts = self._envs, self._layout.slabs, self._supervisor.hosts
         if len(hosts) == 1 and isinstance(hosts[0], StepsAtOnce):
-            if self._shares_thread or len(envs) > 1:
-                self._here = hosts[0]
-            else:
+            self._inline = hosts[0]
+            if len(envs) == 1 and not self._shares_thread:
                 self._alone = hosts[0]
         in_rings = None not in self._rings
         in_one_slab = len(slabs) == 1 and len(envs) == len(envs.all) > 0
         ordinary = (
             in_one_slab
-            and (in_rings or self._alone is not None or self._here is not None)
+            and (in_rings or self._inline is not None)
             and not envs.any_out_of_band
             and slabs[0].action is not None
         )
@@ -131,7 +130,7 @@ class Steps:
     def step_async(self, batch: BatchedData, now: float) -> None:
         """Send a batch of steps."""
         slots = None if self._conditions.active else self._written(batch)
-        if slots is None or self._alone is not None:
+        if slots is None:
             self._core.step_async(batch, now)
             return
         self._requests.collector.num_awaited += len(slots)
@@ -144,9 +143,9 @@ class Steps:
     ) -> Procedure[tuple[BatchedData, list[bool] | None]]:
         """Send a batch of steps and wait for all of them."""
         slots = None if self._conditions.active else self._written(batch)
-        if slots is None or (self._alone is not None and self._continuity.due[0]):
+        if slots is None:
             return (yield from self._core.step(batch, now))
-        if self._alone is not None:
+        if self._alone is not None and not self._continuity.due[0]:
             self._step_at_once(self._alone, now)
             results, flags = self._hand_out(slots, synchronous=True)
             return results, flags if self._continuity.active else None
@@ -244,8 +243,8 @@ class Steps:
     def _publish(self, slots: NDArray[np.intp], now: float) -> None:
         """Number the requests and give them to their workers."""
         requests = self._requests
-        if self._here is not None:
-            self._publish_here(self._here, slots, now)
+        if self._inline is not None:
+            self._publish_inline(self._inline, slots, now)
             return
         asleep = kernel.submit(
             slots,
@@ -262,7 +261,7 @@ class Steps:
         for ring in asleep:
             ring.wake()
 
-    def _publish_here(self, host: StepsAtOnce, slots: NDArray[np.intp], now: float) -> None:
+    def _publish_inline(self, host: StepsAtOnce, slots: NDArray[np.intp], now: float) -> None:
         """Number the requests and give them to the host of all envs."""
         requests, resets = self._requests, self._continuity.due[slots]
         entries = requests.numbering.renew(slots, _STEP)
@@ -275,7 +274,7 @@ class Steps:
 
     def _step_at_once(self, host: StepsAtOnce, now: float) -> None:
         """Step the only env here and now: there is nobody to wait for."""
-        self._requests.step_answered_at_once(0, now)
+        self._requests.number_step_at_once(0, now)
         try:
             out_of_band = host.step_now()
         except BaseException as error:
@@ -306,7 +305,7 @@ class Steps:
 
     def _turn(self, wanted: int) -> Procedure[None]:
         """One turn of waiting for `wanted` more results; see `Waiting.turn`."""
-        if self._here is not None and (self._step_next(self._here) or self._completions):
+        if self._inline is not None and (self._step_next(self._inline) or self._completions):
             yield TURN
             if self._completions:
                 self._intake.drain()  # An error, with which an ordinary step ends.
@@ -382,7 +381,7 @@ class Steps:
             batch = batch_of_results(parts, self._core, slots, part.names, results.sources(slots))
             self._stats.account(parts, synchronous=synchronous)
             continuity.returned(slots, flagged, verdict)
-            if self._alone is not None or self._here is not None:
+            if self._inline is not None:
                 results.let_go(slots)
             requests.state[slots] = _IDLE
         except BaseException:
