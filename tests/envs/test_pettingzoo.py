@@ -13,6 +13,7 @@ from rlightning_aio import sync
 from rlightning_aio.cli.policies import RandomPolicy
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.errors import ConfigError
+from rlightning_aio.evaluation import evaluate
 from rlightning_aio.types import PolicyResponse
 
 if TYPE_CHECKING:
@@ -208,7 +209,7 @@ def test_every_result_has_all_agents() -> None:
     assert [f["early"] for f in flags] == [here, here] + [terminated] * 3
     assert [f["quitter"] for f in flags] == [here] * 3 + [truncated] * 2
     assert [f["ghost"] for f in flags] == [here, here] + [terminated] * 3
-    assert [f["late"] for f in flags] == [terminated, terminated, here, here, terminated]
+    assert [f["late"] for f in flags] == [here] * 4 + [terminated]
 
 
 def test_absent_agents_observe_zeros_and_get_no_reward() -> None:
@@ -230,6 +231,53 @@ def test_infos_are_by_agent() -> None:
         {"late": {"count": 3}},
         {},
     ]
+
+
+class Relay(ParallelEnv):
+    """`first` ends with step 3; `second` joins in step 2, ends with step 5; `third` never comes."""
+
+    metadata: ClassVar = {"name": "relay"}
+    possible_agents: ClassVar = ["first", "second", "third"]
+
+    def observation_space(self, agent: str) -> Any:
+        return Discrete(9)
+
+    action_space = observation_space
+
+    def reset(self, seed: int | None = None, options: Any = None) -> Any:
+        self.agents, self.count = ["first"], 0
+        return {"first": 0}, {}
+
+    def step(self, actions: dict[str, Any]) -> Any:
+        self.count += 1
+        seen = [*self.agents, *(["second"] if self.count == 2 else [])]
+        terminated = {agent: self.count == (3 if agent == "first" else 5) for agent in seen}
+        self.agents = [agent for agent in seen if not terminated[agent]]
+        flags = dict.fromkeys(seen, False)
+        return dict.fromkeys(seen, self.count), dict.fromkeys(seen, 1.0), terminated, flags, {}
+
+
+def relay(**_: Any) -> ParallelEnv:
+    return Relay()
+
+
+@pytest.mark.parametrize(("limit", "length"), [(None, 5), (4, 4)])
+def test_an_episode_waits_for_agents_that_join_late(limit: int | None, length: int) -> None:
+    """But not for those that don't come while others are left."""
+    fields = {} if limit is None else {"max_episode_steps": limit}
+    config = {"name": "r", "backend": "pettingzoo", "task": f"{HERE}:relay", **fields}
+    nothing = {agent: [0] for agent in Relay.possible_agents}
+    with sync.build_env_group({**config, "placement": "inline"}) as group:
+        with group.auto_reset(limit or 99):
+            batch, _ = group.reset()
+            resets = []
+            for _ in range(2 * (length + 1)):
+                batch, _ = group.step(batch.respond(action=nothing))
+                resets.append(bool(batch.is_reset[0]))
+            assert resets == ([False] * length + [True]) * 2
+        with group.auto_reset(limit or 99):
+            found = evaluate(group, lambda batch: nothing, episodes=2)
+    assert [episode.total_reward for episode in found.episodes] == [3.0 + length - 1] * 2
 
 
 def test_the_step_limit_truncates_the_remaining_agents() -> None:

@@ -182,6 +182,69 @@ def test_an_env_in_flight_accepts_another_request(group: EnvGroup) -> None:
     assert sorted(batch.ids()) == sorted([*ids, ids[0]])
 
 
+def one_wants(ids: Any, wish: str) -> BatchedData:
+    """Steps of all `ids`; the last one grants a wish (rl_envs.py)."""
+    batch = responses(ids)
+    batch[ids[-1]].wants = wish
+    return batch
+
+
+@pytest.mark.parametrize("how", [{"wait_all": True}, {"timeout": 5.0}, {}])
+def test_an_error_loses_no_result_of_the_others(group: EnvGroup, how: dict[str, Any]) -> None:
+    """The next `collect_async` calls return them."""
+    ids = group.env_ids
+    group.step_async(one_wants(ids, "an error"))
+    found, errors = list[str](), 0
+    while len(found) + errors < len(ids):
+        try:
+            batch, _ = group.collect_async(**how)
+        except EnvRaised:
+            errors += 1
+        else:
+            assert len(batch)
+            found += batch.ids()
+    assert (sorted(found), errors) == (sorted(ids[:-1]), 1)
+
+
+def test_an_error_in_a_step_has_the_results_of_the_others(group: EnvGroup) -> None:
+    """No later call returns them again."""
+    ids = group.env_ids
+    with pytest.raises(EnvRaised, match="as asked") as caught:
+        group.step(one_wants(ids, "an error"))
+    assert list(caught.value.results.ids()) == ids[:-1]
+    assert [ret.observation[1] for ret in caught.value.results.values()] == [1.0] * 2
+    group.step(responses(ids[:-1]))
+    group.step_async(responses(ids[:-1]))
+    batch, _ = group.collect_async(wait_all=True)
+    assert [ret.observation[1] for ret in batch.values()] == [3.0] * 2
+
+
+def test_an_unknown_id_is_named_before_anything_is_sent(group: EnvGroup) -> None:
+    """Also where other envs of the batch are due for a reset."""
+    ids = group.env_ids
+    with group.auto_reset():  # The limit of all is 9.
+        group.reset()
+        for _ in range(9):
+            group.step(responses(ids))
+        with pytest.raises(KeyError, match="nobody"):
+            group.step_async(responses([ids[0], "nobody"]))
+        batch, flags = group.step(responses(ids))
+        assert [ret.observation[1] for ret in batch.values()] == [0.0] * 3
+        assert flags == [False] * 3
+
+
+def test_a_replaced_env_counts_its_steps_anew() -> None:
+    """The limit is that of the new episode."""
+    with contextlib.closing(build_env_group(entry("counting"))) as group, group.auto_reset(3):
+        group.reset()
+        group.step(responses(group.env_ids))
+        batch, flags = group.step(one_wants(group.env_ids, "an end"))
+        assert (batch.values()[0].observation[1], flags) == (0.0, [False])
+        for step in range(1, 4):
+            batch, flags = group.step(responses(group.env_ids))
+            assert (batch.values()[0].observation[1], flags) == (float(step), [step == 3])
+
+
 def test_statistics_are_means_over_all_envs(group: EnvGroup) -> None:
     """The means are of `episode_info` in results; then every env's rollout is finished."""
     group.get_env_stats(reset=True)

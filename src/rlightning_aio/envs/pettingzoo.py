@@ -1,7 +1,7 @@
 """`pettingzoo`: any parallel environment of PettingZoo, all its agents in each result.
 
 Rule: every result covers every possible agent in the same order, so that a group can lay
-them out once; an agent that doesn't take part counts as terminated.
+them out once; an agent that has left counts as terminated or truncated.
 Left out: turn-based (AEC) environments; PettingZoo converts those itself.
 """
 
@@ -41,9 +41,10 @@ class PettingZooEnv(BaseEnv):
     whose ``parallel_env`` is called; or ``module:function`` for a function of another name.
 
     ``agents`` are the environment's possible agents, and its spaces are Dicts over them.
-    An agent that has left before the episode's end, or hasn't joined yet, keeps an
-    observation of zeros, a reward of 0.0 and the flags it left with (terminated, if it left
-    with none); its action is ignored. Infos are by agent, for agents that reported any.
+    An agent that has left before the episode's end keeps an observation of zeros, a reward of 0.0
+    and the flags it left with (terminated, if it left with none); its action is ignored. So is that
+    of an agent that hasn't joined yet, which is not terminated while any other is left. Infos are
+    by agent, for agents that reported any.
 
     The config's ``max_episode_steps`` truncates the episode for all agents that are left.
     """
@@ -103,7 +104,8 @@ class PettingZooEnv(BaseEnv):
     ) -> MultiAgentEnvRet:
         observations, infos = self.env.reset(seed=seed, options=options)
         self._steps = 0
-        self._terminated = {agent: agent not in observations for agent in self.agents}
+        self._expected = set(self.agents) - set(observations)
+        self._terminated = dict.fromkeys(self.agents, False)
         self._truncated = dict.fromkeys(self.agents, False)
         return self._result(observations, {}, infos)
 
@@ -126,15 +128,18 @@ class PettingZooEnv(BaseEnv):
     ) -> None:
         """Update the agents' flags; `live` took part before the step."""
         there = self.env.agents
+        self._expected -= {*there, *terminated, *truncated}
         for agent in {*live, *there}:
             self._terminated[agent] = bool(terminated.get(agent, False))
             self._truncated[agent] = bool(truncated.get(agent, False))
         for agent in set(live) - set(there):
             # An agent that left has ended, even if the simulator forgot to say so.
             self._terminated[agent] |= not self._truncated[agent]
+        if not there:  # Nobody is waiting for those that are expected.
+            self._terminated |= dict.fromkeys(self._expected, True)
         self._steps += 1
         if self._steps >= (self.config.max_episode_steps or math.inf):
-            self._truncated |= dict.fromkeys(there, True)
+            self._truncated |= dict.fromkeys([*there, *self._expected], True)
 
     def _result(
         self, observations: dict[str, Any], rewards: dict[str, Any], infos: dict[str, Any]

@@ -13,7 +13,7 @@ import time
 import warnings
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from rlightning_aio.errors import EnvFault
+from rlightning_aio.errors import EnvFault, UnknownEnv
 from rlightning_aio.legacy.counter import EnvStepCounter, ThroughputTracker
 from rlightning_aio.legacy.env import default_env_preprocess_fn
 from rlightning_aio.legacy.handles import EnvHandle, ServerHandle
@@ -158,7 +158,7 @@ class EnvGroup:
         """Step the envs of a batch and wait for them. Return the results in the batch's order.
 
         Inside `auto_reset`, the second value has a flag for each env that reached its limit;
-        outside it is None.
+        outside it is None. An error has the results of the other envs as `results`.
         """
         ids = batched_policy_resp.ids()
         for env_id in ids:
@@ -169,9 +169,16 @@ class EnvGroup:
         self._group.settle()
         self._send(batched_policy_resp)
         found: dict[str, ResultRow] = {}
+        faults: list[EnvFault] = []
         while not self._group.pending.isdisjoint(ids):
-            found.update((row.env_id, row) for row in self._group.local_results())
-        batch, flags = self._batch_and_flags([found[env_id] for env_id in ids])
+            try:
+                found.update((row.env_id, row) for row in self._group.local_results())
+            except EnvFault as fault:
+                faults.append(fault)
+        batch, flags = self._batch_and_flags([found[env_id] for env_id in ids if env_id in found])
+        if faults:
+            faults[0].results, faults[0].others = batch, tuple(faults[1:])
+            raise faults[0]
         self.throughput.record("env_throughput_sync", self._num_steps(ids))
         return batch, flags if self._in_auto_reset_context else None
 
@@ -202,16 +209,15 @@ class EnvGroup:
         if not rows and not self._group.pending and not self.env_servers:
             _log.warning("collect_async: nothing was sent, so there is nothing to collect")
             return self._batch_and_flags([])
-        rows = rows or self._group.collected()
-        while wait_all and self._group.pending:
-            rows += self._group.collected(wait_all=True)
-        while self._group.pending and (left := end - time.monotonic()) > 0:
-            try:
-                rows += self._group.collected(deadline=left)
-            except EnvFault:
-                raise  # Among them those of envs that raised `TimeoutError`.
-            except TimeoutError:
-                break
+        try:
+            rows = rows or self._group.collected()
+            while wait_all and self._group.pending:
+                rows += self._group.collected(wait_all=True)
+            while self._group.pending and (left := end - time.monotonic()) > 0:
+                rows += self._within(left)
+        except BaseException:
+            self._group.keep(rows)
+            raise
         self.throughput.record(
             "env_throughput_async", self._num_steps(row.batch_id for row in rows)
         )
@@ -222,6 +228,9 @@ class EnvGroup:
 
     def _send(self, batch: Any) -> None:
         """Step the envs of `batch`, and reset those that the counter has at their limit."""
+        for env_id in batch.ids():
+            if env_id not in self.id_to_env:
+                raise UnknownEnv(f"no env of this group has the id {env_id!r}; nothing was sent")
         counter = self.step_counter
         due: list[str] = []
         steps: list[tuple[str, str, Any]] = []
@@ -248,6 +257,8 @@ class EnvGroup:
         if counter is not None:
             for k, env_id in enumerate(ids):
                 if env_id in self._local_ids:
+                    if rows[k].restarted:
+                        counter.reset(env_id)
                     counter.step(env_id)
                     flags[k] = counter.is_reached_max_steps(env_id)
         return self._names.BatchedData(ids, [row.ret for row in rows]), flags
@@ -276,12 +287,16 @@ class EnvGroup:
 
     def results_within(self, seconds: float | None) -> tuple[Any, ...]:
         """Return results that arrive within `seconds`, for an env_server on its own."""
+        return tuple(row.ret for row in self._within(seconds))
+
+    def _within(self, seconds: float | None) -> list[ResultRow]:
+        """Return the first results that arrive within `seconds`."""
         try:
-            return tuple(row.ret for row in self._group.collected(deadline=seconds))
+            return self._group.collected(deadline=seconds)
         except EnvFault:
-            raise
+            raise  # Among them those of envs that raised `TimeoutError`.
         except TimeoutError:
-            return ()
+            return []
 
     def offload(self) -> None:
         """Make every env free its device memory."""

@@ -31,11 +31,19 @@ __all__ = ["ResultRow", "TranslatedGroup"]
 
 
 class ResultRow(NamedTuple):
-    """A result: its id in batches, the id of its env, and RLightning's `EnvRet`."""
+    """A result.
+
+    Attributes:
+        batch_id: its id in batches.
+        env_id: the id of its env.
+        ret: RLightning's `EnvRet`.
+        restarted: it is the first one of a replaced worker's env.
+    """
 
     batch_id: str
     env_id: str
     ret: Any
+    restarted: bool = False
 
 
 class TranslatedGroup:
@@ -124,7 +132,9 @@ class TranslatedGroup:
         for (part, row), core_id, core_env_id in places:
             batch_id = self._id_of[core_id]
             env_id = batch_id + core_env_id.removeprefix(core_id)
-            rows.append(ResultRow(batch_id, env_id, restored(self._names, part, row, env_id)))
+            restarted = part.restarted is not None and bool(part.restarted[row])
+            ret = restored(self._names, part, row, env_id)
+            rows.append(ResultRow(batch_id, env_id, ret, restarted))
         return rows
 
     def local_results(self) -> list[ResultRow]:
@@ -134,10 +144,14 @@ class TranslatedGroup:
     def settle(self) -> None:
         """Wait for outstanding results of local envs, and keep them for `take_kept`."""
         while not self.pending.isdisjoint(self.local_ids):
-            self._kept += self.local_results()
+            self.keep(self.local_results())
+
+    def keep(self, rows: list[ResultRow]) -> None:
+        """Keep results for `take_kept`."""
+        self._kept += rows
 
     def take_kept(self) -> list[ResultRow]:
-        """Return the results that `settle` has kept, once."""
+        """Return the results that were kept, once."""
         rows, self._kept = self._kept, []
         return rows
 
