@@ -225,7 +225,8 @@ class WorkerDied(EnvFault):
     Attributes:
         exit_code: of the process; negative for a signal; None if unknown.
         stderr_tail: the last lines it wrote to stderr.
-        env_ids: the envs whose outstanding requests this error answers.
+        env_ids: the envs whose requests this error answers: outstanding ones, or new ones that it
+            refuses.
     """
 
     def __init__(

@@ -226,7 +226,7 @@ def test_raise_names_the_env_that_was_being_executed(start: Start) -> None:
 
 @on_one_driver
 def test_raise_gives_up_only_the_envs_of_the_dead_worker(start: Start) -> None:
-    """Every later request to them raises the same cause; the other envs continue."""
+    """Every later request to them raises the cause and names them; the other envs continue."""
     group, tokens = start(two_workers(on_worker_death="raise")), Tokens()
     group.step_async(tokens.steps(group.group.env_ids, {"faulty-0": "exit 3"}))
     with pytest.raises(WorkerDied) as caught:
@@ -235,10 +235,12 @@ def test_raise_gives_up_only_the_envs_of_the_dead_worker(start: Start) -> None:
     batch, _ = group.collect_async(wait_all=True)
     assert sorted(batch.ids()) == ["faulty-2", "faulty-3"]
     tokens.check(batch)
+    refusal = r"faulty-0.* exited with code 3.*nothing was sent to faulty-1"
     for _ in range(3):
-        with pytest.raises(WorkerDied, match="exited with code 3"):
+        with pytest.raises(WorkerDied, match=refusal) as caught:
             group.step_async(tokens.steps(["faulty-2", "faulty-1"]))
-        with pytest.raises(WorkerDied, match="exited with code 3"):
+        assert caught.value.env_ids == ("faulty-1",)
+        with pytest.raises(WorkerDied, match=refusal):
             group.reset(env_ids=["faulty-1"])
         tokens.check(group.step(tokens.steps(["faulty-2", "faulty-3"]))[0])
 

@@ -203,6 +203,28 @@ def test_a_restored_env_resumes_from_the_restored_state(start: Start) -> None:
 
 
 @on_one_driver
+def test_a_snapshot_of_an_env_that_was_taken_back_is_of_one_moment(start: Start) -> None:
+    """State, info and counters are those of the checkpoint, also in its marked result."""
+    entry = {**ENTRY, "num_workers": 2, "make_env": Straight, "snapshot_every": 4}
+    group = start(entry)
+    batch, _ = group.reset(seed=3)
+    with group.group.auto_reset(10):
+        for _ in range(7):
+            batch, _ = group.step(batch.respond(action=[0, 0]))
+        kill(group.group._core.supervisor.hosts[0].pid)
+        batch, _ = group.step(batch.take([0]).respond(action=[0]))
+        assert batch.info()[0]["worker_resumed"] == 3
+        for snapshot in (group.snapshot(["e-0"]), group.snapshot(["e-1"])):
+            batch, _ = group.restore(snapshot, ["e-1"])
+            assert (batch.observation[0][0], batch.info()) == (4, [{"steps": 4}])
+            for step in range(5, 11):
+                batch, at_limit = group.step(batch.respond(action=[0]))
+                assert batch.observation[0][0] == step
+                assert at_limit == [step == 10]
+            assert batch.info()[0]["episode"]["l"] == 10
+
+
+@on_one_driver
 def test_a_death_in_a_restore_does_not_affect_other_envs(start: Start) -> None:
     """They keep their previous state."""
     group = start(

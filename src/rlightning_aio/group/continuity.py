@@ -457,10 +457,15 @@ class Continuity:
         self._ended[part.slots[ended]] = True
 
     def positions(self, slots: NDArray[np.intp]) -> list[Position]:
-        """Return the positions of `slots`, all idle."""
-        return [
-            Position(self._num_steps.item(slot), self._cut.item(slot)) for slot in slots.tolist()
-        ]
+        """Return the positions of `slots`, all idle; after a loss, those of their checkpoints."""
+        found: list[Position] = []
+        for slot in slots.tolist():
+            checkpoint = self._checkpoint(slot) if slot in self._losses else None
+            if checkpoint is not None:
+                found.append(Position(checkpoint.num_steps, is_cut=False))
+            else:
+                found.append(Position(self._num_steps.item(slot), self._cut.item(slot)))
+        return found
 
     # -- checkpoints ------------------------------------------------------------------
 

@@ -125,13 +125,21 @@ class DeathReport:
 
     def error(self, unanswered: NDArray[np.intp]) -> WorkerDied:
         """The error for these slots, with the last lines of the worker's stderr."""
+        return self._error(self.message(unanswered), unanswered)
+
+    def refusal(self, unanswered: NDArray[np.intp], asked: NDArray[np.intp]) -> WorkerDied:
+        """The error for new requests to `asked`, slots of a worker that is not replaced."""
+        names = ", ".join(self._ids(asked))
+        return self._error(f"{self.message(unanswered)}; nothing was sent to {names}", asked)
+
+    def _error(self, message: str, slots: NDArray[np.intp]) -> WorkerDied:
         error = self.kind(
-            self.message(unanswered) + _said(self.death.stderr_tail),
+            message + _said(self.death.stderr_tail),
             env_id=self.envs.env_ids[self.slot],
             exit_code=self.death.exit_code,
             stderr_tail=self.death.stderr_tail,
         )
-        error.env_ids = tuple(self._ids(unanswered))
+        error.env_ids = tuple(self._ids(slots))
         return error
 
     def _ids(self, slots: NDArray[np.intp]) -> list[str]:

@@ -149,11 +149,10 @@ class Results:
             kept: dict[str, Any] = pickle.loads(found) if isinstance(found, bytes) else found or {}
         except Exception:  # noqa: BLE001  # It may hold anything; its reader learns why not.
             return
-        mark = int(slab.info_mark[row])
         info: dict[str, Any] = kept.get("info", {})
-        if mark not in (NO_INFO, PICKLED):
+        mark = int(slab.info_mark[row])  # Left as it is: the env's snapshot reads the row, too.
+        if "info" not in kept and mark not in (NO_INFO, PICKLED):
             info = self._schemas[slot][mark].decode(memoryview(slab.info[row]))
-        slab.info_mark[row] = PICKLED
         self._out_of_band[slot] = {**kept, "info": dict(info)}
         self._conditions.note(BESIDE_ROWS, True)
 
@@ -225,7 +224,7 @@ class Results:
             # Here and not in the row, where envs write their flags only when they change.
             flags[restarted, ..., TRUNCATED] = True
         if self._out_of_band:
-            out_of_band, whole = self._out_of_band_of(slots)
+            out_of_band, whole = self._out_of_band_of(slots, others[0] if width else None)
         if in_rows:
             observation = others[-1]
         else:
@@ -249,15 +248,24 @@ class Results:
             whole_results=whole,
         )
 
-    def _out_of_band_of(self, slots: NDArray[np.intp]) -> tuple[dict[int, Any], bool]:
-        """Return out-of-band data of `slots` by batch row, and True if any is a whole result."""
+    def _out_of_band_of(
+        self, slots: NDArray[np.intp], info_marks: NDArray[np.uint8] | None
+    ) -> tuple[dict[int, Any], bool]:
+        """Return out-of-band data of `slots` by batch row, and True if any is a whole result.
+
+        Mark the infos among it in `info_marks`, gathered from rows that may still mark their own.
+        """
         found: dict[int, Any] = {}
         whole = False
         for row, slot in enumerate(slots.tolist()):
             kept = self._out_of_band.get(slot)
-            if kept is not None:
-                found[row] = kept
-                whole = whole or (type(kept) is dict and "ret" in kept)
+            if kept is None:
+                continue
+            found[row] = kept
+            if type(kept) is dict:
+                whole = whole or "ret" in kept
+                if info_marks is not None and "info" in kept:
+                    info_marks[row] = PICKLED
         return found, whole
 
     def _observations(

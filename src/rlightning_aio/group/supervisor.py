@@ -317,9 +317,10 @@ class Supervisor:
         if not self._any_given_up:
             return
         for record in self._records:
-            failure = record.failure
-            if failure is not None and np.isin(slots, record.slots).any():
-                raise failure()
+            if record.refusal is not None:
+                asked = slots[np.isin(slots, record.slots)]
+                if len(asked):
+                    raise record.refusal(asked)
 
     def submit(
         self, host_id: int, entries: NDArray[np.int64], arguments: Sequence[Any] | None
@@ -390,7 +391,7 @@ class Supervisor:
         self._note_fate("given up" if is_last else "died", exited.host_id, cause)
         if is_last:
             self._requests.lose_host(exited.host_id)
-            self._give_up(record, partial(report.error, owed))
+            self._give_up(record, partial(report.refusal, owed))
             return GivenUp(record.host, owed, report.error)
         _log.warning("%s", report.message(owed))
         self._schedule_restart(record)
@@ -466,10 +467,10 @@ class Supervisor:
         record.hung_slot = record.rebuild_error = None
         return report, cause, is_last
 
-    def _give_up(self, record: HostRecord, failure: Callable[[], WorkerDied]) -> None:
+    def _give_up(self, record: HostRecord, refusal: ErrorFor) -> None:
         record.stage = Stage.FAILED
         record.start_by = record.held = None
-        record.failure = failure
+        record.refusal = refusal
         self._any_given_up = True
         self._update_any_deaths()
 
