@@ -227,7 +227,7 @@ async def test_it_is_awaited_over_an_asynchronous_group() -> None:
     entry = {"name": "env", "make_env": scripted(lambda _: True), "placement": "inline"}
     async with rl.build_env_group(entry) as group:
         with group.auto_reset(1000):
-            found = await evaluate(group, policy, 2)
+            found = await evaluate(group, policy, np.int64(2))
     assert len(found.episodes) == 2
 
 
@@ -252,6 +252,8 @@ def test_it_needs_a_context_and_its_own_envs() -> None:
         with group.auto_reset(9):
             with pytest.raises(ValueError, match="episodes must be at least 1, not 0"):
                 evaluate(group, nothing, 0)
+            with pytest.raises(ValueError, match="max_attempts is for a queue of episodes"):
+                evaluate(group, nothing, 1, max_attempts=2)  # type: ignore[call-overload]
             other = Episode("other-0", 0, 0, 1.0, 1, None)
             with pytest.raises(
                 ValueError, match=r"'other-0'.* was not played by an env of this group"

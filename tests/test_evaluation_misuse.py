@@ -65,6 +65,13 @@ def test_what_is_no_episode_is_refused() -> None:
         evaluated(group_of(), [("1", 0)])
 
 
+@pytest.mark.parametrize("options", [{"seed": 3}, {"played": []}])
+def test_options_of_a_number_of_episodes_are_refused(options: dict[str, Any]) -> None:
+    """A queue would ignore them."""
+    with pytest.raises(ValueError, match=rf"{next(iter(options))} is for a number of episodes"):
+        evaluated(group_of(), **options)
+
+
 @pytest.mark.parametrize("as_list", [True, False])
 def test_a_policy_must_answer_all_results(as_list: bool) -> None:
     """The episodes of the others would never end."""

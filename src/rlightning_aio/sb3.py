@@ -73,6 +73,8 @@ def make_vec_env(
     Raises:
         ValueError: `vec_env_cls` is another class.
         TypeError: an argument is unknown.
+        ConfigError: ``num_threads`` or ``randomize`` is wrong, or another argument keeps the envs
+            of the task separate.
     """
     vec_envs = import_module("stable_baselines3.common.vec_env")
     if vec_env_cls not in (None, VecEnv, vec_envs.SubprocVecEnv, vec_envs.DummyVecEnv):
@@ -84,8 +86,10 @@ def make_vec_env(
     given = {"env_kwargs": env_kwargs, "vec_env_kwargs": vec_env_kwargs, **more}
     inspect.signature(make).bind(env_id, n_envs, seed, **given)
     fields, kwargs = vec_env_kwargs or {}, {"render_mode": "rgb_array", **(env_kwargs or {})}
-    single = any(more.get(name) for name in _OF_SINGLE_ENVS)
-    if isinstance(env_id, str) and not single and steps_together(spec := spec_of(env_id), kwargs):
+    separate = any(more.get(name) for name in _OF_SINGLE_ENVS)
+    if isinstance(env_id, str) and steps_together(
+        spec := spec_of(env_id), kwargs, separate=separate
+    ):
         kwargs = {"disable_env_checker": True, **kwargs}
         fields = {**imports_of(spec), **fields}
         makers, fields = together(spec, kwargs, n_envs, AutoresetMode.SAME_STEP, fields)

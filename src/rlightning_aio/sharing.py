@@ -1,13 +1,15 @@
-"""The number of cores, and the division of simulations into batches for them."""
+"""The number of cores and threads, and the division of simulations into batches for them."""
 
 from __future__ import annotations
 
 import math
 import os
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-__all__ = ["num_batches", "num_cores"]
+from rlightning_aio.errors import ConfigError
+
+__all__ = ["check_threads", "num_batches", "num_cores"]
 
 _AS_GOOD: Final = 1.15
 """A worker may have this many times its share if that makes batches fewer and larger."""
@@ -38,6 +40,16 @@ def _time_limit(cgroups: Path) -> float | None:
     except (OSError, ValueError):  # Without a limit: no file, or "max".
         return None
     return limit if limit > 0 else None
+
+
+def check_threads(name: str, number: Any) -> None:
+    """Check a number of threads that a user gave as `name`; None leaves the choice to us.
+
+    Raises:
+        ConfigError: it is no int above 0.
+    """
+    if number is not None and (type(number) is not int or number < 1):
+        raise ConfigError(f"{name} is {number!r}, but must be an int above 0")
 
 
 def num_batches(total: int, num_workers: int) -> int:

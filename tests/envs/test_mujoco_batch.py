@@ -380,6 +380,9 @@ def test_randomization_needs_simulations_that_are_stepped_together() -> None:
         MujocoEnv(config)
     with pytest.raises(ConfigError, match="several in each batch"):
         make_vec("Hopper-v5", 1, randomize=RANGES)
+    for options in ({"randomize": RANGES}, {"num_threads": 2}):
+        with pytest.raises(ConfigError, match=f"{next(iter(options))} needs envs that are stepped"):
+            make_vec("Hopper-v5", 2, "async", **options)
 
 
 @pytest.mark.parametrize("placement", ["inline", "process"])
@@ -451,8 +454,9 @@ def test_misuse_is_refused() -> None:
     config = EnvConfig(
         name="x", backend="mujoco", task="Hopper-v5", num_envs=2, env_kwargs={"num_threads": 0}
     )
-    with pytest.raises(ConfigError, match=r"num_threads is 0, but must be an int above"):
-        MujocoEnv(config)
+    for start in (lambda: MujocoEnv(config), lambda: make_vec("Hopper-v5", 2, num_threads=0)):
+        with pytest.raises(ConfigError, match=r"num_threads is 0, but must be an int above"):
+            start()
 
 
 def test_one_of_them_is_rendered() -> None:

@@ -28,7 +28,7 @@ __all__ = ["OWN_NAMES", "EnvKind", "Part"]
 
 @dataclass(slots=True)
 class Part:
-    """ResultRows of one kind from one batch.
+    """The results of one batch from envs of one kind.
 
     Attributes:
         unstored: rows of `results` whose transitions are not stored yet.

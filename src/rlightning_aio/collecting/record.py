@@ -21,7 +21,7 @@ from rlightning_aio.group.sync import EnvGroup as SyncEnvGroup
 from rlightning_aio.sealing import seal, unseal
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
     from rlightning_aio.batch import BatchedData
 
@@ -137,13 +137,13 @@ class RecordedGroup(_WrappedGroup[G]):
         super().__init__(group)
         self.record = Record()
 
-    def collect_async(self, **options: Any) -> Any:
+    def collect_async(self, *args: Any, **options: Any) -> Any:
         """Collect like the wrapped group, awaitable if that is asynchronous."""
-        return run(self._collect(options), self.group)
+        return run(self._collect(lambda: self.group.collect_async(*args, **options)), self.group)
 
-    def _collect(self, options: dict[str, Any]) -> Procedure[tuple[BatchedData, list[bool]]]:
+    def _collect(self, collect: Callable[[], Any]) -> Procedure[tuple[BatchedData, list[bool]]]:
         try:
-            batch, flags = yield lambda: self.group.collect_async(**options)
+            batch, flags = yield collect
         except EnvFault as fault:
             self.record.note([(fault.env_id, _FAULT)])
             raise
@@ -169,14 +169,15 @@ class ReplayedGroup(_WrappedGroup[G]):
         self._kept: dict[str, tuple[BatchedData, bool]] = {}
         self._faults: dict[str, EnvFault] = {}
 
-    def collect_async(self, **options: Any) -> Any:
+    def collect_async(self, *args: Any, **options: Any) -> Any:
         """Collect the next recorded results, awaitable if the wrapped group is asynchronous.
 
         Raises:
             ReplayDiverged: the record has ended; or an env can't answer as recorded, because it has
                 no request or another one, or because its worker was replaced.
         """
-        return run(self._collect(options.get("deadline")), self.group)
+        deadline = args[4] if len(args) > 4 else options.get("deadline")
+        return run(self._collect(deadline), self.group)
 
     def _collect(self, deadline: float | None) -> Procedure[tuple[BatchedData, list[bool]]]:
         if self._place == len(self._record):

@@ -24,7 +24,7 @@ from rlightning_aio.envs.base import (
 from rlightning_aio.envs.tensors import as_numpy
 from rlightning_aio.envs.wrappers import autoreset_mode_of, has_wrapper
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.sharing import num_cores
+from rlightning_aio.sharing import check_threads, num_cores
 from rlightning_aio.types import EnvRet, PolicyResponse
 
 if TYPE_CHECKING:
@@ -97,9 +97,7 @@ class GymnasiumEnv(BaseEnv):
         return result_of(self.env_id, self.env.step(action))
 
     def bare_step(self) -> BareStep | None:
-        # A vector env with one sub-environment has an axis that the row doesn't have.
-        plain = type(self).step is GymnasiumEnv.step and self._is_vector == (self.num_envs > 1)
-        return self.env.step if plain else None
+        return self.env.step if type(self).step is GymnasiumEnv.step else None
 
     def bare_step_async(self) -> tuple[BareStepAsync, BareStepWait] | None:
         background = self._background
@@ -173,11 +171,7 @@ class MujocoEnv(GymnasiumEnv):
     def _make(self) -> Any:
         num_threads = self.config.env_kwargs.pop("num_threads", None)
         randomize = self.config.env_kwargs.pop("randomize", None)
-        if num_threads is not None and (type(num_threads) is not int or num_threads < 1):
-            raise ConfigError(
-                f"env {self.env_id!r}: env_kwargs.num_threads is {num_threads!r}, but must be an "
-                "int above 0"
-            )
+        check_threads(f"env {self.env_id!r}: env_kwargs.num_threads", num_threads)
         if randomize and self.config.num_envs == 1:
             raise ConfigError(
                 f"env {self.env_id!r}: env_kwargs.randomize needs simulations that are stepped "

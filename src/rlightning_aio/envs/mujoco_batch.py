@@ -125,7 +125,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         for k in range(num_envs):
             self._take_back(k)
         self._mode = autoreset_mode
-        self._read_options()
+        self._read_step_limit()
         self._num_steps = np.zeros(num_envs, np.int64)
         # All data of a simulation follow from this state and a number of MuJoCo's steps; 0 means a
         # reset.
@@ -135,8 +135,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         self._ended: NDArray[np.bool_] | None = None
         self._everywhere = np.ones(num_envs, np.bool_)
 
-    def _read_options(self) -> None:
-        """Read the step limit of the env."""
+    def _read_step_limit(self) -> None:
         self._limiter: Any = None
         self._limit: int = np.iinfo(np.int64).max
         for wrapper in wrappers_of(self._made):
@@ -240,7 +239,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         observations, (rewards, terminated, columns) = self._task.stepped(actions)
         self._num_steps += 1
         truncated = self._num_steps >= self._limit
-        # Infos of simulations that were not stepped.
+        # Infos of simulations that have failed or were reset instead.
         apart = {k: {FAILED: cause} for k, cause in failures.items()}
         if due is not None:
             apart |= {k: self._reset(k) for k in np.flatnonzero(due).tolist()}
@@ -276,7 +275,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
 
         Args:
             columns: of all simulations, ``[num_envs, ...]``.
-            apart: the infos of simulations that were not stepped.
+            apart: the infos of simulations that have failed or were reset instead.
         """
         infos, stepped = dict[str, Any](), self._everywhere.copy()
         if not apart:
@@ -369,7 +368,7 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
 
     def _note_options(self, positions: Any) -> None:
         """Read the options of the env, which may have changed; the positions are the last ones."""
-        self._read_options()
+        self._read_step_limit()
         self._task = type(self._task)(self.env, self._simulations)
         self._task.positions = positions
 

@@ -8,7 +8,8 @@ until each sub-environment has played its number; further episodes are ignored.
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING, Any, Final, TypeVar, overload
+from operator import index
+from typing import TYPE_CHECKING, Any, Final, SupportsIndex, TypeVar, overload
 
 import numpy as np
 
@@ -48,7 +49,7 @@ def evaluate(
     *,
     seed: int | None = None,
     min_results: int | None = None,
-    played: Iterable[Episode] = (),
+    played: Iterable[Episode] | None = None,
     on_episode: Callable[[Episode], None] | None = None,
 ) -> Evaluation: ...
 
@@ -61,7 +62,7 @@ def evaluate(
     *,
     seed: int | None = None,
     min_results: int | None = None,
-    played: Iterable[Episode] = (),
+    played: Iterable[Episode] | None = None,
     on_episode: Callable[[Episode], None] | None = None,
 ) -> Coroutine[Any, Any, Evaluation]: ...
 
@@ -73,7 +74,7 @@ def evaluate(
     episodes: Iterable[EpisodeSpec],
     *,
     min_results: int | None = None,
-    max_attempts: int = 3,
+    max_attempts: int | None = None,
     results: ResultsFile | None = None,
     video: EpisodeVideo | None = None,
     on_episode: Callable[[EpisodeRecord], None] | None = None,
@@ -87,7 +88,7 @@ def evaluate(
     episodes: Iterable[EpisodeSpec],
     *,
     min_results: int | None = None,
-    max_attempts: int = 3,
+    max_attempts: int | None = None,
     results: ResultsFile | None = None,
     video: EpisodeVideo | None = None,
     on_episode: Callable[[EpisodeRecord], None] | None = None,
@@ -101,10 +102,10 @@ def evaluate(
     *,
     seed: int | None = None,
     min_results: int | None = None,
-    max_attempts: int = 3,
+    max_attempts: int | None = None,
     results: ResultsFile | None = None,
     video: EpisodeVideo | None = None,
-    played: Iterable[Episode] = (),
+    played: Iterable[Episode] | None = None,
     on_episode: Callable[[Any], None] | None = None,
 ) -> Any:
     """Play episodes with `policy`. Await it if the group is asynchronous.
@@ -113,53 +114,60 @@ def evaluate(
 
     Args:
         group: initialised, without outstanding requests and without env_servers.
-        policy: called with a batch of results (`BatchedData`); returns actions, ``[n, *action]``
-            with one row for each result; or a batch made by `respond`; or a list of such batches,
-            which together answer all results. It may be a coroutine function if the group is
-            asynchronous.
+        policy: called with a batch of results (`BatchedData`). It returns actions ``[n, *action]``,
+            or a batch made by `respond`, or a list of such batches, which together answer all
+            results. It may be a coroutine function if the group is asynchronous.
         episodes: a number of episodes for each env, and for each sub-environment; or a queue of
             episodes, each to be played once by any free env.
-        seed: for a number of episodes: episode n of env k (counting sub-environments, N of them) is
-            reset with the seed ``seed + n * N + k``, so it doesn't depend on earlier episodes. An
-            env whose sub-environments reset themselves gets seeds only for its first episodes.
+        seed: for a number of episodes: episode n of env k (of N, counting sub-environments) has the
+            seed ``seed + n * N + k``; of sub-environments that reset themselves, only the first.
         min_results: number of results to wait for before the policy is called, or all pending
             ones if they are fewer. None is the sum of ``min_results`` of the config entries, or 1.
-        max_attempts: for a queue: an episode that was lost this often has failed.
+        max_attempts: for a queue: an episode that was lost this often has failed; None is 3.
         results: for a queue: the file to save episodes in; those that it has are not played again.
         video: for a queue: the episodes to film.
-        played: for a number of episodes: those of an interrupted evaluation, not played again.
+        played: for a number of episodes: those that were played before.
         on_episode: called with each episode as it ends.
 
-    Of a number of episodes, one that is lost with its worker starts again, with the same seed. Of a
-    queue, one that is lost with its worker or by an exception of its env waits again, for any env;
-    an env whose worker is not replaced leaves the others to play.
+    Of a number of episodes, one that is lost with its worker starts again with the same seed. Of a
+    queue, one that is lost with its worker or by an exception waits again, for any env; an env
+    whose worker is not replaced leaves the others to play.
 
     Raises:
         RuntimeError: the group has no open `auto_reset` context.
-        ValueError: a number is below 1, the group has an env_server, or `played` has duplicates or
-            episodes of other envs. Of a queue: an episode is there twice, no entry of the group or
-            more than one can play it, or an env has sub-environments.
-        RLightningError: an env has ended its worker three times in a row, and so finishes no
-            episode, and `episodes` is a number.
+        ValueError: a number is below 1, an option is meant for the other kind of `episodes`, the
+            group has an env_server, or `played` has duplicates or episodes of other envs. Of a
+            queue: an episode is there twice, no entry of the group or more than one can play it, or
+            an env has sub-environments.
+        RLightningError: of a number of episodes: an env has ended its worker three times in a row.
         BadAction: the policy's actions don't fit; nothing was sent.
         EnvRaised, WorkerDied, EnvHung: as for `EnvGroup.collect_async`; for a queue, only if no env
             is left that could play an episode.
         OSError: nothing can be written into the folder of `video`.
     """
     _check(group, episodes, min_results, max_attempts)
-    if not isinstance(episodes, int):
-        rules = QueueRules(min_results, max_attempts, results, video, on_episode)
-        return run(QueuePlay(group, policy, episodes, rules).to_the_end(), group)
-    play = _Play(group, policy, episodes, seed, min_results)
-    play.take_over(played)
-    play.on_episode = on_episode
+    if isinstance(episodes, SupportsIndex):
+        _refuse("a queue of episodes", max_attempts=max_attempts, results=results, video=video)
+        play = _Play(group, policy, index(episodes), seed, min_results, on_episode)
+        play.take_over(played or ())
+    else:
+        _refuse("a number of episodes", seed=seed, played=played)
+        rules = QueueRules(min_results, max_attempts or 3, results, video, on_episode)
+        play = QueuePlay(group, policy, episodes, rules)
     return run(play.to_the_end(), group)
 
 
-def _check(group: Any, episodes: Any, min_results: int | None, max_attempts: int) -> None:
+def _refuse(form: str, **options: Any) -> None:
+    """Raise an error if an option is given that is for another form of `episodes`."""
+    for name, value in options.items():
+        if value is not None:
+            raise ValueError(f"{name} is for {form}; leave it out")
+
+
+def _check(group: Any, episodes: Any, min_results: int | None, max_attempts: int | None) -> None:
     numbers = {"min_results": min_results, "max_attempts": max_attempts}
-    if isinstance(episodes, int):
-        numbers["episodes"] = episodes
+    if isinstance(episodes, SupportsIndex):
+        numbers["episodes"] = index(episodes)
     for name, number in numbers.items():
         if number is not None and number < 1:
             raise ValueError(f"{name} must be at least 1, not {number!r}")
@@ -185,6 +193,7 @@ class _Play:
         episodes: int,
         seed: int | None,
         min_results: int | None,
+        on_episode: Callable[[Episode], None] | None,
     ) -> None:
         self._group, self._policy = group, policy
         self._episodes, self._seed, self._min_results = episodes, seed, min_results
@@ -203,7 +212,7 @@ class _Play:
         # Results of different shapes don't stack.
         self._separate = len({(meta.num_envs, meta.agents) for meta in metas}) > 1
         self._found = Evaluation()
-        self.on_episode: Callable[[Episode], None] | None = None
+        self._on_episode = on_episode
 
     def take_over(self, played: Iterable[Episode]) -> None:
         """Add episodes that were played earlier."""
@@ -340,8 +349,8 @@ class _Play:
         )
         self._count[place] += 1
         self._found.episodes.append(episode)
-        if self.on_episode is not None:
-            self.on_episode(episode)
+        if self._on_episode is not None:
+            self._on_episode(episode)
 
     def _note_losses(self, batch: BatchedData) -> None:
         rows = np.flatnonzero(batch.restarted.reshape(len(batch), -1).any(axis=1))

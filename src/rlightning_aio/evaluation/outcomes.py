@@ -14,7 +14,8 @@ if TYPE_CHECKING:
 
 __all__ = ["responses", "success_of", "summed_rewards"]
 
-_VERDICTS: Final = ("success", "is_success")
+_SUCCESS_KEYS: Final = ("success", "is_success")
+"""In an info: Gymnasium's robotics and ManiSkill's name, and Stable-Baselines3's."""
 
 
 def responses(batch: BatchedData, answer: Any) -> list[BatchedData]:
@@ -52,7 +53,7 @@ def success_of(info: dict[str, Any], sub_env: int = 0) -> bool | None:
     marked: Any = info.get("_final_info")
     if isinstance(final, dict) and (marked is None or marked[sub_env]):
         info = cast("dict[str, Any]", final)  # The rest is about the next episode.
-    for key in _VERDICTS:
+    for key in _SUCCESS_KEYS:
         given, known = info.get(key), info.get(f"_{key}")
         if given is not None and (known is None or known[sub_env]):
             # It may be a tensor on another device.

@@ -87,6 +87,8 @@ class QueuePlay:
         """Envs with a request in flight."""
         self._gone: set[str] = set()
         """Envs whose worker is not replaced."""
+        self._fault: EnvFault | None = None
+        """The last one."""
         self._ended = deque[EpisodeRecord]()
         """Episodes that the last results ended, to be recorded."""
         self._fill(episodes)
@@ -330,7 +332,8 @@ class QueuePlay:
     def _check_players(self) -> None:
         """Raise the last fault if no env is left for an entry's episodes."""
         left = {entry for env_id, entry in self._entry_of.items() if env_id not in self._gone}
-        if any(waiting and entry not in left for entry, waiting in self._waiting.items()):
+        unplayable = any(w and entry not in left for entry, w in self._waiting.items())
+        if unplayable and self._fault is not None:
             raise self._fault
 
 

@@ -115,7 +115,7 @@ class Report(NamedTuple):
     steps_lost: int | None
 
 
-class Returned(NamedTuple):
+class Judged(NamedTuple):
     """What a batch of results changes, once it is returned to the caller.
 
     Attributes:
@@ -259,8 +259,8 @@ class Continuity:
 
     # -- requests ---------------------------------------------------------------------
 
-    def resets(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Return which of `slots` are reset in place of the step that is about to be sent."""
+    def begin_steps(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Note steps that are about to be sent; return which of `slots` are reset instead."""
         if not self.active:
             self._cut[slots] = False  # Outside the context a step continues the episode.
             self._update_due()
@@ -379,7 +379,7 @@ class Continuity:
 
     # -- results ----------------------------------------------------------------------
 
-    def judge(self, slots: NDArray[np.intp], flagged: Sequence[ResultColumns]) -> Returned:
+    def judge(self, slots: NDArray[np.intp], flagged: Sequence[ResultColumns]) -> Judged:
         """Decide what returning the results of `slots` will mean; `returned` carries it out.
 
         Args:
@@ -392,7 +392,7 @@ class Continuity:
         for part in flagged:  # A comprehension is a call more.
             begun.append(self._judge_flags(part, slots, num_steps, restored))  # noqa: PERF401
         if self._limits is None:
-            return Returned(num_steps, None, restored, begun)
+            return Judged(num_steps, None, restored, begun)
         self._margin -= 1
         is_cut = None
         if self._margin <= 0:
@@ -402,7 +402,7 @@ class Continuity:
             if restored:  # The limit was reported when the state was new.
                 is_cut &= ~np.isin(slots, restored)
             is_cut = is_cut if len(is_cut.nonzero()[0]) else None
-        return Returned(num_steps, is_cut, restored, begun)
+        return Judged(num_steps, is_cut, restored, begun)
 
     def _judge_flags(
         self,
@@ -433,18 +433,18 @@ class Continuity:
         return part.slots[resets]
 
     def returned(
-        self, slots: NDArray[np.intp], flagged: Sequence[ResultColumns], verdict: Returned
+        self, slots: NDArray[np.intp], flagged: Sequence[ResultColumns], judged: Judged
     ) -> None:
         """Record that results were returned, as `judge` has decided."""
-        self._num_steps[slots] = verdict.num_steps
-        for part, begun in zip(flagged, verdict.begun, strict=True):
+        self._num_steps[slots] = judged.num_steps
+        for part, begun in zip(flagged, judged.begun, strict=True):
             self._note_flags(part, begun)
-        for slot in verdict.restored:
+        for slot in judged.restored:
             self._cut[slot] = self._restored.pop(slot).is_cut
             self._margin = 0
-        if verdict.is_cut is not None:
-            self._cut[slots[verdict.is_cut]] = True
-        if flagged or verdict.is_cut is not None:
+        if judged.is_cut is not None:
+            self._cut[slots[judged.is_cut]] = True
+        if flagged or judged.is_cut is not None:
             self._update_due()
         if self._pending:
             self._accept_checkpoints(slots)

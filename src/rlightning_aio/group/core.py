@@ -172,7 +172,7 @@ class Core:
         out_of_band = write_actions(batch, slots, self.envs, self._layout)
         packed = [] if out_of_band is None else self._dispatch.packed_steps(slots, out_of_band)
         self.results.note_sent(slots, response_columns(batch, slots, self._layout))
-        resets = self.continuity.resets(slots)
+        resets = self.continuity.begin_steps(slots)
         if self.continuity.exceptional:
             reports, seeds = self.continuity.report_losses(slots, ~resets)
             self._layout.write_seeds(slots[reports], seeds[reports])
@@ -269,14 +269,14 @@ class Core:
         try:
             parts = self.results.gather(slots)
             flagged = [part for part in parts if np.count_nonzero(part.flags)]
-            verdict = self.continuity.judge(slots, flagged)
-            batch = self._batch(slots, parts, flagged, verdict.is_cut)
+            judged = self.continuity.judge(slots, flagged)
+            batch = self._batch(slots, parts, flagged, judged.is_cut)
             if self._first_observations.left:
                 self._first_observations.check(parts)
                 self._conditions.note(FIRST_RESULTS, bool(self._first_observations.left))
-            flags = [False] * len(slots) if verdict.is_cut is None else verdict.is_cut.tolist()
+            flags = [False] * len(slots) if judged.is_cut is None else judged.is_cut.tolist()
             self.stats.account(parts, synchronous=synchronous)
-            self.continuity.returned(slots, flagged, verdict)
+            self.continuity.returned(slots, flagged, judged)
             self.results.let_go(slots)
             self.requests.hand_out(slots)
         except BaseException:

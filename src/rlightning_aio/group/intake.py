@@ -189,28 +189,28 @@ class Intake:
             self._requests.fail(mine, owner, error_for(mine))
 
     def _on_died(self, completion: Died) -> None:
-        verdict = self._supervisor.handle_exit(completion)
-        if isinstance(verdict, GivenUp):
-            self._continuity.give_up(_slots_of_host(verdict.host))
-            self._fail(verdict.owed, verdict.error_for)
-        elif verdict is not None:
-            self._replace_host(verdict)
+        outcome = self._supervisor.handle_exit(completion)
+        if isinstance(outcome, GivenUp):
+            self._continuity.give_up(_slots_of_host(outcome.host))
+            self._fail(outcome.owed, outcome.error_for)
+        elif outcome is not None:
+            self._replace_host(outcome)
 
-    def _replace_host(self, verdict: Replaced) -> None:
+    def _replace_host(self, outcome: Replaced) -> None:
         """Send the outstanding requests of a dead worker to its replacement."""
-        host, owed = verdict.host, verdict.owed
+        host, owed = outcome.host, outcome.owed
         slots = _slots_of_host(host)
         for slot in self._requests.ready(np.array(slots, np.intp)).tolist():
             # Decoded now, because the replacement announces other schemas.
             self._results.detach_info(slot)
         self._results.begin_schemas(slots)
-        if not verdict.resets:
-            self._fail(owed, verdict.error_for)
+        if not outcome.resets:
+            self._fail(owed, outcome.error_for)
             return
-        self._continuity.lose(slots, verdict.cause, verdict.at_fault)
+        self._continuity.lose(slots, outcome.cause, outcome.at_fault)
         # A replacement answers steps and resets, but not calls.
         calls = self._requests.numbering.awaits_value(owed)
-        self._fail(owed[calls], verdict.error_for)
+        self._fail(owed[calls], outcome.error_for)
         owed = owed[~calls]
         if len(owed):
             is_step = self._requests.numbering.ops(owed) == int(Operation.STEP)

@@ -370,8 +370,8 @@ class Steps:
             part = results.part(self._layout.slabs[0], slots)
             parts = (part,)
             flagged = parts if b"\1" in part.flags.tobytes() else ()
-            verdict = continuity.judge(slots, flagged)
-            is_cut = verdict.is_cut
+            judged = continuity.judge(slots, flagged)
+            is_cut = judged.is_cut
             if is_cut is not None:
                 part.limit_reached = is_cut
                 if continuity.mark_truncated:
@@ -380,7 +380,7 @@ class Steps:
                 results.add_episodes(part)
             batch = batch_of_results(parts, self._core, slots, part.names, results.sources(slots))
             self._stats.account(parts, synchronous=synchronous)
-            continuity.returned(slots, flagged, verdict)
+            continuity.returned(slots, flagged, judged)
             if self._inline is not None:
                 results.let_go(slots)
             requests.state[slots] = _IDLE

@@ -1,8 +1,8 @@
 """`InlineHost`: envs in the process of the trainer, with the same rows and rules.
 
-Requests wait in a queue, so sending never blocks. A driver that has no result executes the next one
-(`execute_next`). An env blocks the process while it steps, unless its own thread computes the step
-and an event loop waits for it (`_Threads`). An env that crashes ends the trainer.
+Requests wait in a queue, so sending never blocks; while a driver waits, it executes the next one
+(`group.poller`, `group.steps`). An env blocks the process while it steps, unless its own thread
+computes the step and an event loop waits for it (`_Threads`). An env that crashes ends the trainer.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """`EnvRunner`: executes requests on one env and puts the results into its row.
 
 The same code runs in a worker process and, for inline placement, in the trainer. A step of a plain
-Gymnasium env takes a short way (`steps.ShortWay`).
+Gymnasium env takes a short way (`env_steps.ShortWay`).
 """
 
 from __future__ import annotations

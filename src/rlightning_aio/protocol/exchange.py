@@ -1,8 +1,9 @@
 """The functions of the hot path, in Python; `kernel` chooses between them and compiled ones.
 
-Each has a twin of the same name and contract in `_kernel.c`. `submit`, `complete` and `gather` are
-the trainer's: they carry every ordinary step between arrays and the rings of all workers. `serve`
-and `row_step` are the worker's. `arm` and `is_due` are the two sides of the bell (`rings`).
+Those that `kernel` names have a twin of the same contract in `_kernel.c`. `submit`, `complete` and
+`gather` are the trainer's: they carry every ordinary step between arrays and the rings of all
+workers. `serve` and `row_step` are the worker's. `arm` and `is_due` are the two sides of the bell
+(`rings`).
 
 Invariant: each shared word has one writer. A writer publishes (entry first, then the counter) and
 fences before it checks whether the other side sleeps (`rings`), or sums all counters: of two

@@ -105,7 +105,8 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         self.closed = True  # Until it has started.
         self._pending: str | None = None
         self._arguments: Any = None
-        self._late = False
+        # Requests are outstanding whose results nobody will return.
+        self._has_leftovers = False
         # Results of a step or reset were not returned, so no episode can go on.
         self._has_lost = False
         if max_concurrency is not None:
@@ -124,7 +125,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
             raise
 
     def _adopt(self, metas: list[EnvMeta], *, resumes: bool) -> None:
-        """Set the attributes that come from the envs: spaces, metadata, render mode."""
+        """Set up what depends on the envs: spaces, metadata, rows, deaths, resets."""
         self._rows = rows_of(self.group, metas)
         self.num_envs = self._rows.num_envs
         (
@@ -195,9 +196,9 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         if mask is not None and not mask.all():
             self._check_whole()
         # A reset that can't be sent leaves those before it outstanding.
-        self._late = self._has_lost = True
+        self._has_leftovers = self._has_lost = True
         self._rows.send_resets(seeds, [options] * self.num_envs, which)
-        self._pending, self._arguments, self._late = "reset", mask, False
+        self._pending, self._arguments, self._has_leftovers = "reset", mask, False
 
     def reset_wait(self, timeout: float | None = None) -> tuple[Any, dict[str, Any]]:
         """Wait for `reset_async`, at most `timeout` seconds.
@@ -244,13 +245,13 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
             self.step_async(actions)
             return self.step_wait()
         responses = self._responses(actions)
-        self._late = self._has_lost = True  # Until they are returned.
+        self._has_leftovers = self._has_lost = True  # Until they are returned.
         try:
             self._answerable, _ = self.group.step(responses)
         except BadAction:
             self._has_lost = False  # Nothing was sent.
             raise
-        self._late = False
+        self._has_leftovers = False
         found = self._stepped(self._answerable)
         self._has_lost = False
         return found
@@ -258,7 +259,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
     def step_async(self, actions: Any) -> None:
         """Send steps without waiting; `step_wait` returns their results."""
         responses = self._responses(actions)
-        self._late = self._has_lost = True  # As in `step`.
+        self._has_leftovers = self._has_lost = True  # As in `step`.
         try:
             if self._deaths.unfinished:
                 self._deaths.send(responses)
@@ -267,7 +268,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         except BadAction:
             self._has_lost = False
             raise
-        self._pending, self._late = "step", False
+        self._pending, self._has_leftovers = "step", False
 
     def step_wait(
         self, timeout: float | None = None
@@ -331,9 +332,9 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
                 f"complete; call `{self._pending}_wait` first.",
                 self._pending,
             )
-        if self._late:
+        if self._has_leftovers:
             drop_outstanding(self.group)
-            self._late = False
+            self._has_leftovers = False
 
     def _check_whole(self) -> None:
         if self._has_lost:
@@ -357,7 +358,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
     def _finish(self, what: str, timeout: float | None, collect: Callable[..., Any]) -> Any:
         """Collect the pending requests by `collect`, within `timeout` seconds."""
         self._check_sent(what)
-        self._late = True  # Until all are collected.
+        self._has_leftovers = True  # Until all are collected.
         try:
             found = collect(deadline=_seconds(timeout))
         except EnvFault:
@@ -367,7 +368,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
                 f"the envs have not answered {what}_async within {timeout} s; late results are "
                 "dropped"
             ) from error
-        self._late = False
+        self._has_leftovers = False
         return found
 
     def _collect(self, deadline: float | None = None) -> BatchedData:
@@ -442,7 +443,8 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
                 "one that is not a list or tuple"
             )
         self._begin("set_attr")
-        self._late = True  # A value that can't be sent leaves the calls before it outstanding.
+        # A value that can't be sent leaves the calls before it outstanding.
+        self._has_leftovers = True
         self._rows.set_attr(name, each)
         self._pending = "call"
         self._finish("call", None, self.group.collect_calls)

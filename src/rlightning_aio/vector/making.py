@@ -12,7 +12,7 @@ from rlightning_aio.envs.mujoco_tasks import is_batched
 from rlightning_aio.envs.of_spec import BatchOf, OneOf, VectorOf
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.registry import PLACEMENTS
-from rlightning_aio.sharing import num_batches, num_cores
+from rlightning_aio.sharing import check_threads, num_batches, num_cores
 from rlightning_aio.vector.env import VectorEnv, per_worker
 
 if TYPE_CHECKING:
@@ -54,7 +54,8 @@ def make_vec(
             Gymnasium's checker slows every step; envs with the checker are separate.
 
     Raises:
-        ConfigError: `BATCH_OPTIONS` are wrong, or the envs aren't stepped together.
+        ConfigError: `BATCH_OPTIONS` are wrong, or given for a task that `mujoco_batch` supports
+            with an argument that keeps its envs separate.
         ValueError: the task has no vector environment, or the mode allows no wrappers or is
             unknown.
     """
@@ -75,7 +76,7 @@ def make_vec(
             f"{mode!r}; vector_kwargs={{'placement': 'inline'}} keeps envs in this "
             "process"
         )
-    elif mode is None and not wrappers and steps_together(spec, kwargs):
+    elif steps_together(spec, kwargs, separate=mode == "async" or bool(wrappers)):
         autoreset = AutoresetMode(given.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         makers, given = together(spec, of_one, num_envs, autoreset, given)
     env = VectorEnv(makers, **given)
@@ -100,15 +101,31 @@ def vector_entry_point(
     return make
 
 
-def steps_together(spec: EnvSpec, kwargs: Mapping[str, Any]) -> bool:
+def steps_together(spec: EnvSpec, kwargs: Mapping[str, Any], *, separate: bool = False) -> bool:
     """Return True if stepping the envs of a task together changes nothing but the speed.
 
     Args:
         spec: of the task.
         kwargs: of `gymnasium.make`. Gymnasium's checker and windows need separate envs.
+        separate: other arguments need separate envs.
+
+    Raises:
+        ConfigError: `BATCH_OPTIONS` of a task that allows it are wrong, or its envs are separate.
     """
-    single = kwargs.get("render_mode", spec.kwargs.get("render_mode")) == "human"
-    return is_batched(spec) and kwargs.get("disable_env_checker", True) and not single
+    if not is_batched(spec):
+        return False
+    check_threads("num_threads", kwargs.get("num_threads"))
+    window = kwargs.get("render_mode", spec.kwargs.get("render_mode")) == "human"
+    if not (separate or window or not kwargs.get("disable_env_checker", True)):
+        return True
+    for name in BATCH_OPTIONS:
+        if kwargs.get(name) is not None:
+            raise ConfigError(
+                f"{name} needs envs that are stepped together: leave out what separates them "
+                "(wrappers, monitors of single envs, Gymnasium's checker, a window, "
+                "vectorization_mode='async')"
+            )
+    return False
 
 
 def together(

@@ -240,19 +240,19 @@ class Batches(Singles):
     def send_resets(
         self, seeds: Sequence[int | None], options: Sequence[Options | None], chosen: Sequence[int]
     ) -> None:
-        for batch, which in self._by_batch(chosen):
-            places = range(batch * self._each, (batch + 1) * self._each)
-            self._send_reset(batch, [seeds[k] for k in places], options, which)
+        for number, which in self._by_batch(chosen):
+            places = range(number * self._each, (number + 1) * self._each)
+            self._send_reset(number, [seeds[k] for k in places], options, which)
 
     def _send_reset(
         self,
-        batch: int,
+        number: int,
         seeds: list[int | None],
         options: Sequence[Options | None],
         which: list[int],
     ) -> None:
-        env_id = self._group.env_ids[batch]
-        own = [options[batch * self._each + k] for k in which]
+        env_id = self._group.env_ids[number]
+        own = [options[number * self._each + k] for k in which]
         if any(one is not own[0] and one != own[0] for one in own):
             raise ValueError(
                 "reset options differ between envs that are stepped together; make separate envs"
@@ -273,7 +273,7 @@ class Batches(Singles):
         return self._group.reset_async(None, given or None, [env_id])
 
     def _by_batch(self, chosen: Sequence[int]) -> Iterator[tuple[int, list[int]]]:
-        """Group the places `chosen` by batch, as positions inside each batch."""
+        """Yield the number of each batch with places in `chosen`, and their positions inside it."""
         found: dict[int, list[int]] = {}
         for k in chosen:
             found.setdefault(k // self._each, []).append(k % self._each)
@@ -283,20 +283,20 @@ class Batches(Singles):
         if chosen is None:
             self._group.call_async("call_sub_envs", name, args, kwargs, None)
             return
-        for batch, which in self._by_batch(chosen):
-            env_ids = [self._group.env_ids[batch]]
+        for number, which in self._by_batch(chosen):
+            env_ids = [self._group.env_ids[number]]
             self._group.call_async("call_sub_envs", name, args, kwargs, which, env_ids=env_ids)
 
     def look_up(self, name: str, place: int) -> None:
-        batch, own = divmod(place, self._each)
-        env_ids = [self._group.env_ids[batch]]
+        number, own = divmod(place, self._each)
+        env_ids = [self._group.env_ids[number]]
         self._group.call_async("look_up_sub_env", own, name, env_ids=env_ids)
 
     def values(self, collected: list[Any], chosen: Sequence[int] | None = None) -> list[Any]:
         if chosen is None:
             return [value for values in collected for value in values]
-        parts = [batch for batch, _ in self._by_batch(chosen)]
-        of_batch = {batch: iter(values) for batch, values in zip(parts, collected, strict=True)}
+        parts = [number for number, _ in self._by_batch(chosen)]
+        of_batch = {number: iter(values) for number, values in zip(parts, collected, strict=True)}
         return [next(of_batch[k // self._each]) for k in chosen]
 
     def are_wrapped(self, wrapper_class: type[Any], chosen: Sequence[int]) -> list[bool]:
@@ -316,10 +316,10 @@ class Batches(Singles):
                 f"{name} can't be set for only some of the envs that are stepped together; make "
                 "separate envs, each with its own callable"
             )
-        for batch, _ in found:
+        for number, _ in found:
             values = [value] * self._each
             self._group.call_async(
-                "set_sub_envs", name, values, env_ids=[self._group.env_ids[batch]]
+                "set_sub_envs", name, values, env_ids=[self._group.env_ids[number]]
             )
         self._group.collect_calls()
 
