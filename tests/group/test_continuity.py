@@ -175,7 +175,7 @@ class ContextMachine(RuleBasedStateMachine):
         slots = data.draw(
             st.lists(st.sampled_from(range(len(self.model))), min_size=1, unique=True)
         )
-        due = np.broadcast_to(self.continuity.resets(np.array(slots)), len(slots))
+        due = np.broadcast_to(self.continuity.begin_steps(np.array(slots)), len(slots))
         resets, overs, cuts = [], [], []
         for slot, is_due in zip(slots, due.tolist(), strict=True):
             env = self.model[slot]
