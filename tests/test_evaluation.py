@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 import rlightning_aio as rl
 from rlightning_aio import sync
 from rlightning_aio.errors import EnvBusy
-from rlightning_aio.evaluation import Episode, Evaluation, evaluate
+from rlightning_aio.evaluation import Episode, EpisodeSpec, Evaluation, evaluate
 from rlightning_aio.evaluation.estimates import mean_estimate, wilson_estimate
 
 if TYPE_CHECKING:
@@ -236,11 +236,14 @@ async def test_it_is_awaited_over_an_asynchronous_group() -> None:
 
 def test_a_group_with_steps_in_flight_is_refused_with_what_to_do() -> None:
     """A Collector leaves some after a rollout; an evaluation needs another group."""
-    with group_of(scripted(lambda _: True)) as group, group.auto_reset(9):
+    with (group := group_of(*HALF_SUCCEED[:2])), group.auto_reset(9):
         batch, _ = group.reset()
-        group.step_async(batch.respond(action=nothing(batch)))
-        with pytest.raises(EnvBusy, match="second group of the same entries"):
-            evaluate(group, nothing, episodes=1)
+        group.step_async(batch.take([1]).respond(action=nothing(batch)[1:]))
+        # An evaluation that plays only env 0 would take the result of env 1 for its own.
+        played = [Episode("env-1", 0, 0, 1.0, 1, None)]
+        for episodes, options in ((1, {"played": played}), ([EpisodeSpec("", 0)], {})):
+            with pytest.raises(EnvBusy, match="second group of the same entries"):
+                evaluate(group, nothing, episodes, **options)
         group.collect_async()
 
 

@@ -27,6 +27,7 @@ from rlightning_aio.evaluation import EpisodeSpec, EpisodeVideo, ResultsFile
         ({"entry": None}, "the entry of an episode should be a str, not None"),
         ({"options": [1]}, r"the options of an episode should be a dict, not \[1\]"),
         ({"options": {"x": float("nan")}}, "the options of an episode can't be written as JSON"),
+        ({"options": {"x": object()}}, "object .* is neither a number, a text, a list nor an arr"),
     ],
 )
 def test_an_episode_that_can_not_be_is_refused(fields: dict[str, Any], message: str) -> None:

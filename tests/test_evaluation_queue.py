@@ -277,6 +277,37 @@ def test_an_interrupted_evaluation_resumes_from_its_file(tmp_path: Path) -> None
         ResultsFile(path, {"policy": "other"})
 
 
+def test_an_open_file_knows_what_was_added_to_it(tmp_path: Path) -> None:
+    """An evaluation that was stopped continues within the same `with`."""
+
+    class Enough(Exception):
+        """Ends an evaluation."""
+
+    def stops(record: EpisodeRecord) -> None:
+        if results.lost:
+            raise Enough
+
+    breaks = {"env_kwargs": {"breaks": {"2": "raise"}}}
+    with ResultsFile(tmp_path / "results.jsonl") as results:
+        with pytest.raises(Enough):
+            evaluated(group_of(**breaks), results=results, on_episode=stops, max_attempts=9)
+        assert results.played
+        found = evaluated(group_of(), results=results, max_attempts=9)
+        assert len(found.records) == len({one.key for one in found.records}) == 12
+        assert found.lost == sum(map(len, results.lost.values()))
+    with ResultsFile(tmp_path / "results.jsonl") as results:
+        assert len(results.played) == 12
+
+
+def test_a_subject_is_compared_as_it_is_read(tmp_path: Path) -> None:
+    """JSON has no tuples, and no keys but texts."""
+    for _ in range(2):
+        ResultsFile(tmp_path / "results.jsonl", {"seeds": (0, 3), "steps": {5: 1}}).close()
+    with pytest.raises(rl.ConfigError, match="its subject can't be written as JSON: Object"):
+        ResultsFile(tmp_path / "other.jsonl", {"policy": object()})
+    assert not (tmp_path / "other.jsonl").exists()
+
+
 # -- films --------------------------------------------------------------------------------
 
 

@@ -168,7 +168,8 @@ class VecEnv(_Base):
         """
         with self._exchange(), self._dropping_the_rest():
             self._has_lost = True
-            self._rows.send_resets(self._seeds, self._options, range(self.num_envs))
+            options = [own or None for own in self._options]  # As Stable-Baselines3 does.
+            self._rows.send_resets(self._seeds, options, range(self.num_envs))
             batch, _ = self.group.collect_async(wait_all=True, ordered=True)
         self.reset_infos = self._rows.info_list(batch)
         self._reset_seeds()

@@ -360,6 +360,8 @@ def test_a_snapshot_of_other_simulations_is_refused(saved: Any, here: Any, messa
         ({"opt.timestep": [1, 2]}, "rewards assume"),
         ({"body_weight": [1, 2]}, "no number 'body_weight'"),
         ({"geom_type": [1, 2]}, "no number 'geom_type'"),
+        ({"body_mass": [1, float("inf")]}, r"is \[1, inf\], but must be .* finite"),
+        ({"body_invweight0": [1, 2]}, "MuJoCo computes this field from others"),
         ({"body_mass": [2, 1]}, r"is \[2, 1\], but must be \[lowest, highest\]"),
         ({"body_mass": 0.5}, r"is 0.5, but must be \[lowest, highest\]"),
         (["body_mass"], "must map fields to ranges"),

@@ -165,6 +165,43 @@ def test_any_point_is_restored(fields: dict[str, Any]) -> None:
         made.env.close()
 
 
+class Sampling(gym.Env[Any, Any]):
+    """Its observations are samples of its space."""
+
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, space: gym.Space[Any]) -> None:
+        self.observation_space = space
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.observation_space.seed(seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action: Any) -> Any:
+        return self.observation_space.sample(), 0.0, False, False, {}
+
+
+BOX = gym.spaces.Box(-1, 1, (1,), np.float64)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        BOX,
+        gym.spaces.Dict(a=BOX, b=gym.spaces.Sequence(BOX)),
+        gym.spaces.Tuple((BOX, gym.spaces.Text(9))),
+        gym.spaces.Sequence(BOX, stack=True),
+        gym.spaces.Graph(BOX, gym.spaces.Discrete(3)),
+        gym.spaces.Graph(BOX, None),
+        gym.spaces.OneOf((BOX, gym.spaces.Discrete(3))),
+    ],
+    ids=lambda space: type(space).__name__,
+)
+def test_generators_of_nested_spaces_are_restored(space: gym.Space[Any]) -> None:
+    goes_on(make_env=partial(Sampling, space))
+
+
 @pytest.mark.simulators
 def test_sticky_actions_of_any_other_env_raise() -> None:
     """The console in a callable's env is ale-py's, which doesn't reveal its last action."""

@@ -632,7 +632,14 @@ class CoreMachine(RuleBasedStateMachine):
             for env in self.envs
             if env.request is not None and env.request.owner is None and not env.request.abandoned
         ]
-        assert self.core.pending() == len(mine)
+        pending = self.core.pending()
+        assert self.core.requests.pending()[1] == len(mine)
+        asked = {
+            f"fake-{slot}"
+            for slot, env in enumerate(self.envs)
+            if env.request is not None and not env.request.abandoned
+        }
+        assert asked <= {*pending} if self.fault_queue else asked == {*pending}
         in_flight = self.core.requests.in_flight
         for host, count in zip(self.group.hosts, in_flight, strict=True):
             slots = range(host.first_slot, host.first_slot + host.num_envs)

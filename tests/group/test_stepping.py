@@ -215,6 +215,29 @@ async def test_an_env_that_owes_a_reply_is_busy(start: Any) -> None:
 
 
 @one_driver
+async def test_pending_are_envs_with_a_reply_that_was_not_returned(start: Any) -> None:
+    """Results, values and errors, before they arrive and after."""
+    group = await start(ENTRY)
+    assert group.pending == []
+    await group.reset()
+    group.call_async("double", 1, env_ids=["probe-3"])
+    group.step_async(responses(["probe-2", "probe-0"], 1, RAISE))
+    assert group.pending == ["probe-0", "probe-2", "probe-3"]
+    batch, _ = await group.step(responses(["probe-1"], 1))
+    assert group.pending == ["probe-0", "probe-2", "probe-3"]
+    await group.collect_calls()
+    left = {"probe-0", "probe-2"}
+    while left:
+        assert {*group.pending} == left
+        try:
+            batch, _ = await group.collect_async()
+            left -= {*batch.env_ids()}
+        except EnvRaised as error:
+            left -= {error.env_id}
+    assert group.pending == []
+
+
+@one_driver
 async def test_an_error_of_an_env_arrives_with_its_traceback(start: Any) -> None:
     """With the env's name and the others' results; the type of the exception is not rebuilt."""
     group = await start(ENTRY)

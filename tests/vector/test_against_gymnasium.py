@@ -21,6 +21,7 @@ seeds = st.none() | st.integers(0, 99) | st.lists(
     st.none() | st.integers(0, 99), min_size=SIZE, max_size=SIZE + 1
 )  # fmt: skip
 masks = st.lists(st.booleans(), min_size=SIZE, max_size=SIZE).map(np.array)
+OPTIONS = (None, {}, {"more": 1})
 Doing = tuple[Any, ...]
 
 
@@ -32,7 +33,7 @@ def doings(
     return st.one_of(
         step,
         step,
-        st.tuples(st.just("reset"), seeds, st.none() | masks),
+        st.tuples(st.just("reset"), seeds, st.none() | masks, st.sampled_from(OPTIONS)),
         st.tuples(st.just("call"), st.sampled_from(calls)),
         st.tuples(st.just("get_attr"), st.sampled_from(attributes)),
         st.tuples(st.just("set_attr"), st.sampled_from(assignments)).map(lambda d: (d[0], *d[1])),
@@ -75,13 +76,14 @@ def outcome(env: Any, doing: tuple[Any, ...], due: np.ndarray) -> Any:
     """Result of an operation, or its error."""
     what, *arguments = doing
     if what == "step" and env.autoreset_mode == AutoresetMode.DISABLED and due.any():
-        what, arguments = "reset", [None, due.copy()]
+        what, arguments = "reset", [None, due.copy(), None]
     try:
         if what == "step":
             return env.step(np.array(arguments[0], env.action_space.dtype))
         if what == "reset":
-            seed, mask = arguments
-            options = None if mask is None else {"reset_mask": mask, "more": 1}
+            seed, mask, options = arguments
+            if mask is not None:
+                options = {"reset_mask": mask, **(options or {})}
             return env.reset(seed=seed, options=options)
         if what == "call":
             return env.call(*arguments[0])
@@ -127,7 +129,7 @@ def test_it_does_the_same_as_gymnasiums(mode: AutoresetMode, did: list[Any], see
 @example(
     did=[
         ("call", ("set_state", np.array([0.1, 0.0]), np.array([0.0, 0.2]))),
-        ("reset", None, np.array([False, False, True])),
+        ("reset", None, np.array([False, False, True]), None),
         ("close",),
     ],
     seed=0,

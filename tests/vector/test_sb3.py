@@ -329,9 +329,11 @@ def test_workers_do_not_import_the_classes_that_are_looked_for() -> None:
     env = VecMonitor(VecEnv([Counting] * 2))
     assert not any(env.env_method("loaded", "stable_baselines3"))
     assert not any(env.env_method("loaded", "torch"))
+    assert not any(env.env_is_wrapped(gym.Wrapper)), "without this package's own"
     env.close()
     env = VecEnv([lambda: Monitor(Counting())] * 2)
     assert env.env_is_wrapped(Monitor) == [True, True]
+    assert env.env_is_wrapped(gym.wrappers.TimeLimit) == [False, False]
     assert env.env_is_wrapped(Monitor, indices=[1, 1]) == [True, True]
     env.close()
 

@@ -148,13 +148,15 @@ def test_missing_features_of_a_tasks_vector_environment_raise() -> None:
 
 
 class Short(Toy):
-    """Its observations and infos have a fixed size."""
+    """Its observations and infos have a fixed size; a part of an observation is empty."""
 
-    observation_space = gym.spaces.Dict(place=gym.spaces.Box(-10, 10, (2,), np.float64))
+    observation_space = gym.spaces.Dict(
+        place=gym.spaces.Box(-10, 10, (2,), np.float64), nothing=gym.spaces.Box(-1, 1, (0,))
+    )
     metadata: ClassVar = {**Toy.metadata}
 
     def _observed(self) -> Any:
-        return {"place": self.place.copy()}
+        return {"place": self.place.copy(), "nothing": np.zeros(0, np.float32)}
 
 
 def loops(mode: AutoresetMode, num_envs: int) -> Any:
@@ -181,6 +183,10 @@ def test_callables_may_return_vector_environments(mode: AutoresetMode) -> None:
                 for env in (ours, theirs)
             )
             assert_alike(found, expected, f"reset after {turn}")
+    for options in (None, {}, {"more": 1}):
+        for seed in (None, 3, [3, None, 5, 6, 7, 2]):
+            found, expected = (env.reset(seed=seed, options=options) for env in (ours, theirs))
+            assert_alike(found, expected, f"reset with {options} and {seed}")
     for env in (ours, theirs):
         env.set_attr("speed", [1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
     assert_alike(ours.get_attr("speed"), theirs.get_attr("speed"))

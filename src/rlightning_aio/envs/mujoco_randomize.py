@@ -7,6 +7,7 @@ the rest of a reset doesn't change.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final, cast
 
@@ -23,6 +24,7 @@ __all__ = ["Randomizer"]
 
 _STREAM: Final = 0x7261_6E64
 """Distinguishes this generator from Gymnasium's, which has the same seed."""
+_TRIAL: Final = 1.0625
 
 
 class Randomizer:
@@ -34,7 +36,8 @@ class Randomizer:
             ``opt.<name>`` as in `MjOption`.
 
     Raises:
-        ConfigError: a field is unknown or can't differ, or a range is invalid.
+        ConfigError: a field is unknown, can't differ, or follows from others; or a range is
+            invalid.
     """
 
     def __init__(self, simulations: Simulations, ranges: Mapping[str, Any]) -> None:
@@ -49,7 +52,22 @@ class Randomizer:
             except AttributeError as error:
                 raise ConfigError(f"randomize.{name}: {error}") from None
         self._nominal = {name: values[0].copy() for name, values in self._values.items()}
+        for name in self._values:
+            self._check_kept(name)
         self._generators = [np.random.default_rng() for _ in range(simulations.count)]
+
+    def _check_kept(self, name: str) -> None:
+        """Refuse a field that MuJoCo computes from others, so that a factor has no effect."""
+        first, nominal = np.array([0], np.int32), self._nominal[name]
+        self._values[name][0] = nominal * _TRIAL
+        self._simulations.set_const(first)
+        is_kept = np.array_equal(self._values[name][0], nominal * _TRIAL)
+        self._values[name][0] = nominal
+        self._simulations.set_const(first)
+        if not is_kept:
+            raise ConfigError(
+                f"randomize.{name}: MuJoCo computes this field from others; randomize those"
+            )
 
     def draw(self, k: int, seed: int | None) -> dict[str, float]:
         """Draw new fields for simulation `k`.
@@ -98,8 +116,9 @@ def _range_of(name: str, given: Any) -> tuple[float, float]:
         bounds = list(cast("Sequence[Any]", given))
         if len(bounds) == 2 and all(type(bound) in (int, float) for bound in bounds):
             low, high = bounds
-            if low <= high:
+            if low <= high and math.isfinite(low) and math.isfinite(high):
                 return low, high
     raise ConfigError(
         f"randomize.{name} is {given!r}, but must be [lowest, highest] factor of the model's value"
+        ", and finite"
     )

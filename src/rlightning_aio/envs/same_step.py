@@ -24,7 +24,8 @@ class SameStep(gym.Wrapper[Any, Any, Any, Any]):
         super().__init__(env)
         self.metadata = {**metadata_of(env), "autoreset_mode": AutoresetMode.SAME_STEP}
 
-    # This wrapper hides itself: lookups go to the wrappers of the env's author.
+    # Lookups go to the wrappers of the env's author.
+    hides_itself = True
 
     def has_wrapper_attr(self, name: str) -> bool:
         return self.env.has_wrapper_attr(name)

@@ -107,8 +107,14 @@ def _set_env_attributes(env: Any, state: dict[str, Any]) -> None:
 
 
 def _spaces_in(space: Any) -> list[Any]:
+    """Spaces of a `Dict`, a `Tuple` and the like, and those in attributes, as of a `Sequence`."""
     inner: Any = getattr(space, "spaces", ())
-    return list(cast("Any", inner.values() if isinstance(inner, dict) else inner))
+    own: list[Any] = [value for _, value in sorted(_held(space).items()) if _is_space(value)]
+    return [*cast("Any", inner.values() if isinstance(inner, dict) else inner), *own]
+
+
+def _is_space(value: Any) -> bool:
+    return isinstance(value, gym.Space)
 
 
 def _generators(space: Any) -> list[Any]:

@@ -21,7 +21,9 @@ __all__ = ["SEEDS", "SubEnvs", "adapted"]
 _ONLY_READ: Final = ("get_wrapper_attr", "has_wrapper_attr", "render")
 """Methods without effects, which may be called on more sub-environments than requested."""
 SEEDS: Final = "rlightning_aio.seeds"
-"""Option of a reset: a seed for each sub-environment, if they aren't consecutive."""
+"""Option of a reset: a seed for each sub-environment, if they aren't consecutive, and True if the
+reset has no other options.
+"""
 
 
 def adapted(
@@ -96,8 +98,9 @@ class SubEnvs(_Wrapper):
         """Reset the vector environment; seeds may be given in the options (`SEEDS`)."""
         if options is not None and SEEDS in options:
             options = dict(options)
-            seed = options.pop(SEEDS)
-        return self.env.reset(seed=seed, options=options or None)
+            seed, is_alone = options.pop(SEEDS)
+            options = None if is_alone else options
+        return self.env.reset(seed=seed, options=options)
 
     def get_wrapper_attr(self, name: str) -> Any:
         """Get an attribute of the whole vector environment."""

@@ -22,9 +22,12 @@ def name_of(kind: type[Any]) -> ClassName:
 
 
 def has_wrapper(env: Any, name: ClassName) -> bool:
-    """Return True if the class of that name, or one derived from it, is around `env`."""
-    kinds = (kind for wrapper in wrappers_of(env) for kind in type(wrapper).__mro__)
-    return any(name_of(kind) == name for kind in kinds)
+    """Return True if the class of that name, or one derived from it, is around `env`.
+
+    Wrappers of this package, which have `hides_itself`, don't count.
+    """
+    wrappers = (type(one) for one in wrappers_of(env) if not hasattr(one, "hides_itself"))
+    return any(name_of(kind) == name for wrapper in wrappers for kind in wrapper.__mro__)
 
 
 def metadata_of(env: Any) -> dict[str, Any]:

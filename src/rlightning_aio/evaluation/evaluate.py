@@ -141,6 +141,7 @@ def evaluate(
             an env has sub-environments.
         RLightningError: of a number of episodes: an env has ended its worker three times in a row.
         BadAction: the policy's actions don't fit; nothing was sent.
+        EnvBusy: an env has a request in flight, or a result that was not collected.
         EnvRaised, WorkerDied, EnvHung: as for `EnvGroup.collect_async`; for a queue, only if no env
             is left that could play an episode.
         OSError: nothing can be written into the folder of `video`.
@@ -181,6 +182,12 @@ def _check(group: Any, episodes: Any, min_results: int | None, max_attempts: int
                 f"{meta.env_id} is an env_server, whose clients come and go; evaluate a group "
                 "without env_servers"
             )
+    if pending := group.pending:
+        raise EnvBusy(
+            f"{pending[0]!r} has a request whose result was not collected; collect it, or close "
+            "the group. A Collector leaves requests in flight after each rollout: to evaluate "
+            "between rollouts, build a second group of the same entries"
+        )
 
 
 class _Play:
@@ -234,15 +241,9 @@ class _Play:
             return self._found
         seeds = self._seeds(env_ids)
         batch: BatchedData
-        try:
-            batch, _ = yield lambda: self._group.reset(
-                None if seeds is None else list(seeds.values()), env_ids=env_ids
-            )
-        except EnvBusy as error:
-            raise EnvBusy(
-                f"{error}. A Collector leaves requests in flight after each rollout: to evaluate "
-                "between rollouts, build a second group of the same entries"
-            ) from None
+        batch, _ = yield lambda: self._group.reset(
+            None if seeds is None else list(seeds.values()), env_ids=env_ids
+        )
         pending = yield from self._continue(batch)
         while pending:
             batch, _ = yield lambda: self._group.collect_async(min_results=self._min_results)

@@ -144,7 +144,9 @@ def _written(options: Mapping[str, Any] | None) -> str:
 
 
 def _plain(value: Any) -> Any:
-    return value.tolist() if hasattr(value, "tolist") else repr(value)
+    if not hasattr(value, "tolist"):
+        raise TypeError(f"{value!r} is neither a number, a text, a list nor an array")
+    return value.tolist()
 
 
 @dataclass(slots=True)

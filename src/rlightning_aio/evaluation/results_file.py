@@ -34,13 +34,20 @@ class EpisodeFile(abc.ABC, Generic[E]):
         self, path: str | os.PathLike[str], subject: Mapping[str, Any], *, label: str
     ) -> None:
         self._name, self.played = f"{label} {os.fspath(path)}", list[E]()
+        try:
+            # As it is read again: lists for tuples, texts for the keys of dicts.
+            about: dict[str, Any] = json.loads(json.dumps({**subject}, allow_nan=False))
+        except (TypeError, ValueError) as error:
+            raise ConfigError(
+                f"{self._name}: its subject can't be written as JSON: {error}"
+            ) from error
         with self._writing():
             check_writable(path)
             # Unbuffered, so that `close` does not write a line again that could not be written.
             self._file = Path(path).open("a+b", buffering=0)  # noqa: SIM115  # See `close`.
         try:
             self._lock()
-            self._read({**subject})
+            self._read(about)
         except BaseException:
             self._file.close()
             raise
@@ -121,6 +128,7 @@ class EpisodeFile(abc.ABC, Generic[E]):
             ConfigError: it can't be written; the file is unchanged.
         """
         self._write(self._encode(episode))
+        self.played.append(episode)
 
     def _write(self, value: dict[str, Any]) -> None:
         line = f"{json.dumps(value, allow_nan=False)}\n".encode()
@@ -160,8 +168,8 @@ class ResultsFile(EpisodeFile[EpisodeRecord]):
         label: what messages call the file.
 
     Attributes:
-        played: the episodes in the file when it was opened.
-        lost: causes of lost attempts in the file when it was opened, by episode.
+        played: the episodes in the file.
+        lost: causes of lost attempts in the file, by episode.
 
     Raises:
         ConfigError: the file can't be read and written, another process has it open, it belongs
@@ -185,6 +193,7 @@ class ResultsFile(EpisodeFile[EpisodeRecord]):
             ConfigError: it can't be written; the file is unchanged.
         """
         self._write({**spec.to_json(), "attempt_lost": cause})
+        self.lost.setdefault(spec.key, []).append(cause)
 
     def _encode(self, episode: EpisodeRecord) -> dict[str, Any]:
         return episode.to_json()

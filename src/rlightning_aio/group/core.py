@@ -24,7 +24,7 @@ from rlightning_aio.group.dispatch import Dispatch
 from rlightning_aio.group.first_observations import FirstObservations
 from rlightning_aio.group.hint import HINT_AFTER_BATCHES
 from rlightning_aio.group.intake import Intake
-from rlightning_aio.group.request_states import COLLECTOR
+from rlightning_aio.group.request_states import COLLECTOR, NOBODY, State
 from rlightning_aio.group.resets import Resets
 from rlightning_aio.group.results import Results
 from rlightning_aio.group.snapshots import Snapshots
@@ -398,10 +398,13 @@ class Core:
             self.continuity.note_shows(slots.tolist(), positions)
             return self.settled(*(yield from self._resets.show_restored(now, slots)))
 
-    def pending(self) -> int:
-        """Return the number of requests that `collect_async` has to answer, ready or not."""
+    def pending(self) -> list[str]:
+        """Return the ids of envs whose result, value or error was not returned yet."""
         self.intake.drain()
-        return self.requests.pending()[1]
+        requests, faults = self.requests, self.requests.collector.faults
+        slots = np.flatnonzero((requests.state != State.IDLE) & (requests.owner != NOBODY))
+        failed = [id_ for fault in faults for id_ in (fault.env_id, *getattr(fault, "env_ids", ()))]
+        return list(dict.fromkeys([*self.envs.names.ids(slots), *failed]))
 
 
 def _answered(batch: BatchedData) -> list[str]:

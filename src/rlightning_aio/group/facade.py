@@ -186,6 +186,11 @@ class Facade:
 
     # -- requests -----------------------------------------------------------------
 
+    @property
+    def pending(self) -> list[str]:
+        """Ids of the envs with a request whose result, value or error was not returned yet."""
+        return self._core.pending()
+
     def step_async(self, batch: BatchedData) -> None:
         """Send a step to each env of `batch`; `collect_async` returns the results. Never blocks.
 

@@ -115,7 +115,7 @@ class Steps:
             in_one_slab
             and (in_rings or self._inline is not None)
             and not envs.any_out_of_band
-            and slabs[0].action is not None
+            and bool(slabs[0].action_columns)
         )
         self._conditions.note(UNLIKE_ENVS, not ordinary)
         if ordinary:

@@ -78,7 +78,10 @@ class EnvGroup:
         self.id_to_num_envs = dict(zip(self.env_ids, counts, strict=True))
         self.observation_spaces: list[Any] | None = None
         self.action_spaces: list[Any] | None = None
-        self.step_counter: EnvStepCounter | None = None
+
+    @property
+    def step_counter(self) -> EnvStepCounter | None:
+        return self._group.counter
 
     @property
     def _in_auto_reset_context(self) -> bool:
@@ -147,11 +150,11 @@ class EnvGroup:
         Clients of env_servers get only `seed` and `options`.
         """
         self._group.settle()
-        rows = self._group.reset({ARGUMENTS: (args, kwargs)} if args or kwargs else None)
+        local_ids = self._group.local_ids
+        self._group.send_resets(local_ids, {ARGUMENTS: (args, kwargs)} if args or kwargs else None)
+        rows = self._results_of(local_ids)
         for env_id in self._group.server_ids:
             rows += self._group.reset_server(env_id, kwargs.get("seed"), kwargs.get("options"))
-        if self.step_counter is not None:
-            self.step_counter.reset_all()
         return self._batch_and_flags(rows)
 
     def step(self, batched_policy_resp: Any) -> tuple[Any, list[bool] | None]:
@@ -168,19 +171,18 @@ class EnvGroup:
                 )
         self._group.settle()
         self._send(batched_policy_resp)
-        found: dict[str, ResultRow] = {}
-        faults: list[EnvFault] = []
-        while not self._group.pending.isdisjoint(ids):
-            try:
-                found.update((row.env_id, row) for row in self._group.local_results())
-            except EnvFault as fault:
-                faults.append(fault)
-        batch, flags = self._batch_and_flags([found[env_id] for env_id in ids if env_id in found])
-        if faults:
-            faults[0].results, faults[0].others = batch, tuple(faults[1:])
-            raise faults[0]
+        rows = self._results_of(ids)
         self.throughput.record("env_throughput_sync", self._num_steps(ids))
+        batch, flags = self._batch_and_flags(rows)
         return batch, flags if self._in_auto_reset_context else None
+
+    def _results_of(self, ids: Sequence[str]) -> list[ResultRow]:
+        """Wait for results of local envs. An error has the results of the other envs."""
+        rows, faults = self._group.results_of(ids)
+        if faults:
+            faults[0].results, faults[0].others = self._batch_and_flags(rows)[0], tuple(faults[1:])
+            raise faults[0]
+        return rows
 
     def step_async(self, batched_policy_resp: Any) -> None:
         """Send a step to the envs of a batch; `collect_async` returns the results."""
@@ -205,6 +207,7 @@ class EnvGroup:
             warnings.warn("collect_async(wait_all=True) ignores timeout", stacklevel=2)
             timeout = None
         end = time.monotonic() + (timeout or 0.0)
+        self._group.end_calls()
         rows = self._group.take_kept()
         if not rows and not self._group.pending and not self.env_servers:
             _log.warning("collect_async: nothing was sent, so there is nothing to collect")
@@ -233,35 +236,23 @@ class EnvGroup:
                 raise UnknownEnv(f"no env of this group has the id {env_id!r}; nothing was sent")
         counter = self.step_counter
         due: list[str] = []
-        steps: list[tuple[str, str, Any]] = []
+        steps: list[tuple[str, Any]] = []
         for env_id, response in batch.items():
             if env_id not in self._local_ids:
-                client = self._group.for_client(env_id, response)
-                steps.append((response.env_id, env_id, client))
+                steps.append((env_id, self._group.for_client(env_id, response)))
             elif counter is not None and counter.is_reached_max_steps(env_id):
-                counter.reset(env_id)
                 due.append(env_id)
             else:
-                form = self._forms[env_id].of(response, self._names)
-                steps.append((env_id, env_id, form))
-        if due:
-            self._group.send_resets(due)
+                steps.append((env_id, self._forms[env_id].of(response, self._names)))
+        # Steps come first: if they are refused, nothing was sent.
         if steps:
             self._group.send_steps(steps)
+        self._group.send_resets(due)
 
     def _batch_and_flags(self, rows: list[ResultRow]) -> tuple[Any, list[bool]]:
-        """Count `rows` as steps. Return their batch, and a flag for each env at its limit."""
-        ids = [row.batch_id for row in rows]
-        flags = [False] * len(rows)
-        counter = self.step_counter
-        if counter is not None:
-            for k, env_id in enumerate(ids):
-                if env_id in self._local_ids:
-                    if rows[k].restarted:
-                        counter.reset(env_id)
-                    counter.step(env_id)
-                    flags[k] = counter.is_reached_max_steps(env_id)
-        return self._names.BatchedData(ids, [row.ret for row in rows]), flags
+        """Return the batch of `rows`, and a flag for each env at its limit."""
+        batch = self._names.BatchedData([row.batch_id for row in rows], [row.ret for row in rows])
+        return batch, [row.at_limit for row in rows]
 
     @contextlib.contextmanager
     def auto_reset(self, max_episode_steps: int | None = None) -> Generator[None]:
@@ -277,11 +268,12 @@ class EnvGroup:
             ValueError: the limit isn't a positive int, or it is None and an env has none.
         """
         own: list[int | None] = self._group.call_all("of_env", "get_max_episode_steps", (), {})
-        self.step_counter = EnvStepCounter(self._group.local_ids, _limits(own, max_episode_steps))
+        limits = _limits(own, max_episode_steps)
+        self._group.begin_counting(EnvStepCounter(self._group.local_ids, limits))
         try:
             yield
         finally:
-            self.step_counter = None
+            self._group.counter = None
 
     # -- methods of the envs
 

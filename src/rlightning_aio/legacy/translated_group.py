@@ -1,11 +1,12 @@
 """`TranslatedGroup`: our synchronous group under RLightning's ids.
 
-Rule: it knows which envs are busy, and keeps results that arrive before `collect_async` asks for
-them. What RLightning's operations mean is in `group`.
+Rule: it counts steps as results arrive, and keeps results that arrive before `collect_async` asks
+for them. What RLightning's operations mean is in `group`.
 """
 
 from __future__ import annotations
 
+import contextlib
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
@@ -14,17 +15,18 @@ from rlightning_aio.batch import BatchedData
 from rlightning_aio.batch.contents import parts_of
 from rlightning_aio.batch.parts import rows_in_order
 from rlightning_aio.envs.tensors import as_numpy
-from rlightning_aio.errors import EnvFault
+from rlightning_aio.errors import EnvFault, NothingPending, WorkerDied
 from rlightning_aio.legacy.hosted import restored
 from rlightning_aio.legacy.names import names_in_use
 from rlightning_aio.sync import build_env_group
 from rlightning_aio.types import PolicyResponse
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Generator, Sequence
 
     from numpy.typing import NDArray
 
+    from rlightning_aio.legacy.counter import EnvStepCounter
     from rlightning_aio.legacy.plan import Plan
 
 __all__ = ["ResultRow", "TranslatedGroup"]
@@ -37,13 +39,15 @@ class ResultRow(NamedTuple):
         batch_id: its id in batches.
         env_id: the id of its env.
         ret: RLightning's `EnvRet`.
-        restarted: it is the first one of a replaced worker's env.
+        is_reset: it is the first one of an episode.
+        at_limit: with it the episode has reached its limit of steps.
     """
 
     batch_id: str
     env_id: str
     ret: Any
-    restarted: bool = False
+    is_reset: bool = False
+    at_limit: bool = False
 
 
 class TranslatedGroup:
@@ -51,7 +55,7 @@ class TranslatedGroup:
 
     Attributes:
         local_ids, server_ids: RLightning's ids of the local envs and of the env_servers.
-        pending: ids of envs and clients in flight.
+        counter: of the steps of local envs; None if they are not counted.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -61,8 +65,13 @@ class TranslatedGroup:
         self._local_entries = [entry.name for entry in plan.entries if entry.backend == "callable"]
         self._core = build_env_group(plan.entries, mixed_actions=True)
         self._core.init()
-        self.pending: set[str] = set()
+        self.counter: EnvStepCounter | None = None
+        # What Ctrl-C kept from its caller, or came before `collect_async` asked for it.
         self._kept: list[ResultRow] = []
+        self._faults: list[EnvFault] = []
+        # Calls of all envs may be unanswered.
+        self._calling = False
+        self._id_of = dict(zip(plan.core_ids, plan.core_ids, strict=True))
         self.local_ids: list[str] = []
         self.local_ids = self.call_all("of_env", "get_env_id", (), {})
         self.server_ids = plan.ids[num_local:]
@@ -72,28 +81,22 @@ class TranslatedGroup:
 
     # -- steps and resets of local envs, steps of clients
 
-    def reset(self, options: dict[str, Any] | None) -> list[ResultRow]:
-        """Reset every local env, and wait."""
-        if not self._local_core_ids:
-            return []
-        batch, _ = self._core.reset(options=options, env_ids=self._local_core_ids)
-        return self._rows_of(batch)
-
-    def send_resets(self, env_ids: Sequence[str]) -> None:
+    def send_resets(self, env_ids: Sequence[str], options: dict[str, Any] | None = None) -> None:
         """Send a reset to each of the local envs."""
-        self._core.reset_async(env_ids=[self._core_id_of[env_id] for env_id in env_ids])
-        self.pending.update(env_ids)
+        if not env_ids:
+            return
+        core_ids = [self._core_id_of[env_id] for env_id in env_ids]
+        self._core.reset_async(options=options, env_ids=core_ids)
 
-    def send_steps(self, steps: Sequence[tuple[str, str, Any]]) -> None:
+    def send_steps(self, steps: Sequence[tuple[str, Any]]) -> None:
         """Send steps.
 
         Args:
-            steps: id of a local env or of a client, id of the env or of the client's env_server,
-                and an action or a `PolicyResponse` with the former id.
+            steps: id of a local env and an action or a `PolicyResponse`, or id of an env_server
+                and a `PolicyResponse` for a client.
         """
-        env_ids, owners, forms = zip(*steps, strict=True)
+        owners, forms = zip(*steps, strict=True)
         self._core.step_async(_batch_of([self._core_id_of[id_] for id_ in owners], forms))
-        self.pending.update(env_ids)
 
     def for_client(self, server_id: str, response: Any) -> PolicyResponse:
         """Return `response` with arrays for tensors, addressed to our client."""
@@ -109,22 +112,51 @@ class TranslatedGroup:
             env_id = f"{server_id}/{ret.env_id.partition('/')[2]}"
             own = self._names.EnvRet(env_id, ret.observation, info=ret.info)
             rows.append(ResultRow(server_id, env_id, own))
-        self.pending -= {row.env_id for row in rows}
         return rows
 
     # -- results
 
+    def begin_counting(self, counter: EnvStepCounter) -> None:
+        """Count results from now on, and those that were kept."""
+        self.counter = counter
+        self._kept = [self._counted(row) for row in self._kept]
+
+    def _counted(self, row: ResultRow) -> ResultRow:
+        counter = self.counter
+        if counter is None or row.batch_id in self.server_ids:
+            return row
+        if row.is_reset:
+            counter.reset(row.env_id)
+        counter.step(row.env_id)
+        return row._replace(at_limit=counter.is_reached_max_steps(row.env_id))
+
     def collected(self, **how: Any) -> list[ResultRow]:
         """Return results of our `collect_async`, with arguments `how`."""
-        try:
+        self._raise_kept()
+        with self._own_ids():
             batch, _ = self._core.collect_async(**how)
+        return self._rows_of(batch)
+
+    @property
+    def pending(self) -> set[str]:
+        """Ids of envs and clients in flight."""
+        return {self._own_id(core_id) for core_id in self._core.pending}
+
+    def _own_id(self, core_id: str) -> str:
+        owner, slash, client = core_id.partition("/")
+        return f"{self._id_of[owner]}{slash}{client}"
+
+    @contextlib.contextmanager
+    def _own_ids(self) -> Generator[None]:
+        """Name envs in errors by RLightning's ids."""
+        try:
+            yield
         except EnvFault as fault:
-            ended = {fault.env_id, *getattr(fault, "env_ids", ())}
-            self.pending -= {self._id_of.get(core_id, core_id) for core_id in ended}
+            for one in (fault, *fault.others):
+                one.env_id = self._own_id(one.env_id)
+                if isinstance(one, WorkerDied):
+                    one.env_ids = tuple(map(self._own_id, one.env_ids))
             raise
-        rows = self._rows_of(batch)
-        self.pending -= {row.env_id for row in rows}
-        return rows
 
     def _rows_of(self, batch: BatchedData) -> list[ResultRow]:
         rows: list[ResultRow] = []
@@ -132,19 +164,44 @@ class TranslatedGroup:
         for (part, row), core_id, core_env_id in places:
             batch_id = self._id_of[core_id]
             env_id = batch_id + core_env_id.removeprefix(core_id)
-            restarted = part.restarted is not None and bool(part.restarted[row])
             ret = restored(self._names, part, row, env_id)
-            rows.append(ResultRow(batch_id, env_id, ret, restarted))
+            is_reset = bool(part.is_reset[row].all())
+            rows.append(self._counted(ResultRow(batch_id, env_id, ret, is_reset)))
         return rows
 
-    def local_results(self) -> list[ResultRow]:
+    def results_of(self, env_ids: Sequence[str]) -> tuple[list[ResultRow], list[EnvFault]]:
+        """Wait for the outstanding results of local envs; return them in this order, and errors.
+
+        If Ctrl-C ends the wait, those that have arrived are kept.
+        """
+        found: dict[str, ResultRow] = {}
+        faults: list[EnvFault] = []
+        try:
+            while not self.pending.isdisjoint(env_ids):
+                try:
+                    found.update((row.env_id, row) for row in self._local_results())
+                except EnvFault as fault:
+                    faults.append(fault)
+        except BaseException:
+            self.keep([*found.values()])
+            self._faults += faults
+            raise
+        return [found[env_id] for env_id in env_ids if env_id in found], faults
+
+    def _local_results(self) -> list[ResultRow]:
         """Wait for all outstanding results of local envs."""
         return self.collected(wait_all=True, entries=self._local_entries)
 
     def settle(self) -> None:
-        """Wait for outstanding results of local envs, and keep them for `take_kept`."""
+        """Wait for what local envs owe, and keep results for `take_kept`; raise kept errors."""
+        self._raise_kept()
+        self.end_calls()
         while not self.pending.isdisjoint(self.local_ids):
-            self.keep(self.local_results())
+            self.keep(self._local_results())
+
+    def _raise_kept(self) -> None:
+        if self._faults:
+            raise self._faults.pop(0)
 
     def keep(self, rows: list[ResultRow]) -> None:
         """Keep results for `take_kept`."""
@@ -162,14 +219,29 @@ class TranslatedGroup:
         if not self._local_core_ids:
             return []
         self.settle()
+        self._calling = True
         self._core.call_async(name, *args, env_ids=self._local_core_ids)
-        return self._core.collect_calls()
+        return self._call_values()
+
+    def end_calls(self) -> None:
+        """Wait for calls of all envs that Ctrl-C left behind, and drop their values."""
+        if self._calling:
+            with contextlib.suppress(NothingPending):
+                self._call_values()
+            self._calling = False
+
+    def _call_values(self) -> list[Any]:
+        with self._own_ids():
+            values = self._core.collect_calls()
+        self._calling = False
+        return values
 
     def call_env(self, env_id: str, name: str, *args: Any) -> Any:
         """Call a method of one local env."""
         if env_id in self.pending:
             self.settle()
-        return self._core[self._core_id_of[env_id]].call(name, *args)
+        with self._own_ids():
+            return self._core[self._core_id_of[env_id]].call(name, *args)
 
     def server_address(self, server_id: str) -> tuple[str, int]:
         """Return host and port of an env_server."""

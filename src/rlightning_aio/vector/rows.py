@@ -114,9 +114,7 @@ class Singles:
         env_ids = self._group.env_ids
         if all(options[k] is options[chosen[0]] for k in chosen):
             given = {env_ids[k]: int(seed) for k in chosen if (seed := seeds[k]) is not None}
-            return self._group.reset_async(
-                given, options[chosen[0]] or None, [env_ids[k] for k in chosen]
-            )
+            return self._group.reset_async(given, options[chosen[0]], [env_ids[k] for k in chosen])
         for k in chosen:
             self.send_resets(seeds, options, [k])
         return None
@@ -235,7 +233,7 @@ class Batches(Singles):
             raise TypeError(f"there must be as many actions as envs, {self.num_envs}, not a scalar")
         if len(array) != self.num_envs:
             raise ValueError(f"{len(array)} actions for num_envs={self.num_envs}")
-        return array.reshape(-1, self._each, *array.shape[1:])
+        return array.reshape(self.num_envs // self._each, self._each, *array.shape[1:])
 
     def send_resets(
         self, seeds: Sequence[int | None], options: Sequence[Options | None], chosen: Sequence[int]
@@ -257,20 +255,20 @@ class Batches(Singles):
             raise ValueError(
                 "reset options differ between envs that are stepped together; make separate envs"
             )
-        given = dict(own[0] or {})
+        given = None if own[0] is None else dict(own[0])
         if len(which) < self._each:
             if not self._takes_masks:
                 raise ValueError(
                     "the vector environments of this task reset all of their sub-environments "
                     "together; make separate envs (vectorization_mode='async') for reset_mask"
                 )
-            given["reset_mask"] = np.isin(np.arange(self._each), which)
+            given = {**(given or {}), "reset_mask": np.isin(np.arange(self._each), which)}
         first = seeds[0]
         if first is not None and seeds == list(range(first, first + self._each)):
-            return self._group.reset_async({env_id: int(first)}, given or None, [env_id])
+            return self._group.reset_async({env_id: int(first)}, given, [env_id])
         if any(seed is not None for seed in seeds):
-            given[SEEDS] = seeds
-        return self._group.reset_async(None, given or None, [env_id])
+            given = {**(given or {}), SEEDS: (seeds, given is None)}
+        return self._group.reset_async(None, given, [env_id])
 
     def _by_batch(self, chosen: Sequence[int]) -> Iterator[tuple[int, list[int]]]:
         """Yield the number of each batch with places in `chosen`, and their positions inside it."""
@@ -331,7 +329,8 @@ def rows_of(group: EnvGroup, metas: Sequence[EnvMeta]) -> Singles:
 
 
 def _flat(column: NDArray[Any]) -> NDArray[Any]:
-    return column.reshape(-1, *column.shape[2:])
+    batches, each, *shape = column.shape
+    return column.reshape(batches * each, *shape)
 
 
 def _with_valid(
