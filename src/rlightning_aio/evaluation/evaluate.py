@@ -113,16 +113,15 @@ def evaluate(
     Use it inside ``with group.auto_reset():``, whose step limits apply.
 
     Args:
-        group: initialised, without outstanding requests and without env_servers.
+        group: with nothing `pending` and without env_servers.
         policy: called with a batch of results (`BatchedData`). It returns actions ``[n, *action]``,
             or a batch made by `respond`, or a list of such batches, which together answer all
             results. It may be a coroutine function if the group is asynchronous.
-        episodes: a number of episodes for each env, and for each sub-environment; or a queue of
-            episodes, each to be played once by any free env.
+        episodes: a number for each env, and for each sub-environment; or a queue of episodes,
+            each to be played once by any free env.
         seed: for a number of episodes: episode n of env k (of N, counting sub-environments) has the
             seed ``seed + n * N + k``; of sub-environments that reset themselves, only the first.
-        min_results: number of results to wait for before the policy is called, or all pending
-            ones if they are fewer. None is the sum of ``min_results`` of the config entries, or 1.
+        min_results: of `EnvGroup.collect_async`, before each call of the policy.
         max_attempts: for a queue: an episode that was lost this often has failed; None is 3.
         results: for a queue: the file to save episodes in; those that it has are not played again.
         video: for a queue: the episodes to film.
@@ -135,13 +134,13 @@ def evaluate(
 
     Raises:
         RuntimeError: the group has no open `auto_reset` context.
+        EnvBusy: an env has a request in flight, or a result that was not collected.
         ValueError: a number is below 1, an option is meant for the other kind of `episodes`, the
             group has an env_server, or `played` has duplicates or episodes of other envs. Of a
             queue: an episode is there twice, no entry of the group or more than one can play it, or
             an env has sub-environments.
         RLightningError: of a number of episodes: an env has ended its worker three times in a row.
         BadAction: the policy's actions don't fit; nothing was sent.
-        EnvBusy: an env has a request in flight, or a result that was not collected.
         EnvRaised, WorkerDied, EnvHung: as for `EnvGroup.collect_async`; for a queue, only if no env
             is left that could play an episode.
         OSError: nothing can be written into the folder of `video`.
