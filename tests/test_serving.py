@@ -92,13 +92,16 @@ async def test_invalid_messages_do_not_change_the_session() -> None:
                     '{"type": "dance"}',
                     '{"type": "step", "data": {"act": 1}}',
                     '{"type": "step", "data": {"action": [1, 2]}}',
+                    '{"type": "step", "data": {"action": 0.7}}',
+                    '{"type": "step", "data": {"action": 1e300}}',
+                    '{"type": "step", "data": {"action": 1' + "0" * 40 + "}}",
+                    '{"type": "reset", "data": "abc"}',
                 )
             ]
             assert codes == [
                 "INVALID_JSON",
                 "UNKNOWN_TYPE",
-                "VALIDATION_ERROR",
-                "VALIDATION_ERROR",
+                *["VALIDATION_ERROR"] * 6,
             ]
             assert (await ask('{"type": "step", "data": {"action": 1}}'))["data"]["reward"] == 1
             state = await ask('{"type": "state"}')
@@ -108,8 +111,12 @@ async def test_invalid_messages_do_not_change_the_session() -> None:
             assert refusal["data"]["code"] == "CAPACITY_REACHED"
         for _ in range(100):
             async with connect(address, proxy=None) as socket:
-                if (await ask('{"type": "reset"}'))["type"] == "observation":
-                    return
+                answer = await ask('{"type": "step", "data": {"action": 1}}')
+                if answer["data"]["code"] == "CAPACITY_REACHED":
+                    continue
+                assert "reset it first" in answer["data"]["message"]
+                assert (await ask('{"type": "reset"}'))["type"] == "observation"
+                return
         pytest.fail("the session's env was not given back")
 
 

@@ -118,6 +118,22 @@ def test_the_film_of_an_unfinished_episode_is_marked(tmp_path: Path) -> None:
     }
 
 
+def test_a_film_ends_where_a_state_is_restored(tmp_path: Path) -> None:
+    """What follows is another past of the same episode; the next episode is filmed."""
+    with sync.build_env_group(filmed(Brighter, tmp_path)) as group:
+        batch, _ = group.reset()
+        snapshot = group.snapshot()
+        batch, _ = group.step(batch.respond(action=[0]))
+        batch, _ = group.restore(snapshot)
+        for _ in range(3):
+            batch, _ = group.step(batch.respond(action=[0]))
+        play(group, 3)
+    assert films(tmp_path) == {
+        "env-0-episode-0.partial.mp4": [0, 1],
+        "env-0-episode-1.mp4": [0, 1, 2, 3],
+    }
+
+
 def test_a_step_limit_ends_a_film(tmp_path: Path) -> None:
     """Also that of the group, by the reset that follows."""
     with sync.build_env_group(filmed(Endless, tmp_path)) as group:

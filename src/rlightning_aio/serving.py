@@ -19,6 +19,7 @@ from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.error import ResetNeeded
 from websockets.asyncio.server import serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
@@ -61,6 +62,8 @@ class _Session:
         self.env = env
         self.is_kept = is_kept
         self.is_attached = self.is_closing = False
+        # Before that, the env is in an episode of an earlier session.
+        self.has_reset = False
         self.state: dict[str, Any] = {"episode_id": None, "step_count": 0}
 
 
@@ -250,16 +253,16 @@ class OpenEnvServer:
                 message: Any = json.loads(await socket.recv())
                 kind: Any = message.get("type")
                 data: dict[str, Any] = message.get("data") or {}
-            except (ValueError, AttributeError) as error:
+            except (ValueError, AttributeError, RecursionError) as error:
                 await _send_error(socket, "INVALID_JSON", f"Invalid JSON: {error}")
                 continue
             if kind == "close":
                 return
             try:
                 reply = await self._reply(session, kind, data)
-            except (KeyError, TypeError, ValueError) as error:
+            except (KeyError, TypeError, ValueError, OverflowError) as error:
                 await _send_error(socket, "VALIDATION_ERROR", f"Invalid message: {error}")
-            except RLightningError as error:
+            except (RLightningError, ResetNeeded) as error:
                 await _send_error(socket, "EXECUTION_ERROR", str(error))
             else:
                 if reply is None:
@@ -275,11 +278,16 @@ class OpenEnvServer:
             return "state", session.state
         if kind == "mcp":
             return "mcp", self._rpc(data, session)
+        if not isinstance(data, dict):  # pyright: ignore[reportUnnecessaryIsInstance]
+            raise TypeError("its data must be an object")
         if kind == "reset":
             seed, episode_id = data.pop("seed", None), data.pop("episode_id", None)
             answer = _observed(await session.env.reset(seed, data or None))
             session.state = {"episode_id": episode_id, "step_count": 0}
+            session.has_reset = True
         elif kind == "step":
+            if not session.has_reset:
+                raise ResetNeeded("this session has no episode yet; reset it first")
             answer = _observed(await session.env.step(_action_in(self._space, data)))
             session.state["step_count"] += 1
         else:
@@ -354,7 +362,12 @@ def _value_in(space: gym.Space[Any], value: Any) -> Any:
         return {key: _value_in(inner, value[key]) for key, inner in space.spaces.items()}
     if is_tuple(space):
         return tuple(map(_value_in, space.spaces, value))
-    return value if space.shape is None else np.asarray(value, space.dtype)
+    if space.shape is None:
+        return value
+    array = np.asarray(value, space.dtype)
+    if array.dtype.kind != "f" and not np.array_equal(array, np.asarray(value)):
+        raise ValueError(f"{value!r} is not of {space.dtype}")
+    return array
 
 
 def _fields_schema(space: Any, name: str) -> dict[str, Any]:

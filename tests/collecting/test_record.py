@@ -133,8 +133,10 @@ def test_a_replay_names_the_call_at_which_it_differs() -> None:
         replayed.step_async(batch.respond(action=[0, 0]))
         batch, _ = replayed.collect_async(wait_all=True)
         assert batch.ids() == ["pole-0"]  # As recorded.
+        assert replayed.pending == ["pole-1"]
         batch, _ = replayed.collect_async()
         assert batch.ids() == ["pole-1"]
+        assert replayed.pending == []
         with pytest.raises(ReplayDiverged, match=r"call 3 .*of 3.*'pole-0'.*no request to answer"):
             replayed.collect_async()
         group.reset_async(env_ids=["pole-0"])

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
+import time
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from patience import HANG
 
 import rlightning_aio.sync
+from rlightning_aio.errors import EnvBusy
 from rlightning_aio.vector.leftovers import drop_outstanding
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+    from pathlib import Path
     from types import FrameType
 
     from rlightning_aio.batch import BatchedData
@@ -163,3 +168,56 @@ def test_a_program_that_handles_ctrl_c_itself_goes_on_doing_so() -> None:
             assert signal.signal(signal.SIGINT, own) is not before
         assert heard == [signal.SIGINT]
         assert batch.observation.tolist() == [1]
+
+
+class Waiting(Pressing):
+    """Presses Ctrl-C in the trainer, and waits for a file."""
+
+    def step(self, action: Any) -> Any:
+        return 1, 1.0, False, False, {}
+
+    def wait(self, trainer: int, go_on: str) -> None:
+        os.kill(trainer, signal.SIGINT)
+        while not os.path.exists(go_on):  # noqa: PTH110  # In a worker.
+            time.sleep(0.001)
+
+    def save_state(self) -> Any:
+        self.wait(*self.waits_for)
+        return 0
+
+    def load_state(self, state: Any) -> None: ...
+
+
+@pytest.mark.parametrize("use", ["step", "step_async", "reset", "call"])
+@pytest.mark.parametrize("interrupted", ["call", "snapshot"])
+def test_an_env_is_free_again_after_a_call_that_was_interrupted(
+    use: str, interrupted: str, tmp_path: Path
+) -> None:
+    """Once the call has ended, though nobody waits for it."""
+    go_on = tmp_path / "go-on"
+    waits_for = os.getpid(), str(go_on)
+    entry = {"name": "a", "make_env": Waiting}
+    with rlightning_aio.sync.build_env_group(entry) as group:
+        batch, _ = group.reset()
+        env = group["a-0"]
+        env.set_attr("waits_for", waits_for)
+        uses: dict[str, Callable[[], Any]] = {
+            "step": lambda: group.step(batch.respond(action=[1])),
+            "step_async": lambda: group.step_async(batch.respond(action=[1])),
+            "reset": group.reset,
+            "call": lambda: env.get_attr("waits_for"),
+        }
+        with pytest.raises(KeyboardInterrupt):
+            env.call("wait", *waits_for) if interrupted == "call" else group.snapshot()
+        with pytest.raises(EnvBusy, match="a call that was cancelled still runs in it"):
+            uses[use]()
+        assert group.pending == []
+        go_on.touch()
+        until = time.monotonic() + HANG
+        while True:
+            try:
+                uses[use]()
+            except EnvBusy:
+                assert time.monotonic() < until
+            else:
+                break

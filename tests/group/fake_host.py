@@ -496,6 +496,9 @@ class FakeGroup:
         self.running.remove(running)
         self.turn()
 
+    def read(self) -> None:
+        """See `hosts.base.Watcher`: there is nothing to read."""
+
     def wake(self) -> None:
         """See `hosts.base.Watcher.wake`."""
         for running in self.running:

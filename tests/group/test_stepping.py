@@ -16,6 +16,7 @@ from rlightning_aio import (
     EnvBusy,
     EnvRaised,
     EnvRet,
+    GroupClosed,
     NothingPending,
     PolicyResponse,
     UnknownEnv,
@@ -235,6 +236,9 @@ async def test_pending_are_envs_with_a_reply_that_was_not_returned(start: Any) -
         except EnvRaised as error:
             left -= {error.env_id}
     assert group.pending == []
+    await group.close()
+    with pytest.raises(GroupClosed):
+        _ = group.pending
 
 
 @one_driver

@@ -30,7 +30,7 @@ from rlightning.utils.config import EnvConfig  # noqa: E402
 def entry(backend: str, **fields: Any) -> EnvConfig:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # RLightning warns about each backend that is not its own.
-        return EnvConfig(name="same name", backend=backend, task="any", **fields)
+        return EnvConfig(name="same/name", backend=backend, task="any", **fields)
 
 
 @pytest.fixture(scope="module")

@@ -115,6 +115,17 @@ def test_an_interrupted_step_counts(group: EnvGroup, tmp_path: Path) -> None:
         assert (counts(batch), flags) == ({0: 2, 1: 2}, [False, False])
 
 
+def test_results_of_before_count_at_most_to_the_limit(group: EnvGroup) -> None:
+    """However many were not collected when counting begins."""
+    ids = group.env_ids
+    group.reset()
+    for _ in range(LIMIT + 3):
+        group.step_async(responses(ids))
+    with group.auto_reset(LIMIT):
+        assert counts(group.step(responses(ids))[0]) == {0: 0, 1: 0}
+    assert group.step(responses(ids))[1] is None
+
+
 def test_a_refused_step_resets_nothing(group: EnvGroup) -> None:
     ids = group.env_ids
     with group.auto_reset(LIMIT):

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rlightning_aio.errors import EnvRaised
 from rlightning_aio.legacy.names import is_rlightning_installed, names_in_use
 
 if is_rlightning_installed():
@@ -29,9 +30,12 @@ class Robot(BaseEnv):
     """A robot without spaces that is finished after some steps."""
 
     resets = steps = 0
+    fails_in = 0
 
     def reset(self) -> EnvRet:
         self.resets += 1
+        if self.resets == self.fails_in:
+            raise RuntimeError("stuck")
         self.steps = 0
         return EnvRet(self.env_id, {"joints": np.zeros(7), "rgb": np.zeros((4, 4, 3), np.uint8)})
 
@@ -99,6 +103,32 @@ def test_a_robot_serves_a_group_and_reconnects() -> None:
     assert results[0].observation["joints"].tolist() == [0.5] * 7
     assert (results[-1].observation["rgb"].max(), results[-1].info) == (STEPS, {"gripper": "open"})
     assert robot.steps == STEPS
+
+
+def test_an_error_of_a_robot_in_a_reset_has_the_results_of_the_others() -> None:
+    """Under RLightning's ids, also if an entry's name has a slash."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        group = build_env_group(
+            [
+                EnvConfig(name="local/cheetah", backend="mujoco", task="HalfCheetah-v5"),
+                EnvConfig(name="all/robots", backend="env_server", task="real", zmq_port="0"),
+            ]
+        )
+    local_id, server_id = group.env_ids
+    thread, robot = serving(group.env_servers[0].get_address_port(), times=1)
+    try:
+        batch, _ = group.reset()
+        robot.fails_in = robot.resets + 1
+        with pytest.raises(EnvRaised, match="stuck") as caught:
+            group.reset()
+        assert caught.value.env_id == batch.values()[1].env_id
+        assert caught.value.env_id.startswith(f"{server_id}/")
+        assert caught.value.results.ids() == (local_id,)
+    finally:
+        robot.steps = STEPS  # It is finished.
+        group.close()
+        thread.join()
 
 
 def test_a_server_without_a_group_waits_for_clients() -> None:

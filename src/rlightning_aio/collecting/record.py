@@ -169,6 +169,11 @@ class ReplayedGroup(_WrappedGroup[G]):
         self._kept: dict[str, tuple[BatchedData, bool]] = {}
         self._faults: dict[str, EnvFault] = {}
 
+    @property
+    def pending(self) -> list[str]:
+        """Ids as in `EnvGroup.pending`, with those of results that are kept until their turn."""
+        return list(dict.fromkeys([*self.group.pending, *self._kept, *self._faults]))
+
     def collect_async(self, *args: Any, **options: Any) -> Any:
         """Collect the next recorded results, awaitable if the wrapped group is asynchronous.
 

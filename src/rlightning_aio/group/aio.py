@@ -176,6 +176,9 @@ class AioDriver:
             if not woken.done() and not woken.get_loop().is_closed():
                 woken.set_result(None)
 
+    def read(self) -> None:
+        """Do nothing: the loop reads."""
+
     def forget(self) -> None:
         self._descriptors.clear()
         self._writing.clear()

@@ -107,10 +107,10 @@ class Core:
         self._layout = layout
         self.results = Results(envs, layout, conditions, zero_copy=zero_copy)
         self._first_observations = FirstObservations(envs)
-        self._dispatch = Dispatch(tables, supervisor)
         self._arrivals = Arrivals(tables, self.results, self.stats)
         self.intake = Intake(parts.completions, tables, supervisor, self.results, self._arrivals)
         self.drain = self.intake.drain
+        self._dispatch = Dispatch(tables, supervisor, self.intake, parts.watcher)
         self.waiting = Waiting(requests, supervisor, parts.poller, self.intake, parts.watcher)
         self.calls = Calls(tables, self._dispatch, self.intake, self.waiting)
         self._snapshots = Snapshots(
@@ -403,7 +403,9 @@ class Core:
         self.intake.drain()
         requests, faults = self.requests, self.requests.collector.faults
         slots = np.flatnonzero((requests.state != State.IDLE) & (requests.owner != NOBODY))
-        failed = [id_ for fault in faults for id_ in (fault.env_id, *getattr(fault, "env_ids", ()))]
+        failed = [
+            id_ for fault in faults for id_ in getattr(fault, "env_ids", ()) or (fault.env_id,)
+        ]
         return list(dict.fromkeys([*self.envs.names.ids(slots), *failed]))
 
 

@@ -19,9 +19,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio.group.actions import OutOfBandSteps
+    from rlightning_aio.group.intake import Intake
     from rlightning_aio.group.supervisor import Supervisor
     from rlightning_aio.group.tables import Tables
-    from rlightning_aio.hosts.base import Host, Membership
+    from rlightning_aio.hosts.base import Host, Membership, Watcher
 
 __all__ = ["Dispatch"]
 
@@ -29,11 +30,15 @@ __all__ = ["Dispatch"]
 class Dispatch:
     """The outgoing side of a group."""
 
-    def __init__(self, tables: Tables, supervisor: Supervisor) -> None:
+    def __init__(
+        self, tables: Tables, supervisor: Supervisor, intake: Intake, watcher: Watcher
+    ) -> None:
         self._envs = tables.envs
         self._requests = tables.requests
         self._lifetime = tables.lifetime
         self._supervisor = supervisor
+        self._intake = intake
+        self._watcher = watcher
 
     def distinct(self, env_ids: Sequence[str]) -> NDArray[np.intp]:
         """The slots of `env_ids`; `EnvBusy` if an id appears twice."""
@@ -48,6 +53,10 @@ class Dispatch:
         self._lifetime.check_open()
         self._supervisor.check_usable(slots)
         slot = self._requests.first_not_idle(slots)
+        if slot is not None and self._requests.owner[slot] == NOBODY:
+            self._watcher.read()  # The call may have ended since the group last waited.
+            self._intake.drain()
+            slot = self._requests.first_not_idle(slots)
         if slot is not None:
             why = "its last request was not collected; collect it first"
             if self._requests.owner[slot] == NOBODY:

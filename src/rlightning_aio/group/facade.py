@@ -188,7 +188,16 @@ class Facade:
 
     @property
     def pending(self) -> list[str]:
-        """Ids of the envs with a request whose result, value or error was not returned yet."""
+        """Ids of the envs with a request whose result, value or error was not returned yet.
+
+        `collect_async` returns results and errors, `collect_calls` values.
+
+        Raises:
+            GroupClosed: the group was not initialised, or is closed.
+            RLightningError: another thread is using the group, or it belongs to another loop.
+        """
+        self._driver.check_caller()
+        self._core.lifetime.check_open()
         return self._core.pending()
 
     def step_async(self, batch: BatchedData) -> None:

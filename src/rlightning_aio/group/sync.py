@@ -104,6 +104,9 @@ class SyncDriver:
     def wake(self) -> None:
         """Do nothing: one procedure runs at a time, so no other call waits."""
 
+    def read(self) -> None:
+        self._block(0.0)
+
     def forget(self) -> None:
         if self._epoll is not None:
             self._epoll.close()

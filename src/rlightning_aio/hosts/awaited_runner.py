@@ -76,7 +76,7 @@ class AwaitedRunner(EnvRunner):
     async def _reset_awaited(self, arguments: Any) -> OutOfBand | None:
         if arguments is None:
             if self._checkpoints.must_show():
-                return self._checkpoints.show()
+                return self._show()
             arguments = self._slab.take_seed(self._row), None
         self._checkpoints.forget_result()
         self.reset_with = seed, options = arguments

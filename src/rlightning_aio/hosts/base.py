@@ -77,6 +77,10 @@ class Watcher(Protocol):
         """Wake all waiters, as if a source had posted a completion."""
         ...
 
+    def read(self) -> None:
+        """Read what sources have received, without waiting, if no event loop does so anyway."""
+        ...
+
     def interruptible(self, execute: Callable[[], T]) -> T:
         """Call a function that runs an env; Ctrl-C may interrupt it."""
         ...

@@ -310,7 +310,13 @@ class EnvRunner:
 
     def reset_from_row(self) -> OutOfBand | None:
         """Start a new episode with the seed in the row, or show the restored result there."""
-        return self._checkpoints.show() if self._checkpoints.must_show() else self._reset_env()
+        return self._show() if self._checkpoints.must_show() else self._reset_env()
+
+    def _show(self) -> OutOfBand | None:
+        """Return the restored result; frames that follow aren't of the episode being filmed."""
+        if self._camera is not None:
+            self._camera.close()
+        return self._checkpoints.show()
 
     def _reset_from_row(self) -> OutOfBand | None:
         return self._reset(self._slab.take_seed(self._row), None)

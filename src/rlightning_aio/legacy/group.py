@@ -153,8 +153,17 @@ class EnvGroup:
         local_ids = self._group.local_ids
         self._group.send_resets(local_ids, {ARGUMENTS: (args, kwargs)} if args or kwargs else None)
         rows = self._results_of(local_ids)
-        for env_id in self._group.server_ids:
-            rows += self._group.reset_server(env_id, kwargs.get("seed"), kwargs.get("options"))
+        try:
+            for env_id in self._group.server_ids:
+                rows += self._group.reset_server(env_id, kwargs.get("seed"), kwargs.get("options"))
+        except EnvFault as fault:
+            if fault.results is not None:
+                rows += self._group.rows_of(fault.results)
+            fault.results, _ = self._batch_and_flags(rows)
+            raise
+        except BaseException:
+            self._group.keep(rows)
+            raise
         return self._batch_and_flags(rows)
 
     def step(self, batched_policy_resp: Any) -> tuple[Any, list[bool] | None]:

@@ -101,15 +101,16 @@ class TranslatedGroup:
     def for_client(self, server_id: str, response: Any) -> PolicyResponse:
         """Return `response` with arrays for tensors, addressed to our client."""
         data = {name: as_numpy(value) for name, value in response.to_dict().items()}
-        client = response.env_id.partition("/")[2]
+        client = response.env_id.rpartition("/")[2]
         return PolicyResponse(f"{self._core_id_of[server_id]}/{client}", **data)
 
     def reset_server(self, server_id: str, seed: Any, options: Any) -> list[ResultRow]:
         """Reset the clients of an env_server, and wait."""
-        rets: Any = self._core[self._core_id_of[server_id]].reset(seed, options)
+        with self._own_ids():
+            rets: Any = self._core[self._core_id_of[server_id]].reset(seed, options)
         rows: list[ResultRow] = []
         for ret in rets:
-            env_id = f"{server_id}/{ret.env_id.partition('/')[2]}"
+            env_id = self._own_id(ret.env_id)
             own = self._names.EnvRet(env_id, ret.observation, info=ret.info)
             rows.append(ResultRow(server_id, env_id, own))
         return rows
@@ -127,7 +128,8 @@ class TranslatedGroup:
             return row
         if row.is_reset:
             counter.reset(row.env_id)
-        counter.step(row.env_id)
+        if not counter.is_reached_max_steps(row.env_id):
+            counter.step(row.env_id)
         return row._replace(at_limit=counter.is_reached_max_steps(row.env_id))
 
     def collected(self, **how: Any) -> list[ResultRow]:
@@ -135,7 +137,7 @@ class TranslatedGroup:
         self._raise_kept()
         with self._own_ids():
             batch, _ = self._core.collect_async(**how)
-        return self._rows_of(batch)
+        return self.rows_of(batch)
 
     @property
     def pending(self) -> set[str]:
@@ -143,8 +145,10 @@ class TranslatedGroup:
         return {self._own_id(core_id) for core_id in self._core.pending}
 
     def _own_id(self, core_id: str) -> str:
-        owner, slash, client = core_id.partition("/")
-        return f"{self._id_of[owner]}{slash}{client}"
+        if core_id in self._id_of:
+            return self._id_of[core_id]
+        server_id, _, client = core_id.rpartition("/")
+        return f"{self._id_of[server_id]}/{client}"
 
     @contextlib.contextmanager
     def _own_ids(self) -> Generator[None]:
@@ -158,7 +162,8 @@ class TranslatedGroup:
                     one.env_ids = tuple(map(self._own_id, one.env_ids))
             raise
 
-    def _rows_of(self, batch: BatchedData) -> list[ResultRow]:
+    def rows_of(self, batch: BatchedData) -> list[ResultRow]:
+        """Translate results of our group, and count them."""
         rows: list[ResultRow] = []
         places = zip(rows_in_order(parts_of(batch)), batch.ids(), batch.env_ids(), strict=True)
         for (part, row), core_id, core_env_id in places:
