@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections import Counter
 
 import numpy as np
+import pytest
 
+import rlightning_aio
 import rlightning_aio.sync
 
 
@@ -34,3 +37,21 @@ def test_inline_entries_take_turns() -> None:
                 came.update(list(batch.by_name()))
                 group.step_async(batch.respond(action=np.zeros(len(batch), np.int64)))
     assert came == {"first": 20, "second": 20, "third": 20}
+
+
+async def test_a_cancelled_call_that_still_waits_for_its_turn_delays_no_request() -> None:
+    """It is executed before the next request to its env, after those that were sent earlier."""
+    entry = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1", "num_workers": 2}
+    async with rlightning_aio.build_env_group({**entry, "placement": "inline"}) as group:
+        batch, _ = await group.reset(seed=0)
+        group.step_async(batch.take([1]).respond(action=[0]))
+        call = asyncio.create_task(group["pole-0"].set_attr("gravity", 1.0))
+        await asyncio.sleep(0)
+        call.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await call
+        ret = await group["pole-0"].step(0)
+        assert ret.last_reward == 1.0
+        assert await group["pole-0"].get_attr("gravity") == 1.0
+        batch, _ = await group.collect_async()
+        assert batch.ids() == ["pole-1"]

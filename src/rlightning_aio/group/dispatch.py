@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from rlightning_aio.group.actions import OutOfBandSteps
     from rlightning_aio.group.intake import Intake
+    from rlightning_aio.group.poller import Poller
     from rlightning_aio.group.supervisor import Supervisor
     from rlightning_aio.group.tables import Tables
     from rlightning_aio.hosts.base import Host, Membership, Watcher
@@ -31,12 +32,18 @@ class Dispatch:
     """The outgoing side of a group."""
 
     def __init__(
-        self, tables: Tables, supervisor: Supervisor, intake: Intake, watcher: Watcher
+        self,
+        tables: Tables,
+        supervisor: Supervisor,
+        poller: Poller,
+        intake: Intake,
+        watcher: Watcher,
     ) -> None:
         self._envs = tables.envs
         self._requests = tables.requests
         self._lifetime = tables.lifetime
         self._supervisor = supervisor
+        self._poller = poller
         self._intake = intake
         self._watcher = watcher
 
@@ -54,8 +61,7 @@ class Dispatch:
         self._supervisor.check_usable(slots)
         slot = self._requests.first_not_idle(slots)
         if slot is not None and self._requests.owner[slot] == NOBODY:
-            self._watcher.read()  # The call may have ended since the group last waited.
-            self._intake.drain()
+            self._end_call(slot)
             slot = self._requests.first_not_idle(slots)
         if slot is not None:
             why = "its last request was not collected; collect it first"
@@ -64,6 +70,16 @@ class Dispatch:
             elif self._requests.state[slot] == State.BUSY:
                 why = "its last request has not replied yet; collect it first"
             raise EnvBusy(f"can't {what} {self._envs.describe(slot)}: {why}; nothing was sent")
+
+    def _end_call(self, slot: int) -> None:
+        """Note the end of a cancelled call that has ended since the group last waited.
+
+        In this process, it is executed now, after the requests that were sent before it.
+        """
+        self._watcher.read()
+        self._intake.drain()
+        while not self._requests.is_idle(slot) and self._poller.execute(1, None):
+            self._intake.drain()
 
     def check_local(self, slots: NDArray[np.intp], what: str) -> None:
         """Raise `NotImplementedError` if any of `slots` belongs to a member."""
