@@ -19,7 +19,6 @@ from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 from gymnasium import spaces
-from gymnasium.error import ResetNeeded
 from websockets.asyncio.server import serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
@@ -262,7 +261,7 @@ class OpenEnvServer:
                 reply = await self._reply(session, kind, data)
             except (KeyError, TypeError, ValueError, OverflowError) as error:
                 await _send_error(socket, "VALIDATION_ERROR", f"Invalid message: {error}")
-            except (RLightningError, ResetNeeded) as error:
+            except RLightningError as error:
                 await _send_error(socket, "EXECUTION_ERROR", str(error))
             else:
                 if reply is None:
@@ -287,7 +286,7 @@ class OpenEnvServer:
             session.has_reset = True
         elif kind == "step":
             if not session.has_reset:
-                raise ResetNeeded("this session has no episode yet; reset it first")
+                raise RLightningError("this session has no episode yet; reset it first")
             answer = _observed(await session.env.step(_action_in(self._space, data)))
             session.state["step_count"] += 1
         else:

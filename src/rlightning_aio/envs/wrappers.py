@@ -26,8 +26,9 @@ def has_wrapper(env: Any, name: ClassName) -> bool:
 
     Wrappers of this package, which have `hides_itself`, don't count.
     """
-    wrappers = (type(one) for one in wrappers_of(env) if not hasattr(one, "hides_itself"))
-    return any(name_of(kind) == name for wrapper in wrappers for kind in wrapper.__mro__)
+    wrappers = (type(wrapper) for wrapper in wrappers_of(env))
+    counted = (wrapper for wrapper in wrappers if not hasattr(wrapper, "hides_itself"))
+    return any(name_of(kind) == name for wrapper in counted for kind in wrapper.__mro__)
 
 
 def metadata_of(env: Any) -> dict[str, Any]:
