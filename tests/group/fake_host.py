@@ -447,8 +447,8 @@ class FakeGroup:
             supervisor.add(host, self.config)
             poller.add(host)
         parts = Parts(tables, supervisor, poller, bell, rings, completions, self)
-        self.core = Core(parts, zero_copy=False)
-        self.steps = CheckedSteps(self.core, shares_thread=True)
+        self.core = Core(parts, zero_copy=False, shares_thread=True)
+        self.steps = CheckedSteps(self.core)
         self.running: list[Running] = []
         opened = self.begin(self.steps.start(self.now))
         self.turn()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import socket
 import threading
 from typing import Any
@@ -61,6 +62,37 @@ async def test_they_are_awaited_over_an_asynchronous_group() -> None:
         async with rl.build_env_group(entry) as group:
             with group.auto_reset(100):
                 check(await evaluate(group, ActionChunks(policy, 3), QUEUE))
+
+
+async def test_a_synchronous_group_waits_for_them_in_a_running_loop() -> None:
+    """As in a notebook, where whoever steps such a group can await nothing."""
+    with serving(OpenPiServer()) as url, OpenPiPolicy(url) as policy:
+        check(evaluated(ActionChunks(policy, 3)))
+        with group_of(env_kwargs={"period": 1}) as group:
+            batch, _ = group.reset(seed=0)
+            for number in range(3):
+                chunks = policy(batch)
+                assert chunks.shape == (2, 5, 3)
+                batch, _ = group.step(batch.respond(action=chunks[:, 0]))
+                assert batch.reward.tolist() == [1, 1]
+                assert (batch.observation[:, 1] == number + 1).all()
+
+
+async def test_an_answer_that_nobody_awaits_was_not_asked_for() -> None:
+    """The client can be used on; while an answer is awaited, a second one is refused."""
+    entry = {"name": "env", "make_env": Counting, "placement": "inline"}
+    server = OpenPiServer()
+    with serving(server) as url, OpenPiPolicy(url) as policy:
+        async with rl.build_env_group(entry) as group:
+            batch, _ = await group.reset(seed=0)
+            policy(batch).close()
+            assert not server.connections
+            first = asyncio.create_task(policy(batch))
+            await asyncio.sleep(0)
+            with pytest.raises(RuntimeError, match="is waiting for answers"):
+                await policy(batch)
+            assert (await first).shape == (1, 5, 3)
+            assert (await policy(batch)).shape == (1, 5, 3)
 
 
 def test_what_is_sent_can_be_chosen() -> None:

@@ -99,7 +99,7 @@ def _assembled(plan: Plan, watcher: Watcher, arena: Arena, *, shares_thread: boo
         poller.add(host)
         first_slot += host.num_envs
     parts = Parts(tables, supervisor, poller, bell, rings, completions, watcher)
-    return Core(parts, zero_copy=plan.zero_copy)
+    return Core(parts, zero_copy=plan.zero_copy, shares_thread=shares_thread)
 
 
 def _tables(plan: Plan, orders: Sequence[StartOrder]) -> Tables:

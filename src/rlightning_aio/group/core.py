@@ -85,14 +85,16 @@ class Core:
     Args:
         parts: of the group.
         zero_copy: return observations as views if their rows are contiguous.
+        shares_thread: other tasks may use the group while a procedure waits.
 
     Attributes:
-        parts: as given; results, intake, waiting, stats: made of them.
+        parts, shares_thread: as given; results, intake, waiting, stats: made of them.
         collecting: a call of `collect` waits.
     """
 
-    def __init__(self, parts: Parts, *, zero_copy: bool) -> None:
+    def __init__(self, parts: Parts, *, zero_copy: bool, shares_thread: bool) -> None:
         self.parts = parts
+        self.shares_thread = shares_thread
         tables, supervisor = parts.tables, parts.supervisor
         envs, requests, layout = tables.envs, tables.requests, tables.layout
         continuity, conditions = tables.continuity, tables.conditions

@@ -124,8 +124,7 @@ class Facade:
     def __init__(self, plan: Plan) -> None:
         self._driver = self._new_driver()
         self._core = assemble(plan, self._driver, shares_thread=self._shares_thread)
-        steps = CheckedSteps if DEBUG else Steps
-        self._steps = steps(self._core, shares_thread=self._shares_thread)
+        self._steps = (CheckedSteps if DEBUG else Steps)(self._core)
         self._driver.completions = self._core.parts.completions
         self._driver.drain = self._core.drain
         self._finalizer = weakref.finalize(self, self._core.supervisor.shutdown.abandon)

@@ -70,10 +70,9 @@ class Steps:
 
     Args:
         core: the general path.
-        shares_thread: other tasks may use the group while a procedure waits.
     """
 
-    def __init__(self, core: Core, *, shares_thread: bool) -> None:
+    def __init__(self, core: Core) -> None:
         self._core = core
         parts, tables = core.parts, core.parts.tables
         self._layout = tables.layout
@@ -91,7 +90,6 @@ class Steps:
         self._stats = core.stats
         self._intake = core.intake
         self._waiting = core.waiting
-        self._shares_thread = shares_thread
         self._fence = exchange.new_fence()
         # The inline host of all envs; also the one of the only env, if the group is synchronous.
         self._inline: StepsAtOnce | None = None
@@ -107,7 +105,7 @@ class Steps:
         envs, slabs, hosts = self._envs, self._layout.slabs, self._supervisor.hosts
         if len(hosts) == 1 and isinstance(hosts[0], StepsAtOnce):
             self._inline = hosts[0]
-            if len(envs) == 1 and not self._shares_thread:
+            if len(envs) == 1 and not self._core.shares_thread:
                 self._alone = hosts[0]
         in_rings = None not in self._rings
         in_one_slab = len(slabs) == 1 and len(envs) == len(envs.all) > 0

@@ -15,14 +15,16 @@ from typing import TYPE_CHECKING, Any, Final, Generic, Self, TypeVar, cast
 import numpy as np
 from websockets.exceptions import ConnectionClosed
 
+from rlightning_aio.batch.contents import origin_of
 from rlightning_aio.errors import PolicyServerError
+from rlightning_aio.group.core import Core
 from rlightning_aio.policies.episodes import begins_of_envs
 from rlightning_aio.policy_servers.connection import MAX_BYTES, connected
 from rlightning_aio.policy_servers.loop_thread import LoopThread
 from rlightning_aio.protocol.columns import index
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Generator
     from concurrent.futures import Future
 
     from numpy.typing import NDArray
@@ -61,7 +63,7 @@ class PolicyClient(abc.ABC, Generic[R]):
         self._infos: dict[str, dict[str, Any]] = {}
         """Infos of the resets of envs."""
         self._connections: dict[str, ClientConnection] = {}
-        self._future: Future[Any] | None = None
+        self._is_asking = False
 
     # -- what a protocol says ---------------------------------------------------------
 
@@ -84,16 +86,40 @@ class PolicyClient(abc.ABC, Generic[R]):
     # -- the policy -------------------------------------------------------------------
 
     def __call__(self, batch: BatchedData) -> Any:
-        """Return an answer for each env, stacked; awaitable if an event loop is running.
+        """Return an answer for each env, stacked.
+
+        Where an event loop is running, the answer is awaitable, unless `batch` is of a synchronous
+        group: its caller can't await, as in a notebook. The server is asked once it is awaited.
 
         Raises:
             PolicyServerError: the server is missing, silent or wrong; the message says which.
             RuntimeError: another call is waiting.
         """
-        if self._future is not None:
+        if _can_await(batch):
+            return self._awaited(batch)
+        with self._asking(batch) as future:
+            return future.result()
+
+    async def _awaited(self, batch: BatchedData) -> NDArray[Any]:
+        with self._asking(batch) as future:
+            return await asyncio.wrap_future(future)
+
+    @contextlib.contextmanager
+    def _asking(self, batch: BatchedData) -> Generator[Future[NDArray[Any]]]:
+        """Ask for the answers, until the block is left."""
+        if self._is_asking:
             raise RuntimeError(
                 "this client is waiting for answers; each evaluation needs a client of its own"
             )
+        future = self._thread.submit(self._answers(self._requests(batch)))
+        self._is_asking = True
+        try:
+            yield future
+        finally:
+            future.cancel()
+            self._is_asking = False
+
+    def _requests(self, batch: BatchedData) -> dict[str, R]:
         begun = begins_of_envs(batch)
         env_ids, rows = batch.env_ids(), np.flatnonzero(begun).tolist()
         for row, info in zip(rows, batch.take(rows).info() if rows else (), strict=True):
@@ -103,25 +129,7 @@ class PolicyClient(abc.ABC, Generic[R]):
             info = self._infos.get(env_id, {})
             sent = self._observe(index(batch.observation, row), info)
             requests[env_id] = self._request(sent, info if begun[row] else None)
-        future = self._future = self._thread.submit(self._answers(requests))
-        try:
-            asyncio.get_running_loop()
-        except RuntimeError:
-            return self._waited(future)
-        return self._awaited(future)
-
-    def _waited(self, future: Future[NDArray[Any]]) -> NDArray[Any]:
-        try:
-            return future.result()
-        finally:
-            future.cancel()
-            self._future = None
-
-    async def _awaited(self, future: Future[NDArray[Any]]) -> NDArray[Any]:
-        try:
-            return await asyncio.wrap_future(future)
-        finally:
-            self._future = None
+        return requests
 
     async def _answers(self, requests: dict[str, R]) -> NDArray[Any]:
         try:
@@ -215,7 +223,6 @@ class PolicyClient(abc.ABC, Generic[R]):
 
     def close(self) -> None:
         """Close the connections; a later call opens others."""
-        self._future = None
         connections = [*self._connections.values()]
         self._connections.clear()
         if connections:
@@ -227,6 +234,17 @@ class PolicyClient(abc.ABC, Generic[R]):
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+
+def _can_await(batch: BatchedData) -> bool:
+    """Return True unless no event loop runs, or the group is synchronous."""
+    try:
+        asyncio.get_running_loop()
+    except RuntimeError:
+        return False
+    origin = origin_of(batch)
+    group = None if origin is None else origin.group
+    return not isinstance(group, Core) or group.shares_thread
 
 
 async def _close(connections: list[ClientConnection]) -> None:
