@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import builtins
 import os
+import re
 import select
 import sys
 import threading
@@ -11,6 +12,7 @@ import types
 from itertools import product
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from faults.driven import Driven, Tokens, entry, two_workers
@@ -351,3 +353,52 @@ def test_megabytes_on_stdout_and_stderr_change_nothing(
     group.close()
     written = capfd.readouterr().err
     assert written.count("o") == written.count("e") == 2 * 4 * 3000 * 1023
+
+
+def local_env(reward: Callable[[Any], float]) -> Callable[[], gym.Env[Any, Any]]:
+    """Return a maker of an env of a class that no worker can import."""
+
+    class Local(gym.Env[Any, Any]):
+        observation_space = action_space = gym.spaces.Discrete(2)
+
+        def __init__(self) -> None:
+            self.reward = reward
+
+        def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+            return 0, {}
+
+        def step(self, action: Any) -> Any:
+            return 0, self.reward(action), False, False, {}
+
+        def replace(self, new_reward: Callable[[Any], float]) -> None:
+            self.reward = new_reward
+
+    return Local
+
+
+@on_one_driver
+@pytest.mark.parametrize("way", ["env", "preprocess_fn", "argument", "restored state"])
+def test_the_traceback_of_code_that_no_worker_can_import(start: Start, way: str) -> None:
+    """It names the file and shows the source, however the code got there."""
+
+    def fails(_: Any) -> float:
+        return 1.0 // 0  # Shown.
+
+    def works(_: Any) -> float:
+        return 1.0
+
+    local = {
+        "name": "local",
+        "make_env": local_env(works if way in ("preprocess_fn", "argument") else fails),
+    }
+    group = start(local, preprocess_fn=fails if way == "preprocess_fn" else None)
+    batch, _ = group.reset()
+    if way == "argument":
+        group.call("local-0", "replace", fails)
+    elif way == "restored state":
+        group.restore(group.snapshot())
+    with pytest.raises(EnvRaised) as caught:
+        group.step(batch.respond(action=[0]))
+    shown = caught.value.traceback_text
+    assert re.search(rf'File "{re.escape(__file__)}", line \d+, in fails\n .*# Shown\.\n', shown)
+    assert "dynamic-code" not in shown

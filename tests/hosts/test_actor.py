@@ -12,8 +12,8 @@ from group.sample_envs import Gate, Probe
 from rlightning_aio import EnvConfig
 from rlightning_aio.hosts.actor import Batch, EnvActor, NotStarted
 from rlightning_aio.hosts.messages import StartOrder
-from rlightning_aio.hosts.pickling import dumped_with_code
 from rlightning_aio.protocol.entries import Operation, entry
+from rlightning_aio.protocol.pickling import dumped_with_code
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -18,13 +18,13 @@ from inspect import iscoroutinefunction
 from types import FunctionType, ModuleType
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 
-import cloudpickle
 import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
 from rlightning_aio.envs import mujoco_state
 from rlightning_aio.envs.ale_console import is_sticky
+from rlightning_aio.protocol.pickling import CodePickler
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -284,11 +284,11 @@ def versions_of(env: Any) -> dict[str, str]:
 # -- saving and loading -------------------------------------------------------------------
 
 
-class _Pickler(cloudpickle.Pickler):
+class _Pickler(CodePickler):
     """Replaces parts by references to their paths."""
 
     def __init__(self, file: io.BytesIO, paths: Mapping[int, str]) -> None:
-        super().__init__(file, pickle.HIGHEST_PROTOCOL)  # pyright: ignore[reportUnknownMemberType]
+        super().__init__(file)
         self._paths = paths
 
     def persistent_id(self, obj: Any) -> str | None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 from rlightning_aio.config import EnvConfig, check_installed, parse_configs
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.group.videos import check_videos
-from rlightning_aio.hosts.pickling import dumped_with_code
+from rlightning_aio.protocol.pickling import dumped_with_code
 from rlightning_aio.registry import load, placement_of
 from rlightning_aio.types import PolicyResponse, default_env_preprocess_fn
 

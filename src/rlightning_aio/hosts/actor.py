@@ -21,11 +21,11 @@ import numpy as np
 
 from rlightning_aio.hosts.build_env import built_envs
 from rlightning_aio.hosts.messages import ErrorText
-from rlightning_aio.hosts.pickling import dumped, dumped_with_code
 from rlightning_aio.hosts.row_table import RowTable
 from rlightning_aio.hosts.runner import close_all, resume_all
 from rlightning_aio.protocol.entries import Operation, answers_with_value, op_of, slot_of
 from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
+from rlightning_aio.protocol.pickling import dumped, dumped_with_code
 from rlightning_aio.protocol.slab import Slab
 
 if TYPE_CHECKING:

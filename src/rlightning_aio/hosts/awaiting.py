@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, cast
 from rlightning_aio.hosts.awaited_envs import AwaitedEnvs
 from rlightning_aio.hosts.event_loop import run_loop
 from rlightning_aio.hosts.messages import ErrorText, Failed, Raised, Result, Value
-from rlightning_aio.hosts.pickling import dumped
 from rlightning_aio.protocol.frames import FrameKind
+from rlightning_aio.protocol.pickling import dumped
 
 if TYPE_CHECKING:
     import socket

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from rlightning_aio.hosts.pickling import dumped
 from rlightning_aio.protocol.columns import row_reader
 from rlightning_aio.protocol.entries import Operation
 from rlightning_aio.protocol.info import PICKLED
+from rlightning_aio.protocol.pickling import dumped
 
 if TYPE_CHECKING:
     from collections.abc import Callable

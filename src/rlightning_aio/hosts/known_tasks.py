@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import gymnasium as gym
 
-from rlightning_aio.hosts.pickling import dumped_with_code
+from rlightning_aio.protocol.pickling import dumped_with_code
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

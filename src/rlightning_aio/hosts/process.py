@@ -30,10 +30,10 @@ from rlightning_aio.hosts.fork_messages import (
 from rlightning_aio.hosts.fork_server import BOOTSTRAP
 from rlightning_aio.hosts.link import Link
 from rlightning_aio.hosts.messages import Closed, Death, Died, ErrorText, WorkerPlace
-from rlightning_aio.hosts.pickling import dumped, dumped_with_code
 from rlightning_aio.hosts.standard_streams import occupy_standard_streams
 from rlightning_aio.protocol.entries import slot_of
 from rlightning_aio.protocol.frames import FrameKind
+from rlightning_aio.protocol.pickling import dumped, dumped_with_code
 from rlightning_aio.protocol.rings import rings_size
 from rlightning_aio.registry import ENVS
 

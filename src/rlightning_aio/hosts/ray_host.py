@@ -34,7 +34,6 @@ from rlightning_aio.hosts.messages import (
     Saved,
     Value,
 )
-from rlightning_aio.hosts.pickling import dumped, dumped_with_code
 from rlightning_aio.hosts.ray import (
     RayConnection,
     actor_class,
@@ -47,6 +46,7 @@ from rlightning_aio.hosts.ray import (
 from rlightning_aio.hosts.row_table import RowTable
 from rlightning_aio.hosts.runner import placed
 from rlightning_aio.protocol.entries import Operation, op_of, slot_of
+from rlightning_aio.protocol.pickling import dumped, dumped_with_code
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -21,7 +21,6 @@ from rlightning_aio.envs.results import is_awaitable
 from rlightning_aio.hosts.arena import make_private, map_shared
 from rlightning_aio.hosts.build_env import built_envs
 from rlightning_aio.hosts.messages import ErrorText
-from rlightning_aio.hosts.pickling import dumped, dumped_with_code
 from rlightning_aio.hosts.runner import attach_all, close_all
 from rlightning_aio.hosts.spinner import Spinner
 from rlightning_aio.protocol.entries import (
@@ -34,6 +33,7 @@ from rlightning_aio.protocol.entries import (
 from rlightning_aio.protocol.exchange import CAREFUL
 from rlightning_aio.protocol.frames import BELL, CHUNK_BYTES, Frame, FrameKind, FrameReader, encode
 from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
+from rlightning_aio.protocol.pickling import dumped, dumped_with_code
 from rlightning_aio.protocol.rings import WorkerBell, WorkerRings, bell_size, rings_size
 
 if TYPE_CHECKING:

@@ -19,10 +19,10 @@ from gymnasium.vector.utils import create_empty_array
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.envs.base import BareReset, BareStep, BaseEnv
 from rlightning_aio.envs.tensors import as_numpy, holds_tensor
-from rlightning_aio.hosts.pickling import dumped_with_code
 from rlightning_aio.legacy.names import names_in_use
 from rlightning_aio.legacy.tensors import on_cpu
 from rlightning_aio.protocol.columns import index, leaves
+from rlightning_aio.protocol.pickling import dumped_with_code
 from rlightning_aio.types import EnvRet, PolicyResponse
 
 if TYPE_CHECKING:
