@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
+import logging
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -16,6 +18,9 @@ from websockets.asyncio.client import connect
 import rlightning_aio as rl
 from rlightning_aio.envs.openenv_session import get_json, post_json
 from rlightning_aio.serving import OpenEnvServer
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator
 
 POLE = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1", "placement": "inline"}
 COLUMN = {"columns": {"observation": {"shape": [4]}}, "truncated_field": "truncated"}
@@ -68,6 +73,9 @@ async def test_its_envs_are_described() -> None:
         "maximum": 1,
     }
     assert schema["observation"]["properties"]["observation"]["minItems"] == 4
+    # A client that has only one value sends it as the only required field.
+    assert schema["action"]["required"] == ["action"]
+    assert schema["observation"]["required"] == ["observation"]
 
 
 @on_asyncio
@@ -175,6 +183,81 @@ async def test_a_created_session_outlives_its_socket() -> None:
         key = created["session_id"]
         assert (await rpc(server, "openenv/session/close", session_id=key))["closed"]
         assert await rpc(server, "openenv/session/close", session_id=key) == -32602
+
+
+KEY = "Bearer tell-nobody"
+
+
+@contextlib.asynccontextmanager
+async def private(url: str) -> AsyncGenerator[tuple[str, list[bytes]]]:
+    """Relay connections that have the key; yields the address and the heads of their requests."""
+    heads: list[bytes] = []
+    port = int(url.rpartition(":")[2])
+
+    async def copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        while data := await reader.read(65536):
+            writer.write(data)
+        writer.close()
+
+    async def relay(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        head = await reader.readuntil(b"\r\n\r\n")
+        key = f"Authorization: {KEY}\r\n".encode()
+        if key not in head:
+            writer.write(b"HTTP/1.1 401 Unauthorized\r\nContent-Length: 0\r\n\r\n")
+            writer.close()
+            return
+        heads.append(head)
+        back, forth = await asyncio.open_connection("127.0.0.1", port)
+        forth.write(head.replace(key, b""))
+        await asyncio.gather(copy(reader, forth), copy(back, writer), return_exceptions=True)
+
+    async with await asyncio.start_server(relay, "127.0.0.1", 0) as server:
+        yield f"http://127.0.0.1:{server.sockets[0].getsockname()[1]}", heads
+
+
+@pytest.mark.parametrize("session", ["own", "keep"])
+def test_a_private_server_gets_headers_that_no_log_has(
+    session: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Both over WebSockets and over HTTP; without them it refuses, and is named."""
+    with caplog.at_level(logging.DEBUG):
+        asyncio.run(_use_private(session))
+    assert KEY not in caplog.text
+    assert "websockets" in {record.name.partition(".")[0] for record in caplog.records}
+
+
+async def _use_private(session: str) -> None:
+    async with (
+        rl.build_env_group({**POLE, "num_workers": 2}) as served,
+        OpenEnvServer(served, "pole", "127.0.0.1", 0) as server,
+        private(server.url) as (url, heads),
+    ):
+        config = client_of(server, 2)
+        config |= {"task": url, "env_kwargs": {**COLUMN, "session": session}}
+        config["env_kwargs"] |= {"headers": {"Authorization": KEY}}
+        async with rl.build_env_group(config) as group:
+            batch, _ = await group.reset(seed=[3, 4])
+            batch, _ = await group.step(batch.respond(action=[{"action": 1}] * 2))
+            assert batch.reward.tolist() == [1, 1]
+        calls = sorted({head.split(b" ")[1].partition(b"?")[0] for head in heads})
+        assert calls == ([b"/mcp", b"/ws"] if session == "keep" else [b"/ws"])
+        schema = await asyncio.to_thread(get_json, url, "/schema", {"Authorization": KEY})
+        assert "action" in schema
+        config["env_kwargs"] |= {"headers": {}, "connect_timeout": 0.01}
+        async with rl.build_env_group(config) as group:
+            with pytest.raises(rl.EnvRaised, match=f"{url} can't be reached: .*401"):
+                await group.reset()
+
+
+@pytest.mark.parametrize("headers", [{"A b": KEY}, {"Authorization": f"{KEY}\r\nX: 1"}], ids=str)
+def test_headers_that_can_not_be_sent_are_refused(headers: dict[str, str]) -> None:
+    """The error names the header and not its value."""
+    entry = {"name": "far", "backend": "openenv", "task": "http://127.0.0.1:1"}
+    config = {**entry, "placement": "loop", "env_kwargs": {"headers": headers}}
+    with pytest.raises(rl.ConfigError, match=r"headers: .*header") as failed:
+        asyncio.run(rl.build_env_group(config).init())
+    assert next(iter(headers)) in str(failed.value)
+    assert KEY not in str(failed.value)
 
 
 @on_asyncio

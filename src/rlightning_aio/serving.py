@@ -137,7 +137,7 @@ class OpenEnvServer:
 
     def _schema(self) -> dict[str, Any]:
         (observation, *_) = self._group.get_observation_spaces()
-        state = {"episode_id": {"type": "string"}, "step_count": {"type": "integer"}}
+        state = {"episode_id": {"type": ["string", "null"]}, "step_count": {"type": "integer"}}
         return {
             "action": _fields_schema(self._space, "action"),
             "observation": _fields_schema(observation, "observation"),
@@ -373,7 +373,7 @@ def _fields_schema(space: Any, name: str) -> dict[str, Any]:
     """The JSON Schema of the object that a value of `space` travels as."""
     if is_dict(space):
         return _schema_of(space)
-    return {"type": "object", "properties": {name: _schema_of(space)}}
+    return {"type": "object", "properties": {name: _schema_of(space)}, "required": [name]}
 
 
 def _schema_of(space: Any) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import socket
 import threading
 from typing import Any
@@ -95,8 +96,9 @@ async def test_an_answer_that_nobody_awaits_was_not_asked_for() -> None:
             assert (await policy(batch)).shape == (1, 5, 3)
 
 
-def test_what_is_sent_can_be_chosen() -> None:
-    """Arrays of any number type, texts and nested maps; the key is sent along."""
+def test_what_is_sent_can_be_chosen(caplog: pytest.LogCaptureFixture) -> None:
+    """Arrays of any number type, texts and nested maps; the key is sent along, and not logged."""
+    caplog.set_level(logging.DEBUG)
     keys: list[Any] = []
 
     class Server(OpenPiServer):
@@ -116,6 +118,8 @@ def test_what_is_sent_can_be_chosen() -> None:
     with serving(server) as url, OpenPiPolicy(url, observe, api_key="abc") as policy:
         check(evaluated(ActionChunks(policy, 3)))
     assert set(keys) == {"Api-Key abc"}
+    ours = [record for record in caplog.records if record.name != "websockets.server"]
+    assert not any("Api-Key abc" in record.getMessage() for record in ours)
     assert server.seen[0]["image"].shape == (4, 3, 3)
     assert (server.seen[0]["image"] == 7).all()
     assert [server.seen[0][key] for key in ("gripper", "n", "ok")] == [0.5, 3, True]

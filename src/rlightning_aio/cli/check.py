@@ -98,10 +98,13 @@ async def _look(configs: Sequence[EnvConfig], findings: list[_Finding]) -> None:
 def _offers(config: EnvConfig) -> dict[str, Any]:
     """Return the description and schemas of an entry's first server."""
     # Imported here because it needs an extra.
+    from rlightning_aio.envs.openenv import OpenEnvOptions  # noqa: PLC0415
     from rlightning_aio.envs.openenv_session import get_json  # noqa: PLC0415
+    from rlightning_aio.envs.options import read_options  # noqa: PLC0415
 
+    headers = read_options(OpenEnvOptions, config.name, config.env_kwargs).headers
     try:
-        return {path: get_json(config.task, f"/{path}") for path in ("metadata", "schema")}
+        return {path: get_json(config.task, f"/{path}", headers) for path in ("metadata", "schema")}
     except (OSError, ValueError) as error:
         raise ConfigError(f"{config.name!r}: {config.task} can't be read: {error}") from error
 

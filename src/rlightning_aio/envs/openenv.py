@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 from gymnasium import spaces
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from rlightning_aio.envs.base import BaseEnv
 from rlightning_aio.envs.openenv_session import (
@@ -25,6 +25,7 @@ from rlightning_aio.envs.openenv_session import (
     pauses,
 )
 from rlightning_aio.envs.options import read_options
+from rlightning_aio.envs.secret_headers import check_headers
 from rlightning_aio.errors import BadAction, ConfigError
 from rlightning_aio.spaces import Anything
 from rlightning_aio.types import EnvRet
@@ -57,6 +58,14 @@ class OpenEnvOptions(BaseModel):
     """``keep``: the session survives a lost socket."""
     connect_timeout: float = Field(default=60.0, gt=0)
     """Seconds that a reset waits for a server that can be reached."""
+    headers: dict[str, str] = Field(default_factory=dict, repr=False)
+    """Sent with each connection, such as ``Authorization``; they are never logged."""
+
+    @field_validator("headers")
+    @classmethod
+    def _check_headers(cls, headers: dict[str, str]) -> dict[str, str]:
+        check_headers(headers)
+        return headers
 
 
 class OpenEnv(BaseEnv):
@@ -80,7 +89,10 @@ class OpenEnv(BaseEnv):
             name: _space_of(self.env_id, name, given) for name, given in options.columns.items()
         }
         keep = options.session == "keep"
-        self._servers = [OpenEnvSession(url, keep=keep) for url in (config.task, *options.urls)]
+        self._servers = [
+            OpenEnvSession(url, keep=keep, headers=options.headers)
+            for url in (config.task, *options.urls)
+        ]
         self._server = worker_index % len(self._servers)
         self._last: Any = None
         # Of this episode; steps that were answered, and whether the server counts them as well.
@@ -232,6 +244,14 @@ class OpenEnv(BaseEnv):
         """Call a method of the environment's MCP server, such as ``tools/list``."""
         request = {"jsonrpc": "2.0", "id": 1, "method": method, "params": params or {}}
         return await self._ask({"type": "mcp", "data": request})
+
+    def save_state(self) -> Any:
+        """Refuse: a session is at its server, which can't copy it.
+
+        Raises:
+            NotImplementedError: always.
+        """
+        raise NotImplementedError("a session of an OpenEnv server can't be saved")
 
     async def close(self) -> None:
         """Close the session, and give its slot at the server back."""

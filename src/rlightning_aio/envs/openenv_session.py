@@ -16,6 +16,7 @@ import socket as sockets
 import urllib.request
 from contextvars import Context
 from http.client import HTTPException, HTTPResponse
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, cast
 from urllib.parse import quote, urlsplit, urlunsplit
 
@@ -23,8 +24,10 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidHandshake, WebSocketException
 from websockets.protocol import State
 
+from rlightning_aio.envs.secret_headers import secretly
+
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from websockets.asyncio.client import ClientConnection
 
@@ -75,11 +78,15 @@ class OpenEnvSession:
         url: of the server, ``http(s)://…`` or ``ws(s)://…``.
         keep: create the session by OpenEnv's RPC, and attach sockets to it: it survives a socket
             that is lost. Close it, or its slot at the server leaks.
+        headers: sent with each connection; they may hold a key, and are never logged.
     """
 
-    def __init__(self, url: str, *, keep: bool) -> None:
+    def __init__(
+        self, url: str, *, keep: bool, headers: Mapping[str, str] = MappingProxyType({})
+    ) -> None:
         self.url = url
         self._keep = keep
+        self._headers = headers
         self._socket: ClientConnection | None = None
         self._session_id: str | None = None
         self._creating: asyncio.Task[None] | None = None
@@ -174,6 +181,7 @@ class OpenEnvSession:
                 # It costs more time, on both sides, than the bytes that it saves.
                 compression=None,
                 proxy=None,
+                **secretly(self._headers),
             )
         except (OSError, InvalidHandshake, TimeoutError) as error:
             raise ServerGone(f"{self.url} can't be reached: {error}", is_unsent=True) from error
@@ -210,7 +218,7 @@ class OpenEnvSession:
         request = {"jsonrpc": "2.0", "id": 1, "method": method, "params": params}
         try:
             async with asyncio.timeout(seconds):
-                reply = await post_json(_address(self.url, "http", "/mcp"), request)
+                reply = await post_json(_address(self.url, "http", "/mcp"), request, self._headers)
         except (OSError, ValueError, HTTPException) as error:
             raise ServerGone(f"{self.url} can't be reached: {error}", is_unsent=True) from error
         error = reply.get("error")
@@ -314,7 +322,9 @@ def _address(url: str, scheme: str, path: str, query: str = "") -> str:
     return urlunsplit((scheme + secure, parts.netloc, parts.path.rstrip("/") + path, query, ""))
 
 
-async def post_json(url: str, body: dict[str, Any]) -> dict[str, Any]:
+async def post_json(
+    url: str, body: dict[str, Any], headers: Mapping[str, str] = MappingProxyType({})
+) -> dict[str, Any]:
     """Return the JSON that a server answers to POST `body`.
 
     Raises:
@@ -327,11 +337,15 @@ async def post_json(url: str, body: dict[str, Any]) -> dict[str, Any]:
             parts.hostname, parts.port or (443 if is_secure else 80), ssl=is_secure or None
         )
     try:
-        head = (
-            f"POST {parts.path} HTTP/1.1\r\nHost: {parts.netloc}\r\nConnection: close\r\n"
-            f"Content-Type: application/json\r\nContent-Length: {len(content)}\r\n\r\n"
-        )
-        writer.write(head.encode() + content)
+        fields = {
+            "Host": parts.netloc,
+            "Connection": "close",
+            "Content-Type": "application/json",
+            "Content-Length": str(len(content)),
+            **headers,
+        }
+        lines = [f"POST {parts.path} HTTP/1.1", *map(": ".join, fields.items()), "", ""]
+        writer.write("\r\n".join(lines).encode() + content)
         received = await reader.read()
     finally:
         writer.transport.abort()
@@ -353,8 +367,11 @@ class _Received:
         return io.BytesIO(self._content)
 
 
-def get_json(url: str, path: str) -> Any:
+def get_json(url: str, path: str, headers: Mapping[str, str] = MappingProxyType({})) -> Any:
     """Return the answer of a server to GET `path`."""
     opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-    with opener.open(_address(url, "http", path), timeout=_CONNECT_SECONDS) as reply:
+    request = urllib.request.Request(_address(url, "http", path))  # noqa: S310  # It is http(s).
+    for name, value in headers.items():  # Not sent to where the server may redirect to.
+        request.add_unredirected_header(name, value)
+    with opener.open(request, timeout=_CONNECT_SECONDS) as reply:
         return json.load(reply)

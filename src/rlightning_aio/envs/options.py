@@ -49,4 +49,5 @@ def load_named(env_id: str, field: str, name: str, separator: str = ":") -> Any:
 
 def _describe(fault: Any) -> str:
     place = ".".join(map(str, fault["loc"]))
-    return f"{place}: {fault['msg']}" if place else fault["msg"]
+    text = fault["msg"].removeprefix("Value error, ")
+    return f"{place}: {text}" if place else text

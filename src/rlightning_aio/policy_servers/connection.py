@@ -5,12 +5,13 @@ from __future__ import annotations
 import asyncio
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 from urllib.parse import urlsplit
 
 from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidHandshake, InvalidStatus
 
+from rlightning_aio.envs.secret_headers import check_headers, secretly
 from rlightning_aio.errors import ConfigError, PolicyServerError
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ class Address:
         headers: of the request that opens a connection.
 
     Raises:
-        ConfigError: it is no such URL, or a time is not positive.
+        ConfigError: it is no such URL, a time is not positive, or a header can't be sent.
     """
 
     url: str
@@ -56,6 +57,10 @@ class Address:
             raise ConfigError(f"{self.url!r}: should look like ws://localhost:8000")
         if self.timeout <= 0 or self.connect_timeout < 0:
             raise ConfigError("timeout must be above 0, and connect_timeout at least 0")
+        try:
+            check_headers(self.headers)
+        except ValueError as error:
+            raise ConfigError(f"{self.url}: {error}") from None
 
 
 async def connected(address: Address) -> ClientConnection:
@@ -69,7 +74,6 @@ async def connected(address: Address) -> ClientConnection:
         try:
             return await connect(
                 address.url,
-                additional_headers=dict[str, Any](address.headers),
                 # A server may compute for a while before it looks at its connections.
                 open_timeout=address.timeout,
                 ping_interval=None,
@@ -77,6 +81,7 @@ async def connected(address: Address) -> ClientConnection:
                 max_size=MAX_BYTES,
                 compression=None,
                 proxy=None,
+                **secretly(address.headers),
             )
         except (OSError, InvalidHandshake, EOFError) as error:
             may_start = not isinstance(error, InvalidStatus) or error.response.status_code >= 500
