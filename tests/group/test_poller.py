@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -75,7 +76,7 @@ class Scene:
     """A poller over hosts with given numbers of requests in flight, and a visible bell."""
 
     def __init__(
-        self, *in_flight: int, kinds: Any = Worker, num_cores: int = 0, clock: Any = None
+        self, *in_flight: int, kinds: Any = Worker, num_cores: int = 0, clock: Any = time.monotonic
     ) -> None:
         count = len(in_flight)
         memory = memoryview(bytearray(bell_size(count)))
@@ -93,8 +94,7 @@ class Scene:
             arm(goal, at_last=at_last)
 
         self.bell.arm = noted  # type: ignore[method-assign]
-        given_clock = {} if clock is None else {"clock": clock}
-        self.poller = Poller(self.requests, self.bell, num_cores, **given_clock)
+        self.poller = Poller(self.requests, self.bell, num_cores, clock=clock)
         kinds = kinds if isinstance(kinds, tuple) else (kinds,) * count
         self.hosts: list[Any] = [kind(k) for k, kind in enumerate(kinds)]
         for host in self.hosts:
@@ -227,7 +227,7 @@ def test_a_spinning_trainer_disarms_the_bell() -> None:
 # -- inline hosts
 
 
-def inline_scene(*waiting: int, workers: int = 0, clock: Any = None) -> Scene:
+def inline_scene(*waiting: int, workers: int = 0, clock: Any = time.monotonic) -> Scene:
     """Return a scene with inline hosts and one worker, with given numbers of requests."""
     kinds = tuple(lambda k, n=n: Inline(k, n) for n in waiting)
     scene = Scene(*waiting, workers, kinds=(*kinds, Worker), clock=clock)

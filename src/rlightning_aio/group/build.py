@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from typing import TYPE_CHECKING
 
@@ -74,9 +75,15 @@ def _assembled(plan: Plan, watcher: Watcher, arena: Arena, *, shares_thread: boo
     bell = TrainerBell(bell_memory, len(orders))
     tables = _tables(plan, orders)
     completions: Completions = deque()
-    supervisor = Supervisor(tables, arena, completions.append, mixed_actions=plan.mixed_actions)
+    supervisor = Supervisor(
+        tables,
+        arena,
+        completions.append,
+        mixed_actions=plan.mixed_actions,
+        clock=time.monotonic,
+    )
     supervisor.resources["bell"] = bell
-    poller = Poller(tables.requests, bell, cores)
+    poller = Poller(tables.requests, bell, cores, clock=time.monotonic)
     rings: list[Ring | None] = [None] * len(orders)
     wiring = Wiring(
         completions=completions,

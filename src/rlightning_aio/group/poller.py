@@ -7,7 +7,6 @@ long the other envs take: see `arm`.
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from typing import TYPE_CHECKING
 
@@ -39,7 +38,7 @@ class Poller:
         requests: Requests,
         bell: TrainerBell,
         num_cores: int,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float],
     ) -> None:
         self.num_cores = num_cores
         self._requests = requests

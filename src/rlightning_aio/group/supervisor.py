@@ -9,7 +9,6 @@ may be found at any moment. `HangDetector` decides which workers are killed.
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -134,7 +133,7 @@ class Supervisor:
         post: Callable[[Died], object],
         *,
         mixed_actions: bool,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float],
     ) -> None:
         self.hosts: list[Host] = []
         self.any_deaths = False

@@ -44,7 +44,6 @@ _Owner: TypeAlias = "asyncio.Task[Any] | int"
 _Noted: TypeAlias = "tuple[int, int, NDArray[np.int64], NDArray[np.int64]]"
 """Lane, time, and the entries and send times of the requests of results."""
 
-_clock: Final = time.monotonic_ns
 _current_task: Final = asyncio.current_task
 
 
@@ -79,7 +78,7 @@ class Trace(Scope):
         self._lanes = _Lanes(self._owner)
         self._lanes.current()
         self._down_since: dict[int, int] = {}
-        self._began = _clock()
+        self._began = time.monotonic_ns()
         self._running.append(self)
         self._core.observed.attach(self)
 
@@ -119,7 +118,7 @@ class Trace(Scope):
         requests = self._core.requests
         return (
             self._lanes.current(),
-            _clock(),
+            time.monotonic_ns(),
             requests.numbering.entry[slots],
             requests.sent_ns[slots],
         )
@@ -131,7 +130,7 @@ class Trace(Scope):
             self._records.add_results(entries[own], sent[own], part.times, began, lane)
             if part.limit_reached is not None or part.restarted is not None:
                 self._note_flags(part)
-        self._records.add_span((self._records.name("hand out"), lane, began, _clock()))
+        self._records.add_span((self._records.name("hand out"), lane, began, time.monotonic_ns()))
 
     def _note_flags(self, part: ResultColumns) -> None:
         flags = {"step limit": part.limit_reached, "episode lost": part.restarted}
@@ -144,7 +143,7 @@ class Trace(Scope):
         self._records.marks.append(Mark(name, at, host_id, slot, **more))
 
     def note_fate(self, fate: Fate, host_id: int, slot: int, cause: str) -> None:
-        now = _clock()
+        now = time.monotonic_ns()
         if fate == "up":
             if host_id in self._down_since:
                 began = self._down_since.pop(host_id)
@@ -170,7 +169,7 @@ class Trace(Scope):
 
     def _note_unfinished(self) -> None:
         if self._core.lifetime.open:
-            now, busy = _clock(), self._core.requests.state == int(State.BUSY)
+            now, busy = time.monotonic_ns(), self._core.requests.state == int(State.BUSY)
             for slot in np.flatnonzero(busy).tolist():
                 self._note_unanswered(slot, "not done", now)
 
@@ -215,10 +214,10 @@ class _Span:
 
     def __enter__(self) -> None:
         self._lane = self._lanes.current()
-        self._began = _clock() if self._given is None else self._given
+        self._began = time.monotonic_ns() if self._given is None else self._given
 
     def __exit__(self, *error: object) -> None:
-        self._records.add_span((self._number, self._lane, self._began, _clock()))
+        self._records.add_span((self._number, self._lane, self._began, time.monotonic_ns()))
 
 
 class _Lanes:
