@@ -1,0 +1,179 @@
+"""A simulated fork server and its workers.
+
+The fork server reacts to each message as the real one does, at events of the world. A worker is the
+real `Worker`, in a process of the world.
+"""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import traceback
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from rlightning_aio.hosts.arena import map_shared
+from rlightning_aio.hosts.fork_messages import (
+    Exited,
+    Fork,
+    Forked,
+    Kill,
+    MessageSocket,
+    Ready,
+)
+from rlightning_aio.hosts.worker import Worker
+from rlightning_aio.protocol.rings import WorkerBell, WorkerRings, bell_size, rings_size
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from simulator.world import Process, World
+
+    from rlightning_aio.hosts.messages import WorkerPlace
+
+__all__ = ["SimulatedForkServer"]
+
+_GRACE_SECONDS = 1.2
+_DUMP_SECONDS = 0.3
+_DUMP = 'Current thread 0x0000 (most recent call first):\n  File "simulated", line 1 in step\n'
+
+
+class SimulatedForkServer:
+    """The process, and the trainer's `subprocess.Popen` of it."""
+
+    def __init__(
+        self, world: World, command: Sequence[str], *, pass_fds: Sequence[int], **others: Any
+    ) -> None:
+        del command, others
+        self.pid = next(world.pids)
+        self.returncode: int | None = None
+        self._world = world
+        self._exit_code: int | None = None
+        self._socket = world.sockets.by_number[world.sockets.duplicate(pass_fds[0])]
+        self._socket.end.holders.append(self)
+        self._trainer = MessageSocket(self._socket)  # pyright: ignore[reportArgumentType]
+        self._children: dict[int, tuple[Process, int]] = {}
+        self._is_ready = self._is_looking = False
+        world.after(world.rng.choice((0.01, 0.3)), self._begin)
+
+    # -- as the trainer's child -----------------------------------------------------
+
+    def kill(self) -> None:
+        """See `Popen.kill`."""
+        self.end(-signal.SIGKILL)
+
+    def wait(self, timeout: float | None = None) -> int:
+        """See `Popen.wait`."""
+        self._world.wait_for(lambda: self._exit_code is not None, timeout)
+        if self._exit_code is None:
+            assert timeout is not None
+            raise subprocess.TimeoutExpired("fork server", timeout)
+        self.returncode = self._exit_code
+        return self.returncode
+
+    # -- the process ------------------------------------------------------------------
+
+    def _begin(self) -> None:
+        """Have imported the modules."""
+        if self._exit_code is None:
+            self._is_ready = True
+            self._trainer.send(Ready(None))
+            self.wake()
+
+    def end(self, code: int) -> None:
+        """End at once; the kernel then kills its workers."""
+        if self._exit_code is not None:
+            return
+        self._world.note(f"the fork server ends with {code}")
+        self._trainer.close()
+        self._exit_code = code
+        for worker, channel in list(self._children.values()):
+            self._world.sockets.close_if_open(channel)
+            worker.end(-signal.SIGKILL)
+
+    def wake(self) -> None:
+        """Look at its socket, soon."""
+        if self._is_ready and not self._is_looking and self._exit_code is None:
+            self._is_looking = True
+            self._world.after(self._world.delay(), self._look)
+
+    def _look(self) -> None:
+        self._is_looking = False
+        if self._exit_code is not None:
+            return
+        try:
+            self._trainer.flush()
+            while (received := self._trainer.receive()) is not None:
+                self._obey(received.message, received.descriptors)
+        except EOFError:
+            self._leave()
+
+    def _obey(self, message: Any, descriptors: list[int]) -> None:
+        if isinstance(message, Fork):
+            self._fork(message.place, *descriptors)
+        elif isinstance(message, Kill) and message.host_id in self._children:
+            worker, _ = self._children[message.host_id]
+            if message.dump:
+                worker.stderr += _DUMP
+            self._world.after(
+                _DUMP_SECONDS if message.dump else 0.0, partial(worker.end, -signal.SIGKILL)
+            )
+
+    def _fork(self, place: WorkerPlace, channel: int, arena: int) -> None:
+        sockets, host_id = self._world.sockets, place.host_id
+        kept = sockets.duplicate(channel)
+        worker = new_worker(self._world, place, channel, arena, partial(self._report_exit, host_id))
+        self._children[host_id] = worker, kept
+        self._trainer.send(Forked(host_id, worker.pid))
+
+    def _report_exit(self, host_id: int, code: int, stderr: str) -> None:
+        if self._exit_code is not None:
+            return
+        _, channel = self._children.pop(host_id)
+        self._trainer.send(Exited(host_id, code, stderr))
+        self._world.sockets.close_if_open(channel)
+
+    def _leave(self) -> None:
+        """End, as the trainer has closed the socket or is gone: first the workers, in time."""
+        sockets = self._world.sockets
+        for _, channel in self._children.values():
+            sockets.by_number[channel].shutdown(0)
+        self._trainer.close()
+        self._until_gone(self._world.now_ns + int(_GRACE_SECONDS * 1e9))
+
+    def _until_gone(self, until_ns: int) -> None:
+        some_live = any(worker.alive for worker, _ in self._children.values())
+        if some_live and self._world.now_ns < until_ns:
+            self._world.after(0.01, partial(self._until_gone, until_ns))
+        else:
+            self.end(0)
+
+
+def new_worker(world: World, place: WorkerPlace, channel: int, arena: int, on_exit: Any) -> Process:
+    """Fork the worker of `place`."""
+    from simulator.world import Killed, Process  # They import each other.
+
+    sockets = world.sockets
+
+    def main() -> int:
+        try:
+            memory = map_shared(arena, place.bell_offset, bell_size(place.num_hosts))
+            bell = WorkerBell(memory, place.num_hosts, place.host_id)
+            memory = map_shared(arena, place.rings_offset, rings_size(place.num_envs))
+            rings = WorkerRings(memory, place.num_envs, bell)
+            Worker(sockets.by_number[channel], arena, rings, place.first_slot).serve()  # pyright: ignore[reportArgumentType]
+        except Killed:
+            raise
+        except BaseException:  # noqa: BLE001  # As in a real one, it goes to stderr.
+            process.stderr += traceback.format_exc()
+            return 1
+        return 0
+
+    def close() -> None:
+        sockets.close_if_open(channel)
+        sockets.close_if_open(arena)
+
+    process = Process(world, f"worker {place.host_id}", main, on_exit)
+    process.on_close = close
+    sockets.by_number[channel].end.holders.append(process)
+    return process

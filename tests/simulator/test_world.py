@@ -1,0 +1,109 @@
+"""A `World` runs real groups over simulated processes, and is the same for the same seed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from simulator.world import World
+
+import rlightning_aio as rl
+from rlightning_aio import sync
+from rlightning_aio.errors import EnvRaised
+
+
+class CountingEnv(gym.Env[Any, Any]):
+    """Its observation is its seed and the number of its steps; an action raises if it is 1."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    action_space = gym.spaces.Discrete(8)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        self.seed = -1 if seed is None else seed
+        self.steps = 0
+        return np.array([self.seed, 0.0]), {}
+
+    def step(self, action: Any) -> Any:
+        if action == 1:
+            raise ValueError("as asked for")
+        self.steps += 1
+        info = {"nested": [self.steps]} if action == 2 else {}
+        return np.array([self.seed, self.steps], np.float64), 1.0, False, False, info
+
+    def count(self) -> int:
+        return self.steps
+
+
+def config(**fields: Any) -> rl.EnvConfig:
+    return rl.EnvConfig(
+        name="counting",
+        backend="callable",
+        make_env=CountingEnv,
+        **{"num_workers": 4, "envs_per_process": 2, **fields},
+    )
+
+
+def played(world: World, **fields: Any) -> list[float]:
+    """Play with a synchronous group; return all numbers that were seen."""
+    seen: list[float] = []
+    with world, sync.build_env_group(config(**fields)) as group:
+        batch, _ = group.reset(seed=5)
+        for _ in range(5):
+            batch, _ = group.step(batch.respond(action=np.zeros(4, np.int64)))
+            seen += batch.observation.ravel().tolist()
+        group.step_async(batch.respond(action=np.full(4, 2)))
+        left = 4
+        while left:
+            batch, _ = group.collect_async(min_results=1)
+            left -= len(batch)
+            seen += batch.observation.ravel().tolist()
+        saved = group.snapshot()
+        assert group["counting-1"].call("count") == 6
+        batch, _ = group.restore(saved)
+        with pytest.raises(EnvRaised, match="as asked for"):
+            group.step(batch.respond(action=np.array([0, 0, 1, 0])))
+    return seen
+
+
+async def played_async(world: World, **fields: Any) -> list[float]:
+    """Play with an asynchronous group; return all numbers that were seen."""
+    seen: list[float] = []
+    async with rl.build_env_group(config(**fields)) as group:
+        batch, _ = await group.reset(seed=5)
+        for _ in range(6):
+            group.step_async(batch.respond(action=np.zeros(len(batch), np.int64)))
+            batch, _ = await group.collect_async(min_results=2)
+            seen += batch.observation.ravel().tolist()
+        if group.pending:
+            await group.collect_async(wait_all=True)
+        assert await group["counting-1"].call("count") > 0
+    return seen
+
+
+@pytest.mark.parametrize("implementation", ["python", "c"])
+def test_group_runs_over_simulated_processes(implementation: str) -> None:
+    for seed in range(5):
+        world = World(seed, implementation=implementation)
+        seen = played(world)
+        assert seen[:8] == [5, 1, 6, 1, 7, 1, 8, 1]
+        assert world.counts["exits"] == 2
+        assert world.counts["deaths"] == 0
+
+
+def test_asynchronous_group_runs_on_the_loop_of_the_world() -> None:
+    for seed in range(5):
+        with World(seed) as world:
+            seen = world.run(played_async(world))
+        assert set(seen[::2]) == {5, 6, 7, 8}
+
+
+def test_same_seed_gives_the_same_trace() -> None:
+    def trace(seed: int) -> list[str]:
+        world = World(seed)
+        played(world)
+        return world.trace
+
+    for seed in range(5):
+        assert trace(seed) == trace(seed)

@@ -1,0 +1,501 @@
+"""`World`: one process in which the whole runtime runs over a simulated operating system.
+
+It simulates what lies below the package, and nothing of the package: the clock, sockets, `epoll`
+and event loops, processes, their deaths and signals. So the trainer's side is the real one, with
+its drivers, hosts and links, and so is the code of workers. A simulated process is a greenlet. It
+runs until it asks the operating system for something that takes time, or until the world takes the
+core away from it at a *point*: a system call, or a fence between two writes to shared memory.
+
+One seed decides every duration, order and fault, so the same seed gives the same trace.
+
+Why a real process can do each of these things:
+
+- The scheduler can take the core away between any two instructions, for any time. The other
+  processes then go on (`Process.point`, `World.point`).
+- SIGKILL, the kernel's out-of-memory killer and crashes of native code end a process between any
+  two instructions; what it wrote to shared memory and sockets before stays (`Process.end`).
+- SIGSTOP, a debugger or a frozen container stop a process for any time, and it goes on as if
+  nothing had happened (`Process.stop`).
+- Ctrl-C reaches the trainer between any two instructions of Python (`World.point`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import heapq
+import itertools
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections import Counter
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from random import Random
+from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
+from unittest import mock
+
+import greenlet
+from simulator.fork_server import SimulatedForkServer
+from simulator.sockets import Epoll, Loop, Sockets, run_in_process
+
+from rlightning_aio import sharing
+from rlightning_aio.hosts import awaiting
+from rlightning_aio.protocol import exchange, kernel, rings
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine
+
+__all__ = ["Deadlock", "Faults", "Killed", "Process", "World"]
+
+T = TypeVar("T")
+
+_TICK_NS: Final = 200
+"""How long it takes to read the clock. So a loop that only looks at the clock ends."""
+_START_NS: Final = 10**12
+_EPOCH_NS: Final = 1_700_000_000 * 10**9
+_MAX_EVENTS: Final = 2_000_000
+
+
+class Deadlock(AssertionError):
+    """The trainer waits, and nothing can happen any more."""
+
+
+class Killed(greenlet.GreenletExit):
+    """Unwinds the code of a process that has ended, when its world ends."""
+
+
+@dataclass(frozen=True)
+class Faults:
+    """How often things go wrong: chances at a point where the world intervenes.
+
+    Attributes:
+        deaths: that a process is killed.
+        stops: that a process is stopped, for milliseconds up to minutes.
+        interrupts: that the user presses Ctrl-C.
+        starts: that a start is slow, or a worker can't be forked, for each start.
+    """
+
+    deaths: float = 0.0
+    stops: float = 0.0
+    interrupts: float = 0.0
+    starts: float = 0.0
+
+
+CALM: Final = Faults()
+
+
+class World:
+    """See the module.
+
+    Args:
+        seed: decides everything.
+        faults: that happen until `calm`.
+        implementation: of the hot path, ``python`` or ``c``.
+
+    Attributes:
+        rng: the source of all chances; see `reseed`.
+        counts: how often things happened.
+        running: whose code runs: a process's, the kernel's or a fork server's (`_NOBODY`), or the
+            trainer's (None).
+    """
+
+    def __init__(self, seed: int, faults: Faults = CALM, *, implementation: str = "python") -> None:
+        self.rng = Random(seed)
+        self.faults = self._storm = faults
+        self.counts: Counter[str] = Counter()
+        self.running: Process | _Nobody | None = None
+        self.now_ns = _START_NS
+        self.sockets = Sockets(self)
+        self.pids = itertools.count(10_000)
+        self._implementation = implementation
+        self._notes: list[tuple[int, str]] = []
+        self._events: list[list[Any]] = []
+        self._order = itertools.count()
+        self._processes: list[Process] = []
+        self._pieces = self.rng.choice((3, 10, 30, 100))
+        self._until_point = self.rng.randrange(1, 2 * self._pieces)
+        self._slowness = self.rng.choice((3e-6, 3e-5, 3e-4))
+        self._cores = self.rng.choice((1, 2, 4, 8))
+        self._ended = False
+        self._patches = ExitStack()
+
+    # -- life ---------------------------------------------------------------------
+
+    def __enter__(self) -> Self:
+        for target, name, replacement in self._replacements():
+            self._patches.enter_context(mock.patch.object(target, name, replacement))
+        self._patches.callback(kernel.select, kernel.selected)
+        kernel.select(self._implementation)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._ended = True
+        for process in self._processes:
+            process.unwind()
+        self._patches.close()
+        self.sockets.close()
+
+    def _replacements(self) -> list[tuple[Any, str, Any]]:
+        nothing = lambda *_: 0  # noqa: E731
+        cores = set(range(self._cores))
+        scripted = sys.modules.get("simulator.scripted")
+        return [
+            (time, "monotonic_ns", self.clock_ns),
+            (time, "monotonic", lambda: self.clock_ns() / 1e9),
+            (time, "perf_counter_ns", self.clock_ns),
+            (time, "perf_counter", lambda: self.clock_ns() / 1e9),
+            (time, "time_ns", lambda: _EPOCH_NS + self.clock_ns()),
+            (time, "time", lambda: (_EPOCH_NS + self.clock_ns()) / 1e9),
+            (time, "sleep", self.sleep),
+            (select, "epoll", lambda: Epoll(self)),
+            (socket, "socketpair", self.sockets.pair),
+            (subprocess, "Popen", lambda *args, **named: SimulatedForkServer(self, *args, **named)),
+            (os, "close", self.sockets.close_descriptor),
+            (os, "set_inheritable", self.sockets.set_inheritable),
+            (os, "sched_yield", self.give_way),
+            (os, "sched_getaffinity", lambda _: cores),
+            (os, "sched_setaffinity", nothing),
+            (sharing, "_time_limit", lambda _: None),
+            # Each process has a heap of its own, so these would act on one that is small.
+            (gc, "collect", nothing),
+            (gc, "freeze", nothing),
+            # As on a processor that reorders accesses to memory, so that there are more fences.
+            (exchange, "IN_ORDER", False),
+            (rings, "IN_ORDER", False),
+            (exchange, "new_fence", lambda: self.point),
+            (rings, "new_fence", lambda: self.point),
+            (awaiting, "run_loop", lambda main: run_in_process(self, main)),
+            *([(scripted, "machine", SimulatedMachine(self))] if scripted else []),
+        ]
+
+    def run(self, main: Coroutine[Any, Any, T]) -> T:
+        """Run a program on an event loop of the world."""
+        with asyncio.Runner(debug=False, loop_factory=lambda: Loop(self)) as runner:
+            return runner.run(main)
+
+    def calm(self) -> None:
+        """Let nothing go wrong from now on; what is stopped goes on."""
+        self.faults = CALM
+        for process in self._processes:
+            process.go_on()
+
+    def storm(self) -> None:
+        """Let things go wrong again."""
+        self.faults = self._storm
+
+    def reseed(self, seed: int) -> None:
+        """Let `seed` alone decide what happens from now on."""
+        self.rng.seed(seed)
+        self._until_point = self.rng.randrange(1, 2 * self._pieces)
+
+    # -- what happened ------------------------------------------------------------
+
+    @property
+    def trace(self) -> list[str]:
+        """What happened, a line each, with the time in seconds."""
+        return [f"{(at - _START_NS) / 1e9:.6f} {what}" for at, what in self._notes]
+
+    @property
+    def hours(self) -> float:
+        """Simulated hours."""
+        return (self.now_ns - _START_NS) / 3.6e12
+
+    def note(self, what: str) -> None:
+        """Add a line to the trace."""
+        self._notes.append((self.now_ns, what))
+
+    # -- the clock, and what happens ------------------------------------------------
+
+    def clock_ns(self) -> int:
+        """Return the time."""
+        self.now_ns += _TICK_NS
+        return self.now_ns
+
+    def delay(self) -> float:
+        """Draw how long something takes that takes no time for its own sake, in seconds."""
+        return self.rng.expovariate(1 / self._slowness)
+
+    def after(self, seconds: float, callback: Callable[[], object]) -> list[Any]:
+        """Call `callback` at a later time; `cancel` takes what this returns."""
+        event = [self.now_ns + int(seconds * 1e9), next(self._order), callback]
+        heapq.heappush(self._events, event)
+        return event
+
+    @staticmethod
+    def cancel(event: list[Any]) -> None:
+        """Let something not happen."""
+        event[2] = None
+
+    def happen(self, until_ns: int | None) -> bool:
+        """Let the next thing happen; False if nothing is left to happen by then."""
+        while self._events:
+            if until_ns is not None and self._events[0][0] > until_ns:
+                return False
+            at, order, callback = heapq.heappop(self._events)
+            if callback is not None:
+                if order > _MAX_EVENTS:
+                    raise Deadlock(f"{_MAX_EVENTS} events have led to nothing")
+                self.now_ns = max(self.now_ns, at)
+                self.running = _NOBODY
+                try:
+                    callback()
+                finally:
+                    self.running = None
+                return True
+        return False
+
+    def sleep(self, seconds: float) -> None:
+        """Take this long, in the trainer or in a process."""
+        if self.running is not None:
+            self.running.sleep(seconds)
+            return
+        until = self.now_ns + int(seconds * 1e9)
+        while self.happen(until):
+            pass
+        self.now_ns = max(self.now_ns, until)
+
+    def wait_for(self, ready: Callable[[], T], seconds: float | None) -> T:
+        """Wait until `ready` returns something true, for at most some seconds.
+
+        Raises:
+            Deadlock: the trainer waits, and nothing can happen any more.
+        """
+        if self._ended:
+            raise Killed
+        until = None if seconds is None else self.now_ns + max(0, int(seconds * 1e9))
+        if self.running is not None:
+            return self.running.wait_for(ready, until)
+        self.sleep(1e-6)  # A system call takes time, so a loop of calls that don't wait ends.
+        while not (found := ready()):
+            if not self.happen(until):
+                if until is None:
+                    raise Deadlock("the trainer waits, and nothing can happen any more")
+                self.now_ns = max(self.now_ns, until)
+                return ready()
+        if self.rng.random() < 0.3:  # It wakes up late.
+            self.sleep(self.delay())
+            found = ready()
+        return found
+
+    def give_way(self) -> None:
+        """Let others have the core, as by `sched_yield`."""
+        self.sleep(5e-6 if self.rng.random() < 0.9 else self.delay())
+
+    # -- faults -------------------------------------------------------------------
+
+    def point(self, *, interruptible: bool = True) -> None:
+        """Let something else happen here, now and then."""
+        self._until_point -= 1
+        if self._until_point > 0:
+            return
+        self._until_point = self.rng.randrange(1, 2 * self._pieces)
+        if self._ended:
+            raise Killed
+        if self.running is not None:
+            self.running.point()
+            return
+        self.sleep(self.delay())
+        if interruptible and self.rng.random() < self.faults.interrupts:
+            self.interrupt()
+
+    def interrupt(self) -> None:
+        """Press Ctrl-C."""
+        self.counts["interrupts"] += 1
+        self.note("Ctrl-C")
+        self.running = None  # The trainer handles it.
+        signal.raise_signal(signal.SIGINT)
+
+    def interrupt_at(self, seconds: float) -> None:
+        """Press Ctrl-C after some seconds."""
+        self.after(seconds, self.interrupt)
+
+    def add(self, process: Process) -> None:
+        """Keep a process until the end."""
+        self._processes.append(process)
+
+    @property
+    def processes(self) -> list[Process]:
+        """All that live."""
+        return [process for process in self._processes if process.alive]
+
+
+class Process:
+    """A simulated process with one thread.
+
+    Args:
+        world: where it lives.
+        name: for the trace.
+        main: its program; it ends with the exit code that this returns.
+        on_exit: is called with its exit code and with what it wrote to stderr.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        name: str,
+        main: Callable[[], int],
+        on_exit: Callable[[int, str], object],
+    ) -> None:
+        self.name = name
+        self.pid = next(world.pids)
+        self.alive = True
+        self.stderr = ""
+        self.on_close: Callable[[], object] = lambda: None
+        self._world = world
+        self._main = main
+        self._on_exit = on_exit
+        self._greenlet = greenlet.greenlet(self._run)
+        self._resumer: greenlet.greenlet
+        self._is_parked = self._is_stopped = self._is_due = False
+        self._timer: list[Any] | None = None
+        self._loop: Any = None
+        self._hooks = (None, None)
+        world.add(self)
+        self._timer = world.after(world.delay(), self._resume)
+
+    # -- running --------------------------------------------------------------------
+
+    def _run(self) -> None:
+        code = self._main()
+        if self.alive:
+            self.end(code)
+
+    def _resume(self) -> None:
+        """Go on where it is, as an event of the world."""
+        self._timer = None
+        if not self.alive:
+            return
+        if self._is_stopped:
+            self._is_due = True
+            return
+        self._is_parked = False
+        world = self._world
+        world.running, self._resumer = self, greenlet.getcurrent()
+        loop = asyncio._get_running_loop()
+        asyncio._set_running_loop(self._loop)
+        try:
+            self._greenlet.switch()
+        finally:
+            self._loop = asyncio._get_running_loop()
+            asyncio._set_running_loop(loop)
+            world.running = _NOBODY
+
+    def _give_up_core(self) -> None:
+        self._resumer.switch()
+        if self._world._ended:
+            raise Killed
+
+    def sleep(self, seconds: float) -> None:
+        """Take this long."""
+        self._timer = self._world.after(seconds, self._resume)
+        self._give_up_core()
+
+    def wait_for(self, ready: Callable[[], T], until_ns: int | None) -> T:
+        """Wait until `ready` returns something true, or until then."""
+        world = self._world
+        while not (found := ready()) and (until_ns is None or world.now_ns < until_ns):
+            self._is_parked = True
+            if until_ns is not None:
+                self._timer = world.after((until_ns - world.now_ns) / 1e9, self._resume)
+            self._give_up_core()
+        return found
+
+    def wake(self) -> None:
+        """Let it look again at what it waits for."""
+        if self._is_parked:
+            self._is_parked = False
+            if self._timer is not None:
+                self._world.cancel(self._timer)
+            self._timer = self._world.after(self._world.delay(), self._resume)
+
+    def unwind(self) -> None:
+        """Leave all its functions, at the end of the world."""
+        self.alive = False
+        with suppress(BaseException):  # Of code that would never have run on.
+            self._greenlet.throw(Killed)
+
+    # -- faults -------------------------------------------------------------------
+
+    def point(self) -> None:
+        """Let something else happen now."""
+        world, faults = self._world, self._world.faults
+        chance = world.rng.random()
+        if chance < faults.deaths:
+            self.end(-signal.SIGKILL)
+        elif chance < faults.deaths + faults.stops:
+            self.stop(world.rng.choice((1e-3, 0.1, 10.0, 1000.0)))
+        self.sleep(world.delay())
+
+    def end(self, code: int) -> None:
+        """End it; everything that it has open is closed. If it ends itself, this doesn't return."""
+        world = self._world
+        if not self.alive:
+            return
+        self.alive = False
+        world.counts["deaths" if code else "exits"] += 1
+        world.note(f"{self.name} ends with {code}")
+        self.on_close()
+        world.after(world.delay(), lambda: self._on_exit(code, self.stderr))
+        if world.running is self:
+            self._give_up_core()
+
+    def stop(self, seconds: float) -> None:
+        """Stop it for some time, as by SIGSTOP and SIGCONT."""
+        self._world.counts["stops"] += 1
+        self._world.note(f"{self.name} is stopped for {seconds:g} s")
+        self._is_stopped = True
+        self._world.after(seconds, self.go_on)
+
+    def go_on(self) -> None:
+        """Go on after `stop`."""
+        self._is_stopped = False
+        if self._is_due:
+            self._is_due = False
+            self._timer = self._world.after(0, self._resume)
+
+
+class _Nobody:
+    """Runs in events of the world, in which nothing else happens and nothing takes time."""
+
+    def point(self) -> None: ...
+
+    def sleep(self, seconds: float) -> None: ...
+
+    def wait_for(self, ready: Callable[[], T], until_ns: int | None) -> T:
+        del until_ns
+        return ready()
+
+
+_NOBODY: Final = _Nobody()
+
+
+class SimulatedMachine:
+    """See `scripted.Machine`, of which it takes the place."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+
+    def spend(self, seconds: float) -> None:
+        self._world.sleep(seconds)
+
+    def die(self, how: str) -> None:
+        self._process().end(-signal.SIGKILL if how == "killed" else 3)
+
+    def hang(self) -> None:
+        self._process().wait_for(lambda: False, None)
+
+    def _process(self) -> Process:
+        process = self._world.running
+        assert isinstance(process, Process), "an env in the trainer's process can't die or hang"
+        return process
+
+    async def await_for(self, seconds: float) -> None:
+        await asyncio.sleep(seconds)
+
+    async def await_for_ever(self) -> None:
+        await asyncio.Event().wait()
