@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import logging
 import math
 import time
@@ -411,6 +412,31 @@ async def test_an_env_that_blocks_the_event_loop_is_reported(
     env_id, entry_name, milliseconds, doing = args
     assert (env_id, entry_name, doing) == ("slow-1", "slow", "step")
     assert milliseconds >= 120
+
+
+async def test_the_garbage_collectors_time_is_nobodys(caplog: pytest.LogCaptureFixture) -> None:
+    """A collection happens in the turn of whichever env makes the next object."""
+
+    class Littered(Plain):
+        async def step(self, action: Any) -> Any:
+            gc.collect()
+            return await super().step(action)
+
+    def take_long(phase: str, info: dict[str, int]) -> None:
+        del info
+        if phase == "start":
+            time.sleep(0.12)
+
+    asyncio.get_running_loop().set_debug(False)
+    config = rl.EnvConfig(name="p", make_env=Littered, placement="loop")
+    async with rl.build_env_group(config) as group:
+        await group.reset(seed=0)
+        gc.callbacks.append(take_long)
+        try:
+            await group.step(steps(p_0=1))
+        finally:
+            gc.callbacks.remove(take_long)
+    assert "blocked the event loop" not in caplog.text
 
 
 async def test_tasks_that_an_env_leaves_behind_are_cancelled(

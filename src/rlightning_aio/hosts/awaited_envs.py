@@ -29,6 +29,7 @@ from rlightning_aio.hosts.event_loop import (
     new_task,
     place_of,
     tasks_of,
+    time_collector,
     watched,
 )
 from rlightning_aio.hosts.messages import ErrorText, Failed, NotBuilt, Raised, Result, Value
@@ -123,6 +124,7 @@ class AwaitedEnvs:
         self._done = done
         self._enter = enter
         self._loop: asyncio.AbstractEventLoop
+        time_collector()
         self._all: list[_Env] = []
         self._queue: deque[tuple[_Env, int, Any]] = deque()
         self.num_busy = 0

@@ -1,6 +1,7 @@
 """What envs do to the event loop that they share: how long they hold it, and what they leave.
 
-`watched` awaits a coroutine and measures each of its turns. `TimeLimit` finds requests that take
+`watched` awaits a coroutine and measures each of its turns, without the time of the garbage
+collector, which no env has chosen. `TimeLimit` finds requests that take
 too long with one timer for all envs. Tasks that an env starts belong to it, because they inherit
 its context; `cancel_leftovers` finds them.
 """
@@ -30,6 +31,7 @@ __all__ = [
     "place_of",
     "run_loop",
     "tasks_of",
+    "time_collector",
     "watched",
 ]
 
@@ -51,6 +53,34 @@ def run_loop(main: Coroutine[Any, Any, T]) -> T:
     return uvloop.run(main)
 
 
+class _CollectorTime:
+    """How long the garbage collector has run in this process; one of `gc.callbacks`.
+
+    Attributes:
+        seconds: in all.
+    """
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self._began = 0.0
+
+    def __call__(self, phase: str, info: dict[str, int]) -> None:
+        del info
+        if phase == "start":
+            self._began = time.monotonic()
+        else:
+            self.seconds += time.monotonic() - self._began
+
+
+_collector: Final = _CollectorTime()
+
+
+def time_collector() -> None:
+    """Measure the garbage collector from now on, so that `watched` can leave it out. Idempotent."""
+    if _collector not in gc.callbacks:
+        gc.callbacks.insert(0, _collector)
+
+
 @coroutine
 def watched(
     answering: Coroutine[Any, Any, Any],
@@ -62,7 +92,8 @@ def watched(
 
     Args:
         answering: a coroutine that has not begun.
-        report: gets `entry` and the seconds of each turn longer than `LONG_TURN_SECONDS`.
+        report: gets `entry` and the seconds of each turn longer than `LONG_TURN_SECONDS`; after
+            `time_collector` without those of the garbage collector.
         enter: gets `entry` before each turn.
         entry: of the request.
     """
@@ -71,13 +102,13 @@ def watched(
     while True:
         if enter is not None:
             enter(entry)
-        began = clock()
+        began, collected = clock(), _collector.seconds
         try:
             future = send(None) if error is None else throw(error)
         except StopIteration as stop:
             return stop.value
         finally:
-            held = clock() - began
+            held = clock() - began - (_collector.seconds - collected)
             if held > LONG_TURN_SECONDS:
                 report(entry, held)
         error = None
