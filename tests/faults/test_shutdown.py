@@ -209,6 +209,39 @@ def test_killed_trainer_takes_its_workers_along(moment: str, tmp_path: Path) -> 
         assert last_words.count("is left alone") == 4
 
 
+@pytest.mark.parametrize("kind", ["left alone", "left alone, awaitable"])
+def test_envs_whose_trainer_dies_are_stopped_once_and_closed_once(kind: str) -> None:
+    """In this order; an env that took another's place as well."""
+    script = """
+        import faults.left_alone
+        kind = sys.argv[1]
+        fields = {"imports": ["faults.left_alone"], "num_workers": 2, "envs_per_process": 2}
+        if "awaitable" in kind:
+            fields["step_timeout"] = 0.1
+        group = rlightning_aio.sync.build_env_group(
+            {"name": "e", "backend": kind, "task": "-", **fields}
+        )
+        group.init()
+        batch, _ = group.reset()
+        if "awaitable" in kind:
+            batch, _ = group.step(batch.respond(action=[0, faults.left_alone.HANG]))
+            assert batch.restarted.tolist() == [False, True]
+        print("ready", file=sys.stderr, flush=True)
+        signal.pause()
+    """
+    with trainer(script, kind) as process:
+        assert process.stderr is not None
+        said = read_until(process.stderr, "ready")
+        with watched(descendants(process.pid)) as ended:
+            process.kill()
+            ended()
+        said += process.stderr
+    ends = ["is left alone", "is closed"]
+    replaced = ["is closed"] if "awaitable" in kind else []
+    for env_id, expected in {"e-0": ends, "e-1": [*replaced, *ends]}.items():
+        assert [line[4:-1] for line in said if line.startswith(env_id)] == expected
+
+
 LEFT_OPEN = {
     "the end of the script": "",
     "sys.exit": "sys.exit(3)",

@@ -34,6 +34,7 @@ from rlightning_aio.hosts.event_loop import (
 )
 from rlightning_aio.hosts.messages import ErrorText, Failed, NotBuilt, Raised, Result, Value
 from rlightning_aio.hosts.restart_pause import restart_pause
+from rlightning_aio.hosts.runner import disconnect_all
 from rlightning_aio.protocol.entries import Operation, answers_with_value, op_of, slot_of
 
 if TYPE_CHECKING:
@@ -197,6 +198,10 @@ class AwaitedEnvs:
         await cancel([task for task in closing if not task.done()], _CANCEL_SECONDS / 4)
         await cancel_leftovers({env: env.name for env in self._all}, _CANCEL_SECONDS / 4)
         return errors
+
+    def disconnect(self) -> None:
+        """Bring the envs to a safe state: the trainer is gone."""
+        disconnect_all(self.runners)
 
     def release(self) -> None:
         """Cancel everything without waiting, also tasks that envs have started. Idempotent."""

@@ -69,27 +69,21 @@ class Awaiting:
         self._envs.submit(entry, arguments)
 
     def serve(
-        self,
-        channel: socket.socket,
-        take_requests: Callable[[], bool],
-        disconnect: Callable[[], None],
+        self, channel: socket.socket, take_requests: Callable[[], bool]
     ) -> list[tuple[int, ErrorText]]:
         """Execute requests until there are no more, and close the envs.
 
         Args:
             channel: readable when there are requests.
-            take_requests: submits them; False if there will be no more.
-            disconnect: is called before the envs are closed, if `take_requests` raises.
+            take_requests: submits them; False if there will be no more. If it raises, the trainer
+                is gone: the envs come to a safe stop before they are closed.
 
         Returns what closing has raised, with the env's index.
         """
-        return run_loop(self._serve(channel, take_requests, disconnect))
+        return run_loop(self._serve(channel, take_requests))
 
     async def _serve(
-        self,
-        channel: socket.socket,
-        take_requests: Callable[[], bool],
-        disconnect: Callable[[], None],
+        self, channel: socket.socket, take_requests: Callable[[], bool]
     ) -> list[tuple[int, ErrorText]]:
         loop = asyncio.get_running_loop()
         self._envs.adopt(self._runners)
@@ -119,7 +113,7 @@ class Awaiting:
         try:
             await ended
         except BaseException:
-            disconnect()
+            self._envs.disconnect()
             await self._envs.close()
             raise
         finally:

@@ -6,6 +6,7 @@ Gymnasium env takes a short way (`env_steps.ShortWay`).
 
 from __future__ import annotations
 
+import contextlib
 import time
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -53,7 +54,15 @@ if TYPE_CHECKING:
     from rlightning_aio.protocol.info import InfoSchema
     from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet
 
-__all__ = ["EnvRunner", "attach_all", "attach_here", "close_all", "placed", "resume_all"]
+__all__ = [
+    "EnvRunner",
+    "attach_all",
+    "attach_here",
+    "close_all",
+    "disconnect_all",
+    "placed",
+    "resume_all",
+]
 
 
 class EnvRunner:
@@ -445,6 +454,13 @@ def close_all(
             errors.append((index, ErrorText.of(error)))
     runners.clear()
     return errors
+
+
+def disconnect_all(runners: Sequence[EnvRunner]) -> None:
+    """Bring the envs of a host to a safe state, because the trainer is gone."""
+    for runner in runners:
+        with contextlib.suppress(Exception):
+            runner.env.on_disconnect()
 
 
 def _camera(env: BaseEnv, video: VideoConfig) -> Camera:

@@ -21,7 +21,7 @@ from rlightning_aio.envs.results import is_awaitable
 from rlightning_aio.hosts.arena import make_private, map_shared
 from rlightning_aio.hosts.build_env import built_envs
 from rlightning_aio.hosts.messages import ErrorText
-from rlightning_aio.hosts.runner import attach_all, close_all
+from rlightning_aio.hosts.runner import attach_all, close_all, disconnect_all
 from rlightning_aio.hosts.spinner import Spinner
 from rlightning_aio.protocol.entries import (
     Operation,
@@ -100,19 +100,13 @@ class Worker:
                 self.run_requests()
                 self._wait()
         except TrainerGone as gone:
-            self._disconnect()
+            if not self._closing:
+                disconnect_all(self._runners)
             if not isinstance(gone.__cause__, BrokenPipeError | ConnectionResetError | None):
                 raise
         finally:
             if not self._closing:
                 self._close_envs()
-
-    def _disconnect(self) -> None:
-        """Bring the envs to a safe state: the trainer is gone."""
-        for index, runner in enumerate(self._runners):
-            self._begin_with(index)
-            with contextlib.suppress(Exception):
-                runner.env.on_disconnect()
 
     def _serve_awaitable(self) -> None:
         """Serve envs whose `reset` and `step` are coroutine functions concurrently."""
@@ -129,7 +123,10 @@ class Worker:
             (lambda entry: rings.begin(entry, time.monotonic_ns())) if self._timed else None,
         )
         self._submit = awaiting.submit
-        errors = awaiting.serve(self._channel, self._take_requests, self._disconnect)
+        try:
+            errors = awaiting.serve(self._channel, self._take_requests)
+        finally:
+            self._closing = True  # The event loop has closed them.
         send(FrameKind.CLOSED, payload=pickle.dumps(errors))
 
     def _take_requests(self) -> bool:
