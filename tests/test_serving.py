@@ -1,5 +1,7 @@
 """`OpenEnvServer`, with the `openenv` backend as its client."""
 
+# pyright: reportPrivateUsage=false
+
 from __future__ import annotations
 
 import asyncio
@@ -7,6 +9,7 @@ import contextlib
 import json
 import logging
 import math
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -14,6 +17,8 @@ import numpy as np
 import pytest
 from envs.test_openenv import on_asyncio
 from websockets.asyncio.client import connect
+from websockets.asyncio.server import serve
+from websockets.frames import Frame, Opcode
 
 import rlightning_aio as rl
 from rlightning_aio.envs.openenv_session import get_json, post_json
@@ -154,6 +159,69 @@ async def test_tools_are_answered_as_by_an_environment_without_any() -> None:
             reply = json.loads(await socket.recv())
         assert reply["type"] == "mcp"
         assert reply["data"]["error"]["message"] == "Environment does not support MCP"
+
+
+@on_asyncio
+async def test_a_session_without_a_connection_ends_by_itself() -> None:
+    """Whether it had one or not, its env is free again; one that has a connection goes on."""
+
+    async def until_free() -> str:
+        while isinstance(  # noqa: ASYNC110
+            created := await rpc(server, "openenv/session/create"), int
+        ):
+            await asyncio.sleep(0.01)
+        return created["session_id"]
+
+    async def ask(text: str) -> Any:
+        await socket.send(text)
+        return json.loads(await socket.recv())
+
+    async with (
+        rl.build_env_group({**POLE, "num_workers": 2}) as served,
+        OpenEnvServer(served, "pole", "127.0.0.1", 0) as server,
+    ):
+        address = server.url.replace("http", "ws") + "/ws?session_id="
+        kept = await until_free()
+        server._session_timeout = 0.01
+        async with connect(address + kept, proxy=None) as socket:
+            await ask('{"type": "reset"}')
+            never_attached = [await until_free() for _ in range(3)]
+            assert (await ask('{"type": "step", "data": {"action": 1}}'))["data"]["reward"] == 1
+        for _ in range(2):
+            await until_free()
+        for key in (kept, *never_attached):
+            async with connect(address + key, proxy=None) as socket:
+                refusal = json.loads(await socket.recv())
+            assert refusal["data"]["message"] == f"Unknown session_id: {key}"
+
+
+def test_a_client_that_answers_no_ping_keeps_its_session(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its learner may hold its event loop for minutes."""
+    often: Any = partial(serve, ping_interval=0.01, ping_timeout=0.01)
+    monkeypatch.setattr("rlightning_aio.serving.serve", often)
+    asyncio.run(_answer_no_ping())
+
+
+async def _answer_no_ping() -> None:
+    pings = asyncio.Semaphore(0)
+
+    def send_frame(frame: Frame) -> None:
+        if frame.opcode is Opcode.PONG:
+            pings.release()
+        else:
+            send(frame)
+
+    async with (
+        rl.build_env_group(POLE) as served,
+        OpenEnvServer(served, "pole", "127.0.0.1", 0) as server,
+        connect(server.url.replace("http", "ws") + "/ws", proxy=None) as socket,
+    ):
+        send = socket.protocol.send_frame
+        socket.protocol.send_frame = send_frame  # type: ignore[method-assign]
+        for _ in range(10):
+            await pings.acquire()
+        await socket.send('{"type": "reset"}')
+        assert json.loads(await socket.recv())["type"] == "observation"
 
 
 @on_asyncio

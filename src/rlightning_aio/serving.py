@@ -2,12 +2,13 @@
 
 Each connection to ``/ws`` gets an env of its own as long as one is free, and gives it back at its
 end. Observations and infos travel as JSON: arrays as nested lists. Sessions that were created over
-``POST /mcp`` keep their envs until they are closed there.
+``POST /mcp`` keep their envs until they are closed there, or have had no connection for some time.
 Left out: ``POST /reset`` and ``/step``, whose envs live for one call, and tools, which no env has.
 """
 
 from __future__ import annotations
 
+import asyncio
 import json
 import uuid
 from collections import deque
@@ -24,6 +25,7 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Response
 
+from rlightning_aio.envs.openenv_session import keep_alive_by_system
 from rlightning_aio.envs.post_connection import PostConnection
 from rlightning_aio.errors import ConfigError, RLightningError
 from rlightning_aio.protocol.columns import as_array, is_dict, is_tuple
@@ -54,6 +56,7 @@ class _Session:
         is_kept: it was created over ``/mcp``, and outlives its socket.
         is_attached: it has a socket.
         is_closing: it ends with its socket.
+        ending: ends it, while it has no socket.
     """
 
     def __init__(self, key: str, env: EnvHandle, *, is_kept: bool) -> None:
@@ -61,6 +64,7 @@ class _Session:
         self.env = env
         self.is_kept = is_kept
         self.is_attached = self.is_closing = False
+        self.ending: asyncio.TimerHandle | None = None
         # Before that, the env is in an episode of an earlier session.
         self.has_reset = False
         self.state: dict[str, Any] = {"episode_id": None, "step_count": 0}
@@ -76,15 +80,20 @@ class OpenEnvServer:
         name: of the environment, as clients are told it.
         host: address to listen on.
         port: to listen on; 0 picks a free one.
+        session_timeout: seconds after which a session without a connection ends, and its env is
+            free again.
 
     Raises:
         ConfigError: on entry, if it can't listen there.
     """
 
-    def __init__(self, group: EnvGroup, name: str, host: str, port: int) -> None:
+    def __init__(
+        self, group: EnvGroup, name: str, host: str, port: int, *, session_timeout: float = 300.0
+    ) -> None:
         self._group = group
         self._name = name
         self._host, self._port = host, port
+        self._session_timeout = session_timeout
         self._free = deque(group.env_ids)
         self._sessions: dict[str, _Session] = {}
         self._space: Any = group.get_action_spaces()[0]
@@ -98,6 +107,8 @@ class OpenEnvServer:
                 self._port,
                 process_request=self._http,
                 max_size=None,
+                # A client whose learner holds its event loop can't answer; see `_talk`.
+                ping_timeout=None,
                 create_connection=cast("Any", partial(PostConnection, answer=self._post)),
             )
         except OSError as error:
@@ -108,6 +119,8 @@ class OpenEnvServer:
     async def __aexit__(self, *exc: object) -> None:
         self._server.close()
         await self._server.wait_closed()
+        for session in list(self._sessions.values()):
+            self._end(session)
 
     @property
     def url(self) -> str:
@@ -206,15 +219,24 @@ class OpenEnvServer:
         env = self._group[self._free.popleft()]
         session = _Session(str(uuid.uuid4()), env, is_kept=is_kept)
         self._sessions[session.key] = session
+        self._detach(session)
         return session
 
+    def _detach(self, session: _Session) -> None:
+        session.is_attached = False
+        loop = asyncio.get_running_loop()
+        session.ending = loop.call_later(self._session_timeout, self._end, session)
+
     def _end(self, session: _Session) -> None:
+        if session.ending is not None:
+            session.ending.cancel()
         del self._sessions[session.key]
         self._free.append(session.env.env_id)
 
     async def _talk(self, socket: ServerConnection) -> None:
         """Serve one connection."""
         assert socket.request is not None
+        keep_alive_by_system(socket.transport)
         (key,) = parse_qs(urlsplit(socket.request.path).query).get("session_id", [None])
         try:
             session = self._create(is_kept=False) if key is None else self._sessions.get(key)
@@ -239,10 +261,12 @@ class OpenEnvServer:
 
     async def _attach(self, socket: ServerConnection, session: _Session) -> None:
         session.is_attached = True
+        assert session.ending is not None
+        session.ending.cancel()
         try:
             await self._serve(socket, session)
         finally:
-            session.is_attached = False
+            self._detach(session)
             if session.is_closing or not session.is_kept:
                 self._end(session)
 

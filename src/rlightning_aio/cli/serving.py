@@ -27,6 +27,9 @@ def serve(
     *,
     port: Annotated[int, typer.Option(min=0, max=_MAX_PORT, help="0 picks a free one.")] = 8000,
     host: Annotated[str, typer.Option(help="Address to listen at.")] = "127.0.0.1",
+    session_timeout: Annotated[
+        float, typer.Option(min=0, help="Seconds until a session without a connection ends.")
+    ] = 300.0,
 ) -> None:
     """Serve the envs of a config with one entry as sessions of an OpenEnv server.
 
@@ -44,10 +47,10 @@ def serve(
             "env_server's; serve other entries at other ports"
         )
     check_installed(configs)
-    run_interruptible(_serve(configs[0], host, port))
+    run_interruptible(_serve(configs[0], host, port, session_timeout))
 
 
-async def _serve(config: EnvConfig, host: str, port: int) -> None:
+async def _serve(config: EnvConfig, host: str, port: int, session_timeout: float) -> None:
     # Not at the top: it needs an extra.
     try:
         from rlightning_aio.serving import OpenEnvServer  # noqa: PLC0415
@@ -55,7 +58,7 @@ async def _serve(config: EnvConfig, host: str, port: int) -> None:
         raise ConfigError(f"{error}: pip install 'rlightning-aio[openenv]'") from error
     async with (
         rlightning_aio.build_env_group(config) as group,
-        OpenEnvServer(group, config.name, host, port) as server,
+        OpenEnvServer(group, config.name, host, port, session_timeout=session_timeout) as server,
     ):
         sessions = counted(len(group), "session")
         out().print(f"{config.name}: {sessions} at {server.url}", soft_wrap=True, markup=False)

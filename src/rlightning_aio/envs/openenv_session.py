@@ -31,7 +31,15 @@ if TYPE_CHECKING:
 
     from websockets.asyncio.client import ClientConnection
 
-__all__ = ["OpenEnvSession", "ServerGone", "ServerRefused", "get_json", "pauses", "post_json"]
+__all__ = [
+    "OpenEnvSession",
+    "ServerGone",
+    "ServerRefused",
+    "get_json",
+    "keep_alive_by_system",
+    "pauses",
+    "post_json",
+]
 
 _PAUSE_SECONDS: Final = (0.05, 1.0)
 """Between two attempts to get a session: the first, and the longest."""
@@ -185,7 +193,7 @@ class OpenEnvSession:
             )
         except (OSError, InvalidHandshake, TimeoutError) as error:
             raise ServerGone(f"{self.url} can't be reached: {error}", is_unsent=True) from error
-        _keep_alive_by_system(self._socket.transport)
+        keep_alive_by_system(self._socket.transport)
 
     async def _create(self) -> None:
         """Create the session, in a task that goes on when this is cancelled, lest a slot leak."""
@@ -286,7 +294,7 @@ async def _keep_alive(socket: ClientConnection) -> None:
         return
 
 
-def _keep_alive_by_system(transport: asyncio.Transport) -> None:
+def keep_alive_by_system(transport: asyncio.Transport) -> None:
     """Let the system find a far end that has vanished, also while a step is in flight."""
     socket = transport.get_extra_info("socket")
     socket.setsockopt(sockets.SOL_SOCKET, sockets.SO_KEEPALIVE, 1)
