@@ -312,6 +312,14 @@ class Fresh(BaseEnv):
         "array": spaces.Box(-1, 1, (3,), np.float32),
         "words": spaces.Text(8),
         "tree": TREE,
+        "lines": spaces.Sequence(spaces.Box(-9, 9, (2,), np.float64)),
+        "titled count": spaces.Dict(title=spaces.Text(8), value=spaces.MultiDiscrete([9])),
+        "titled value": spaces.Dict(title=spaces.Text(8), value=spaces.Box(-9, 9, (1,))),
+        "value of two titles": spaces.Dict(
+            title=spaces.Tuple([spaces.Text(8), spaces.Text(8)]),
+            value=spaces.Box(-9, 9, (1,), np.float64),
+        ),
+        "further keys": spaces.Dict(title=spaces.Text(8), more=spaces.Box(-9, 9, (1,))),
     }
 
     fresh_results = True
@@ -330,7 +338,8 @@ class Fresh(BaseEnv):
         return EnvRet(env_id=self.env_id, observation=self.space.sample())
 
     def step(self, policy_resp: PolicyResponse) -> EnvRet:
-        return result_of(self.env_id, self.bare_step()(policy_resp.action))
+        # Its awaitable twin has no bare step.
+        return result_of(self.env_id, Fresh.bare_step(self)(policy_resp.action))
 
     def bare_step(self) -> BareStep:
         def step(action: Any) -> Any:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import warnings
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -13,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from rlightning_aio import BatchedData, EnvConfig, PolicyResponse
+from rlightning_aio import BatchedData, EnvConfig, PolicyResponse, sync
 from rlightning_aio.batch.data import batch_of_results
 from rlightning_aio.errors import BadAction
 from rlightning_aio.group.actions import write_actions
@@ -95,6 +97,40 @@ def test_meaningless_numbers_are_refused_by_name(
         rows.write(
             {"part": actions} if form == "columns" else [{"part": one} for one in actions], form
         )
+
+
+class Waiting(gym.Env[Any, Any]):
+    """Takes two numbers."""
+
+    observation_space = spaces.Discrete(2)
+
+    def __init__(self, limit: float) -> None:
+        self.action_space = spaces.Box(-limit, limit, (2,))
+
+    def reset(self, **_kwargs: Any) -> Any:
+        return 0, {}
+
+    def step(self, action: Any) -> Any:
+        return 0, float(action.max()), False, False, {}
+
+
+@pytest.mark.parametrize("order", [("far", "near"), ("near", "far")])
+@pytest.mark.parametrize("form", ["columns", "values"])
+def test_infinity_is_judged_by_the_space_of_its_own_env(form: str, order: tuple[str, str]) -> None:
+    """Whatever the space of the group's first env, whose rows have the same arrays."""
+    made = {name: partial(Waiting, limit) for name, limit in (("near", 1), ("far", INF))}
+    entries = [EnvConfig(name=n, make_env=made[n], placement="inline") for n in order]
+    with sync.build_env_group(entries) as group:
+        batch, _ = group.reset()
+
+        def responses(part: BatchedData, action: Any) -> BatchedData:
+            columns = part.respond(action=np.array(action, np.float32))
+            return columns if form == "columns" else BatchedData(part.ids(), columns.values())
+
+        far = responses(batch.by_name()["far"], [[INF, 0]])
+        assert group.step(far)[0].reward.tolist() == [INF]
+        with pytest.raises(BadAction, match="'near-0'.* holds inf"):
+            group.step(responses(batch, [[INF, 0], [INF, 0]]))
 
 
 @pytest.mark.parametrize("form", ["columns", "values"])

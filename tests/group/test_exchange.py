@@ -356,6 +356,28 @@ async def test_envs_of_different_observations_work_as_one_group(start: Any) -> N
     assert len(batch.info()) == 3
 
 
+UNFIXED = ["words", "lines", "titled count", "titled value", "value of two titles", "further keys"]
+
+
+@pytest.mark.parametrize("task", UNFIXED)
+async def test_each_entry_is_read_by_its_own_space(start: Any, task: str) -> None:
+    """Also if no space has a fixed size: each column holds what the values of its envs hold."""
+    tasks = [task, *(other for other in UNFIXED if other != task)]
+    entries = [{**PROBE, "name": t, "backend": "fresh", "task": t, "num_workers": 1} for t in tasks]
+    group = await start(entries)
+    batch, _ = await group.reset()
+    for _ in range(3):
+        for part in batch.by_name().values():
+            assert same(first_row(part.observation), part.values()[0].observation)
+        batch, _ = await group.step(batch.respond(action=np.zeros(len(tasks), int)))
+
+
+def first_row(column: Any) -> Any:
+    if isinstance(column, dict):
+        return {key: first_row(part) for key, part in column.items()}
+    return tuple(map(first_row, column)) if isinstance(column, tuple) else column[0]
+
+
 def test_custom_spaces_are_compared_by_their_repr() -> None:
     """Without the object's address."""
 

@@ -44,6 +44,7 @@ __all__ = [
     "row_reader",
     "row_writer",
     "stacked",
+    "structure",
 ]
 
 Tree: TypeAlias = Any
@@ -86,6 +87,23 @@ def _walk(space: gym.Space[Any], path: tuple[str | int, ...]) -> Iterator[Leaf |
         yield Leaf(path, space.shape, space.dtype)
     else:
         yield None
+
+
+def structure(space: gym.Space[Any], *, limits: bool = False) -> object:
+    """A key that is equal for spaces whose values become columns in the same way.
+
+    With `limits`, boxes that are bounded in different places differ.
+    """
+    if is_dict(space):
+        return dict, *((key, structure(s, limits=limits)) for key, s in space.spaces.items())
+    if is_tuple(space):
+        return tuple, *(structure(s, limits=limits) for s in space.spaces)
+    if not is_array(space):
+        return type(space).__qualname__
+    if limits and hasattr(space, "bounded_below"):
+        bounded = space.bounded_below.tobytes(), space.bounded_above.tobytes()
+        return space.shape, space.dtype, *bounded
+    return space.shape, space.dtype
 
 
 def is_dict(space: object) -> TypeGuard[spaces.Dict[Any]]:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from rlightning_aio.protocol.columns import Leaf, Tree, assemble, leaf_of, leaves
+from rlightning_aio.protocol.columns import Leaf, Tree, assemble, leaf_of, leaves, structure
 from rlightning_aio.protocol.info import INFO_BYTES, INFO_BYTES_OF_SUB_ENV
 
 if TYPE_CHECKING:
@@ -55,7 +55,8 @@ class RowLayout:
             ``(num_agents, ...)``.
         agents: agent names of a multi-agent env.
         observations_out_of_band: observations are passed as objects (inline placement).
-        key: equal for layouts with interchangeable rows and stackable observations.
+        key: equal for layouts with interchangeable rows and stackable observations, whose actions
+            may hold infinity in the same places.
     """
 
     observation_space: gym.Space[Any]
@@ -67,8 +68,8 @@ class RowLayout:
 
     def __post_init__(self) -> None:
         # Where the env is built; the key travels with the layout.
-        observations, actions = leaves(self.observation_space), self.action_leaves
-        key = (observations, self.observations_out_of_band, actions, self.head, self.agents)
+        observations = structure(self.observation_space), self.observations_out_of_band
+        key = (*observations, structure(self.action_space, limits=True), self.head, self.agents)
         object.__setattr__(self, "key", key)
 
     @property
