@@ -29,6 +29,7 @@ from rlightning_aio.batch.sent import UNASKED, columns_of_values, copied
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.errors import BadAction
 from rlightning_aio.group.env_table import EnvTable
+from rlightning_aio.protocol.columns import index
 from rlightning_aio.protocol.info import INFO_BYTES, PICKLED, InfoSchema, InfoSchemas, InfoWriter
 from rlightning_aio.protocol.slab import IS_RESET, OVER, TERMINATED, TRUNCATED
 from rlightning_aio.types import EnvRet, MultiAgentEnvRet, PolicyResponse
@@ -614,6 +615,63 @@ def sent_for(n: int, *requests: Any, of_rows: list[int], rows: list[int]) -> Any
     of_each = np.empty(n, object)
     of_each[:] = [requests[k] for k in of_rows]
     return results(columns(list(range(n)), None), sources=(of_each, np.array(rows))).sent
+
+
+PUSHES = np.array([[1.5, 2.5], [3.5, 4.5]])
+FORMS: list[Any] = [
+    {"push": PUSHES, "jump": np.array([0, 1])},
+    [{"push": PUSHES[0], "jump": 0}, {"jump": 1}],
+    (PUSHES, ["a", "b"]),
+    [6, "six"],
+    ["seven", "eight"],
+    np.array([9, 10]),
+    np.array([True, False]),
+    np.array([0.25, 0.5]),
+    np.array(["nine", "ten"]),
+    np.array([None, {"eleven": 11}]),
+    PUSHES,
+    np.array([[1], [2]]),
+]
+
+
+def plain(value: Any) -> Any:
+    """The value without arrays."""
+    if isinstance(value, dict):
+        return {key: plain(part) for key, part in value.items()}
+    if isinstance(value, tuple):
+        return tuple(map(plain, value))
+    return np.array(value, object).tolist()
+
+
+@given(data=st.data())
+def test_columns_sent_in_several_forms_keep_their_values(data: st.DataObject) -> None:
+    """Numbers stay numbers and texts stay texts, whichever comes first; other rows have None."""
+    chosen = data.draw(st.lists(st.sampled_from(FORMS), min_size=1, max_size=4))
+    requests: list[Any] = [{"action": column} for column in chosen]
+    n = data.draw(st.integers(1, 6))
+    of_rows = data.draw(st.lists(st.integers(0, len(chosen) - 1), min_size=n, max_size=n))
+    rows = data.draw(st.lists(st.sampled_from([0, 1]), min_size=n, max_size=n))
+    found = sent_for(n, *requests, of_rows=of_rows, rows=rows).action
+    expected = [plain(index(chosen[k], row)) for k, row in zip(of_rows, rows, strict=True)]
+    assert [plain(index(found, k)) for k in range(n)] == expected
+
+
+def test_rows_without_a_request_have_none_among_several_forms() -> None:
+    """In a list, which holds None for them, and in an array of objects."""
+    of_rows, rows = [0, 1, 2], [0, 0, 1]
+    requests = [None, {"action": FORMS[0]}, {"action": FORMS[4]}]
+    found = sent_for(3, *requests, of_rows=of_rows, rows=rows).action
+    assert plain(tuple(found)) == (None, {"push": [1.5, 2.5], "jump": 0}, "eight")
+    objects = {"action": np.array([{}, []], object)}
+    assert sent_for(2, None, objects, of_rows=[1, 0], rows=[1, 0]).action.tolist() == [[], None]
+
+
+@pytest.mark.parametrize("values", [[6, "x"], ["x", 6], [[1, "a"], [2, "b"]], [b"\0", b"x"]])
+def test_single_responses_with_texts_stay_values(values: list[Any]) -> None:
+    """In an array, numbers would become texts."""
+    responses = [PolicyResponse(f"a-{k}", v, extra={"it": v}) for k, v in enumerate(values)]
+    found = columns_of_values(responses)
+    assert found["action"] == found["extra"]["it"] == values
 
 
 def test_sent_tensors_stay_tensors() -> None:

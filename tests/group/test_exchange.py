@@ -23,6 +23,7 @@ from rlightning_aio import (
     build_env_group,
 )
 from rlightning_aio.group.slab_layout import check_actions
+from rlightning_aio.protocol.columns import stacked
 
 # Values are made and read independently of the loop.
 pytestmark = pytest.mark.one_driver_for_each_place
@@ -219,6 +220,38 @@ async def test_actions_of_every_space_that_fits_in_rows(start: Any) -> None:
     wrong["hands"] = (wrong["hands"][0], np.zeros(3, int))
     with pytest.raises(BadAction, match=r"\['hands'\]\[1\].*\(2,\).*\(3,\)"):
         await group["e-0"].step(wrong)
+
+
+async def test_sent_actions_keep_their_values_in_every_form(start: Any) -> None:
+    """In one batch of results for actions sent as columns, as a list, and as single responses."""
+    group = await start(gym_entry("Tree-v0", num_workers=3))
+    batch, _ = await group.reset(seed=0)
+    drawn = [sample_envs.MOVES.sample() for _ in range(3)]
+    for first, second, third in ((0, 1, 2), (2, 0, 1), (1, 2, 0)):
+        columns = stacked([drawn[first]])
+        group.step_async(batch.take([first]).respond(action=columns))
+        group.step_async(batch.take([second]).respond(action=[drawn[second]]))
+        env_id = batch.env_ids()[third]
+        group.step_async(BatchedData([env_id], [PolicyResponse(env_id, drawn[third])]))
+        batch, _ = await group.collect_async(wait_all=True)
+        order = [int(env_id[-1]) for env_id in batch.env_ids()]
+        assert isinstance(batch.sent.action, list)
+        assert all(same(batch.sent.action[k], drawn[env]) for k, env in enumerate(order))
+        batch = batch.take(np.argsort(order).tolist())
+
+
+async def test_what_a_batch_says_was_sent_never_changes(start: Any) -> None:
+    """Rows that answer no response have the columns sent last when they were returned."""
+    group = await start(PROBE)
+    first, _ = await group.reset()
+    assert list(first.sent) == ["action"]
+    action = np.zeros((2, 2))
+    await group.step(first.respond(action=action, log_prob=np.zeros(2)))
+    second, _ = await group.reset()
+    await group.step(second.respond(action=action, value=np.zeros((2, 3))))
+    assert (list(first.sent), list(second.sent)) == (["action"], ["action", "log_prob"])
+    third, _ = await group.reset()
+    assert np.isnan(third.sent.value).shape == (2, 3)
 
 
 async def test_actions_without_a_fixed_size_are_sent_out_of_band(start: Any) -> None:

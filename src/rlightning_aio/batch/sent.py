@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
 
 import numpy as np
 
-from rlightning_aio.batch.stacking import columns_where_possible, concatenated
-from rlightning_aio.protocol.columns import mapped
+from rlightning_aio.batch.stacking import columns_where_possible, concatenated, form_of
+from rlightning_aio.protocol.columns import index, mapped
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -74,6 +74,8 @@ def joined_sources(parts: Sequence[tuple[Sources | None, int]]) -> Sources:
 class Sent:
     """Columns by name, as attributes or by ``[]``, in the order of the batch.
 
+    A column has the form that was sent: an array, a tensor, a dict or tuple of such, or a list with
+    one value for each row. If its rows were sent in several forms, it is a list of their values.
     Rows that answer no response (a requested reset, a first result) hold NaN, or 0 if the dtype has
     no NaN, or None in a list; their `BatchedData.is_reset` is True. They have the shapes and dtypes
     that were sent last to their config entry. In a batch of only such rows, a name that was never
@@ -126,19 +128,30 @@ class Sent:
                 continue
             found.append(mapped(lambda leaf, w=where: _rows_of(leaf, self._rows[w]), columns[name]))
             places.append(where)
+        like = found or examples
+        if not like and (self._rows == UNASKED).all():
+            like = [np.empty(0)]
+        if not like:
+            known = ", ".join(self.keys()) or "nothing"
+            raise KeyError(f"no {name!r} was sent for these results; sent were: {known}")
+        if len(like) > 1 and len(set(map(form_of, like))) > 1:
+            return self._listed(found, places)
         if lacking:
-            like = [*found, *examples]
-            if not like and (self._rows == UNASKED).all():
-                like = [np.empty(0)]
-            if not like:
-                known = ", ".join(self.keys()) or "nothing"
-                raise KeyError(f"no {name!r} was sent for these results; sent were: {known}")
             missing = np.concatenate(lacking)
-            found.append(mapped(lambda leaf: _filler(leaf, len(missing)), like[0]))
+            example = like[0] if len(like) == 1 else concatenated(like)
+            found.append(mapped(lambda leaf: _filler(leaf, len(missing)), example))
             places.append(missing)
         if len(found) == 1:
             return found[0]
         return concatenated(found, np.argsort(np.concatenate(places)))
+
+    def _listed(self, found: list[Any], places: list[NDArray[np.intp]]) -> list[Any]:
+        """The values of columns with different forms; None for all other rows."""
+        values: list[Any] = [None] * len(self._rows)
+        for column, where in zip(found, places, strict=True):
+            for row, place in enumerate(where.tolist()):
+                values[place] = index(column, row)
+        return values
 
     def _groups(self) -> Iterator[tuple[Mapping[str, Any] | None, NDArray[np.intp]]]:
         """Columns of requests, each with the rows of the batch that answer it."""
@@ -162,8 +175,10 @@ def _filler(leaf: Any, count: int) -> Any:
         return [None] * count
     if isinstance(leaf, np.ndarray):
         array = cast("NDArray[Any]", leaf)
-        nothing = np.nan if array.dtype.kind in "fc" else 0
-        return np.full((count, *array.shape[1:]), nothing, array.dtype)
+        filler = np.zeros((count, *array.shape[1:]), array.dtype)
+        if array.dtype.kind in "fcO":
+            filler[...] = None if array.dtype.kind == "O" else np.nan
+        return filler
     nothing = float("nan") if leaf.is_floating_point() else 0
     return leaf.new_full((count, *leaf.shape[1:]), nothing)
 

@@ -10,11 +10,13 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["columns_where_possible", "concatenated", "differing", "stacked_values"]
+__all__ = ["columns_where_possible", "concatenated", "differing", "form_of", "stacked_values"]
 
 
 def stacked_values(values: list[Any]) -> Any:
     """Stack `values` to columns: arrays, torch tensors, or dicts and tuples of them.
+
+    Texts, and lists that hold any, stay a list: in an array they would turn numbers into texts.
 
     Raises:
         ValueError: they differ in structure or shape.
@@ -22,15 +24,20 @@ def stacked_values(values: list[Any]) -> Any:
     first = values[0] if values else None
     if isinstance(first, dict | tuple):
         return _stacked_trees(cast("dict[Any, Any] | tuple[Any, ...]", first), values)
-    if isinstance(first, str):
-        return values
     if type(first).__module__.partition(".")[0] == "torch":
         # A process that holds a tensor has imported torch.
         return sys.modules["torch"].stack(values)
     arrays = [np.asarray(value) for value in values]
+    kinds = {array.dtype.kind for array in arrays}
+    if kinds & {"S", "U"} and (len(kinds) > 1 or not all(map(_is_array, values))):
+        return values
     if len({array.shape for array in arrays}) > 1:
         raise differing()
     return np.stack(arrays) if arrays else np.empty(0)
+
+
+def _is_array(value: Any) -> bool:
+    return isinstance(value, np.ndarray)
 
 
 def _stacked_trees(first: dict[Any, Any] | tuple[Any, ...], values: list[Any]) -> Any:
@@ -63,6 +70,23 @@ def columns_where_possible(values: list[Any]) -> Any:
         RuntimeError,
     ):  # Tensors on several devices, or of several shapes.
         return values
+
+
+def form_of(tree: Any) -> object:
+    """A key that is equal for columns that `concatenated` joins without changing a value."""
+    if isinstance(tree, dict):
+        parts = cast("dict[str, Any]", tree)
+        return dict, frozenset((key, form_of(part)) for key, part in parts.items())
+    if isinstance(tree, tuple):
+        return tuple, *map(form_of, cast("tuple[Any, ...]", tree))
+    if isinstance(tree, np.ndarray):
+        column = cast("NDArray[Any]", tree)
+        kind = column.dtype.kind
+        return np.ndarray, column.shape[1:], "number" if kind in "biufc" else kind
+    if isinstance(tree, list):
+        return list
+    tensor = cast("Any", tree)
+    return type(tensor), tensor.shape[1:], str(tensor.device)
 
 
 def concatenated(trees: list[Any], order: NDArray[np.intp] | slice = slice(None)) -> Any:

@@ -19,7 +19,6 @@ from rlightning_aio.group.slab_layout import rows_in
 from rlightning_aio.hosts.messages import NO_ACTION
 from rlightning_aio.protocol.columns import Leaf, Rows, Tree, as_array, index, out_of_range
 from rlightning_aio.protocol.exchange import FEW_NUMBERS, sum_of_squares
-from rlightning_aio.spaces import Anything
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -230,8 +229,9 @@ def response_columns(
     columns = columns_of_responses(batch)
     if columns is not None:
         return columns
-    space = layout.of(int(slots[0]))[0].layout.action_space if len(slots) else None
-    return columns_of_values(batch.values(), actions_as_list=isinstance(space, Anything))
+    slabs: set[int] = {*layout.slab[slots].tolist()}
+    actions_as_list = any(layout.slabs[k].action is None for k in slabs)
+    return columns_of_values(batch.values(), actions_as_list=actions_as_list)
 
 
 def _extras_alone(

@@ -58,8 +58,10 @@ class Results:
         self._sent_columns = np.full(len(envs), None, object)
         self._sent_rows = np.zeros(len(envs), np.intp)
         self._last_sent: tuple[NDArray[np.intp], Mapping[str, Any]] | None = None
-        # The columns sent last to each entry: examples for rows that answer no request.
+        # The columns sent last to each entry: examples for rows that answer no request. Batches
+        # refer to these dicts, so they are replaced and never changed.
         self._examples: list[dict[str, Any]] = [{} for _ in envs.names.entry_names]
+        self._any_unasked = False
         self._each = np.arange(len(envs))
 
     # -- what comes in ----------------------------------------------------------------
@@ -76,18 +78,13 @@ class Results:
         if len(self._examples) > 1:
             entries = set(cast("list[int]", self._envs.names.entries[slots].tolist()))
         for k in entries:
-            self._examples[k].clear()
-            self._examples[k].update(kept)
+            self._examples[k] = dict(kept)
 
     def note_unasked(self, slots: NDArray[np.intp]) -> None:
         """Note that the next results of `slots` answer no response."""
         self._enter_last_sent()
-        entries = self._envs.names.entries
-        for slot in slots.tolist():
-            example = self._sent_columns[slot] = self._examples[entries.item(slot)]
-            if not example and (action := self._layout.of(slot)[0].action) is not None:
-                example["action"] = mapped(_without_rows, action)
         self._sent_rows[slots] = UNASKED
+        self._any_unasked = True
 
     def _enter_last_sent(self) -> None:
         if self._last_sent is not None:
@@ -198,7 +195,21 @@ class Results:
         if self._last_sent is not None and self._last_sent[0] is slots:
             return self._last_sent[1], None  # As `step` asks and is answered.
         self._enter_last_sent()
-        return self._sent_columns[slots], self._sent_rows[slots]
+        columns, rows = self._sent_columns[slots], self._sent_rows[slots]
+        if self._any_unasked:
+            for k in np.flatnonzero(rows == UNASKED).tolist():
+                columns[k] = self._example_for(slots.item(k))
+            self._any_unasked = bool((self._sent_rows == UNASKED).any())
+        return columns, rows
+
+    def _example_for(self, slot: int) -> dict[str, Any]:
+        """Return the columns sent last to the entry of `slot`, or an action without rows."""
+        entry = self._envs.names.entries.item(slot)
+        if not self._examples[entry]:
+            action = self._layout.of(slot)[0].action
+            if action is not None:
+                self._examples[entry] = {"action": mapped(_without_rows, action)}
+        return self._examples[entry]
 
     def part(
         self, slab: Slab, slots: NDArray[np.intp], positions: NDArray[np.intp] | None = None
