@@ -223,9 +223,12 @@ class VecEnv(_Base):
         rows = self._rows
         done = rows.flat(batch.done)
         infos = LazyInfos(lambda: _infos_of_step(rows, batch))
-        for k in np.flatnonzero(done).tolist():
+        ended = np.flatnonzero(done).tolist()
+        lost = rows.flat(batch.restarted) if ended else done
+        for k in ended:
             cut = infos[k].pop("TimeLimit.truncated")
-            infos[k], self.reset_infos[k] = _last_and_first(infos[k], self._observations, k)
+            returned = index(self._observations, k) if lost[k] else None
+            infos[k], self.reset_infos[k] = _last_and_first(infos[k], returned)
             infos[k]["TimeLimit.truncated"] = cut
         found = self._copied_observations(batch), rows.flat(batch.reward), done, infos
         self._has_lost = False
@@ -332,14 +335,13 @@ def _infos_of_step(rows: Singles, batch: BatchedData) -> list[dict[str, Any]]:
 
 
 def _last_and_first(
-    info: dict[str, Any], returned: Any, place: int
+    info: dict[str, Any], returned: Any | None
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Split an info into the last of an episode and the first of the next; see `SameStep`.
 
     An episode that was lost with its worker ends with the observation `returned` last.
     """
-    if "final_info" not in info:
-        cause, first = cause_and_rest(info)
-        return {**cause, "terminal_observation": copy.deepcopy(index(returned, place))}, first
-    first = {key: value for key, value in info.items() if key not in ("final_info", "final_obs")}
-    return {**info["final_info"], "terminal_observation": info["final_obs"]}, first
+    cause, first = cause_and_rest(info)
+    if returned is None:
+        return {**info["final_info"], "terminal_observation": info["final_obs"]}, first
+    return {**cause, "terminal_observation": copy.deepcopy(returned)}, first

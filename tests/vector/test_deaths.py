@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -463,3 +464,172 @@ def test_a_masked_reset_is_refused_where_a_neighbour_has_taken_the_worker_along(
     assert envs.reset()[0].tolist() == [[0.0]] * 4
     assert envs.step(np.zeros(4, np.int64))[0].tolist() == [[1.0]] * 4
     envs.close()
+
+
+class Counted(gym.Env[Any, Any]):
+    """Observes [episode, step]; action 1 ends the episode."""
+
+    observation_space = gym.spaces.Box(-1, 99, (2,), np.float64)
+    action_space = gym.spaces.Discrete(2)
+    episode = 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        self.episode += 1
+        self.count = 0
+        return np.array([self.episode, 0.0]), {"begun": self.episode}
+
+    def step(self, action: Any) -> Any:
+        self.count += 1
+        info = {"count": self.count}
+        return np.array([self.episode, self.count], float), 1.0, bool(action), False, info
+
+
+SAVED = {
+    "a reset": ([0], 0),
+    "a step": ([0, 0, 0], 2),
+    "an end": ([0, 1], 2),
+    "an end before the last step": ([1, 0], 1),
+    "an end of only one": ([0, 1], 2),
+}
+"""Actions before a death, and the position of the result that was saved last, from the reset."""
+
+
+def fits(mode: AutoresetMode, on_worker_death: str, saved: str, width: int) -> bool:
+    """Return False if it is refused, or as in another case."""
+    if on_worker_death == "restart":
+        return saved in ("a reset", "an end")
+    if saved == "an end of only one":
+        return mode == AutoresetMode.SAME_STEP and width > 0
+    return mode != AutoresetMode.NEXT_STEP or not width
+
+
+CASES = [case for case in product(MODES, ["restart", "resume"], SAVED, [0, 2]) if fits(*case)]
+
+
+def counted(width: int, mode: AutoresetMode) -> list[Callable[[], Any]]:
+    """Two callables, each of a single env or of `width` that are stepped together."""
+    if not width:
+        return [Counted] * 2
+    return [lambda: SyncVectorEnv([Counted] * width, autoreset_mode=mode)] * 2
+
+
+def ending(lost: Any, saved: str) -> Any:
+    """Mask of the envs whose episode the action 1 ends: of the worker that will die."""
+    return np.arange(len(lost)) == 0 if saved == "an end of only one" else lost
+
+
+def fields_of(on_worker_death: str) -> dict[str, Any]:
+    fields: dict[str, Any] = {"on_worker_death": on_worker_death, "envs_per_process": 1}
+    return fields | ({"snapshot_every": 2} if on_worker_death == "resume" else {})
+
+
+def causes_of(on_worker_death: str) -> set[str]:
+    """Keys of an info that tell of a death."""
+    resumed = ["worker_resumed"] if on_worker_death == "resume" else []
+    return {"worker_restarted", "env_at_fault", *resumed}
+
+
+def observed(envs: VectorEnv, actions: list[int], ends: Any) -> tuple[list[Any], Any]:
+    """Take actions in the envs of the mask `ends`; in the others, do nothing.
+
+    Returns all observations, and a mask of the envs that the program must reset next.
+    """
+    shown, due = [envs.reset()[0]], np.zeros(envs.num_envs, np.bool_)
+    for action in actions:
+        if due.any():
+            shown.append(envs.reset(options={"reset_mask": due})[0])
+            due = np.zeros_like(due)
+        else:
+            observation, _, terminated, truncated, _ = envs.step(action * ends)
+            shown.append(observation)
+            if envs.autoreset_mode == AutoresetMode.DISABLED:
+                due = terminated | truncated
+    return shown, due
+
+
+@pytest.fixture
+def closed_after() -> Iterator[list[Any]]:
+    """A list of vector envs to close."""
+    made: list[Any] = []
+    yield made
+    for envs in made:
+        envs.close()
+
+
+@pytest.mark.parametrize(("mode", "on_worker_death", "saved", "width"), CASES)
+def test_what_a_lost_step_reports_is_of_the_episode_that_was_lost(
+    mode: AutoresetMode, on_worker_death: str, saved: str, width: int, closed_after: list[Any]
+) -> None:
+    """Whatever the result was that was saved last."""
+    resumes, at_once = on_worker_death == "resume", mode == AutoresetMode.SAME_STEP
+    envs = VectorEnv(counted(width, mode), autoreset_mode=mode, **fields_of(on_worker_death))
+    closed_after.append(envs)
+    size, (actions, place) = max(width, 1), SAVED[saved]
+    lost, nothing = np.arange(2 * size) < size, np.zeros(2 * size, int)
+    shown, due = observed(envs, actions, ending(lost, saved))
+    if due.any():
+        killed(envs.group, lambda: envs.reset_async(options={"reset_mask": due}))
+        observation, infos = envs.reset_wait()
+        truncated = ~lost & lost
+    else:
+        killed(envs.group, lambda: envs.step_async(nothing))
+        observation, reward, terminated, truncated, infos = envs.step_wait()
+        assert (reward.tolist(), terminated.any()) == ((~lost).tolist(), False)
+    assert infos["_worker_restarted"].tolist() == lost.tolist()
+    assert all("was killed by SIGKILL" in cause for cause in infos["worker_restarted"][lost])
+    if saved == "an end" and not at_once:  # It was about to be reset, and has lost nothing.
+        assert (truncated.any(), "final_obs" in infos) == (False, False)
+        assert observation[lost].tolist() == [[2, 0] if resumes else [1, 0]] * size
+        return
+    if saved == "an end before the last step" and not at_once:
+        place = 2  # The last step was a reset, after which the state was saved.
+    first = shown[place][lost].tolist() if resumes else [[1, 0]] * size
+    last, causes = shown[-1][lost].tolist(), causes_of(on_worker_death)
+    causes |= {f"_{cause}" for cause in causes}
+    assert truncated.tolist() == lost.tolist()
+    if resumes:
+        assert infos["worker_resumed"][lost].tolist() == [len(actions) - place] * size
+    if at_once:
+        assert observation[lost].tolist() == first
+        assert infos["_final_obs"].tolist() == infos["_final_info"].tolist() == lost.tolist()
+        assert [row.tolist() for row in infos["final_obs"][lost]] == last
+        assert infos["final_info"].keys() == causes
+    else:
+        assert observation[lost].tolist() == last
+        assert infos.keys() == causes | {"count", "_count"}
+        assert infos["_count"].tolist() == (~lost).tolist()
+    if mode == AutoresetMode.NEXT_STEP:
+        observation, reward, _, truncated, _ = envs.step(nothing)
+        assert (reward.tolist(), truncated.any()) == ((~lost).tolist(), False)
+        assert observation[lost].tolist() == first
+
+
+@pytest.mark.simulators
+@pytest.mark.parametrize(
+    ("on_worker_death", "saved", "width"),
+    [own for mode, *own in CASES if mode == AutoresetMode.SAME_STEP],
+)
+def test_what_a_lost_step_reports_to_stable_baselines3(
+    on_worker_death: str, saved: str, width: int, closed_after: list[Any]
+) -> None:
+    pytest.importorskip("stable_baselines3")
+    from rlightning_aio.sb3 import VecEnv
+
+    resumes, (actions, place) = on_worker_death == "resume", SAVED[saved]
+    size = max(width, 1)
+    makers = counted(width, AutoresetMode.SAME_STEP)
+    envs = VecEnv(makers, **fields_of(on_worker_death))
+    closed_after.append(envs)
+    lost = np.arange(2 * size) < size
+    shown = [envs.reset(), *(envs.step(action * ending(lost, saved))[0] for action in actions)]
+    killed(envs.group, lambda: envs.step_async(np.zeros(2 * size, int)))
+    observation, reward, done, infos = envs.step_wait()
+    assert (done.tolist(), reward.tolist()) == (lost.tolist(), (~lost).tolist())
+    first = shown[place].tolist() if resumes else [[1, 0]] * size
+    causes = causes_of(on_worker_death)
+    for k in range(size):
+        assert infos[k].keys() == causes | {"terminal_observation", "TimeLimit.truncated"}
+        assert infos[k]["TimeLimit.truncated"]
+        assert infos[k]["terminal_observation"].tolist() == shown[-1][k].tolist()
+        assert observation[k].tolist() == first[k]
+        assert not envs.reset_infos[k].keys() & {"final_obs", "final_info", *causes}

@@ -33,6 +33,8 @@ __all__ = ["Deaths", "Stepped", "cause_and_rest"]
 
 _CAUSE: Final = ("worker_restarted", "env_at_fault", "worker_resumed")
 """Keys of an info that say why its env was restarted, who was at fault, and how much was lost."""
+_OF_AN_END: Final = ("final_info", "final_obs")
+"""Keys of an info that a step with same-step autoreset adds where it ends an episode."""
 
 
 class Stepped(NamedTuple):
@@ -145,10 +147,10 @@ class Deaths:
         lost = rows.lost(restarted, self._due)
         (chosen,) = np.nonzero(lost)
         for k in chosen.tolist():
-            cause, _ = cause_and_rest(each[k])
+            cause, first = cause_and_rest(each[k])
             if self._mode == AutoresetMode.SAME_STEP:
                 final = copy.deepcopy(index(last, k))
-                each[k] = {"final_info": cause, "final_obs": final, **each[k]}
+                each[k] = {**first, **cause, "final_info": cause, "final_obs": final}
             else:
                 each[k] = cause
         if self._mode != AutoresetMode.SAME_STEP:
@@ -192,6 +194,11 @@ class Deaths:
 
 
 def cause_and_rest(info: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Split the info of a restarted env into entries about its worker and entries of the reset."""
+    """Split the info of a restarted env into entries about its worker and entries of the reset.
+
+    An env that resumes shows its last saved result again. If that ended an episode, its info is
+    also about that end, which was returned long ago; those entries are left out.
+    """
     cause = {key: info[key] for key in _CAUSE if key in info}
-    return cause, {key: value for key, value in info.items() if key not in cause}
+    rest = {key: value for key, value in info.items() if key not in (*cause, *_OF_AN_END)}
+    return cause, rest
