@@ -14,7 +14,7 @@ from faults.drivers import on_one_driver
 from gymnasium.wrappers import NormalizeObservation
 
 from rlightning_aio.config import parse_configs
-from rlightning_aio.errors import ConfigError, EnvRaised, WorkerDied
+from rlightning_aio.errors import ConfigError, EnvRaised
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -224,32 +224,6 @@ def test_a_snapshot_of_an_env_that_was_taken_back_is_of_one_moment(start: Start)
             assert batch.info()[0]["episode"]["l"] == 10
 
 
-@on_one_driver
-def test_a_death_in_a_restore_does_not_affect_other_envs(start: Start) -> None:
-    """They keep their previous state."""
-    group = start(
-        {
-            **ENTRY,
-            "make_env": Deadly,
-            "on_worker_death": "restart",
-            "snapshot_every": None,
-            "envs_per_process": 1,
-            "num_workers": 2,
-        }
-    )
-    batch, _ = group.reset(seed=3)
-    batch, _ = group.step(batch.respond(action=[0, 0]))
-    snapshot = group.snapshot()
-    group.call("e-1", "prepare")
-    for _ in range(2):
-        batch, _ = group.step(batch.respond(action=[0, 0]))
-    with pytest.raises(WorkerDied, match="exited with code 5"):
-        group.restore(snapshot)
-    batch, _ = group.step(batch.respond(action=[0, 0]))
-    assert batch.observation[:, 0].tolist() == [4, 0]
-    assert batch.restarted.tolist() == [False, True]
-
-
 class Straight(Walk):
     """Never ends by itself."""
 
@@ -261,23 +235,6 @@ class Straight(Walk):
 class Averaged(NormalizeObservation):
     def __init__(self) -> None:
         super().__init__(Straight())
-
-
-class Deadly(Straight):
-    """Dies when its state is restored, once it is prepared."""
-
-    is_prepared = False
-
-    def prepare(self) -> None:
-        self.is_prepared = True
-
-    def save_state(self) -> Any:
-        return self.steps
-
-    def load_state(self, state: Any) -> None:
-        if self.is_prepared:
-            os._exit(5)
-        self.steps = state
 
 
 @on_one_driver

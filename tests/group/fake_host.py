@@ -178,6 +178,8 @@ class FakeHost:
                 Operation.STEP: self._step,
                 Operation.RESET: self._reset,
                 Operation.CALL: self._call,
+                Operation.SNAPSHOT: self._snapshot,
+                Operation.RESTORE: self._restore,
             }[Operation(op_of(entry))]
             index = slot_of(entry) - self.first_slot
             self.waiting.append((index, lambda e=execute, k=entry, g=given: e(k, g)))
@@ -206,7 +208,8 @@ class FakeHost:
     def _reset(self, entry: int, given: Any) -> None:
         index = slot_of(entry) - self.first_slot
         at = self.row_of[index]
-        self.envs[index].reset()
+        if not self.slab.take_as_restored(at):
+            self.envs[index].reset()
         seed = None if given is not None else self.slab.take_seed(at)
         info = {} if seed is None else {"seed": [seed]}
         self._write(index, 0.0, False, False, info)
@@ -240,6 +243,15 @@ class FakeHost:
             self._raise(entry)
         else:
             self.answer(Value(self.host_id, entry, (slot_of(entry), name, args)))
+
+    def _snapshot(self, entry: int, given: Any) -> None:
+        del given
+        steps = self.envs[slot_of(entry) - self.first_slot].steps
+        self.answer(Value(self.host_id, entry, ({}, steps >= 0, bytes([steps + 1]))))
+
+    def _restore(self, entry: int, given: Any) -> None:
+        self.envs[slot_of(entry) - self.first_slot].steps = given[0][0] - 1
+        self.answer(Value(self.host_id, entry, None))
 
     def report(self, entry: int) -> None:
         """Report a result that is in the row."""

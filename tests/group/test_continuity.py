@@ -44,7 +44,7 @@ def part_of(slots: Any, is_reset: Any, over: Any) -> Any:
 
 
 EVENTS: dict[LossEvent, Callable[[Continuity], object]] = {
-    LossEvent.EPISODE_LOST: lambda c: c.lose([0], "was killed"),
+    LossEvent.EPISODE_LOST: lambda c: c.lose([0], "was killed", from_checkpoint=True),
     LossEvent.REPORT_SENT: lambda c: c.report_losses(SLOT, ~STEP),
     LossEvent.RESUME_SENT: lambda c: c.report_losses(SLOT, STEP),
     LossEvent.RESET_SENT: lambda c: c.note_resets([0]),
@@ -110,8 +110,8 @@ def test_a_lost_episode_resumes_from_its_last_valid_checkpoint() -> None:
             continuity.save(0, b"third", number, before=False, is_step=True)
         continuity.returned(SLOT, (), continuity.judge(SLOT, ()))
     continuity.save(0, b"sixth", 6, before=False, is_step=True)
-    continuity.drop_unanswered([0], [6])
-    continuity.lose([0], "was killed", "env-1")
+    continuity.drop_unfinished([0], {6})
+    continuity.lose([0], "was killed", "env-1", from_checkpoint=True)
     assert continuity.checkpoints([0]) == (b"third",)
     reports, seeds = continuity.report_losses(SLOT, STEP)
     assert (reports.tolist(), seeds.tolist()) == ([True], [AS_RESTORED])
@@ -132,10 +132,30 @@ def test_an_env_that_is_being_reset_or_due_does_not_resume() -> None:
 def test_an_env_that_dies_while_it_resumes_resumes_again() -> None:
     """Although its request is a reset by then."""
     continuity = in_phase(LossPhase.RESUMING)
-    continuity.lose([0], "was killed again")
+    continuity.lose([0], "was killed again", from_checkpoint=True)
     _, seeds = continuity.report_losses(SLOT, ~STEP)
     assert seeds.tolist() == [AS_RESTORED]
     assert continuity.answered(SLOT) == [Report(0, "was killed again", None, 0)]
+
+
+@pytest.mark.parametrize("shown", [LossPhase.SHOWING, LossPhase.RESUMING])
+def test_the_steps_of_an_episode_that_could_not_be_shown_do_not_count(shown: LossPhase) -> None:
+    """The reset after that begins at 0, whatever position was to be shown."""
+    continuity = in_phase(shown)
+    continuity.raised(0)
+    continuity.note_resets([0])
+    assert continuity.answered(SLOT) == []
+    first = part_of([0], [True], [False])
+    continuity.returned(SLOT, [first], continuity.judge(SLOT, [first]))
+    assert continuity.positions(SLOT) == [Position(0, is_cut=False)]
+
+
+def test_an_env_that_was_not_built_anew_does_not_resume() -> None:
+    """It has no state of its checkpoint that it could show."""
+    continuity = in_phase(LossPhase.INTACT)
+    continuity.lose([0], "could not be put back")
+    _, seeds = continuity.report_losses(SLOT, STEP)
+    assert seeds.tolist() == [NO_SEED]
 
 
 @dataclass

@@ -9,7 +9,14 @@ import pytest
 from group.fake_host import PLAIN, RAISES, FakeGroup
 
 from rlightning_aio.batch import BatchedData
-from rlightning_aio.errors import BadAction, EnvBusy, EnvRaised, GroupClosed, NothingPending
+from rlightning_aio.errors import (
+    BadAction,
+    EnvBusy,
+    EnvRaised,
+    GroupClosed,
+    NothingPending,
+    WorkerDied,
+)
 from rlightning_aio.group.wait import CollectRules
 from rlightning_aio.types import PolicyResponse
 
@@ -281,6 +288,59 @@ def test_an_env_whose_error_was_not_raised_yet_is_busy(new_group: NewGroup) -> N
     with pytest.raises(EnvRaised):
         running.result()
     group.steps.step_async(steps(0, 1), group.now)
+
+
+@pytest.mark.parametrize("on_worker_death", ["restart", "raise"])
+@pytest.mark.parametrize("fails", ["at its own", "after another's", "in the undo"])
+def test_a_worker_that_dies_at_any_moment_of_a_restore_leaves_the_others_as_they_were(
+    new_group: NewGroup, on_worker_death: str, fails: str
+) -> None:
+    """Also if its envs had been restored, so that nobody waited for it."""
+    group = new_group(1, 1, 1, on_worker_death=on_worker_death)
+    core = group.core
+    run(group, core.reset(group.now, None, None, None))
+    snapshot = run(group, core.snapshot(group.now, None))
+    for _ in range(3):
+        run(group, group.steps.step(steps(0, 1, 2), group.now))
+    restoring = group.begin(core.restore(group.now, snapshot, None))
+    for slot in range(3):
+        group.finish(slot)
+    if fails != "at its own":
+        group.finish(0)
+    if fails == "in the undo":
+        group.finish(1)
+        die(group, 2)
+    die(group, 0)
+    while not restoring.done:
+        group.finish(next(k for k in range(3) if group.hosts[k].waiting))
+    with pytest.raises(WorkerDied) as caught:
+        restoring.result()
+    dead = [0, 2] if fails == "in the undo" else [0]
+    assert caught.value.env_ids == (f"fake-{dead[-1]}",)
+    assert caught.value.__notes__[0].startswith("nothing was restored: the other envs are where")
+    for slot in range(3):
+        if slot in dead and on_worker_death == "raise":
+            with pytest.raises(WorkerDied, match="nothing was sent"):
+                group.steps.step_async(steps(slot), group.now)
+            continue
+        (batch, _) = run(group, group.steps.step(steps(slot), group.now))
+        assert batch.restarted.tolist() == [slot in dead]
+        assert batch.observation[:, 3].tolist() == [0 if slot in dead else 4]
+
+
+def run(group: FakeGroup, procedure: Any) -> Any:
+    """Run a procedure, and have its requests executed."""
+    running = group.begin(procedure)
+    while not running.done:
+        group.finish(next(host.first_slot for host in group.hosts if host.waiting))
+    return running.result()
+
+
+def die(group: FakeGroup, slot: int) -> None:
+    group.host_of(slot).die()
+    group.core.drain()
+    group.wake()
+    group.turn()
 
 
 def test_a_collect_also_waits_for_requests_sent_meanwhile(new_group: NewGroup) -> None:

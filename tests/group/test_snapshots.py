@@ -309,6 +309,7 @@ class Fragile(gym.Env[Any, Any]):
     observation_space = gym.spaces.Box(0, 99, (1,), np.int64)
     action_space = gym.spaces.Discrete(2)
     fails: Any = None
+    count = 0
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         self.count = 0
@@ -368,6 +369,18 @@ def test_an_env_that_cannot_go_back_begins_a_new_episode() -> None:
         assert batch.observation.tolist() == [[2], [0]]
         assert batch.restarted.tolist() == [False, True]
         assert batch.info()[1]["worker_restarted"] == "could not be put back"
+
+
+def test_an_env_that_was_never_reset_has_no_state_after_a_restore_that_failed() -> None:
+    entry = {"name": "e", "make_env": Lost, "num_workers": 2, "placement": "inline"}
+    with sync.build_env_group(entry) as one, sync.build_env_group(entry) as other:
+        one.reset()
+        batch, _ = other.reset(env_ids=["e-1"])
+        other.step(batch.respond(action=[1]))
+        with pytest.raises(EnvRaised, match=r"env 'e-1'.*the disk is gone"):
+            other.restore(one.snapshot())
+        with pytest.raises(SnapshotError, match="env 'e-0' has no state yet"):
+            other.snapshot(["e-0"])
 
 
 def test_an_env_without_parts_has_no_versions_to_compare() -> None:

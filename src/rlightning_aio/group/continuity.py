@@ -19,10 +19,11 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from rlightning_aio.group.conditions import CUT_BEFORE, LOST_EPISODE, Conditions
+from rlightning_aio.protocol.entries import Operation, op_of
 from rlightning_aio.protocol.slab import AS_RESTORED, IS_RESET, NO_SEED, OVER
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Container, Iterable, Sequence
 
     from numpy.typing import NDArray
 
@@ -136,16 +137,19 @@ class _Loss:
     """The phase of one env that is not intact.
 
     Attributes:
-        position: of the state that the reply in flight will show.
+        from_checkpoint: it was built anew from its last checkpoint, which it can show.
         resumes: the request that was lost with the worker was to show a state.
+        position: of the state that the reply in flight will show; of this phase only, as
+        steps_lost: see `Report`.
     """
 
     phase: LossPhase
     cause: str = "could not show the state that was restored"
     at_fault: str | None = None
-    steps_lost: int | None = None
-    position: Position | None = None
+    from_checkpoint: bool = False
     resumes: bool = False
+    position: Position | None = None
+    steps_lost: int | None = None
 
 
 @dataclass(slots=True)
@@ -294,15 +298,14 @@ class Continuity:
             if loss is None or loss.phase is not LossPhase.LOST:
                 continue
             reports[k] = True
-            checkpoint = self._checkpoint(slot)
+            checkpoint = self._checkpoint(slot) if loss.from_checkpoint else None
             if checkpoint is None or not (is_step[k] or loss.resumes):
-                loss.position = loss.steps_lost = None
                 self._move(slot, LossEvent.REPORT_SENT)
                 continue
             seeds[k] = AS_RESTORED
+            self._move(slot, LossEvent.RESUME_SENT)
             loss.position = Position(checkpoint.num_steps, is_cut=False)
             loss.steps_lost = max(self._num_steps.item(slot) - checkpoint.num_steps, 0)
-            self._move(slot, LossEvent.RESUME_SENT)
         return reports, seeds
 
     def note_resets(self, slots: Iterable[int]) -> None:
@@ -315,17 +318,30 @@ class Continuity:
         """Record that resets which show restored states at `positions` are about to be sent."""
         for slot, position in zip(slots, positions, strict=True):
             self._move(slot, LossEvent.SHOW_SENT).position = position
-            checkpoint = self._checkpoint(slot)
-            if checkpoint is not None:
+            checkpoint = self._pending.pop(slot, None)
+            if checkpoint is not None:  # Of the state that was put back.
                 checkpoint.num_steps = position.num_steps
+                self._checkpoints[slot] = checkpoint
 
     # -- replies ----------------------------------------------------------------------
 
-    def lose(self, slots: Iterable[int], cause: str, at_fault: str | None = None) -> None:
-        """Record that the episodes of `slots` are lost; nothing is in flight there."""
+    def lose(
+        self,
+        slots: Iterable[int],
+        cause: str,
+        at_fault: str | None = None,
+        *,
+        from_checkpoint: bool = False,
+    ) -> None:
+        """Record that the episodes of `slots` are lost; nothing is in flight there.
+
+        `cause` and `at_fault` are those of `Report`. `from_checkpoint`: the envs are built anew,
+        from their checkpoints where they have any.
+        """
         for slot in slots:
             loss = self._move(slot, LossEvent.EPISODE_LOST)
             loss.cause, loss.at_fault = cause, at_fault
+            loss.from_checkpoint = from_checkpoint
 
     def answered(self, slots: NDArray[np.intp]) -> list[Report]:
         """Record that results of `slots` arrived, and return the losses that they report."""
@@ -347,7 +363,7 @@ class Continuity:
         if loss is None or loss.phase is LossPhase.LOST:
             return None
         cause = loss.cause if loss.phase in (LossPhase.REPORTING, LossPhase.RESUMING) else None
-        self._move(slot, LossEvent.RAISED)
+        self._move(slot, LossEvent.RAISED).from_checkpoint = False
         return cause
 
     def give_up(self, slots: Iterable[int]) -> None:
@@ -367,8 +383,9 @@ class Continuity:
             raise RuntimeError(f"slot {slot} is {phase.name}, where {event.name} can't happen")
         if loss is None:
             loss = _Loss(after)
-        loss.resumes = phase in (LossPhase.RESUMING, LossPhase.SHOWING)
         loss.phase = after
+        loss.resumes = phase in (LossPhase.RESUMING, LossPhase.SHOWING)
+        loss.position = loss.steps_lost = None
         if after is LossPhase.INTACT:
             self._losses.pop(slot, None)
         else:
@@ -460,7 +477,9 @@ class Continuity:
         """Return the positions of `slots`, all idle; after a loss, those of their checkpoints."""
         found: list[Position] = []
         for slot in slots.tolist():
-            checkpoint = self._checkpoint(slot) if slot in self._losses else None
+            loss = self._losses.get(slot)
+            from_checkpoint = loss is not None and loss.from_checkpoint
+            checkpoint = self._checkpoint(slot) if from_checkpoint else None
             if checkpoint is not None:
                 found.append(Position(checkpoint.num_steps, is_cut=False))
             else:
@@ -477,7 +496,7 @@ class Continuity:
             content: its state, opaque here.
             entry: of the current request.
             before: the state is from before the request, so it is valid at once. Otherwise it
-                is valid once the request is answered.
+                is valid once the request is answered, and that of a restore once it is complete.
             is_step: the request is a step.
         """
         answered = self._pending.pop(slot, None)
@@ -496,11 +515,17 @@ class Continuity:
                 checkpoint.num_steps = self._num_steps.item(slot)
                 self._checkpoints[slot] = checkpoint
 
-    def drop_unanswered(self, slots: Iterable[int], entries: Iterable[int]) -> None:
-        """Drop checkpoints of requests that were not answered: `entries` of busy `slots`."""
-        for slot, entry in zip(slots, entries, strict=True):
+    def drop_unfinished(self, slots: Iterable[int], unanswered: Container[int]) -> None:
+        """Drop checkpoints that a replacement of the host of `slots` must not start from.
+
+        They are of requests that were not answered (entries), or of a restore that was not
+        completed: see `note_shows`.
+        """
+        for slot in slots:
             pending = self._pending.get(slot)
-            if pending is not None and pending.entry == entry:
+            if pending is not None and (
+                pending.entry in unanswered or op_of(pending.entry) == Operation.RESTORE
+            ):
                 del self._pending[slot]
 
     def checkpoints(self, slots: Iterable[int]) -> tuple[bytes | None, ...]:

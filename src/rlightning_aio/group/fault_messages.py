@@ -132,6 +132,11 @@ class DeathReport:
         names = ", ".join(self._ids(asked))
         return self._error(f"{self.message(unanswered)}; nothing was sent to {names}", asked)
 
+    def loss(self, unanswered: NDArray[np.intp], lost: NDArray[np.intp]) -> WorkerDied:
+        """The error for `lost`, slots that had replied, but whose states are gone."""
+        names = ", ".join(self._ids(lost))
+        return self._error(f"{self.message(unanswered)}; lost with it: {names}", lost)
+
     def _error(self, message: str, slots: NDArray[np.intp]) -> WorkerDied:
         error = self.kind(
             message + _said(self.death.stderr_tail),

@@ -57,6 +57,7 @@ class HostRecord:
         idle: its progress when it was last seen idle, and idle_since the time (`HangDetector`).
         rebuild_error: the error of its replacement while rebuilding the envs.
         lost_slots: of envs that are not rebuilt though their host goes on.
+        last_death: makes the error for slots whose states were lost in it.
         refusal: makes the error for new requests to slots of a host that was given up.
         killable: the host, if it can be killed.
         is_local: its envs use this machine's cores; is_hardware: they move in the real world.
@@ -85,6 +86,7 @@ class HostRecord:
     idle_since: float = 0.0
     rebuild_error: ErrorText | None = None
     lost_slots: set[int] = field(default_factory=set[int])
+    last_death: Callable[[NDArray[np.intp]], WorkerDied] | None = None
     refusal: Callable[[NDArray[np.intp]], WorkerDied] | None = None
     killable: Killable | None = field(init=False)
     timed: bool = field(init=False)

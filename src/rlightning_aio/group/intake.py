@@ -207,7 +207,7 @@ class Intake:
         if not outcome.resets:
             self._fail(owed, outcome.error_for)
             return
-        self._continuity.lose(slots, outcome.cause, outcome.at_fault)
+        self._continuity.lose(slots, outcome.cause, outcome.at_fault, from_checkpoint=True)
         # A replacement answers steps and resets, but not calls.
         calls = self._requests.numbering.awaits_value(owed)
         self._fail(owed[calls], outcome.error_for)

@@ -199,7 +199,8 @@ class GroupInterface(Facade):
             EnvBusy: an env has a reply outstanding; nothing was sent.
             UnknownEnv: no env of this group has that id.
             NotImplementedError: an env is a client's.
-            EnvRaised, WorkerDied, EnvHung: an env failed; the others keep their states.
+            EnvRaised, WorkerDied, EnvHung: an env failed; the others keep their states. After all
+                were restored, the results of the others are in the error's ``results``.
             GroupClosed: the group was not initialised, or is closed.
         """
         raise NotImplementedError

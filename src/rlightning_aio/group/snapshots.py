@@ -6,7 +6,9 @@ be undone. `Continuity` records what the next results then report; `snapshot_for
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from rlightning_aio.errors import EnvFault, SnapshotError, WorkerDied
 from rlightning_aio.group.calls import values_of
@@ -18,7 +20,6 @@ from rlightning_aio.registry import ENVS
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    import numpy as np
     from numpy.typing import NDArray
 
     from rlightning_aio.group.calls import Calls
@@ -100,10 +101,19 @@ class Snapshots:
         snapshots = unpack(data)
         slots = self._slots_for(snapshots, env_ids)
         self._check_restorable(slots)
+        deaths = self._supervisor.last_deaths(slots)
         before = yield from self._take(now, slots)
         for slot, snapshot, (own, _) in zip(slots.tolist(), snapshots, before, strict=True):
             check_same(snapshot, own.identity, self._envs.describe(slot))
-        yield from self._put_back(now, slots, snapshots, [own.state for own, _ in before])
+        try:
+            yield from self._put_back(
+                now, slots, snapshots, [own.state for own, _ in before], deaths
+            )
+        except EnvFault:
+            raise
+        except BaseException:
+            self._continuity.lose(slots.tolist(), "was being restored when that was cancelled")
+            raise
         return slots, [Position(snapshot.num_steps, snapshot.is_cut) for snapshot in snapshots]
 
     def _slots_for(
@@ -130,29 +140,41 @@ class Snapshots:
         slots: NDArray[np.intp],
         snapshots: Sequence[EnvSnapshot],
         before: Sequence[bytes],
+        deaths: NDArray[Any],
     ) -> Procedure[None]:
         """Load the state of each snapshot; if one fails, load the states from `before` again.
 
-        An env that can't even go back begins a new episode, and so do all if this is cancelled.
+        The envs of a worker that has died since `deaths` were its last can't go back.
         """
         states = [(snapshot.state, True) for snapshot in snapshots]
         try:
             yield from self._load(now, slots, states)
+            last = self._supervisor.last_deaths(slots)
+            for death in last[last != deaths]:
+                raise death(slots[last == death])  # Its envs had replied, so nobody has heard.
         except EnvFault as fault:
-            failed = {one.env_id for one in (fault, *fault.others) if isinstance(one, WorkerDied)}
-            kept = [k for k, slot in enumerate(slots) if self._envs.env_ids[slot] not in failed]
-            back = [(before[k], False) for k in kept]
-            try:
-                yield from self._load(now, slots[kept], back)
-            except EnvFault as again:
-                lost = {one.env_id for one in (again, *again.others)}
-                left = [slot for slot in slots[kept].tolist() if self._envs.env_ids[slot] in lost]
-                self._continuity.lose(left, "could not be put back")
-            fault.add_note("nothing was restored: the other envs are where they were before")
+            alive = self._supervisor.last_deaths(slots) == deaths
+            kept = [before[k] for k in np.flatnonzero(alive).tolist()]
+            lost = yield from self._undo(now, slots[alive], kept)
+            note = "nothing was restored: the other envs are where they were before"
+            if lost:
+                note += f", but {', '.join(lost)}: to begin a new episode with the next step"
+            fault.add_note(note)
             raise
-        except BaseException:
-            self._continuity.lose(slots.tolist(), "was being restored when that was cancelled")
-            raise
+
+    def _undo(
+        self, now: float, slots: NDArray[np.intp], before: Sequence[bytes]
+    ) -> Procedure[list[str]]:
+        """Load the states from `before` again; return the ids of envs that can't go back."""
+        try:
+            yield from self._load(now, slots, [(state, False) for state in before])
+        except EnvFault as fault:
+            # What a death means for its envs is settled.
+            faults = [one for one in (fault, *fault.others) if not isinstance(one, WorkerDied)]
+            lost = [fault.env_id for fault in faults]
+            self._continuity.lose(self._envs.find(lost).tolist(), "could not be put back")
+            return lost
+        return []
 
     def _load(
         self, now: float, slots: NDArray[np.intp], states: Sequence[tuple[bytes, bool]]

@@ -321,6 +321,14 @@ class Supervisor:
                 if len(asked):
                     raise record.refusal(asked)
 
+    def last_deaths(self, slots: NDArray[np.intp]) -> NDArray[Any]:
+        """Return what makes errors about the last death of the worker of each of `slots`.
+
+        It is another one after each death, and None before the first.
+        """
+        deaths = np.array([record.last_death for record in self._records], object)
+        return deaths[self._requests.hosts[slots]]
+
     def submit(
         self, host_id: int, entries: NDArray[np.int64], arguments: Sequence[Any] | None
     ) -> None:
@@ -382,11 +390,11 @@ class Supervisor:
         if record.stage is not Stage.DOWN:
             record.refusals, record.refused_since = 0, None  # It had started.
         owed = self._requests.owed(np.array(record.slots, np.intp))
-        self._continuity.drop_unanswered(
-            owed.tolist(), self._requests.numbering.entry[owed].tolist()
-        )
+        unanswered = self._requests.numbering.entry[owed].tolist()
+        self._continuity.drop_unfinished(record.slots, set(unanswered))
         was_up = record.stage is Stage.UP
         report, cause, is_last = self._judge(record, death, owed)
+        record.last_death = partial(report.loss, owed)
         self._note_fate("given up" if is_last else "died", exited.host_id, cause)
         if is_last:
             self._requests.lose_host(exited.host_id)

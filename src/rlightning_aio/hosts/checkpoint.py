@@ -88,7 +88,8 @@ class Checkpoints:
         shown_result = self._restored
         if shown_result is None and self.has_result:
             shown_result = self._read()
-        return dumped((self._env.save_state(), shown_result), "its state")
+        is_unshown = self._restored is not None
+        return dumped((self._env.save_state(), shown_result, is_unshown), "its state")
 
     def _read(self) -> _ShownResult:
         """Return a copy of the row and of what was out of band."""
@@ -105,11 +106,15 @@ class Checkpoints:
         return _ShownResult(observation, info, whole, *(column[row, ...].copy() for column in sums))
 
     def load(self, checkpoint: bytes, *, show: bool) -> None:
-        """Restore the env. With `show`, its next reset `AS_RESTORED` shows the saved result."""
-        state, shown_result = pickle.loads(checkpoint)
+        """Restore the env.
+
+        With `show`, its next reset `AS_RESTORED` shows the saved result; otherwise only if that
+        had still to be shown when the checkpoint was taken.
+        """
+        state, shown_result, is_unshown = pickle.loads(checkpoint)
         self._env.load_state(state)
-        if show and shown_result is not None:
-            self.has_result, self._restored = True, shown_result
+        self.has_result = shown_result is not None
+        self._restored = shown_result if show or is_unshown else None
 
     def resume(self, checkpoint: bytes) -> None:
         """Restore an env that was just built."""

@@ -188,7 +188,8 @@ class EnvRunner:
     def _restore(self, checkpoint: bytes, show: bool) -> None:
         self._checkpoints.load(checkpoint, show=show)
         if self._saver is not None:
-            self._saver.save()
+            # Where nothing is to be shown, it goes back to where the trainer knows it to be.
+            self._saver.save(before=not show)
 
     def resume(self, checkpoint: bytes) -> None:
         """Continue where the env of a replaced worker was."""
