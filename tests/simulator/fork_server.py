@@ -6,11 +6,14 @@ real `Worker`, in a process of the world.
 
 from __future__ import annotations
 
+import errno
 import signal
 import subprocess
 import traceback
 from functools import partial
 from typing import TYPE_CHECKING, Any
+
+from simulator.processes import Living, Process
 
 from rlightning_aio.hosts.arena import map_shared
 from rlightning_aio.hosts.fork_messages import (
@@ -19,6 +22,7 @@ from rlightning_aio.hosts.fork_messages import (
     Forked,
     Kill,
     MessageSocket,
+    NotForked,
     Ready,
 )
 from rlightning_aio.hosts.worker import Worker
@@ -27,34 +31,41 @@ from rlightning_aio.protocol.rings import WorkerBell, WorkerRings, bell_size, ri
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from simulator.world import Process, World
+    from simulator.world import World
 
     from rlightning_aio.hosts.messages import WorkerPlace
 
-__all__ = ["SimulatedForkServer"]
+__all__ = ["ForkServer"]
 
 _GRACE_SECONDS = 1.2
 _DUMP_SECONDS = 0.3
 _DUMP = 'Current thread 0x0000 (most recent call first):\n  File "simulated", line 1 in step\n'
 
 
-class SimulatedForkServer:
-    """The process, and the trainer's `subprocess.Popen` of it."""
+class ForkServer(Living):
+    """The process, and the trainer's `subprocess.Popen` of it.
+
+    Args:
+        world: where it lives.
+        command, pass_fds, others: of `Popen`.
+    """
 
     def __init__(
         self, world: World, command: Sequence[str], *, pass_fds: Sequence[int], **others: Any
     ) -> None:
         del command, others
-        self.pid = next(world.pids)
+        if world.refuses():
+            raise BlockingIOError(errno.EAGAIN, "no more processes")
+        super().__init__(world, "the fork server")
         self.returncode: int | None = None
-        self._world = world
-        self._exit_code: int | None = None
-        self._socket = world.sockets.by_number[world.sockets.duplicate(pass_fds[0])]
-        self._socket.end.holders.append(self)
-        self._trainer = MessageSocket(self._socket)  # pyright: ignore[reportArgumentType]
+        self._exit_code = 0
+        end = world.sockets.by_number[world.sockets.duplicate(pass_fds[0])]
+        end.end.holders.append(self)
+        end.end.name = self.name
+        self._trainer = MessageSocket(end)  # pyright: ignore[reportArgumentType]
         self._children: dict[int, tuple[Process, int]] = {}
         self._is_ready = self._is_looking = False
-        world.after(world.rng.choice((0.01, 0.3)), self._begin)
+        self.later(0.01 + world.start_delay(), self._begin)
 
     # -- as the trainer's child -----------------------------------------------------
 
@@ -64,8 +75,8 @@ class SimulatedForkServer:
 
     def wait(self, timeout: float | None = None) -> int:
         """See `Popen.wait`."""
-        self._world.wait_for(lambda: self._exit_code is not None, timeout)
-        if self._exit_code is None:
+        self._world.wait_for(lambda: not self.alive, timeout)
+        if self.alive:
             assert timeout is not None
             raise subprocess.TimeoutExpired("fork server", timeout)
         self.returncode = self._exit_code
@@ -75,32 +86,41 @@ class SimulatedForkServer:
 
     def _begin(self) -> None:
         """Have imported the modules."""
-        if self._exit_code is None:
-            self._is_ready = True
-            self._trainer.send(Ready(None))
-            self.wake()
+        self._is_ready = True
+        if self._world.refuses():
+            self._trainer.send(Ready("ImportError: as the world wants it"))
+            self.end(0)
+            return
+        self._trainer.send(Ready(None))
+        self.wake()
 
     def end(self, code: int) -> None:
         """End at once; the kernel then kills its workers."""
-        if self._exit_code is not None:
+        if not self.alive:
             return
-        self._world.note(f"the fork server ends with {code}")
-        self._trainer.close()
+        self.alive = False
         self._exit_code = code
+        self._world.counts["fork servers that ended"] += 1
+        self._world.note("{} ends with {}", self.name, code)
+        self._trainer.close()
         for worker, channel in list(self._children.values()):
             self._world.sockets.close_if_open(channel)
             worker.end(-signal.SIGKILL)
 
     def wake(self) -> None:
         """Look at its socket, soon."""
-        if self._is_ready and not self._is_looking and self._exit_code is None:
+        if self._is_ready and not self._is_looking:
             self._is_looking = True
-            self._world.after(self._world.delay(), self._look)
+            self.later(self._world.delay(), self._look)
 
     def _look(self) -> None:
         self._is_looking = False
-        if self._exit_code is not None:
+        chance, chances = self._world.rng.random(), self._world.faults.fork_servers
+        if chance < chances / 2:
+            self.end(-signal.SIGKILL)
             return
+        if chance < chances:
+            self.stop(self._world.long())
         try:
             self._trainer.flush()
             while (received := self._trainer.receive()) is not None:
@@ -115,36 +135,40 @@ class SimulatedForkServer:
             worker, _ = self._children[message.host_id]
             if message.dump:
                 worker.stderr += _DUMP
-            self._world.after(
-                _DUMP_SECONDS if message.dump else 0.0, partial(worker.end, -signal.SIGKILL)
-            )
+            self.later(_DUMP_SECONDS if message.dump else 0.0, partial(worker.end, -signal.SIGKILL))
 
     def _fork(self, place: WorkerPlace, channel: int, arena: int) -> None:
         sockets, host_id = self._world.sockets, place.host_id
+        if self._world.refuses():
+            sockets.close_descriptor(channel)
+            sockets.close_descriptor(arena)
+            self._trainer.send(NotForked(host_id, "no more processes"))
+            return
         kept = sockets.duplicate(channel)
-        worker = new_worker(self._world, place, channel, arena, partial(self._report_exit, host_id))
+        worker = new_worker(self._world, place, channel, arena, partial(self._reap, host_id))
         self._children[host_id] = worker, kept
         self._trainer.send(Forked(host_id, worker.pid))
 
+    def _reap(self, host_id: int, code: int, stderr: str) -> None:
+        """Handle the exit of a worker, soon."""
+        self.later(self._world.delay(), partial(self._report_exit, host_id, code, stderr))
+
     def _report_exit(self, host_id: int, code: int, stderr: str) -> None:
-        if self._exit_code is not None:
-            return
         _, channel = self._children.pop(host_id)
         self._trainer.send(Exited(host_id, code, stderr))
         self._world.sockets.close_if_open(channel)
 
     def _leave(self) -> None:
         """End, as the trainer has closed the socket or is gone: first the workers, in time."""
-        sockets = self._world.sockets
         for _, channel in self._children.values():
-            sockets.by_number[channel].shutdown(0)
+            self._world.sockets.by_number[channel].shutdown(0)
         self._trainer.close()
         self._until_gone(self._world.now_ns + int(_GRACE_SECONDS * 1e9))
 
     def _until_gone(self, until_ns: int) -> None:
         some_live = any(worker.alive for worker, _ in self._children.values())
         if some_live and self._world.now_ns < until_ns:
-            self._world.after(0.01, partial(self._until_gone, until_ns))
+            self.later(0.01, partial(self._until_gone, until_ns))
         else:
             self.end(0)
 
@@ -173,7 +197,10 @@ def new_worker(world: World, place: WorkerPlace, channel: int, arena: int, on_ex
         sockets.close_if_open(channel)
         sockets.close_if_open(arena)
 
-    process = Process(world, f"worker {place.host_id}", main, on_exit)
+    name = f"worker {place.host_id}"
+    process = Process(world, name, main, on_exit)
+    world.note("{} is forked", name)
+    sockets.by_number[channel].end.name = name
     process.on_close = close
     sockets.by_number[channel].end.holders.append(process)
     return process

@@ -40,6 +40,7 @@ class _End:
     """One end of a pair: what it has received, and who has it open."""
 
     def __init__(self, *, packets: bool) -> None:
+        self.name = "the trainer"
         self.packets = packets
         self.received: Any = deque() if packets else bytearray()
         self.descriptors = 0
@@ -75,6 +76,8 @@ class Sockets:
     ) -> tuple[SimulatedSocket, SimulatedSocket]:
         """See `socket.socketpair`."""
         del family, proto
+        if self._world.refuses():
+            raise OSError(errno.EMFILE, "too many open files")
         packets = kind == socket.SOCK_SEQPACKET
         ends = _End(packets=packets), _End(packets=packets)
         ends[0].peer, ends[1].peer = ends[1], ends[0]
@@ -141,9 +144,16 @@ class SimulatedSocket:
         if number < 0:
             return
         del self._world.sockets.by_number[number]
-        self.end.descriptors -= 1
-        if not self.end.descriptors and not self.end.is_shut:
-            self.end.shut()
+        end = self.end
+        end.descriptors -= 1
+        if end.descriptors:
+            return
+        if not end.is_shut:
+            end.shut()
+        if end.packets:  # Descriptors on the way to it are closed.
+            for _, passed in end.received:
+                for descriptor in passed:
+                    self._world.sockets.close_if_open(descriptor)
 
     def shutdown(self, how: int) -> None:
         del how
@@ -213,11 +223,14 @@ class SimulatedSocket:
         return len(data)
 
     def _deliver(self, data: Any) -> None:
-        if self.end.packets:
-            self.end.peer.received.append(data)
+        end = self.end
+        if end.packets:
+            end.peer.received.append(data)
+            self._world.note("{} sends {} a packet", end.name, end.peer.name)
         else:
-            self.end.peer.received += data
-        self.end.peer.wake()
+            end.peer.received += data
+            self._world.note("{} sends {} {} bytes", end.name, end.peer.name, len(data))
+        end.peer.wake()
 
     def recv(self, size: int, flags: int = 0) -> bytes:
         """Receive what is there."""

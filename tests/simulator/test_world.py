@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from contextlib import suppress
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from simulator.world import World
+from simulator.world import Faults, World
 
 import rlightning_aio as rl
 from rlightning_aio import sync
-from rlightning_aio.errors import EnvRaised
+from rlightning_aio.errors import EnvRaised, StartFailed, WorkerDied
 
 
 class CountingEnv(gym.Env[Any, Any]):
@@ -99,11 +101,37 @@ def test_asynchronous_group_runs_on_the_loop_of_the_world() -> None:
         assert set(seen[::2]) == {5, 6, 7, 8}
 
 
-def test_same_seed_gives_the_same_trace() -> None:
-    def trace(seed: int) -> list[str]:
-        world = World(seed)
-        played(world)
-        return world.trace
+STORM = Faults(deaths=0.03, stops=0.02, interrupts=0.02, lags=0.02, starts=0.1, fork_servers=0.02)
 
+
+def survived(seed: int) -> World:
+    """Step through faults; the group must be usable, and close, when they are over."""
+    world = World(seed, STORM)
+    with world, suppress(StartFailed, KeyboardInterrupt):
+        world.calm()
+        with sync.build_env_group(config(step_timeout=5.0, reset_timeout=5.0)) as group:
+            batch, _ = group.reset(seed=5)
+            world.storm()
+            for _ in range(20):
+                with suppress(KeyboardInterrupt, WorkerDied):
+                    group.step(batch.respond(action=np.zeros(4, np.int64)))
+                while group.pending:
+                    with suppress(KeyboardInterrupt, WorkerDied):
+                        group.collect_async()
+            world.calm()
+            while group.pending:
+                group.collect_async()
+            group.reset()  # Reports deaths from before.
+            batch, _ = group.reset(seed=9)
+            assert batch.observation.tolist() == [[9, 0], [10, 0], [11, 0], [12, 0]]
+    return world
+
+
+def test_group_survives_every_kind_of_fault() -> None:
+    counts = sum((survived(seed).counts for seed in range(20)), Counter[str]())
+    assert counts.keys() >= {"deaths", "stops", "interrupts", "lags", "slow starts", "refusals"}
+
+
+def test_same_seed_gives_the_same_trace() -> None:
     for seed in range(5):
-        assert trace(seed) == trace(seed)
+        assert survived(seed).trace == survived(seed).trace

@@ -33,14 +33,15 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from random import Random
 from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
 from unittest import mock
 
-import greenlet
-from simulator.fork_server import SimulatedForkServer
+from simulator.fork_server import ForkServer
+from simulator.processes import NOBODY, Killed, Process
 from simulator.sockets import Epoll, Loop, Sockets, run_in_process
 
 from rlightning_aio import sharing
@@ -50,7 +51,9 @@ from rlightning_aio.protocol import exchange, kernel, rings
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
 
-__all__ = ["Deadlock", "Faults", "Killed", "Process", "World"]
+    from simulator.processes import Living, Nobody
+
+__all__ = ["Deadlock", "Faults", "World"]
 
 T = TypeVar("T")
 
@@ -65,25 +68,26 @@ class Deadlock(AssertionError):
     """The trainer waits, and nothing can happen any more."""
 
 
-class Killed(greenlet.GreenletExit):
-    """Unwinds the code of a process that has ended, when its world ends."""
-
-
 @dataclass(frozen=True)
 class Faults:
-    """How often things go wrong: chances at a point where the world intervenes.
+    """How often things go wrong.
 
     Attributes:
-        deaths: that a process is killed.
-        stops: that a process is stopped, for milliseconds up to minutes.
-        interrupts: that the user presses Ctrl-C.
-        starts: that a start is slow, or a worker can't be forked, for each start.
+        deaths: chance that a worker is killed where the world takes its core away.
+        stops: chance that it is stopped there, for milliseconds up to minutes.
+        interrupts: chance that the user presses Ctrl-C where the world takes the trainer's core.
+        lags: chance that the trainer gets its core back late there, by milliseconds to minutes.
+        starts: chance of each start that it takes long, or that the system refuses it.
+        fork_servers: chance of a fork server, whenever it looks at its messages, that it is killed
+            or stopped.
     """
 
     deaths: float = 0.0
     stops: float = 0.0
     interrupts: float = 0.0
+    lags: float = 0.0
     starts: float = 0.0
+    fork_servers: float = 0.0
 
 
 CALM: Final = Faults()
@@ -100,7 +104,9 @@ class World:
     Attributes:
         rng: the source of all chances; see `reseed`.
         counts: how often things happened.
-        running: whose code runs: a process's, the kernel's or a fork server's (`_NOBODY`), or the
+        ended: it is no more.
+        stopped: processes that are stopped.
+        running: whose code runs: a process's, the kernel's or a fork server's (`NOBODY`), or the
             trainer's (None).
     """
 
@@ -108,20 +114,21 @@ class World:
         self.rng = Random(seed)
         self.faults = self._storm = faults
         self.counts: Counter[str] = Counter()
-        self.running: Process | _Nobody | None = None
+        self.running: Process | Nobody | None = None
         self.now_ns = _START_NS
         self.sockets = Sockets(self)
         self.pids = itertools.count(10_000)
         self._implementation = implementation
-        self._notes: list[tuple[int, str]] = []
+        self._notes: list[tuple[Any, ...]] = []
         self._events: list[list[Any]] = []
         self._order = itertools.count()
         self._processes: list[Process] = []
+        self.stopped: list[Living] = []
         self._pieces = self.rng.choice((3, 10, 30, 100))
         self._until_point = self.rng.randrange(1, 2 * self._pieces)
         self._slowness = self.rng.choice((3e-6, 3e-5, 3e-4))
         self._cores = self.rng.choice((1, 2, 4, 8))
-        self._ended = False
+        self.ended = False
         self._patches = ExitStack()
 
     # -- life ---------------------------------------------------------------------
@@ -134,7 +141,7 @@ class World:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._ended = True
+        self.ended = True
         for process in self._processes:
             process.unwind()
         self._patches.close()
@@ -154,7 +161,7 @@ class World:
             (time, "sleep", self.sleep),
             (select, "epoll", lambda: Epoll(self)),
             (socket, "socketpair", self.sockets.pair),
-            (subprocess, "Popen", lambda *args, **named: SimulatedForkServer(self, *args, **named)),
+            (subprocess, "Popen", partial(ForkServer, self)),
             (os, "close", self.sockets.close_descriptor),
             (os, "set_inheritable", self.sockets.set_inheritable),
             (os, "sched_yield", self.give_way),
@@ -180,9 +187,10 @@ class World:
 
     def calm(self) -> None:
         """Let nothing go wrong from now on; what is stopped goes on."""
+        self.note("calm")
         self.faults = CALM
-        for process in self._processes:
-            process.go_on()
+        for stopped in list(self.stopped):
+            stopped.go_on()
 
     def storm(self) -> None:
         """Let things go wrong again."""
@@ -198,16 +206,18 @@ class World:
     @property
     def trace(self) -> list[str]:
         """What happened, a line each, with the time in seconds."""
-        return [f"{(at - _START_NS) / 1e9:.6f} {what}" for at, what in self._notes]
+        return [
+            f"{(at - _START_NS) / 1e9:.6f} {what.format(*args)}" for at, what, *args in self._notes
+        ]
 
     @property
     def hours(self) -> float:
         """Simulated hours."""
         return (self.now_ns - _START_NS) / 3.6e12
 
-    def note(self, what: str) -> None:
-        """Add a line to the trace."""
-        self._notes.append((self.now_ns, what))
+    def note(self, what: str, *args: object) -> None:
+        """Add a line to the trace, with `args` in the places that `what` has for them."""
+        self._notes.append((self.now_ns, what, *args))
 
     # -- the clock, and what happens ------------------------------------------------
 
@@ -219,6 +229,23 @@ class World:
     def delay(self) -> float:
         """Draw how long something takes that takes no time for its own sake, in seconds."""
         return self.rng.expovariate(1 / self._slowness)
+
+    def long(self) -> float:
+        """Draw how long something takes that goes wrong, in seconds."""
+        return self.rng.choice((1e-3, 0.03, 1.0, 30.0, 400.0))
+
+    def refuses(self) -> bool:
+        """Draw if the system refuses to start something."""
+        refuses = self.rng.random() < self.faults.starts / 2
+        self.counts["refusals"] += refuses
+        return refuses
+
+    def start_delay(self) -> float:
+        """Draw how long a start takes, in seconds."""
+        if self.rng.random() < self.faults.starts:
+            self.counts["slow starts"] += 1
+            return self.long()
+        return self.delay()
 
     def after(self, seconds: float, callback: Callable[[], object]) -> list[Any]:
         """Call `callback` at a later time; `cancel` takes what this returns."""
@@ -241,7 +268,7 @@ class World:
                 if order > _MAX_EVENTS:
                     raise Deadlock(f"{_MAX_EVENTS} events have led to nothing")
                 self.now_ns = max(self.now_ns, at)
-                self.running = _NOBODY
+                self.running = NOBODY
                 try:
                     callback()
                 finally:
@@ -265,7 +292,7 @@ class World:
         Raises:
             Deadlock: the trainer waits, and nothing can happen any more.
         """
-        if self._ended:
+        if self.ended:
             raise Killed
         until = None if seconds is None else self.now_ns + max(0, int(seconds * 1e9))
         if self.running is not None:
@@ -294,13 +321,18 @@ class World:
         if self._until_point > 0:
             return
         self._until_point = self.rng.randrange(1, 2 * self._pieces)
-        if self._ended:
+        if self.ended:
             raise Killed
         if self.running is not None:
             self.running.point()
             return
-        self.sleep(self.delay())
-        if interruptible and self.rng.random() < self.faults.interrupts:
+        chance, faults = self.rng.random(), self.faults
+        if chance < faults.lags:
+            self.counts["lags"] += 1
+            self.sleep(self.long())
+        else:
+            self.sleep(self.delay())
+        if interruptible and chance > 1 - faults.interrupts:
             self.interrupt()
 
     def interrupt(self) -> None:
@@ -317,161 +349,6 @@ class World:
     def add(self, process: Process) -> None:
         """Keep a process until the end."""
         self._processes.append(process)
-
-    @property
-    def processes(self) -> list[Process]:
-        """All that live."""
-        return [process for process in self._processes if process.alive]
-
-
-class Process:
-    """A simulated process with one thread.
-
-    Args:
-        world: where it lives.
-        name: for the trace.
-        main: its program; it ends with the exit code that this returns.
-        on_exit: is called with its exit code and with what it wrote to stderr.
-    """
-
-    def __init__(
-        self,
-        world: World,
-        name: str,
-        main: Callable[[], int],
-        on_exit: Callable[[int, str], object],
-    ) -> None:
-        self.name = name
-        self.pid = next(world.pids)
-        self.alive = True
-        self.stderr = ""
-        self.on_close: Callable[[], object] = lambda: None
-        self._world = world
-        self._main = main
-        self._on_exit = on_exit
-        self._greenlet = greenlet.greenlet(self._run)
-        self._resumer: greenlet.greenlet
-        self._is_parked = self._is_stopped = self._is_due = False
-        self._timer: list[Any] | None = None
-        self._loop: Any = None
-        self._hooks = (None, None)
-        world.add(self)
-        self._timer = world.after(world.delay(), self._resume)
-
-    # -- running --------------------------------------------------------------------
-
-    def _run(self) -> None:
-        code = self._main()
-        if self.alive:
-            self.end(code)
-
-    def _resume(self) -> None:
-        """Go on where it is, as an event of the world."""
-        self._timer = None
-        if not self.alive:
-            return
-        if self._is_stopped:
-            self._is_due = True
-            return
-        self._is_parked = False
-        world = self._world
-        world.running, self._resumer = self, greenlet.getcurrent()
-        loop = asyncio._get_running_loop()
-        asyncio._set_running_loop(self._loop)
-        try:
-            self._greenlet.switch()
-        finally:
-            self._loop = asyncio._get_running_loop()
-            asyncio._set_running_loop(loop)
-            world.running = _NOBODY
-
-    def _give_up_core(self) -> None:
-        self._resumer.switch()
-        if self._world._ended:
-            raise Killed
-
-    def sleep(self, seconds: float) -> None:
-        """Take this long."""
-        self._timer = self._world.after(seconds, self._resume)
-        self._give_up_core()
-
-    def wait_for(self, ready: Callable[[], T], until_ns: int | None) -> T:
-        """Wait until `ready` returns something true, or until then."""
-        world = self._world
-        while not (found := ready()) and (until_ns is None or world.now_ns < until_ns):
-            self._is_parked = True
-            if until_ns is not None:
-                self._timer = world.after((until_ns - world.now_ns) / 1e9, self._resume)
-            self._give_up_core()
-        return found
-
-    def wake(self) -> None:
-        """Let it look again at what it waits for."""
-        if self._is_parked:
-            self._is_parked = False
-            if self._timer is not None:
-                self._world.cancel(self._timer)
-            self._timer = self._world.after(self._world.delay(), self._resume)
-
-    def unwind(self) -> None:
-        """Leave all its functions, at the end of the world."""
-        self.alive = False
-        with suppress(BaseException):  # Of code that would never have run on.
-            self._greenlet.throw(Killed)
-
-    # -- faults -------------------------------------------------------------------
-
-    def point(self) -> None:
-        """Let something else happen now."""
-        world, faults = self._world, self._world.faults
-        chance = world.rng.random()
-        if chance < faults.deaths:
-            self.end(-signal.SIGKILL)
-        elif chance < faults.deaths + faults.stops:
-            self.stop(world.rng.choice((1e-3, 0.1, 10.0, 1000.0)))
-        self.sleep(world.delay())
-
-    def end(self, code: int) -> None:
-        """End it; everything that it has open is closed. If it ends itself, this doesn't return."""
-        world = self._world
-        if not self.alive:
-            return
-        self.alive = False
-        world.counts["deaths" if code else "exits"] += 1
-        world.note(f"{self.name} ends with {code}")
-        self.on_close()
-        world.after(world.delay(), lambda: self._on_exit(code, self.stderr))
-        if world.running is self:
-            self._give_up_core()
-
-    def stop(self, seconds: float) -> None:
-        """Stop it for some time, as by SIGSTOP and SIGCONT."""
-        self._world.counts["stops"] += 1
-        self._world.note(f"{self.name} is stopped for {seconds:g} s")
-        self._is_stopped = True
-        self._world.after(seconds, self.go_on)
-
-    def go_on(self) -> None:
-        """Go on after `stop`."""
-        self._is_stopped = False
-        if self._is_due:
-            self._is_due = False
-            self._timer = self._world.after(0, self._resume)
-
-
-class _Nobody:
-    """Runs in events of the world, in which nothing else happens and nothing takes time."""
-
-    def point(self) -> None: ...
-
-    def sleep(self, seconds: float) -> None: ...
-
-    def wait_for(self, ready: Callable[[], T], until_ns: int | None) -> T:
-        del until_ns
-        return ready()
-
-
-_NOBODY: Final = _Nobody()
 
 
 class SimulatedMachine:
