@@ -51,6 +51,8 @@ class Backend:
         extra: the extra of this package that installs it; empty for core dependencies.
         cpu_bound: a step is plain computation on one core, so several envs may share a worker
             (``envs_per_process: auto``).
+        awaitable: its envs are awaitable and do nothing but wait, so one worker runs all of an
+            entry's (``envs_per_process: auto``).
         vectorized: ``num_envs`` above 1 is supported.
         hardware: it moves something real. After a worker's death only an explicit reset may set
             that in motion: ``on_worker_death`` is ``raise`` by default, a replacement is not reset
@@ -66,6 +68,7 @@ class Backend:
     distribution: str
     extra: str = ""
     cpu_bound: bool = False
+    awaitable: bool = False
     vectorized: bool = False
     hardware: bool = False
     own_command: str = ""
@@ -132,7 +135,7 @@ BACKENDS: dict[str, Backend] = {
         Backend("aloha", "rlightning_aio.envs.lerobot_tasks:AlohaEnv", "gym_aloha", "gym-aloha",
                 extra="aloha", cpu_bound=True, preload=("rlightning_aio.envs.lerobot_tasks",)),
         Backend("openenv", "rlightning_aio.envs.openenv:OpenEnv", "websockets", "websockets",
-                extra="openenv"),
+                extra="openenv", awaitable=True),
     )
 }
 # fmt: on
@@ -346,6 +349,11 @@ class Registry:
         """Return True if envs of backend `name` are known to be CPU-bound."""
         backend = self.described(name)
         return self._cpu_bound.get(name, backend is not None and backend.cpu_bound)
+
+    def is_awaitable(self, name: str) -> bool:
+        """Return True if envs of backend `name` are known to do nothing but wait."""
+        backend = self.described(name)
+        return name not in self._classes and backend is not None and backend.awaitable
 
     def registered(self, name: str) -> type[Any] | None:
         """Return the class registered in this process under `name`, or None."""

@@ -13,10 +13,12 @@ import numpy as np
 import pytest
 from envs.misbehaving_openenv import Misbehaving, numbers
 from gymnasium import spaces
+from patience import HANG
 
 import rlightning_aio as rl
 from rlightning_aio.envs.openenv_session import OpenEnvSession, ServerRefused
 from rlightning_aio.errors import StartFailed
+from rlightning_aio.policy_servers.loop_thread import LoopThread
 
 ENVS = 4
 
@@ -175,6 +177,31 @@ async def test_an_env_queues_while_its_server_is_full() -> None:
                 assert not resetting.done()
             await resetting
         assert server.most == 1
+
+
+@on_asyncio
+async def test_sessions_outlive_a_learner_that_holds_the_event_loop() -> None:
+    """They are in one worker by default, which answers the pings of their servers meanwhile."""
+
+    async def ping_all() -> int:
+        for socket in [*server._sockets]:
+            await (await socket.ping())
+        return len(server._sockets)
+
+    thread, server = LoopThread("server"), Misbehaving(capacity=ENVS)
+    thread.submit(server.__aenter__()).result()
+    try:
+        config = {"name": "o", "backend": "openenv", "task": server.url, "num_workers": ENVS}
+        async with rl.build_env_group(config) as group:
+            await group.reset()
+            assert len(group.get_workers()) == 1
+            # It waits for the answers without its event loop, as a learner computes.
+            assert thread.submit(ping_all()).result(HANG) == ENVS
+            batch, _ = await group.step(steps_of(*group.env_ids))
+            assert not batch.truncated.any()
+    finally:
+        thread.submit(server.__aexit__()).result()
+        thread.close()
 
 
 @on_asyncio

@@ -61,8 +61,8 @@ def test_sessions_equal_stepping_the_env_directly(kind: str) -> None:
         subprocess.Popen(command, stdout=subprocess.PIPE, env=AS_USUAL) as direct,
     ):
         found = [
-            asyncio.run(play(kind, url, session, 64, episodes), debug=False)
-            for session in ("own", "keep")
+            asyncio.run(play(kind, url, session, placement, 64, episodes), debug=False)
+            for session, placement in (("own", "loop"), ("keep", "process"))
         ]
         assert direct.stdout is not None
         expected = json.load(direct.stdout)
@@ -71,12 +71,12 @@ def test_sessions_equal_stepping_the_env_directly(kind: str) -> None:
 
 
 async def play(
-    kind: str, url: str, session: str, count: int, episodes: int
+    kind: str, url: str, session: str, placement: str, count: int, episodes: int
 ) -> list[list[list[Any]]]:
     """Rows of observation, reward, done and metadata: of each session, each episode."""
     kwargs = {"session": session, **(CUT if kind == "dice" else {})}
     entry = {"name": "d", "backend": "openenv", "task": url, "num_workers": count}
-    entry |= {"placement": "loop", "env_kwargs": kwargs}
+    entry |= {"placement": placement, "env_kwargs": kwargs}
     played: list[list[list[Any]]] = [[] for _ in range(count)]
     async with rl.build_env_group(entry) as group:
         for episode in range(episodes):

@@ -114,8 +114,9 @@ def _own_makers(config: EnvConfig, indices: Sequence[int]) -> EnvConfig:
 def _nums_hosts(configs: Sequence[EnvConfig], num_cores: int) -> list[int]:
     """The number of hosts of each entry.
 
-    Entries of CPU-bound simulators with ``envs_per_process: auto`` share the cores in proportion
-    to their envs. Entries on other machines don't, as the cores there are unknown here.
+    With ``envs_per_process: auto``, entries of CPU-bound simulators share the cores in proportion
+    to their envs. Entries on other machines don't, as the cores there are unknown here. Envs that
+    only wait are all in one worker, which keeps an event loop for them.
     """
     nums: list[int] = []
     sharing: list[int] = []
@@ -124,6 +125,8 @@ def _nums_hosts(configs: Sequence[EnvConfig], num_cores: int) -> list[int]:
             nums.append(1)
         elif config.envs_per_process != "auto":
             nums.append(-(-config.num_workers // config.envs_per_process))
+        elif ENVS.is_awaitable(config.backend):
+            nums.append(1)
         elif ENVS.is_cpu_bound(config.backend) and place_of(config).local:
             nums.append(1)
             sharing.append(k)
