@@ -176,6 +176,7 @@ class Process(Living):
             return
         self.alive = False
         world.counts["deaths" if code else "exits"] += 1
+        world.deaths[self.name] += code != 0
         world.note("{} ends with {}", self.name, code)
         self.on_close()
         self._on_exit(code, self.stderr)

@@ -8,6 +8,7 @@ same class, so that it knows each result beforehand. What an env does to its pro
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 import signal
 import string
@@ -145,12 +146,14 @@ class Script:
         grudge: what the next reset does.
         refuses: the next snapshot is refused.
         over: its episode has ended.
+        limit: a wrapper truncates its episodes once as many steps have elapsed since the last
+            reset, which may have failed.
     """
 
-    def __init__(self, code: int) -> None:
-        self.code = code
+    def __init__(self, code: int, limit: float = math.inf) -> None:
+        self.code, self.limit = code, limit
         self.seed = -1
-        self.episode = self.steps = self.mix = self.mark = 0
+        self.episode = self.steps = self.elapsed = self.mix = self.mark = 0
         self.grudge = ""
         self.refuses = self.over = False
 
@@ -166,20 +169,21 @@ class Script:
 
     def fault_of_reset(self, options: dict[str, Any] | None) -> str:
         """What the next reset does to its process; forgets a grudge."""
-        grudge, self.grudge = self.grudge, ""
+        grudge, self.grudge, self.elapsed = self.grudge, "", 0
         return grudge or (options or {}).get("effect", "plain")
 
     def reset(self, seed: int | None, options: dict[str, Any] | None) -> dict[str, Any]:
         if seed is not None:
             self.seed = int(seed)
         self.episode, self.steps, self.over = (self.episode + 1) % 128, 0, False
+        self.elapsed = 0
         token = (options or {}).get("token", 0)
         self.mix = mixed(self.code, self.seed, self.episode, token, self.mark)
         return {"seed": -1 if seed is None else int(seed), **({"token": token} if token else {})}
 
     def step(self, effect: str, token: int) -> tuple[float, bool, bool, dict[str, Any]]:
         """Make a step; return reward, terminated, truncated and info."""
-        self.steps = (self.steps + 1) % 128
+        self.steps, self.elapsed = (self.steps + 1) % 128, self.elapsed + 1
         self.mix = mixed(self.mix, EFFECTS.index(effect), token, self.mark)
         if effect.endswith(" next"):
             self.grudge = {"raise next": "raise", "die next": "exit", "hang next": "hang"}[effect]
@@ -189,7 +193,8 @@ class Script:
             info |= _changing(token)
         elif effect == "nested":
             info["nested"] = {"token": token, "array": np.arange(3) + token, "words": ["a", {}]}
-        ended, cut = effect in ("end", "both"), effect in ("cut", "both")
+        ended = effect in ("end", "both")
+        cut = effect in ("cut", "both") or self.elapsed >= self.limit
         self.over |= ended or cut
         return (self.mix % 64) / 4, ended, cut, info
 
@@ -234,8 +239,10 @@ class Scripts:
         mode: when an ended one is reset: ``disabled``, ``next_step`` or ``same_step``.
     """
 
-    def __init__(self, codes: Sequence[int], mode: str = "disabled") -> None:
-        self.subs = [Script(code) for code in codes]
+    def __init__(
+        self, codes: Sequence[int], mode: str = "disabled", limit: float = math.inf
+    ) -> None:
+        self.subs = [Script(code, limit) for code in codes]
         self.mode = mode
 
     @property

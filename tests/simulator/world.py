@@ -49,7 +49,7 @@ from rlightning_aio.hosts import awaiting
 from rlightning_aio.protocol import exchange, kernel, rings
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine
+    from collections.abc import Callable, Coroutine, Sequence
 
     from simulator.processes import Living, Nobody
 
@@ -104,6 +104,7 @@ class World:
     Attributes:
         rng: the source of all chances; see `reseed`.
         counts: how often things happened.
+        deaths: of each process that ended with an error, by its name.
         ended: it is no more.
         stopped: processes that are stopped.
         running: whose code runs: a process's, the kernel's or a fork server's (`NOBODY`), or the
@@ -114,6 +115,7 @@ class World:
         self.rng = Random(seed)
         self.faults = self._storm = faults
         self.counts: Counter[str] = Counter()
+        self.deaths: Counter[str] = Counter()
         self.running: Process | Nobody | None = None
         self.now_ns = _START_NS
         self.sockets = Sockets(self)
@@ -349,6 +351,12 @@ class World:
     def add(self, process: Process) -> None:
         """Keep a process until the end."""
         self._processes.append(process)
+
+    def kill(self, pids: Sequence[int | None]) -> None:
+        """Kill processes, as a user does."""
+        for process in self._processes:
+            if process.pid in pids:
+                process.end(-signal.SIGKILL)
 
 
 class SimulatedMachine:

@@ -1,0 +1,694 @@
+"""What a group must answer: one plain list of envs, each stepped as Gymnasium says.
+
+Written from the contract and docs/, not from the code. A request is played when its result has
+come, on a copy of what is known of its env, and the two are compared. Only deaths leave a choice:
+an env whose worker may have died may also answer as one that was built anew (or was put back to
+a state that it saved), and the model then adopts what it shows.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from simulator.scripted import (
+    DYING,
+    RAISING,
+    Act,
+    Outcome,
+    Scripts,
+    Words,
+    decoded,
+    element,
+    words_of,
+)
+
+from rlightning_aio.errors import EnvHung, EnvRaised, WorkerDied
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
+    from rlightning_aio.batch import BatchedData
+    from rlightning_aio.errors import EnvFault
+
+COLLECTOR = "collector"
+"""Owner of the requests whose results a collect returns."""
+
+
+class Violation(AssertionError):
+    """A group broke its contract."""
+
+
+def require(true: Any, what: str, *details: object) -> None:
+    """Raise `Violation` unless a condition is true."""
+    if not true:
+        raise Violation(": ".join([what, ", ".join(map(str, details))]) if details else what)
+
+
+@dataclass
+class Entry:
+    """What the model must know of an entry of the configuration."""
+
+    name: str
+    form: str
+    layout: str
+    controls: str
+    num_envs: int
+    mode: str
+    limit: int | None
+    on_death: str
+    every: int | None
+    max_restarts: int
+    min_results: int | None
+
+
+class Host:
+    """Envs that die together.
+
+    Args:
+        mortal: it is another process, or its envs are replaced alone.
+        count: counts its deaths; None if only those that were asked for are known.
+    """
+
+    def __init__(self, *, mortal: bool, count: Callable[[], int] | None = None) -> None:
+        self.mortal = mortal
+        self._count = count
+        self._asked = 0
+
+    @property
+    def deaths(self) -> int:
+        """How many there may have been."""
+        return self._asked if self._count is None else self._count()
+
+    def ask(self) -> None:
+        """Note that it is about to die, or to hang until it is killed."""
+        self._asked += 1
+
+
+@dataclass
+class Request:
+    """What an env was asked, and by whom.
+
+    Attributes:
+        kind: ``step``, ``reset``, ``show`` (a state that was restored) or ``call``.
+        acts: of a step, one for each sub-environment.
+        due: `auto_reset` resets the env in place of its step.
+        sent: the policy's columns, one value of each; None if it was no response.
+        kills: it ends the worker, unless that ends before.
+        deaths: of the host, before it was sent.
+        before: whether the env was in limbo, and cut, before it was sent.
+    """
+
+    kind: str
+    owner: Any = COLLECTOR
+    acts: Sequence[Act] = ()
+    seed: int | None = None
+    options: dict[str, Any] | None = None
+    due: bool = False
+    sent: dict[str, Any] | None = None
+    kills: bool = False
+    deaths: int = 0
+    before: tuple[bool, bool] = (False, False)
+
+    @property
+    def resets(self) -> bool:
+        return self.kind == "reset" or self.due
+
+
+class Expected(NamedTuple):
+    """What a played request shows, and what it cut."""
+
+    outcome: Outcome
+    limit: bool
+    truncated: list[bool]
+    episodes: list[tuple[float, int] | None]
+
+
+class State:
+    """An env, its place in the episode, and the sums of its episodes.
+
+    Attributes:
+        count: steps since the reset, as returned; cut: the step limit was reached there.
+        counted: which sub-environments are within an episode.
+        infos, finals: as reported with the last result; no infos if they aren't known.
+    """
+
+    def __init__(self, codes: Sequence[int], entry: Entry) -> None:
+        # Gymnasium's own wrapper applies the limit of an entry of its envs.
+        limit = entry.limit if entry.form == "gym" and entry.limit else math.inf
+        self.scripts = Scripts(codes, entry.mode, limit)
+        self.count, self.cut = 0, False
+        self.returns, self.lengths = [0.0] * len(codes), [0] * len(codes)
+        self.counted = [False] * len(codes)
+        self.infos: list[dict[str, Any]] = []
+        self.finals: list[Words | None] = [None for _ in codes]
+
+    def copy(self) -> State:
+        found = copy.copy(self)
+        found.scripts = copy.copy(self.scripts)
+        found.scripts.subs = []
+        for sub in self.scripts.subs:
+            twin = object.__new__(type(sub))
+            vars(twin).update(vars(sub))
+            found.scripts.subs.append(twin)
+        for name in ("returns", "lengths", "counted"):
+            setattr(found, name, list(getattr(self, name)))
+        return found
+
+    @property
+    def ended(self) -> bool:
+        """All episodes have ended, and the env resets none of them by itself."""
+        return self.scripts.mode == "disabled" and all(sub.over for sub in self.scripts.subs)
+
+    @property
+    def refuses(self) -> bool:
+        """The next snapshot is refused."""
+        return any(sub.refuses for sub in self.scripts.subs)
+
+    @refuses.setter
+    def refuses(self, refuses: bool) -> None:
+        for sub in self.scripts.subs:
+            sub.refuses = refuses
+
+    def faults(self, request: Request) -> list[Act]:
+        """What the request does to the process of the env."""
+        if request.kind in ("show", "call"):
+            return []
+        if request.resets:
+            return self.scripts.faults_of_reset(request.options)
+        return self.scripts.faults_of_step(request.acts)
+
+    def play(self, request: Request, limit: float, *, marks: bool) -> Expected:
+        """Do what was asked, under the limit of the `auto_reset` context that is open."""
+        subs, mode = self.scripts.subs, self.scripts.mode
+        many = range(len(subs))
+        nothing = [0.0 for _ in many], [False for _ in many], [False for _ in many]
+        if request.kind == "show":
+            outcome = Outcome(
+                self.scripts.words, *nothing, [True for _ in many], self.finals, self.infos
+            )
+            return Expected(outcome, False, nothing[1], [None for _ in many])
+        self.faults(request)  # Grudges are over.
+        if request.resets:
+            infos = self.scripts.reset(request.seed, request.options)
+            self.count, self.cut, self.infos = 0, False, infos
+            self.finals = [None for _ in many]
+            self.returns, self.lengths = [0.0 for _ in many], [0 for _ in many]
+            self.counted = [True for _ in many]
+            outcome = Outcome(
+                self.scripts.words, *nothing, [True for _ in many], [None for _ in many], infos
+            )
+            return Expected(outcome, False, nothing[1], [None for _ in many])
+        outcome = self.scripts.step(request.acts)
+        self.infos, self.finals = outcome.infos, outcome.finals
+        ends = [t or c for t, c in zip(outcome.terminated, outcome.truncated, strict=True)]
+        self._count(outcome, ends)
+        if all(outcome.resets) or (mode != "disabled" and all(ends or [])):
+            self.count = 0
+        else:
+            self.count += 1
+        cut = self.count >= limit
+        self.cut |= cut
+        truncated = [t or (cut and marks) for t in outcome.truncated]
+        episodes = [
+            (self.returns[k], self.lengths[k]) if (ends[k] or cut) and self.lengths[k] else None
+            for k in many
+        ]
+        return Expected(outcome, cut, truncated, episodes)
+
+    def _count(self, outcome: Outcome, ends: Sequence[bool]) -> None:
+        """Add a step to the sums; steps between an end and a reset belong to no episode."""
+        mode = self.scripts.mode
+        for k, reset in enumerate(outcome.resets):
+            if reset or (mode == "same_step" and not self.counted[k]):
+                self.returns[k], self.lengths[k], self.counted[k] = 0.0, 0, True
+            if self.counted[k] and not reset:
+                self.returns[k] += outcome.rewards[k]
+                self.lengths[k] += 1
+            else:
+                self.lengths[k] = 0
+            self.counted[k] = self.counted[k] and not ends[k]
+
+
+@dataclass
+class Env:
+    """An env of the group, as far as its results are known.
+
+    Attributes:
+        codes: of its sub-environments.
+        first: its first place in `batch.index`.
+        limbo: the call that it executes may have been given up.
+        gone: its worker ended and is not replaced.
+        dirty: its last result could not be read, so its episode must end.
+        hangs: how often it was to hang and be replaced alone, as awaitable envs are.
+        seen: `deaths` that its results have shown.
+        saves: states to which it may be put back after a death.
+        loose: states of which it may have one, because a restore was given up.
+        episodes: return and length of each that has ended.
+    """
+
+    env_id: str
+    entry: Entry
+    codes: Sequence[int]
+    first: int
+    host: Host
+    state: State
+    request: Request | None = None
+    limbo: bool = False
+    gone: bool = False
+    dirty: bool = False
+    hangs: int = 0
+    seen: int = 0
+    since_save: int = 0
+    saves: list[State] = field(default_factory=list)
+    loose: list[State] = field(default_factory=list)
+    episodes: list[tuple[float, int]] = field(default_factory=list)
+
+    @property
+    def idle(self) -> bool:
+        return self.request is None and not self.gone
+
+    @property
+    def may_be_lost(self) -> bool:
+        return self.deaths > self.seen or bool(self.loose)
+
+    @property
+    def deaths(self) -> int:
+        """How often its host may have died, or the env been replaced alone."""
+        return self.host.deaths + self.hangs
+
+    @property
+    def was_reset(self) -> bool:
+        return self.state.scripts.subs[0].episode > 0
+
+    def fresh(self) -> State:
+        return State(self.codes, self.entry)
+
+    def after_loss(self) -> list[State]:
+        """The states in which a replacement may be: as saved, or newly built."""
+        loose = [state.copy() for state in self.loose]
+        return loose + ([save.copy() for save in self.saves] or [self.fresh()])
+
+    def put_back(self, state: State) -> None:
+        """Note a state that was restored."""
+        self.state = state.copy()
+        self.saves = [state.copy()] if self.entry.every is not None else []
+        self.since_save, self.dirty = 0, False
+
+
+class Row(NamedTuple):
+    """One result; each list has one value for each sub-environment."""
+
+    env_id: str
+    words: list[Words]
+    rewards: list[float]
+    terminated: list[bool]
+    truncated: list[bool]
+    resets: list[bool] | None
+    limit: list[bool] | None
+    restarted: list[bool] | None
+    index: list[int] | None
+    info: dict[str, Any]
+    sent: dict[str, Any] | None
+
+
+@dataclass
+class Context:
+    """An open `auto_reset`."""
+
+    limit: float | None
+    on_done: bool
+    marks: bool
+
+    def limit_of(self, env: Env) -> float:
+        if self.limit is not None:
+            return self.limit
+        return (
+            math.inf if env.entry.limit is None or env.entry.mode != "disabled" else env.entry.limit
+        )
+
+
+class Model:
+    """The envs of a group, and the `auto_reset` that is open."""
+
+    def __init__(self, envs: Iterable[Env]) -> None:
+        self.envs = {env.env_id: env for env in envs}
+        self.context: Context | None = None
+        self.num_results = self.num_marked = 0
+
+    # -- requests
+
+    def idle(self) -> list[Env]:
+        return [env for env in self.envs.values() if env.idle]
+
+    def pending(self, *owners: Any) -> list[Env]:
+        """Envs that owe something, to these owners if any are given."""
+        return [
+            env
+            for env in self.envs.values()
+            if env.request is not None and (not owners or env.request.owner in owners)
+        ]
+
+    def send(self, env: Env, request: Request) -> None:
+        """Note a request that was accepted."""
+        require(env.idle, "a busy env was asked again", env.env_id)
+        request.before, request.deaths = (env.limbo, env.state.cut), env.deaths
+        context = self.context
+        if request.kind == "step":
+            if context is None:
+                env.state.cut = False
+            else:
+                request.due = env.state.cut or (context.on_done and env.state.ended)
+        effects = [effect for effect, _ in env.state.copy().faults(request)]
+        request.kills = any(effect in (*DYING, "hang") for effect in effects)
+        if request.kills and env.entry.form == "awaitable" and "hang" in effects:
+            env.hangs += 1
+        elif request.kills:
+            env.host.ask()
+        env.request, env.limbo = request, False
+
+    def withdraw(self, env: Env) -> None:
+        """Note that its request was not accepted after all."""
+        assert env.request is not None
+        (env.limbo, env.state.cut), env.request = env.request.before, None
+
+    def orphan(self, owner: Any) -> None:
+        """Note that a call no longer waits: its results go to the collector, its values nowhere."""
+        for env in self.pending(owner):
+            assert env.request is not None
+            if env.request.kind == "call":
+                env.request, env.limbo = None, True
+            else:
+                env.request.owner = COLLECTOR
+
+    # -- results
+
+    def take(self, rows: Iterable[Row], owner: Any) -> None:
+        """Compare results with what was asked."""
+        for row in rows:
+            env = self.envs.get(row.env_id)
+            require(env is not None, "a result of a stranger", row)
+            assert env is not None
+            request = env.request
+            require(request is not None, "a result that nobody asked for", row)
+            assert request is not None
+            require(request.owner == owner, "a result for another call", owner, request, row)
+            try:
+                self._judge(env, request, row)
+            except Violation as violation:
+                raise Violation(
+                    f"{violation}\n  env {env.env_id}, {env.state.scripts.words}"
+                    f"\n  {request}\n  {row}"
+                ) from None
+            env.request = None
+            self.num_results += 1
+
+    def _judge(self, env: Env, request: Request, row: Row) -> None:
+        restarted = row.restarted
+        if restarted is None:
+            restarted = ["worker_restarted" in row.info] * len(row.words)
+        require(len(set(restarted)) == 1, "restarted in part")
+        _check_sent(env, request, row)
+        if restarted[0]:
+            self._judge_marked(env, request, row)
+            return
+        states = [env.state]
+        if env.may_be_lost and request.kind == "reset":
+            states += env.after_loss()
+        limit, marks = self._limit_of(env)
+        for state in states:
+            now = state.copy()
+            expected = now.play(request, limit, marks=marks)
+            if expected.outcome.words == row.words:
+                break
+        else:
+            raise Violation(f"another state than {self._played(env, request)}")
+        acts = state.copy().faults(request)
+        endless = {*RAISING, *DYING, "hang", "rubbish"}
+        require(not any(effect in endless for effect, _ in acts), "a result where there is none")
+        _compare(env, expected, row)
+        if state is not env.state:
+            env.seen = request.deaths
+        env.state, env.dirty, env.loose = now, False, []
+        env.episodes += [episode for episode in expected.episodes if episode is not None]
+        self._save(env, request)
+
+    def _limit_of(self, env: Env) -> tuple[float, bool]:
+        context = self.context
+        return (math.inf, False) if context is None else (context.limit_of(env), context.marks)
+
+    def _played(self, env: Env, request: Request) -> list[Words]:
+        return env.state.copy().play(request, math.inf, marks=False).outcome.words
+
+    def _save(self, env: Env, request: Request) -> None:
+        """Note a state that the worker has saved."""
+        if env.entry.every is None:
+            return
+        env.since_save = 0 if request.kind != "step" or request.due else env.since_save + 1
+        ended = all(sub.over for sub in env.state.scripts.subs)
+        if not env.since_save or env.since_save >= env.entry.every or ended:
+            env.saves, env.since_save = [env.state.copy()], 0
+
+    def _judge_marked(self, env: Env, request: Request, row: Row) -> None:
+        if not env.loose:
+            require(env.host.mortal and env.may_be_lost, "marked, and nothing has died")
+            require(env.entry.on_death != "raise", "marked, where a death is to be raised")
+        require(isinstance(row.info.get("worker_restarted"), str), "marked without a cause")
+        many = len(row.words)
+        heads = row.rewards, row.terminated, row.truncated
+        require(heads == ([0.0] * many, [False] * many, [True] * many), "not marked in all ways")
+        for column, value in ((row.resets, True), (row.limit, False)):
+            require(column in (None, [value] * many), "not marked in all ways")
+        at_fault = row.info.get("env_at_fault")
+        if at_fault is not None:
+            require(
+                at_fault in self.envs and self.envs[at_fault].host is env.host,
+                "a stranger at fault", at_fault,
+            )  # fmt: skip
+        shows = "worker_resumed" in row.info
+        require(not (shows and env.entry.every is None), "resumed, and nothing was saved")
+        again = Request("show") if shows else Request("reset")
+        for state in env.after_loss():
+            lost = max(env.state.count - state.count, 0)
+            expected = state.play(again, math.inf, marks=False)
+            if expected.outcome.words == row.words:
+                break
+        else:
+            raise Violation("marked, in no state that it may have")
+        if shows:
+            require(row.info["worker_resumed"] == lost, "a wrong number of lost steps", lost)
+            state.cut = False
+        elif request.kind == "step" and not request.due:
+            require(not env.saves, "a new episode, and the old one was saved")
+        require("episode" not in row.info, "an episode that was lost")
+        env.seen = max(env.seen + 1, request.deaths)
+        env.state, env.dirty, env.loose = state, False, []
+        self.num_marked += 1
+        self._save(env, again)
+
+    # -- errors
+
+    def failed(self, fault: EnvFault, owner: Any) -> list[Env]:
+        """End the requests that an error answers; return their envs."""
+        ended: list[Env] = []
+        for one in (fault, *fault.others):
+            for env_id in getattr(one, "env_ids", ()) or (one.env_id,):
+                env = self.envs.get(env_id)
+                require(env is not None, "an error of a stranger", repr(one))
+                assert env is not None
+                request = env.request
+                require(
+                    request is not None and request.owner == owner,
+                    "an error that answers nothing", owner, request, repr(one),
+                )  # fmt: skip
+                assert request is not None
+                self._judge_fault(env, request, one)
+                env.request = None
+                ended.append(env)
+        return ended
+
+    def _judge_fault(self, env: Env, request: Request, fault: EnvFault) -> None:
+        if isinstance(fault, WorkerDied):
+            self.gone(env, fault)
+            env.seen = max(env.seen + 1, request.deaths)
+            return
+        require(isinstance(fault, EnvRaised), "an odd error", repr(fault))
+        assert isinstance(fault, EnvRaised)
+        if request.kind == "call":
+            return
+        acts = env.state.faults(request)
+        raising = [act for act in acts if act[0] in RAISING]
+        if raising:
+            check_raised(fault, *raising[0])
+        else:
+            rubbish = any(effect == "rubbish" for effect, _ in acts)
+            require(rubbish and not request.resets, "an error of nobody", repr(fault), request)
+            env.state.scripts.step(request.acts)
+            env.state.infos = []
+            env.dirty = True
+
+    def gone(self, env: Env, fault: WorkerDied) -> None:
+        """Check an error that says that an env's worker has ended for good, or during a call."""
+        host, entry = env.host, env.entry
+        require(host.mortal and env.may_be_lost, "dead, and nothing has died", repr(fault))
+        hung = isinstance(fault, EnvHung)
+        require(fault.exit_code != 0, "dead, and left in order", hung)
+        in_call = env.request is not None and env.request.kind == "call"
+        if entry.on_death == "raise" or not in_call:
+            spent = entry.on_death == "raise" or host.deaths > entry.max_restarts
+            require(spent, "given up before its restarts were used up", repr(fault))
+            for other in self.envs.values():
+                if other.host is host:
+                    other.gone = True
+
+
+def check_raised(fault: EnvRaised, effect: str, token: int) -> None:
+    """Compare an error with what an env was to raise."""
+    text = f"as asked for: {token}" if effect == "raise" else f"odd {token}"
+    require(fault.exception_text == text, "another error", fault.exception_text, text)
+    require(isinstance(fault, ValueError) == (effect == "raise"), "another kind of error")
+    require(fault.exception_type.endswith("ValueError" if effect == "raise" else "Odd"), "its type")
+    require(fault.traceback_text and fault.env_id in str(fault), "an error without its place")
+
+
+def _compare(env: Env, expected: Expected, row: Row) -> None:
+    outcome = expected.outcome
+    many = len(outcome.words)
+    for what, found, right in (
+        ("rewards", row.rewards, outcome.rewards),
+        ("terminated", row.terminated, outcome.terminated),
+        ("truncated", row.truncated, expected.truncated),
+        ("is_reset", row.resets, outcome.resets),
+        ("limit_reached", row.limit, [expected.limit] * many),
+        ("index", row.index, [env.first + k for k in range(many)]),
+    ):
+        require(found is None or found == right, f"{what} must be {right}")
+    info = dict(row.info)
+    episode = info.pop("episode", None)
+    found = [None] * many
+    if episode is not None:
+        returns, lengths = np.ravel(episode["r"]), np.ravel(episode["l"])
+        found = [(float(returns[k]), int(lengths[k])) if lengths[k] else None for k in range(many)]
+    require(found == expected.episodes, f"episodes must be {expected.episodes}")
+    for k, right in enumerate(outcome.infos):
+        final = outcome.finals[k]
+        own = info if env.entry.form != "stacked" else sub_info(info, k)
+        if final is not None:
+            shown = words_of(env.entry.layout, own["final_obs"])
+            require(shown == final, f"final_obs must be {final}")
+            own = own["final_info"]
+        require(same(own, right), f"info must be {right}", own)
+
+
+def sub_info(info: dict[str, Any], k: int) -> dict[str, Any]:
+    """What an info in Gymnasium's vector form says of one sub-environment."""
+    found: dict[str, Any] = {}
+    for key, value in info.items():
+        if key[:1] != "_" and info[f"_{key}"][k]:
+            found[key] = sub_info(value, k) if isinstance(value, dict) else value[k]
+    return found
+
+
+def same(one: Any, other: Any) -> bool:
+    """Return True if two values are equal, arrays and what holds them included."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(same(one[k], other[k]) for k in one)
+    if isinstance(one, list | tuple) and isinstance(other, list | tuple):
+        return len(one) == len(other) and all(map(same, one, other))
+    if isinstance(one, np.ndarray) or isinstance(other, np.ndarray):
+        one, other = np.asarray(one), np.asarray(other)
+        if object in (one.dtype, other.dtype):
+            return one.shape == other.shape and same(one.tolist(), other.tolist())
+        return np.array_equal(one, other, equal_nan="f" in one.dtype.kind + other.dtype.kind)
+    return bool(one == other)
+
+
+def _check_sent(env: Env, request: Request, row: Row) -> None:
+    if row.sent is None or request.sent is None:
+        return
+    for name, value in request.sent.items():
+        require(name in row.sent, "a column that was sent is missing", name)
+        require(same(row.sent[name], value), f"sent.{name} must be {value}", row.sent[name])
+
+
+# -- batches
+
+
+def rows_of(batch: BatchedData, envs: dict[str, Env], flags: Sequence[bool] | None) -> list[Row]:
+    """The results of a batch, one by one."""
+    env_ids = batch.env_ids()
+    require(batch.ids() == env_ids and len(batch) == len(env_ids), "ids", batch.ids(), env_ids)
+    require(flags is None or len(flags) == len(env_ids), "as many flags as results", flags)
+    names = {envs[env_id].entry.name for env_id in env_ids if env_id in envs}
+    parts = [batch] if len(names) == 1 else list(batch.by_name().values())
+    rows = {row.env_id: row for part in parts for row in _rows_of(part, envs)}
+    require(sorted(rows) == sorted(env_ids), "a part of the batch is missing", sorted(rows))
+    found = [rows[env_id] for env_id in env_ids]
+    if flags is not None:
+        limits = [row.limit is not None and row.limit[0] for row in found]
+        require(flags == limits, "flags and limit_reached differ", flags, limits)
+    return found
+
+
+def _rows_of(part: BatchedData, envs: dict[str, Env]) -> list[Row]:
+    env_ids = part.env_ids()
+    entry = envs[env_ids[0]].entry
+    columns = [
+        column.reshape(len(env_ids), -1).tolist()
+        for column in (
+            part.reward, part.terminated, part.truncated, part.is_reset, part.limit_reached,
+            part.restarted, part.index,
+        )
+    ]  # fmt: skip
+    done = part.terminated | part.truncated | part.limit_reached
+    require((part.done == done).all(), "done is not what it is made of")
+    observation, infos = part.observation, part.info()
+    sent = {name: part.sent[name] for name in part.sent}
+    rows: list[Row] = []
+    for k, env_id in enumerate(env_ids):
+        own = {name: element(column, k) for name, column in sent.items()}
+        words = all_words(entry, element(observation, k))
+        rows.append(Row(env_id, words, *(column[k] for column in columns), infos[k], own))
+    check_infos(part.infos, infos)
+    return rows
+
+
+def all_words(entry: Entry, observation: Any) -> list[Words]:
+    """The state of each sub-environment that an observation shows."""
+    if entry.form != "stacked":
+        return [words_of(entry.layout, observation)]
+    return [words_of(entry.layout, element(observation, k)) for k in range(entry.num_envs)]
+
+
+def row_of_ret(entry: Entry, ret: Any) -> Row:
+    """A result as a handle returns it."""
+    head = (
+        np.ravel(x).tolist() for x in (ret.last_reward, ret.last_terminated, ret.last_truncated)
+    )
+    words = all_words(entry, ret.observation)
+    return Row(ret.env_id, words, *head, None, None, None, None, ret.info, None)
+
+
+def check_infos(columns: dict[str, Any], infos: Sequence[dict[str, Any]]) -> None:
+    """Compare infos as columns, in Gymnasium's form, with single ones."""
+    keys = {key for info in infos for key in info if key[:1] != "_"}
+    require({key for key in columns if key[:1] != "_"} == keys, "other keys", columns.keys(), keys)
+    for key in keys:
+        there = [key in info for info in infos]
+        mask = columns[f"_{key}"]
+        require([bool(np.any(one)) for one in mask] == there, "another mask", key, mask)
+        if isinstance(columns[key], dict):
+            check_infos(columns[key], [info.get(key, {}) for info in infos])
+            continue
+        for k, info in enumerate(infos):
+            require(not there[k] or same(columns[key][k], info[key]), "another info", key)
+
+
+def acts_of(entry: Entry, action: Any) -> list[Act]:
+    """What an action has the sub-environments of an env do."""
+    if entry.form != "stacked":
+        return [decoded(entry.controls, action)]
+    return [decoded(entry.controls, element(action, k)) for k in range(entry.num_envs)]

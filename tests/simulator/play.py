@@ -1,0 +1,1008 @@
+"""Plays a program: does its operations to a group and to the model, and compares the two.
+
+Each operation is a coroutine, for groups of both kinds: `Play.done` awaits what must be awaited.
+An operation that a program's state doesn't allow does nothing, so any part of a program is one.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import inspect
+import math
+import os
+import pickle
+import signal
+import tempfile
+import time
+import warnings
+from collections import Counter
+from pathlib import Path
+from random import Random
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from simulator.model import (
+    COLLECTOR,
+    Context,
+    Env,
+    Model,
+    Request,
+    Row,
+    Violation,
+    require,
+    row_of_ret,
+    rows_of,
+    same,
+)
+from simulator.scripted import DYING, FIXED, TOKENS, Act, encoded
+
+import rlightning_aio
+import rlightning_aio.sync
+from rlightning_aio import BatchedData, PolicyResponse
+from rlightning_aio.errors import (
+    BadAction,
+    EnvBusy,
+    EnvFault,
+    NothingPending,
+    RLightningError,
+    SnapshotError,
+    UnknownEnv,
+    WorkerDied,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine, Sequence
+
+    from simulator.program import Op, Program
+
+HANG = 60.0
+"""Seconds after which a call that must end counts as hung."""
+
+
+class Play:
+    """One run of a program.
+
+    Attributes:
+        counts: what was done and what came of it.
+    """
+
+    def __init__(self, program: Program, world: Any = None) -> None:
+        self.program, self.world = program, world
+        self.features = program.features
+        self.is_async = "async" in program.features
+        self.counts: Counter[str] = Counter()
+        self.model: Model
+        self.group: Any
+        # Results that may be answered again, states that may be put back, calls in flight.
+        self.batches: list[BatchedData] = []
+        self.snapshots: list[tuple[bytes, list[tuple[Env, Any]]]] = []
+        self.calls: list[tuple[list[Env], int]] = []
+        self.tasks: list[asyncio.Task[None]] = []
+        self.context: Any = None
+        self.trace: Any = None
+        self.collecting = self.collecting_calls = False
+        self.kept: list[tuple[Any, Any]] = []
+        self.owners = 0
+        self.nested: set[str] = set()
+
+    # -- a run
+
+    def run(self) -> None:
+        """Play the program; raises `Violation`."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            main = self.main()
+            if not self.is_async:
+                with contextlib.suppress(StopIteration):
+                    main.send(None)
+                    raise Violation("a synchronous group has to be awaited")
+            elif self.world is None:
+                asyncio.run(main)
+            else:
+                self.world.run(main)
+
+    async def main(self) -> None:
+        build = rlightning_aio if self.is_async else rlightning_aio.sync
+        self.group = build.build_env_group(
+            self.program.configs(), mixed_actions=True, zero_copy="zero_copy" in self.features
+        )
+        try:
+            if self.world is not None:
+                self.world.calm()
+            await self.done(self.group.init())
+            self.model = Model(self.program.envs(self.group.get_workers(), self.world))
+            require([*self.model.envs] == self.group.env_ids, "ids", self.group.env_ids)
+            for number, op in enumerate(self.program.ops):
+                await self.play(number, op)
+            await self.finish()
+        finally:
+            for task in self.tasks:
+                task.cancel()
+            if self.tasks:
+                await asyncio.wait(self.tasks)
+            await self.done(self.group.close())
+        self.check_kept()
+
+    async def play(self, number: int, op: Op) -> None:
+        if self.world is not None:
+            self.world.reseed(op.seed)
+            self.world.storm()
+        self.say(f"{number}: {op.name}")
+        await getattr(self, f"op_{op.name}")(Random(op.seed))
+        self.counts[f"op {op.name}"] += 1
+        await self.look_at_tasks()
+        self.check_pending()
+
+    def say(self, text: str) -> None:
+        """Add a line to the trace."""
+        if self.world is not None:
+            self.world.note(text)
+
+    async def done(self, answer: Any) -> Any:
+        """What a call returns, whichever kind of group it is of."""
+        return await answer if inspect.isawaitable(answer) else answer
+
+    async def look_at_tasks(self, *, wait: bool = False) -> None:
+        """Raise what tasks have raised, and forget those that have ended."""
+        if wait and self.tasks:
+            _, late = await asyncio.wait(self.tasks, timeout=HANG)
+            require(not late, "a call hangs", late)
+        for task in [task for task in self.tasks if task.done()]:
+            self.tasks.remove(task)
+            if not task.cancelled() and task.exception() is not None:
+                raise task.exception() or AssertionError
+
+    def check_pending(self) -> None:
+        owed = self.model.pending()
+        # An episode steps in a task of its own, so its results are handed out a little earlier.
+        nested = {env.env_id for env in owed if env.env_id in self.nested}
+        pending = {env.env_id for env in owed} - nested
+        found = set(self.group.pending) - nested
+        require(found == pending, "pending", sorted(found), "must be", sorted(pending))
+
+    async def finish(self) -> None:
+        """Faults are over: everything that is pending ends, and every env is usable."""
+        if self.world is not None:
+            self.world.calm()
+        self.say("calm")
+        await self.look_at_tasks(wait=True)
+        if self.calls:
+            await self.op_collect_calls(Random(0))
+        while self.model.pending(COLLECTOR):
+            await self.collect(deadline=HANG)
+        if self.context is not None:
+            self.leave()
+        for env in self.model.envs.values():
+            for _ in range(6):  # Errors of the env, or of a call that was given up, may come first.
+                if env.gone or (await self.reset([env]) and await self.step_on([env])):
+                    break
+                await self.rest()
+            else:
+                raise Violation(f"env {env.env_id} can't be used any more")
+        self.check_stats()
+        self.stop_trace()
+
+    async def rest(self) -> None:
+        """Let others do what they still have to do."""
+        if self.is_async:
+            await asyncio.sleep(0.1)
+        else:
+            time.sleep(0.1)  # noqa: ASYNC251  # Nothing else waits.
+
+    # -- comparing
+
+    def owner(self) -> int:
+        self.owners += 1
+        return self.owners
+
+    async def answer(
+        self,
+        requests: dict[str, Request],
+        call: Callable[[], Any],
+        take: Callable[[Any], None],
+    ) -> bool:
+        """Make a call that waits for requests of its own; True if it returned a result."""
+        owner = self.owner()
+        self.send(requests, owner)
+        try:
+            found = await self.done(call())
+        except EnvFault as fault:
+            if next(iter(requests.values())).kind == "call":
+                self.fail_values(fault, requests)
+            else:
+                self.fail(fault, requests, owner)
+            return False
+        except EnvBusy:
+            self.refuse_busy(requests)
+            return False
+        except (asyncio.CancelledError, KeyboardInterrupt):
+            self.model.orphan(owner)
+            raise
+        take(found)
+        return True
+
+    def send(self, requests: dict[str, Request], owner: Any) -> None:
+        for env_id, request in requests.items():
+            request.owner = owner
+            self.model.send(self.model.envs[env_id], request)
+
+    def withdraw(self, requests: dict[str, Request]) -> None:
+        """Note that none of these requests was sent."""
+        pending = self.group.pending
+        for env_id in requests:
+            require(env_id not in pending, "refused, and sent nevertheless", env_id)
+            self.model.withdraw(self.model.envs[env_id])
+
+    def refuse_busy(self, requests: dict[str, Request]) -> None:
+        """A call that was given up may still run in an env."""
+        limbo = any(request.before[0] for request in requests.values())
+        require(limbo, "busy, and nothing was asked", *requests)
+        self.withdraw(requests)
+
+    def fail(self, fault: EnvFault, requests: dict[str, Request], owner: Any) -> None:
+        """Take an error, and the results that it carries."""
+        results = [] if fault.results is None else fault.results.env_ids()
+        named = [env_id for one in (fault, *fault.others) for env_id in ids_of(one)]
+        if isinstance(fault, WorkerDied) and {*results, *named} < {*requests}:
+            # An env whose worker is gone: nothing was sent.
+            require(not results, "refused with results", repr(fault))
+            for env_id in named:
+                self.model.gone(self.model.envs[env_id], fault)
+            self.withdraw(requests)
+            return
+        require(sorted([*results, *named]) == sorted(requests), "an error of others", repr(fault))
+        self.counts[type(fault).__name__] += 1
+        self.model.failed(fault, owner)
+        if fault.results is not None:
+            self.take(fault.results, None, owner)
+
+    def fail_values(self, fault: EnvFault, requests: dict[str, Request]) -> None:
+        """Take an error of a call that answers with values: those of other envs are gone."""
+        for one in (fault, *fault.others):
+            self.counts[type(one).__name__] += 1
+            for env_id in ids_of(one):
+                require(env_id in requests, "an error of another call", repr(one))
+                if isinstance(one, WorkerDied):
+                    self.model.gone(self.model.envs[env_id], one)
+        for env_id in requests:
+            self.model.envs[env_id].request = None
+
+    def take(self, batch: BatchedData, flags: Sequence[bool] | None, owner: Any) -> None:
+        """Compare a batch with what was asked, and keep it."""
+        rows = rows_of(batch, self.model.envs, flags)
+        self.say(f"   {'; '.join(map(_shown, rows))}")
+        self.model.take(rows, owner)
+        self.batches.append(batch)
+        del self.batches[:-6]
+        self.keep(batch)
+
+    def keep(self, batch: BatchedData) -> None:
+        """Keep a batch, to see at the end that nobody wrote to it."""
+        parts = list(batch.by_name().values()) if self.program.plans[1:] else [batch]
+        for part in parts:
+            columns = [part.reward, part.terminated, part.infos]
+            if "zero_copy" not in self.features:
+                columns.append(part.observation)
+            columns.append({name: part.sent[name] for name in part.sent})
+            self.kept.append((columns, pickle.loads(pickle.dumps(columns))))
+
+    def check_kept(self) -> None:
+        for columns, copies in self.kept:
+            require(same(columns, copies), "a result was overwritten", columns, copies)
+
+    def check_stats(self) -> None:
+        """Compare the figures of the group with the episodes that were seen."""
+        for env_id, found in self.group.get_env_stats().items():
+            episodes = self.model.envs[env_id].episodes
+            require(found["episodes"] == len(episodes), "episodes", env_id, found, episodes)
+            if episodes:
+                mean = sum(total for total, _ in episodes) / len(episodes)
+                require(math.isclose(found["mean_return"], mean), "mean", env_id, found, mean)
+
+    # -- drawing
+
+    def ready(self) -> list[Env]:
+        """Envs that can be stepped."""
+        return [env for env in self.model.idle() if env.was_reset and not env.dirty]
+
+    def some(self, rng: Random, envs: list[Env]) -> list[Env]:
+        """All of these envs, or some in any order."""
+        if "partial steps" not in self.features or rng.random() < 0.4:
+            return envs
+        return rng.sample(envs, rng.randint(1, len(envs))) if envs else []
+
+    def acts(self, rng: Random, env: Env, *, plain: bool = False) -> list[Act]:
+        return [self.act(rng, env, plain=plain) for _ in env.codes]
+
+    def act(self, rng: Random, env: Env, *, plain: bool) -> Act:
+        features, token = self.features, rng.randrange(TOKENS)
+        effects = ["plain"] * 6
+        effects += ["end", "cut", "both"] * ("ends" in features)
+        effects += ["info", "nested"] * ("infos" in features)
+        effects += ["slow"] * ("slow" in features)
+        effect = rng.choice(effects)
+        if plain or rng.random() > 0.15:
+            return effect, token
+        effects = ["keep state"] * ("snapshots" in features and env.entry.every is None)
+        if "raise" in features:
+            effects += ["raise", "raise oddly", "raise next"]
+        effects += ["rubbish"] * ("rubbish" in features and env.entry.layout in (*FIXED, "number"))
+        plan = self.plan(env)
+        if env.host.mortal and "die" in features and plan.placement != "loop":
+            effects += [*DYING] + ["die next"] * (env.entry.every is None)
+        if env.host.mortal and plan.timeout is not None:
+            effects += ["hang"] + ["hang next"] * (env.entry.every is None)
+        return (rng.choice(effects) if effects else effect), token
+
+    def plan(self, env: Env) -> Any:
+        return next(plan for plan in self.program.plans if plan.name == env.entry.name)
+
+    def response(
+        self, rng: Random, envs: list[Env], *, plain: bool = False
+    ) -> tuple[BatchedData, dict[str, Request]]:
+        """A batch that steps these envs, and what it asks of each."""
+        batch = self.answerable(rng, envs)
+        if batch is not None:
+            envs = [self.model.envs[env_id] for env_id in batch.env_ids()]
+        sent: list[dict[str, Any]] = []
+        requests: dict[str, Request] = {}
+        extras = "extras" in self.features and rng.random() < 0.7
+        for env in envs:
+            acts = self.acts(rng, env, plain=plain)
+            own: dict[str, Any] = {"action": action_of(env, acts)}
+            if extras:
+                own |= {"log_prob": rng.random(), "note": f"n{rng.randrange(99)}"}
+                own["shift"] = rng.randrange(3)
+                if env.entry.form == "base":
+                    acts = [(e, (t + own["shift"]) % TOKENS) for e, t in acts]
+            sent.append(own)
+            requests[env.env_id] = Request("step", acts=acts, sent=own)
+        if batch is not None:
+            return batch.respond(**self.columns(rng, envs, sent)), requests
+        values = [PolicyResponse(env.env_id, **own) for env, own in zip(envs, sent, strict=True)]
+        return BatchedData([env.env_id for env in envs], values), requests
+
+    def answerable(self, rng: Random, envs: list[Env]) -> BatchedData | None:
+        """A batch of results, or a part of one, that has only such envs."""
+        allowed = {env.env_id for env in envs}
+        if "plain values" in self.features and rng.random() < 0.3:
+            return None
+        for batch in reversed(self.batches):
+            rows = [k for k, env_id in enumerate(batch.env_ids()) if env_id in allowed]
+            if not rows:
+                continue
+            if len(rows) == len(batch) and rng.random() < 0.8:
+                return batch
+            return batch.take(rows)
+        return None
+
+    def columns(self, rng: Random, envs: list[Env], sent: list[dict[str, Any]]) -> dict[str, Any]:
+        """The same as columns, or as lists where they can't or may not be."""
+        columns: dict[str, Any] = {name: [own[name] for own in sent] for name in sent[0]}
+        kinds = {(env.entry.controls, env.entry.form == "stacked", len(env.codes)) for env in envs}
+        if len(kinds) == 1 and rng.random() < 0.8:
+            columns["action"] = stacked(columns["action"])
+        if "log_prob" in columns:
+            columns["log_prob"] = np.array(columns["log_prob"])
+            columns["shift"] = np.array(columns["shift"])
+        return columns
+
+    # -- operations: steps and resets
+
+    async def op_step(self, rng: Random) -> None:
+        envs = self.some(rng, self.ready())
+        if envs:
+            await self.step_on(envs, rng)
+
+    async def step_on(self, envs: list[Env], rng: Random | None = None) -> bool:
+        """Step envs and wait for them; plainly without a generator."""
+        batch, requests = self.response(rng or Random(0), envs, plain=rng is None)
+
+        def take(found: Any) -> None:
+            results, flags = found
+            require((flags is None) == (self.model.context is None), "flags", flags)
+            require(results.env_ids() == batch.env_ids(), "another order", results, batch)
+            self.take(results, flags, self.owner_of(requests))
+
+        return await self.answer(requests, lambda: self.group.step(batch), take)
+
+    def owner_of(self, requests: dict[str, Request]) -> Any:
+        return next(iter(requests.values())).owner
+
+    async def op_step_async(self, rng: Random) -> None:
+        envs = self.some(rng, self.ready())
+        if not envs:
+            return
+        batch, requests = self.response(rng, envs)
+        self.send_async(requests, lambda: self.group.step_async(batch))
+
+    def send_async(self, requests: dict[str, Request], call: Callable[[], None]) -> None:
+        """Send requests whose results the collector gets."""
+        self.send(requests, COLLECTOR)
+        try:
+            call()
+        except WorkerDied as fault:
+            for env_id in fault.env_ids:
+                self.model.gone(self.model.envs[env_id], fault)
+            self.withdraw(requests)
+        except EnvBusy:
+            self.refuse_busy(requests)
+
+    async def op_collect(self, rng: Random) -> None:
+        rules: dict[str, Any] = {}
+        if rng.random() < 0.5:
+            rules["min_results"] = rng.randint(1, 4)
+        if rng.random() < 0.3:
+            rules["max_results"] = rules.get("min_results", 1) + rng.randint(0, 2)
+        if rng.random() < 0.25:
+            rules["wait_all"] = True
+        elif "timeouts" in self.features and rng.random() < 0.4:
+            rules["timeout"] = rng.choice([0.001, 0.5])
+        if "timeouts" in self.features and rng.random() < 0.4:
+            rules["deadline"] = rng.choice([0.001, 0.2, HANG])
+        if self.program.plans[1:] and rng.random() < 0.2:
+            names = [plan.name for plan in self.program.plans]
+            rules["entries"] = rng.sample(names, rng.randint(1, len(names)))
+        rules["ordered"] = rng.random() < 0.3
+        await self.collect(**rules)
+
+    async def collect(self, **rules: Any) -> None:
+        """Collect by these rules."""
+        if self.collecting:
+            with expected(RLightningError, "a second collect"):
+                await self.done(self.group.collect_async(**rules))
+            return
+        self.collecting, nothing = True, not self.collectable(rules)
+        try:
+            batch, flags = await self.done(self.group.collect_async(**rules))
+        except TimeoutError as error:
+            if isinstance(error, EnvFault):
+                self.take_fault(error, rules)
+                return
+            require(rules.get("deadline", HANG) < HANG, "a deadline that has not passed", rules)
+            self.counts["TimeoutError"] += 1
+            return
+        except EnvFault as fault:
+            self.take_fault(fault, rules)
+            return
+        except NothingPending:
+            require(nothing or not self.collectable(rules), "nothing pending, and something is")
+            return
+        finally:
+            self.collecting = False
+        self.check_count(batch, rules)
+        require(len(flags) == len(batch), "flags", flags)
+        self.take(batch, flags, COLLECTOR)
+
+    def collectable(self, rules: dict[str, Any]) -> list[Env]:
+        names = rules.get("entries")
+        return [
+            env for env in self.model.pending(COLLECTOR) if names is None or env.entry.name in names
+        ]
+
+    def take_fault(self, fault: EnvFault, rules: dict[str, Any]) -> None:
+        self.counts[type(fault).__name__] += 1
+        require(fault.results is None and not fault.others, "an error of one request", repr(fault))
+        ended = self.model.failed(fault, COLLECTOR)
+        names = rules.get("entries")
+        require(names is None or any(env.entry.name in names for env in ended), "another entry's")
+
+    def check_count(self, batch: BatchedData, rules: dict[str, Any]) -> None:
+        """As many results as the rules say."""
+        there = len(self.collectable(rules))
+        most = min(rules.get("max_results") or there, there)
+        usual = 1 if rules.get("wait_all") else self.usual_min_results(rules)
+        need = most if rules.get("wait_all") else min(rules.get("min_results") or usual, most)
+        require(need <= len(batch) <= most, f"{need} to {most} results", len(batch), rules)
+        names = rules.get("entries")
+        own = [self.model.envs[env_id].entry.name for env_id in batch.env_ids()]
+        require(names is None or set(own) <= set(names), "results of other entries", own)
+        if rules.get("ordered"):
+            order = list(self.model.envs)
+            places = [order.index(env_id) for env_id in batch.env_ids()]
+            require(places == sorted(places), "not in the group's order", places)
+
+    def usual_min_results(self, rules: dict[str, Any]) -> int:
+        names = rules.get("entries")
+        given = [
+            plan.min_results for plan in self.program.plans if names is None or plan.name in names
+        ]
+        return sum(one or 0 for one in given) or 1
+
+    async def op_reset(self, rng: Random) -> None:
+        envs = self.some(rng, self.model.idle())
+        if envs:
+            await self.reset(envs, rng)
+
+    async def reset(self, envs: list[Env], rng: Random | None = None) -> bool:
+        seed, options, requests = self.resets(envs, rng)
+        everyone = len(envs) == len(self.model.envs) and envs == list(self.model.envs.values())
+        ids = None if everyone and rng is not None and rng.random() < 0.7 else [*requests]
+
+        def take(found: Any) -> None:
+            batch, flags = found
+            require(flags == [False] * len(envs), "flags", flags)
+            require(batch.env_ids() == [*requests], "another order", batch.env_ids())
+            self.take(batch, flags, self.owner_of(requests))
+
+        return await self.answer(requests, lambda: self.group.reset(seed, options, ids), take)
+
+    def resets(
+        self, envs: list[Env], rng: Random | None
+    ) -> tuple[Any, dict[str, Any] | None, dict[str, Request]]:
+        """Seeds and options of a reset, and what they ask of each env."""
+        requests = {env.env_id: Request("reset") for env in envs}
+        if rng is None:
+            return None, None, requests
+        options = None
+        if rng.random() < 0.3:
+            options = {"token": rng.randrange(TOKENS)}
+            if "raise" in self.features and rng.random() < 0.3:
+                options["effect"] = rng.choice(["raise", "raise oddly"])
+        seed: Any = None
+        kind = rng.choice(["none", "int", "list", "mapping"])
+        if kind == "int":
+            seed = rng.randrange(1000)
+            seeds = [seed + env.first for env in envs]
+        elif kind == "list":
+            seed = seeds = [rng.randrange(1000) for _ in envs]
+        elif kind == "mapping":
+            chosen = rng.sample(envs, rng.randint(1, len(envs)))
+            seed = {env.env_id: rng.randrange(1000) for env in chosen}
+            seeds = [seed.get(env.env_id) for env in envs]
+        else:
+            seeds = [None for _ in envs]
+        for request, own in zip(requests.values(), seeds, strict=True):
+            request.seed, request.options = own, options
+        return seed, options, requests
+
+    async def op_reset_async(self, rng: Random) -> None:
+        envs = self.some(rng, self.model.idle())
+        if not envs:
+            return
+        seed, options, requests = self.resets(envs, rng)
+        self.send_async(requests, lambda: self.group.reset_async(seed, options, [*requests]))
+
+    async def op_enter(self, rng: Random) -> None:
+        if self.nested:
+            return
+        limit = rng.choice([math.inf, math.inf, None, 1, 2, 3, 5])
+        on_done, marks = rng.random() < 0.7, rng.random() < 0.3
+        context = self.group.auto_reset(limit, on_done, marks)
+        if self.context is not None:
+            with expected(RuntimeError, "a nested auto_reset"):
+                context.__enter__()
+            return
+        entries = [env.entry for env in self.model.envs.values()]
+        if limit is None and any(e.limit is None and e.mode == "disabled" for e in entries):
+            with expected(ValueError, "an auto_reset without a limit"):
+                context.__enter__()
+            return
+        context.__enter__()
+        self.context, self.model.context = context, Context(limit, on_done, marks)
+
+    async def op_leave(self, rng: Random) -> None:
+        if self.context is not None and not self.nested:
+            self.leave()
+
+    def leave(self) -> None:
+        self.context.__exit__(None, None, None)
+        self.context = self.model.context = None
+
+    # -- operations: calls and handles
+
+    async def op_call(self, rng: Random) -> None:
+        envs = self.model.idle()
+        if not envs:
+            return
+        env, token = rng.choice(envs), rng.randrange(TOKENS)
+        handle = self.group[env.env_id]
+        if "raise" in self.features and rng.random() < 0.3:
+            await self.call_fault(env, "raise", token)
+        elif "die" in self.features and env.host.mortal and self.plan(env).placement != "loop":
+            await self.call_fault(env, rng.choice(["plain", *DYING]), token)
+        else:
+            await self.answer(
+                {env.env_id: Request("call")},
+                lambda: handle.call("peek", token),
+                lambda value: self.take_value(env, value, token),
+            )
+
+    async def call_fault(self, env: Env, effect: str, token: int) -> None:
+        """Call a method that may not return."""
+        request = Request("call")
+        if effect in DYING:
+            env.host.ask()
+        call = self.group[env.env_id].call
+
+        def take(value: Any) -> None:
+            require(value is None and effect == "plain", "a value of a call that fails", value)
+            env.request = None
+
+        await self.answer({env.env_id: request}, lambda: call("fault", effect, token), take)
+
+    def take_value(self, env: Env, value: Any, token: int) -> None:
+        """Compare the value of `peek`."""
+        words, echo = value
+        env.request = None
+        shown = [tuple(one) for one in words]
+        possible = [[tuple(one) for one in env.state.scripts.words]]
+        if env.may_be_lost:
+            possible += [[tuple(w) for w in s.scripts.words] for s in env.after_loss()]
+        require(shown in possible, "another state", shown, possible)
+        require(tuple(echo) == (token,), "another call's arguments", echo)
+
+    async def op_call_async(self, rng: Random) -> None:
+        envs = self.some(rng, self.model.idle())
+        if not envs or self.collecting_calls:
+            return
+        token = rng.randrange(TOKENS)
+        requests = {env.env_id: Request("call") for env in envs}
+        self.send(requests, "calls")
+        try:
+            self.group.call_async("peek", token, env_ids=[*requests])
+        except WorkerDied as fault:
+            for env_id in fault.env_ids:
+                self.model.gone(self.model.envs[env_id], fault)
+            self.withdraw(requests)
+        except EnvBusy:
+            self.refuse_busy(requests)
+        else:
+            self.calls.append((envs, token))
+
+    async def op_collect_calls(self, rng: Random) -> None:
+        if self.collecting_calls:
+            with expected(RLightningError, "a second collect_calls"):
+                await self.done(self.group.collect_calls())
+            return
+        if not self.calls:
+            with expected(NothingPending, "a collect of no calls"):
+                await self.done(self.group.collect_calls())
+            return
+        self.collecting_calls = True
+        try:
+            values = await self.done(self.group.collect_calls(HANG))
+        except EnvFault as fault:
+            require(isinstance(fault, WorkerDied), "an error of a call that has none", repr(fault))
+            self.fail_values(
+                fault, {env.env_id: env.request for env in self.model.pending("calls")}
+            )
+            self.calls = []
+            return
+        finally:
+            self.collecting_calls = False
+        sent = [(env, token) for envs, token in self.calls for env in envs]
+        self.calls = []
+        require(len(values) == len(sent), "as many values as calls", values)
+        for (env, token), value in zip(sent, values, strict=True):
+            self.take_value(env, value, token)
+
+    async def op_mark(self, rng: Random) -> None:
+        envs = self.model.idle()
+        if not envs:
+            return
+        env, mark = rng.choice(envs), rng.randrange(99)
+        handle = self.group[env.env_id]
+
+        def take(_: Any) -> None:
+            env.request = None
+            for sub in env.state.scripts.subs:
+                sub.mark = mark
+
+        def take_mark(value: Any) -> None:
+            env.request = None
+            lost = [state.scripts.subs[0].mark for state in env.after_loss()]
+            possible = [mark, *lost] if env.may_be_lost else [mark]
+            require(value in possible, "another attribute", value, mark)
+
+        request = {env.env_id: Request("call")}
+        if await self.answer(request, lambda: handle.set_attr("mark", mark), take) and env.idle:
+            request = {env.env_id: Request("call")}
+            await self.answer(request, lambda: handle.get_attr("mark"), take_mark)
+
+    async def op_handle(self, rng: Random) -> None:
+        envs = self.ready()
+        if not envs:
+            return
+        env = rng.choice(envs)
+        handle = self.group[env.env_id]
+        if rng.random() < 0.3:
+            seed = rng.choice([None, rng.randrange(1000)])
+            request = Request("reset", seed=seed)
+            call = lambda: handle.reset(seed)  # noqa: E731
+        else:
+            acts = self.acts(rng, env)
+            action = action_of(env, acts)
+            request = Request("step", acts=acts)
+            call = lambda: handle.step(action)  # noqa: E731
+        requests = {env.env_id: request}
+        await self.answer(requests, call, lambda ret: self.take_ret(env, ret, request))
+
+    def take_ret(self, env: Env, ret: Any, request: Request) -> None:
+        row = row_of_ret(env.entry, ret)
+        self.say(f"   {_shown(row)}")
+        self.model.take([row], request.owner)
+
+    async def op_episode(self, rng: Random) -> None:
+        """Play an episode as an agent that is one coroutine."""
+        envs = self.model.idle()
+        if not envs or not self.is_async:
+            return
+        env = rng.choice(envs)
+        self.nested.add(env.env_id)
+        try:
+            await self.episode(rng, env)
+        finally:
+            self.nested.discard(env.env_id)
+
+    async def episode(self, rng: Random, env: Env) -> None:
+        request = Request("reset", seed=rng.randrange(1000))
+        episode = self.group.episode(env.env_id, seed=request.seed)
+
+        def take(_: Any) -> None:
+            self.take_ret(env, episode.last, request)
+
+        if not await self.answer({env.env_id: request}, episode.__aenter__, take):
+            return
+        for _ in range(rng.randint(0, 3)):
+            if episode.is_over and self.model.context is None:
+                break
+            acts = self.acts(rng, env)
+            action, request = action_of(env, acts), Request("step", acts=acts)
+            if not await self.answer({env.env_id: request}, lambda a=action: episode.step(a), take):
+                break
+        await episode.__aexit__(None, None, None)
+
+    # -- operations: states
+
+    async def op_snapshot(self, rng: Random) -> None:
+        envs = self.some(rng, self.ready())
+        if not envs:
+            return
+        states = [(env, env.state.copy()) for env in envs]
+        requests = {env.env_id: Request("call") for env in envs}
+
+        def take(data: bytes) -> None:
+            for env in envs:
+                env.request = None
+                require(not env.state.refuses, "a snapshot that was refused", env.env_id)
+            self.snapshots.append((data, states))
+            del self.snapshots[:-4]
+
+        try:
+            await self.answer(requests, lambda: self.group.snapshot([*requests]), take)
+        except SnapshotError as error:
+            require(any(env.may_be_lost for env in envs), "no state", repr(error))
+            for env in envs:
+                env.request = None
+        for env in envs:
+            env.state.refuses = False
+
+    async def op_restore(self, rng: Random) -> None:
+        if not self.snapshots:
+            return
+        data, states = rng.choice(self.snapshots)
+        envs = self.targets(rng, [env for env, _ in states])
+        if not all(env.idle for env in envs):
+            return
+        # Until it returns, it is a call: it answers with the states or changes nothing.
+        requests = {env.env_id: Request("call") for env in envs}
+        before = [env.state for env in envs]
+
+        def take(found: Any) -> None:
+            batch, flags = found
+            require(flags == [False] * len(envs), "flags", flags)
+            require(batch.env_ids() == [*requests], "another order", batch.env_ids())
+            for env, (_, state) in zip(envs, states, strict=True):
+                assert env.request is not None
+                env.request.kind = "show"
+                env.put_back(state)
+            self.take(batch, flags, self.owner_of(requests))
+
+        try:
+            await self.answer(requests, lambda: self.group.restore(data, [*requests]), take)
+        except (asyncio.CancelledError, KeyboardInterrupt):
+            for env, state, (_, saved) in zip(envs, before, states, strict=True):
+                env.loose = [state.copy(), saved.copy()]
+            raise
+        for env in envs:
+            env.state.refuses = False
+
+    def targets(self, rng: Random, envs: list[Env]) -> list[Env]:
+        """Where the states of these envs may go: there, or to others of the same entries."""
+        if rng.random() < 0.6:
+            return envs
+        found: list[Env] = []
+        for env in envs:
+            others = [
+                one
+                for one in self.model.envs.values()
+                if one.entry is env.entry and one not in found
+            ]
+            found.append(rng.choice(others))
+        return found
+
+    # -- operations: calls that are given up, and calls at the same time
+
+    WAITING = ("step", "collect", "reset", "call", "snapshot", "restore", "handle")
+
+    def waiting(self, rng: Random, *more: str) -> Coroutine[Any, Any, None]:
+        """An operation that waits."""
+        names = [name for name in (*self.WAITING, *more) if name in self.allowed()]
+        return getattr(self, f"op_{rng.choice(names)}")(rng)
+
+    def allowed(self) -> list[str]:
+        from simulator.program import OPS
+
+        return [n for n, (_, needs) in OPS.items() if needs is None or needs in self.features]
+
+    async def op_cancel(self, rng: Random) -> None:
+        if not self.is_async:
+            return
+        task = asyncio.create_task(self.waiting(rng))
+        for _ in range(rng.randint(1, 6)):
+            await asyncio.sleep(0)
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+    async def op_expire(self, rng: Random) -> None:
+        if not self.is_async:
+            return
+        seconds = rng.choice([0.001, 0.01, 0.3])
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                await self.waiting(rng)
+
+    async def op_task(self, rng: Random) -> None:
+        if not self.is_async or len(self.tasks) > 3:
+            return
+        self.tasks.append(asyncio.create_task(self.waiting(rng, "episode")))
+        await asyncio.sleep(0)
+
+    async def op_join(self, rng: Random) -> None:
+        """Let all tasks end; a collect only if it can."""
+        if self.tasks:
+            await self.look_at_tasks(wait=True)
+
+    # -- operations: misuse, looking, killing
+
+    async def op_misuse(self, rng: Random) -> None:
+        """What is refused changes nothing."""
+        envs = self.some(rng, self.ready())
+        if not envs:
+            return
+        batch, _ = self.response(rng, envs)
+        ids, values = list(batch.env_ids()), list(batch.values())
+        kind = rng.choice(["unknown", "double", "shape", "count", "busy"])
+        busy = [env.env_id for env in self.model.pending()]
+        wrong: Any = EnvBusy
+        if kind == "unknown":
+            ids.append("nobody-7")
+            values.append(PolicyResponse("nobody-7", values[0].action))
+            wrong = UnknownEnv
+        elif kind == "double":
+            ids.append(ids[0])
+            values.append(values[0])
+        elif kind == "busy" and busy:
+            ids.append(busy[0])
+            values.append(
+                PolicyResponse(
+                    busy[0],
+                    action_of(self.model.envs[busy[0]], self.acts(rng, self.model.envs[busy[0]])),
+                )
+            )
+        elif kind == "shape":
+            fits = [
+                k
+                for k, env_id in enumerate(ids)
+                if self.model.envs[env_id].entry.controls
+                in ("vector", "single", "digits", "number")
+            ]
+            if not fits:
+                return
+            values[fits[0]] = PolicyResponse(ids[fits[0]], np.zeros((3, 3, 7)))
+            wrong = BadAction
+        else:
+            with expected(BadAction, "columns of another length"):
+                batch.respond(action=[0] * (len(batch) + 1))
+            return
+        with expected((wrong, WorkerDied), kind):
+            self.group.step_async(BatchedData(ids, values))
+
+    async def op_look(self, rng: Random) -> None:
+        """What is asked of a group without waiting."""
+        pending = {env.env_id for env in self.model.pending()}
+        limbo = {env.env_id for env in self.model.envs.values() if env.limbo}
+        for worker in self.group.get_workers():
+            require(set(worker["owed"]) <= pending | limbo, "owed", worker, pending)
+        self.check_stats()
+        self.group.get_stats()
+        require(self.group.resets_by_itself == (self.context is not None), "resets_by_itself")
+        if self.batches and rng.random() < 0.3:
+            batch = self.batches[-1]
+            twin = pickle.loads(pickle.dumps(batch))
+            require(twin.env_ids() == batch.env_ids(), "a pickled batch")
+            require(
+                same(twin.reward, batch.reward) if not self.program.plans[1:] else True,
+                "its rewards",
+            )
+
+    async def op_trace(self, rng: Random) -> None:
+        if self.trace is not None:
+            self.stop_trace()
+            return
+        self.trace = tempfile.TemporaryDirectory()
+        self.tracing = self.group.trace(Path(self.trace.name) / "run.json")
+        self.tracing.start()
+
+    def stop_trace(self) -> None:
+        if self.trace is not None:
+            self.tracing.stop()
+            self.trace.cleanup()
+            self.trace = None
+
+    async def op_kill(self, rng: Random) -> None:
+        """End a worker from outside."""
+        envs = [
+            env
+            for env in self.model.envs.values()
+            if env.host.mortal and not env.gone and self.plan(env).placement != "loop"
+        ]
+        if not envs:
+            return
+        env = rng.choice(envs)
+        env.host.ask()
+        pids = [w["pid"] for w in self.group.get_workers() if env.env_id in w["env_ids"]]
+        if self.world is not None:
+            self.world.kill(pids)
+        elif pids[0] is not None:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pids[0], signal.SIGKILL)
+
+
+def ids_of(fault: EnvFault) -> Sequence[str]:
+    """The envs whose requests an error answers."""
+    return getattr(fault, "env_ids", ()) or (fault.env_id,)
+
+
+@contextlib.contextmanager
+def expected(kind: Any, what: str) -> Any:
+    """Require an error, by which nothing changes."""
+    try:
+        yield
+    except kind:
+        return
+    raise Violation(f"not refused: {what}")
+
+
+def _shown(row: Row) -> str:
+    words = " ".join(",".join(map(str, one)) for one in row.words)
+    marks = [
+        name
+        for name, column in (
+            ("end", row.terminated), ("cut", row.truncated), ("reset", row.resets),
+            ("limit", row.limit), ("restarted", row.restarted),
+        )
+        if column is not None and any(column)
+    ]  # fmt: skip
+    return " ".join([row.env_id, words, *marks])
+
+
+def action_of(env: Env, acts: Sequence[Act]) -> Any:
+    """The action that has an env do this."""
+    actions = [encoded(env.entry.controls, *act) for act in acts]
+    return actions[0] if env.entry.form != "stacked" else stacked(actions)
+
+
+def stacked(actions: Sequence[Any]) -> Any:
+    """Actions of the same space as columns; a list of those that have no fixed size."""
+    first = actions[0]
+    if isinstance(first, dict) and "do" not in first:
+        return {key: stacked([one[key] for one in actions]) for key in first}
+    if isinstance(first, tuple):
+        return tuple(stacked(column) for column in zip(*actions, strict=True))
+    if isinstance(first, str | dict):
+        return list(actions)
+    return np.array(actions)

@@ -1,0 +1,215 @@
+"""Programs: a configuration and a list of operations, each drawn from one seed.
+
+`draw` makes a program by swarm: each leaves out a random half of the features. An operation draws
+its arguments from its own seed and from what the model knows, so that a list of them can be shrunk.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from random import Random
+from typing import TYPE_CHECKING, Any
+
+from simulator.model import Entry, Env, Host, State
+from simulator.scripted import CONTROLS, FIXED, LAYOUTS, MAKERS
+
+if TYPE_CHECKING:
+    from simulator.world import World
+
+FEATURES = (
+    "async", "several entries", "several envs", "stacked", "out of band", "base", "awaitable",
+    "processes",
+    "auto_reset", "partial steps", "plain values", "extras", "calls", "handles", "snapshots",
+    "cancel", "timeouts", "tasks", "raise", "rubbish", "infos", "ends", "slow", "die", "hang",
+    "raise deaths", "resume", "misuse", "zero_copy", "timeline",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Op:
+    """An operation, and the seed of its arguments."""
+
+    name: str
+    seed: int
+
+
+@dataclass(frozen=True)
+class Plan:
+    """An entry of the configuration."""
+
+    name: str
+    form: str = "gym"
+    layout: str = "vector"
+    controls: str = "vector"
+    num_workers: int = 1
+    num_envs: int = 1
+    mode: str = "disabled"
+    placement: str = "inline"
+    share: int = 1
+    limit: int | None = None
+    on_death: str = "restart"
+    every: int | None = None
+    max_restarts: int = 3
+    timeout: float | None = None
+    min_results: int | None = None
+
+    def config(self, number: int) -> dict[str, Any]:
+        """The fields of the entry, the `number`-th."""
+        found: dict[str, Any] = {
+            "name": self.name, "num_workers": self.num_workers, "placement": self.placement,
+            "max_restarts": self.max_restarts, "step_timeout": self.timeout,
+            "reset_timeout": self.timeout, "on_worker_death": self.on_death,
+            "min_results": self.min_results,
+        }  # fmt: skip
+        if self.placement in ("inline", "loop"):
+            if self.placement == "inline":
+                del found["max_restarts"], found["on_worker_death"]
+        else:
+            found["envs_per_process"] = self.share
+        if self.timeout is None:
+            del found["step_timeout"], found["reset_timeout"]
+        if self.every is not None:
+            found["snapshot_every"] = self.every
+        if self.limit is not None:
+            found["max_episode_steps"] = self.limit
+        if self.form == "base":
+            kwargs = {"layout": self.layout, "controls": self.controls}
+            kwargs["first_code"] = self.codes(number, 0)[0]
+            return found | {
+                "backend": "scripted", "task": "-", "imports": ["simulator.scripted"],
+                "env_kwargs": kwargs,
+            }  # fmt: skip
+        make = MAKERS[self.form]
+        makers: list[Any] = []
+        for worker in range(self.num_workers):
+            codes = self.codes(number, worker)
+            own: tuple[Any, ...] = (codes, self.mode) if self.form == "stacked" else (codes[0],)
+            makers.append(partial(make, *own, self.layout, self.controls))
+        return found | {"make_env": makers}
+
+    def codes(self, number: int, worker: int) -> list[int]:
+        """Of the sub-environments of one env."""
+        first = number * 64 + worker * (8 if self.form == "stacked" else 1)
+        return [first + k for k in range(self.num_envs)]
+
+    def entry(self) -> Entry:
+        """What the model must know."""
+        return Entry(
+            self.name, self.form, self.layout, self.controls, self.num_envs, self.mode,
+            self.limit, self.on_death, self.every, self.max_restarts, self.min_results,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Program:
+    """One run.
+
+    Attributes:
+        features: what it may use.
+    """
+
+    seed: int
+    features: frozenset[str]
+    plans: tuple[Plan, ...]
+    ops: tuple[Op, ...]
+
+    def configs(self) -> list[dict[str, Any]]:
+        return [plan.config(number) for number, plan in enumerate(self.plans)]
+
+    def envs(self, workers: list[dict[str, Any]], world: World | None) -> list[Env]:
+        """The model's envs, on the hosts that `get_workers` names."""
+        host_of: dict[str, Host] = {}
+        for number, worker in enumerate(workers):
+            plan = next(plan for plan in self.plans if plan.name == worker["entry"])
+            here = plan.placement == "inline" or worker["pid"] is None
+            count = None if world is None else partial(world.deaths.__getitem__, f"worker {number}")
+            host = Host(mortal=plan.placement == "ray" or not here, count=count)
+            host_of |= dict.fromkeys(worker["env_ids"], host)
+        envs: list[Env] = []
+        first = 0
+        for number, plan in enumerate(self.plans):
+            entry = plan.entry()
+            for worker in range(plan.num_workers):
+                env_id, codes = f"{plan.name}-{worker}", plan.codes(number, worker)
+                # On an event loop each is replaced alone.
+                host = Host(mortal=True) if plan.placement == "loop" else host_of[env_id]
+                envs.append(Env(env_id, entry, codes, first, host, State(codes, entry)))
+                first += plan.num_envs
+        return envs
+
+
+OPS: dict[str, tuple[int, str | None]] = {
+    "step": (10, None),
+    "step_async": (14, None),
+    "collect": (16, None),
+    "reset": (4, None),
+    "reset_async": (3, None),
+    "enter": (4, "auto_reset"),
+    "leave": (2, "auto_reset"),
+    "call": (3, "calls"),
+    "call_async": (3, "calls"),
+    "collect_calls": (3, "calls"),
+    "mark": (2, "calls"),
+    "handle": (4, "handles"),
+    "episode": (2, "handles"),
+    "snapshot": (4, "snapshots"),
+    "restore": (5, "snapshots"),
+    "cancel": (6, "cancel"),
+    "expire": (4, "timeouts"),
+    "task": (8, "tasks"),
+    "join": (3, "tasks"),
+    "misuse": (4, "misuse"),
+    "look": (3, None),
+    "trace": (2, "timeline"),
+    "kill": (3, "die"),
+}
+"""Weight of each operation, and the feature that it needs."""
+
+
+def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 40) -> Program:
+    """The program of a seed, without some features."""
+    rng = Random(seed)
+    features = frozenset(f for f in FEATURES if rng.random() < 0.5) - without
+    plans = [_plan(rng, features, "a")]
+    if "several entries" in features:
+        plans += [_plan(rng, features, name) for name in "bc"[: rng.randint(1, 2)]]
+    names = [name for name, (_, needs) in OPS.items() if needs is None or needs in features]
+    weights = [OPS[name][0] for name in names]
+    count = rng.randint(num_ops // 4, num_ops)
+    ops = [Op(name, rng.getrandbits(32)) for name in rng.choices(names, weights, k=count)]
+    first = [Op("reset", rng.getrandbits(32))] if rng.random() < 0.8 else []
+    return Program(seed, features, tuple(plans), (*first, *ops))
+
+
+def _plan(rng: Random, features: frozenset[str], name: str) -> Plan:
+    form = rng.choice(
+        [f for f in ("gym", "stacked", "base", "awaitable") if f == "gym" or f in features]
+    )
+    fixed = form == "stacked" or "out of band" not in features
+    controls = [c for c in CONTROLS if not fixed or c not in ("text", "anything")]
+    layouts = [*FIXED, "number"] if form != "stacked" and fixed else FIXED if fixed else LAYOUTS
+    plan = Plan(
+        name, form, rng.choice([*layouts]), rng.choice(controls),
+        num_workers=rng.randint(1, 3) if "several envs" in features else 1,
+        limit=rng.choice([None, 3]) if form != "stacked" else None,
+    )  # fmt: skip
+    if form == "stacked":
+        modes = ["disabled", "next_step", "same_step"]
+        plan = replace(plan, num_envs=rng.randint(2, 3), mode=rng.choice(modes))
+    if "extras" in features and rng.random() < 0.3:
+        plan = replace(plan, min_results=rng.randint(1, plan.num_workers))
+    places = ["inline"] if form != "awaitable" else ["loop"] if "async" in features else []
+    if "processes" in features or not places:
+        places += ["process"] if form == "awaitable" else ["process", "process", "split"]
+    placement = rng.choice(places)
+    if placement in ("inline", "loop"):
+        return replace(plan, placement=placement)
+    plan = replace(plan, placement=placement, share=rng.randint(1, 3))
+    if "hang" in features and placement != "split" and rng.random() < 0.7:
+        plan = replace(plan, timeout=2.0)
+    if "raise deaths" in features and rng.random() < 0.3:
+        return replace(plan, on_death="raise")
+    if "resume" in features and form != "awaitable" and rng.random() < 0.5:
+        return replace(plan, on_death="resume", every=rng.randint(1, 4))
+    return plan
