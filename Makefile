@@ -23,10 +23,12 @@ PYTHON_OF_LEROBOT ?= python3.12
 # What other projects' own tests need, and where `make test-peers PEERS=folder` finds their sources.
 PEERS_VENV := .venv-peers
 PEERS ?= peers
+# What `pip install` brings without constraints.txt.
+NEWEST := .venv-newest
 PIP_INSTALL = $(@D)/bin/python -m pip install --quiet --disable-pip-version-check
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-programs test-sanitized test-aarch64 test-ray environments test-simulators test-gpu test-lerobot test-peers test-pythons test-site check prose format docs dist bench clean
+.PHONY: help run test test-programs test-newest test-sanitized test-aarch64 test-ray environments test-simulators test-gpu test-lerobot test-peers test-pythons test-site check prose format docs dist bench clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 24
@@ -39,13 +41,20 @@ PROGRAMS := tests/benchmarks tests/cli tests/examples tests/legacy/test_scripts.
 
 # Most tests wait for processes that they start, so four at a time keep two cores busy. A process
 # without tests takes some from another; until then it has whole files, whose tests share fixtures.
-PYTEST := $(PY) -m pytest --numprocesses 4 --dist worksteal
+PYTEST = $(PY) -m pytest --numprocesses 4 --dist worksteal
 
 test: $(VENV)/installed-test ## the tests of the library
 	$(PYTEST) $(PROGRAMS:%=--ignore=%)
 
 test-programs: $(VENV)/installed-test ## the tests of the command line, benchmarks, examples and pages
 	$(PYTEST) $(PROGRAMS)
+
+# No stamp: what is newest changes every day.
+test-newest: PY := $(NEWEST)/bin/python
+test-newest: | $(NEWEST)/bin/python ## all of these tests, with the newest versions that pyproject.toml allows
+	$(PY) -m pip install --quiet --disable-pip-version-check --upgrade --upgrade-strategy eager --editable '.[test]'
+	$(PY) -m pip list --disable-pip-version-check
+	$(PYTEST)
 
 # What is said of every place where envs may live, and what only Ray can be asked.
 test-ray: $(VENV)/installed-ray ## the tests of `placement: ray`, on clusters of this machine
@@ -141,7 +150,7 @@ bench: $(VENV)/installed-bench $(VENV)/installed-pufferlib $(OPENENV)/installed 
 	$(PY) benchmarks/run_all.py
 
 clean: ## remove the virtual environments and every cache
-	rm -rf $(VENV) $(SIMULATORS) $(ISAAC) $(RLLIB) $(OPENENV) $(ROBOTS) $(LEROBOT) $(PEERS_VENV) build dist site .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) $(SIMULATORS) $(ISAAC) $(RLLIB) $(OPENENV) $(ROBOTS) $(LEROBOT) $(PEERS_VENV) $(NEWEST) build dist site .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 	find src tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
 
 %/bin/python:
