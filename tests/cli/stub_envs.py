@@ -73,11 +73,14 @@ class Raising(Stub):
 
 @rl.ENVS.register("dying")
 class Dying(Stub):
-    """Its worker ends in its third step."""
+    """Its process ends with ``status``, or by that signal, in the step after ``steps`` of them."""
 
     def step(self, policy_resp: rl.PolicyResponse) -> rl.EnvRet:
-        if self.count == 2:
-            os._exit(7)
+        if self.count == self.options.get("steps", 2):
+            status = self.options.get("status", 7)
+            if status < 0:
+                os.kill(os.getpid(), -status)
+            os._exit(status)
         return super().step(policy_resp)
 
 
@@ -101,6 +104,17 @@ class Stuck(Stub):
 
     def step(self, policy_resp: rl.PolicyResponse) -> rl.EnvRet:
         if self.count == 2:
+            threading.Event().wait()
+        return super().step(policy_resp)
+
+
+@rl.ENVS.register("stuck_inline")
+class StuckInline(Stub):
+    """Hangs in its third step outside of a worker, after writing its process id to a file."""
+
+    def step(self, policy_resp: rl.PolicyResponse) -> rl.EnvRet:
+        if self.config.placement == "inline" and self.count == 2:
+            Path(self.options["pid_file"]).write_text(str(os.getpid()))
             threading.Event().wait()
         return super().step(policy_resp)
 

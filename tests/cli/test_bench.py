@@ -5,6 +5,9 @@ from __future__ import annotations
 import csv
 import importlib.util
 import json
+import os
+import re
+import signal
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -119,8 +122,6 @@ def test_a_bench_without_any_working_setting_fails(tmp_path: Path) -> None:
 
 def test_an_interrupted_bench_prints_its_results_so_far(tmp_path: Path) -> None:
     """Ctrl-C ends it after the present measurement."""
-    import signal
-
     with start("bench", write_config(tmp_path, CARTPOLE), "--rounds", 10**6, "--json") as child:
         assert child.stderr is not None
         while not child.stderr.readline().startswith("measuring"):
@@ -379,16 +380,67 @@ def test_bench_traces_the_fastest_contender(tmp_path: Path) -> None:
     assert Seen(tmp_path / "run.json").called("step")
 
 
+ENDS = {
+    0: "exited with code 0",
+    7: "exited with code 7",
+    -signal.SIGSEGV: "was killed by SIGSEGV",
+}
+"""Exit statuses of an env's process, and words for them."""
+
+
+@pytest.mark.parametrize("status", ENDS)
+def test_bench_reports_an_env_that_ends_its_process(tmp_path: Path, status: int) -> None:
+    """Contenders in workers are measured; those of the process that died have no figures."""
+    entry = {"name": "dying", "backend": "dying", "task": "any", "env_kwargs": {"status": status}}
+    done = run("bench", write_config(tmp_path, entry), "--rounds", 1, "--seconds", 0.05)
+    assert done.returncode == 0, done.stderr
+    assert f"inline: the process that stepped the envs {ENDS[status]}" in done.stdout
+    assert re.search(
+        "^1 worker process: \\d+ restarts? of a worker that died$", done.stdout, re.MULTILINE
+    )
+    assert "Traceback" not in done.stderr
+
+
+def test_tune_reports_an_env_that_ends_its_process(tmp_path: Path) -> None:
+    """The best setting is one with workers."""
+    entry = {"name": "dying", "backend": "dying", "task": "any", "env_kwargs": {"status": 0}}
+    done = run("tune", write_config(tmp_path, entry), "--rounds", 1, "--seconds", 0.05)
+    assert done.returncode == 0, done.stderr
+    assert "placement: process" in done.stdout
+    assert "inline: the process that stepped the envs exited with code 0" in done.stderr
+
+
+FAILING = {
+    "dying": ({"status": 0, "steps": 0}, "the process that stepped the envs exited with code 0"),
+    "raising": ({}, "ZeroDivisionError: the floor is missing"),
+}
+"""Backends of envs that fail in every placement, with their options and the error."""
+
+
+@pytest.mark.parametrize("backend", FAILING)
 @pytest.mark.parametrize("command", ["bench", "tune"])
-def test_an_env_that_ends_this_process_is_named_as_a_possible_cause(
-    tmp_path: Path, command: str
+def test_without_any_measurement_the_exit_code_is_1(
+    tmp_path: Path, command: str, backend: str
 ) -> None:
-    """Nothing in the process can say so."""
-    entry = {"name": "dying", "backend": "dying", "task": "any"}
+    """Also if the env ends its process as after a success."""
+    kwargs, message = FAILING[backend]
+    entry = {"name": "a", "backend": backend, "task": "any", "env_kwargs": kwargs}
     done = run(command, write_config(tmp_path, entry), "--rounds", 1, "--seconds", 0.05)
-    assert (done.returncode, done.stdout) == (7, "")
-    assert "stepped itself crashed or called os._exit" in done.stderr
-    entry = {"name": "stub", "backend": "stub", "task": "any"}
-    done = run(command, write_config(tmp_path, entry), "--rounds", 1, "--seconds", 0.05)
-    assert done.returncode == 0
-    assert "error" not in done.stderr
+    assert (done.returncode, done.stdout) == (1, "")
+    assert message in done.stderr.splitlines()[-1]
+    assert done.stderr.splitlines()[-1].startswith("error: ")
+
+
+def test_an_interrupted_bench_leaves_no_process(tmp_path: Path) -> None:
+    """Neither a worker nor the process of an env that hangs outside of workers."""
+    entry = {**STUB, "backend": "stuck_inline", "num_workers": 1}
+    pid_file = tmp_path / "pid"
+    os.mkfifo(pid_file)
+    config = write_config(tmp_path, {**entry, "env_kwargs": {"pid_file": str(pid_file)}})
+    with start("bench", config) as child:
+        stepper = int(pid_file.read_text())
+        child.send_signal(signal.SIGINT)
+        _, stderr = child.communicate(timeout=HANG)
+    assert child.returncode == 130
+    assert "Traceback" not in stderr
+    assert not Path(f"/proc/{stepper}").exists()

@@ -254,3 +254,17 @@ def test_help_and_version_to_a_full_stdout_are_code_2() -> None:
         assert done.returncode == 2
         assert len(done.stderr.splitlines()) == 1
         assert "No space left on device" in done.stderr
+
+
+@pytest.mark.parametrize("status", [0, 7])
+@pytest.mark.parametrize("words", [("rollout",), ("eval", "--episodes", 9), ("check",)])
+def test_an_env_that_ends_the_process_of_the_command_is_no_success(
+    tmp_path: Path, words: tuple[object, ...], status: int
+) -> None:
+    """The message says how; an exit code of 0 becomes 1."""
+    kwargs = {"status": status}
+    dying = {"name": "frail", "backend": "dying", "task": "any", "env_kwargs": kwargs}
+    command, *options = words
+    done = run(command, write_config(tmp_path, {**dying, "placement": "inline"}), *options)
+    assert (done.returncode, done.stdout) == (status or 1, "")
+    assert f"error: os._exit({status}) was called in the process of this command" in done.stderr

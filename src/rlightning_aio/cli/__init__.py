@@ -12,9 +12,12 @@ import os
 import signal
 import sys
 import warnings
-from typing import TextIO, cast
+from typing import Final, NoReturn, TextIO, cast
 
-__all__ = ["main"]
+__all__ = ["main", "show_warning"]
+
+_end_process: Final = os._exit
+_PID: Final = os.getpid()
 
 
 def main() -> None:
@@ -22,7 +25,8 @@ def main() -> None:
     # A command catches Ctrl-C itself while envs run. At other times there is nothing to clean
     # up, and an exception could get lost in code that expects none.
     signal.signal(signal.SIGINT, _quit)
-    warnings.showwarning = _say
+    os._exit = _quit_by_env
+    warnings.showwarning = show_warning
     from rlightning_aio.errors import ConfigError  # noqa: PLC0415
 
     try:
@@ -50,13 +54,25 @@ def main() -> None:
         sys.stderr.write(f"error: {error}\n")
         sys.exit(2)
     finally:
+        os._exit = _end_process
         sys.stdout = sys.stderr
 
 
 def _quit(*_: object) -> None:
-    os._exit(130)
+    _end_process(130)
 
 
-def _say(message: Warning | str, *_: object) -> None:
+def _quit_by_env(status: int) -> NoReturn:
+    """End the process as `os._exit` does, but never as if the command had succeeded."""
+    if os.getpid() != _PID:  # A process that an env has forked.
+        _end_process(status)
+    sys.stderr.write(
+        f"error: os._exit({status}) was called in the process of this command, so there is no "
+        "result; under `placement: process`, an env ends a worker, which is reported and replaced\n"
+    )
+    _end_process(status or 1)
+
+
+def show_warning(message: Warning | str, *_: object) -> None:
     """Show a warning without the line of code that raised it."""
     sys.stderr.write(f"warning: {message}\n")

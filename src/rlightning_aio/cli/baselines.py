@@ -6,7 +6,6 @@ Rule: the same simulations with the same random actions, and none of our code in
 from __future__ import annotations
 
 import contextlib
-import importlib
 import os
 import signal
 import time
@@ -24,6 +23,7 @@ from rlightning_aio.registry import ENVS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Sequence
+    from pathlib import Path
 
     from rlightning_aio.config import EnvConfig
 
@@ -45,6 +45,16 @@ class Baseline:
 
     words: str
     config: EnvConfig
+
+    @property
+    def configs(self) -> tuple[EnvConfig, ...]:
+        """Return its only entry."""
+        return (self.config,)
+
+    @property
+    def steps_here(self) -> bool:
+        """Return True: an env of it, which has the spaces, is always in this process."""
+        return True
 
     @property
     def num_sims(self) -> int:
@@ -76,8 +86,6 @@ def opened_baseline(baseline: Baseline, seed: int) -> Generator[BaselineStand]:
 
     Raises what the simulator raises.
     """
-    for module in baseline.config.imports:
-        importlib.import_module(module)
     before = memory_bytes([os.getpid()])
     began = time.monotonic()
     envs = _made(baseline)
@@ -100,9 +108,9 @@ class BaselineStand:
         self._envs = envs
         self._sample = sampler_of(envs.action_space, np.random.default_rng(seed))
 
-    async def measure(self, rule: Rule, limits: Limits) -> Round:
-        """Measure it; `rule` has no effect."""
-        del rule
+    async def measure(self, rule: Rule, limits: Limits, trace: Path | None = None) -> Round:
+        """Measure it; `rule` and `trace` have no effect."""
+        del rule, trace
         self._round(Limits(limits.steps, limits.seconds / 10))
         return self._round(limits)
 

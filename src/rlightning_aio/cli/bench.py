@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -11,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Self, TypeAlias
 import typer
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
-from rlightning_aio.cli.baselines import Baseline, baselines_of, opened_baseline
-from rlightning_aio.cli.collecting import traced
+from rlightning_aio.cli.apart import opened
+from rlightning_aio.cli.baselines import Baseline, baselines_of
 from rlightning_aio.cli.comparing import Comparison, check_name, check_save, compared, save
 from rlightning_aio.cli.contender_table import as_csv, as_markdown, print_contenders
-from rlightning_aio.cli.measuring import Contender, Limits, Rule, Stand, opened, take_turns
+from rlightning_aio.cli.measuring import Contender, Limits, Rule, take_turns
 from rlightning_aio.cli.option_files import check_option_file
 from rlightning_aio.cli.options import (
     AsJson,
@@ -28,10 +27,9 @@ from rlightning_aio.cli.options import (
     check_seed,
 )
 from rlightning_aio.cli.plots import check_plot, draw_contenders
-from rlightning_aio.cli.policies import Policy, load_policy
+from rlightning_aio.cli.policies import load_policy
 from rlightning_aio.cli.publishing import publish
 from rlightning_aio.cli.settings import Setting, possible_settings
-from rlightning_aio.cli.sudden_end import explained_sudden_end
 from rlightning_aio.cli.surroundings import surroundings
 from rlightning_aio.cli.terminal import (
     count,
@@ -43,11 +41,12 @@ from rlightning_aio.cli.terminal import (
     run_interruptible,
 )
 from rlightning_aio.config import load_config
+from rlightning_aio.errors import RLightningError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
-    from rlightning_aio.cli.measuring import Measurable, Place
+    from rlightning_aio.cli.measuring import Stands
     from rlightning_aio.config import EnvConfig
 
 __all__ = ["Watch", "bench"]
@@ -72,12 +71,14 @@ class _Bench:
     baselines: list[Baseline]
     rounds: int
     limits: Limits
-    policy: Policy | None
+    policy: str | None
     seed: int
     trace: Path | None
     contenders: list[Contender] = field(default_factory=list[Contender])
 
     def __post_init__(self) -> None:
+        if self.policy is not None:
+            load_policy(self.policy)  # Only a check: nothing has been started yet.
         self.contenders = [
             Contender(setting, rule)
             for setting in self.settings
@@ -223,7 +224,7 @@ def bench(
         [] if policy else baselines_of(configs),
         rounds,
         Limits(steps or 2**62, seconds),
-        load_policy(policy) if policy else None,
+        policy,
         seed,
         trace,
     )
@@ -248,35 +249,23 @@ def _rules(num_envs: int) -> list[Rule]:
 
 
 async def _measure(order: _Bench, watch: Watch) -> None:
-    with explained_sudden_end(), contextlib.ExitStack() as stack:
-        # Before the groups start, because Gymnasium forks this process.
-        plain: dict[Place, Measurable | str] = {}
-        for baseline in order.baselines:
-            try:
-                plain[baseline] = stack.enter_context(opened_baseline(baseline, order.seed))
-            except Exception as error:  # noqa: BLE001  # It is the simulator's code.
-                plain[baseline] = f"{type(error).__name__}: {error}".partition("\n")[0]
-        async with opened(order.settings, order.policy, order.seed) as stands:
-            watch.say(
-                f"measuring {counted(len(order.contenders), 'contender')}, "
-                f"{counted(order.rounds, 'round')}"
-            )
-            await take_turns(
-                plain | stands, order.contenders, order.rounds, order.limits, watch.measured
-            )
-            if order.trace is not None:
-                await _trace_fastest(order, stands, order.trace)
+    places = [*order.settings, *order.baselines]
+    async with opened(places, order.policy, order.seed) as stands:
+        watch.say(
+            f"measuring {counted(len(order.contenders), 'contender')}, "
+            f"{counted(order.rounds, 'round')}"
+        )
+        await take_turns(stands, order.contenders, order.rounds, order.limits, watch.measured)
+        if order.trace is not None:
+            await _trace_fastest(order, stands, order.trace)
 
 
-async def _trace_fastest(
-    order: _Bench, stands: Mapping[Place, Measurable | str], path: Path
-) -> None:
+async def _trace_fastest(order: _Bench, stands: Stands, path: Path) -> None:
     """Measure the fastest of the groups once more, with its timeline recorded."""
     for contender in sorted(order.contenders, key=lambda c: c.steps_per_second, reverse=True):
-        stand = stands.get(contender.setting)
-        if isinstance(stand, Stand):
-            async with traced(stand.group, path):
-                await stand.measure(contender.rule, order.limits)
+        stand = stands[contender.setting]
+        if isinstance(contender.setting, Setting) and not isinstance(stand, RLightningError):
+            await stand.measure(contender.rule, order.limits, path)
             return
 
 

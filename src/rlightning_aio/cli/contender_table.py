@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections import Counter
 from typing import TYPE_CHECKING, Final
 
 from rlightning_aio.cli.terminal import count, counted, duration, named_columns, print_table
@@ -43,6 +44,11 @@ def print_contenders(console: Console, title: str, contenders: Sequence[Contende
     failures = {c.setting.words: c.failure for c in contenders if c.failure}
     for words, failure in failures.items():
         console.print(f"{words}: {failure}", markup=False)
+    restarts = Counter[str]()
+    for contender in contenders:
+        restarts[contender.setting.words] += contender.restarts
+    for words, times in (+restarts).items():
+        console.print(f"{words}: {counted(times, 'restart')} of a worker that died", markup=False)
 
 
 def as_csv(contenders: Sequence[Contender]) -> str:

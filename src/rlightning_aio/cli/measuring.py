@@ -11,28 +11,31 @@ import asyncio
 import contextlib
 import os
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from statistics import median
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy as np
 
 import rlightning_aio
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.batch.contents import parts_of
-from rlightning_aio.cli.collecting import Roster, resetting, respond_to_all, responder
+from rlightning_aio.cli.collecting import Roster, resetting, respond_to_all, responder, traced
 from rlightning_aio.cli.processes import cpu_seconds, memory_bytes
 from rlightning_aio.cli.rollout_statistics import RolloutStatistics
+from rlightning_aio.cli.terminal import in_words
 from rlightning_aio.errors import RLightningError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Callable, Sequence
+    from pathlib import Path
 
     from numpy.typing import NDArray
 
     from rlightning_aio.cli.policies import Policy
     from rlightning_aio.cli.settings import Setting
+    from rlightning_aio.config import EnvConfig
     from rlightning_aio.group.aio import EnvGroup
 
 __all__ = [
@@ -44,8 +47,11 @@ __all__ = [
     "Round",
     "Rule",
     "Stand",
+    "Stands",
     "as_round",
-    "opened",
+    "opened_group",
+    "raise_if_all_failed",
+    "take_turn",
     "take_turns",
 ]
 
@@ -82,11 +88,15 @@ class Round:
     Attributes:
         latency_us: time from sending an action to receiving its result, p50 and p99.
         cores: number of cores kept busy by this process and the workers.
+        step_us: mean time in an env's own step so far; None where it is not known.
+        restarts: number of workers that were replaced meanwhile.
     """
 
     steps_per_second: float
     latency_us: tuple[float, float]
     cores: float
+    step_us: float | None = None
+    restarts: int = 0
 
 
 @dataclass(frozen=True)
@@ -112,6 +122,16 @@ class Place(Protocol):
         """Return its name in tables."""
         ...
 
+    @property
+    def configs(self) -> tuple[EnvConfig, ...]:
+        """Return the entries of its envs."""
+        ...
+
+    @property
+    def steps_here(self) -> bool:
+        """Return True if envs of it live in the process that measures them."""
+        ...
+
     def as_json(self) -> dict[str, Any]:
         """Return its description for JSON."""
         ...
@@ -122,9 +142,22 @@ class Measurable(Protocol):
 
     costs: Costs
 
-    async def measure(self, rule: Rule, limits: Limits) -> Round:
-        """Measure once, after a few steps that warm the caches."""
+    async def measure(self, rule: Rule, limits: Limits, trace: Path | None = None) -> Round:
+        """Measure once, after a few steps that warm the caches.
+
+        Args:
+            rule: when results are collected.
+            limits: the end of the measurement.
+            trace: a file for a timeline; only groups write it.
+
+        Raises:
+            RLightningError: an env, its worker or its process failed.
+        """
         ...
+
+
+Stands: TypeAlias = dict[Place, Measurable | RLightningError]
+"""Places that are open, and the errors of those that could not start or have failed."""
 
 
 @dataclass
@@ -161,6 +194,11 @@ class Contender:
         """Return the median over the rounds of the cores that were busy."""
         return median(r.cores for r in self.rounds)
 
+    @property
+    def restarts(self) -> int:
+        """Return the number of workers that were replaced in all rounds."""
+        return sum(r.restarts for r in self.rounds)
+
     def as_json(self) -> dict[str, Any]:
         """Return all figures for JSON."""
         document: dict[str, Any] = {
@@ -169,6 +207,7 @@ class Contender:
             "rule": self.rule.words,
             "min_results": self.rule.min_results,
             "failure": self.failure,
+            "restarts": self.restarts,
             "rounds": [r.steps_per_second for r in self.rounds],
         }
         if self.rounds:
@@ -206,21 +245,27 @@ class Stand:
         self.group = group
         self._respond = responder(group, roster, policy, seed)
         self._everyone = everyone
-        self._pids = _processes(group)
         self._sent_at = np.zeros(len(everyone))
         self.statistics = RolloutStatistics(setting.configs)
         self.statistics.begin(roster)
 
-    async def measure(self, rule: Rule, limits: Limits) -> Round:
+    async def measure(self, rule: Rule, limits: Limits, trace: Path | None = None) -> Round:
         """Measure once, after a few steps that warm the caches."""
-        least = rule.min_results
+        least, before = rule.min_results, self._restarts()
         one_round = self._step if least is None else partial(self._collect, least)
-        await one_round(Limits(limits.steps, limits.seconds / 10))
-        return await one_round(limits)
+        async with traced(self.group, trace):
+            await one_round(Limits(limits.steps, limits.seconds / 10))
+            measured = await one_round(limits)
+        step_us, restarts = self.statistics.mean_step_us(), self._restarts() - before
+        return replace(measured, step_us=step_us, restarts=restarts)
+
+    def _restarts(self) -> int:
+        return sum(worker["restarts"] for worker in self.group.get_workers())
 
     async def _step(self, limits: Limits) -> Round:
         latencies: list[float] = []
-        busy = cpu_seconds(self._pids)
+        pids = _processes(self.group)
+        busy = cpu_seconds(pids)
         first, began = self.statistics.steps, time.monotonic()
         now = began
         while limits.not_reached(self.statistics.steps - first, now - began):
@@ -231,13 +276,14 @@ class Stand:
             latencies.append(now - sent_at)
             self.statistics.add(batch)
         steps = self.statistics.steps - first
-        used = cpu_seconds(self._pids) - busy
+        used = max(0.0, cpu_seconds(pids) - busy)
         return as_round(steps, now - began, used, np.array(latencies))
 
     async def _collect(self, min_results: int, limits: Limits) -> Round:
         latencies: list[NDArray[np.float64]] = []
         group, sent_at = self.group, self._sent_at
-        busy = cpu_seconds(self._pids)
+        pids = _processes(self.group)
+        busy = cpu_seconds(pids)
         first, began = self.statistics.steps, time.monotonic()
         now = began
         sent_at[:] = now
@@ -250,7 +296,7 @@ class Stand:
                 latencies.append(now - sent_at[part.slots])
                 sent_at[part.slots] = now
             await respond_to_all(group, self._respond, batch)
-        steps, used = self.statistics.steps - first, cpu_seconds(self._pids) - busy
+        steps, used = self.statistics.steps - first, max(0.0, cpu_seconds(pids) - busy)
         done = as_round(steps, now - began, used, np.concatenate(latencies))
         batch, _ = await group.collect_async(wait_all=True)
         self.statistics.add(batch)
@@ -279,62 +325,68 @@ def _joined(responses: list[BatchedData]) -> BatchedData:
     return BatchedData([value.env_id for value in values], values)
 
 
-async def _open(
-    stack: contextlib.AsyncExitStack, setting: Setting, policy: Policy | None, seed: int
-) -> Stand:
-    before = memory_bytes([os.getpid()])
-    began = time.monotonic()
-    group = rlightning_aio.build_env_group(list(setting.configs), mixed_actions=True)
-    await stack.enter_async_context(group)
-    roster = Roster(group)
-    started = time.monotonic()
-    everyone, _ = await group.reset(seed=seed)
-    reset = time.monotonic()
-    grown = max(0, memory_bytes([os.getpid()]) - before)
-    workers = memory_bytes(_processes(group)[1:])
-    costs = Costs(started - began, reset - started, workers or grown)
-    stack.enter_context(resetting(group, setting.configs))
-    return Stand(group, setting, roster, everyone, costs, policy, seed)
-
-
 @contextlib.asynccontextmanager
-async def opened(
-    settings: Sequence[Setting], policy: Policy | None = None, seed: int = 0
-) -> AsyncGenerator[dict[Place, Measurable | str]]:
-    """Open groups for all settings. Yield them, and a message for each that could not start.
+async def opened_group(
+    setting: Setting, policy: Policy | None = None, seed: int = 0
+) -> AsyncGenerator[Stand]:
+    """Build a group, and reset its envs.
 
     Raises:
-        RLightningError: no group could start.
+        RLightningError: it could not start.
     """
-    async with contextlib.AsyncExitStack() as stack:
-        stands: dict[Place, Measurable | str] = {}
-        error: RLightningError | None = None
-        for setting in settings:
-            try:
-                stands[setting] = await _open(stack, setting, policy, seed)
-            except RLightningError as failure:
-                error = failure
-                stands[setting] = str(failure).partition("\n")[0]
-        if error is not None and all(isinstance(stand, str) for stand in stands.values()):
-            raise error
-        yield stands
+    before = memory_bytes([os.getpid()])
+    began = time.monotonic()
+    async with rlightning_aio.build_env_group(list(setting.configs), mixed_actions=True) as group:
+        roster = Roster(group)
+        started = time.monotonic()
+        everyone, _ = await group.reset(seed=seed)
+        reset = time.monotonic()
+        grown = max(0, memory_bytes([os.getpid()]) - before)
+        workers = memory_bytes(_processes(group)[1:])
+        costs = Costs(started - began, reset - started, workers or grown)
+        with resetting(group, setting.configs):
+            yield Stand(group, setting, roster, everyone, costs, policy, seed)
+
+
+async def take_turn(stands: Stands, contender: Contender, limits: Limits) -> None:
+    """Measure a contender once, or note why that is impossible.
+
+    An error while it is measured takes the place of its stand.
+    """
+    stand = stands[contender.setting]
+    if not isinstance(stand, RLightningError):
+        contender.costs = stand.costs
+        try:
+            contender.rounds.append(await stand.measure(contender.rule, limits))
+        except RLightningError as error:
+            stand = stands[contender.setting] = error
+    if isinstance(stand, RLightningError):
+        contender.failure = in_words(stand).partition("\n")[0]
 
 
 async def take_turns(
-    stands: dict[Place, Measurable | str],
+    stands: Stands,
     contenders: Sequence[Contender],
     rounds: int,
     limits: Limits,
     report: Callable[[Contender], None],
 ) -> None:
-    """Measure all contenders in turn, `rounds` times; `report` is called after each."""
+    """Measure all contenders in turn, `rounds` times; `report` is called after each.
+
+    Raises:
+        RLightningError: none could be measured.
+    """
     for _ in range(rounds):
         for contender in contenders:
-            stand = stands[contender.setting]
-            if isinstance(stand, str):
-                contender.failure = stand
-            else:
-                contender.costs = stand.costs
-                contender.rounds.append(await stand.measure(contender.rule, limits))
+            await take_turn(stands, contender, limits)
             report(contender)
             await asyncio.sleep(0)  # Let Ctrl-C take effect.
+    if not any(contender.rounds for contender in contenders):
+        raise_if_all_failed(stands)
+
+
+def raise_if_all_failed(stands: Stands) -> None:
+    """Raise the last error if there is no stand that works."""
+    errors = [stand for stand in stands.values() if isinstance(stand, RLightningError)]
+    if len(errors) == len(stands):
+        raise errors[-1]

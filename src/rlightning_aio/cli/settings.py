@@ -49,6 +49,11 @@ class Setting:
         return self.configs[0].placement
 
     @property
+    def steps_here(self) -> bool:
+        """Return True if some of the envs are in the process of the group."""
+        return self.placement != "process"
+
+    @property
     def has_workers(self) -> bool:
         """Return True if some of the envs are in worker processes."""
         return PLACEMENTS[self.placement].spreads

@@ -38,6 +38,7 @@ __all__ = [
     "finite",
     "fitted",
     "guarded",
+    "in_words",
     "interruptible",
     "named_columns",
     "notes_on_returns",
@@ -176,7 +177,7 @@ def guarded(command: Callable[..., None]) -> Callable[..., None]:
             with _prints_on_stderr():
                 command(*args, **kwargs)
         except RLightningError as error:
-            typer.echo(f"error: {_in_words(error)}", err=True)
+            typer.echo(f"error: {in_words(error)}", err=True)
             raise typer.Exit(2 if isinstance(error, ConfigError) else 1) from None
         except TimeoutError as error:  # A group's clients have not connected in time.
             typer.echo(f"error: {error}", err=True)
@@ -212,7 +213,7 @@ def run_interruptible(command: Coroutine[Any, Any, None]) -> None:
         rlightning_aio.run(command)
 
 
-def _in_words(error: RLightningError) -> str:
+def in_words(error: RLightningError) -> str:
     """Return the message, with the place in the env's code instead of a traceback."""
     text = str(error)
     if isinstance(error.__cause__, RemoteTraceback):

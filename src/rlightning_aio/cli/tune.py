@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 import yaml
 
+from rlightning_aio.cli.apart import opened
 from rlightning_aio.cli.bench import Watch
 from rlightning_aio.cli.contender_table import print_contenders
-from rlightning_aio.cli.measuring import Contender, Limits, Rule, Stand, opened, take_turns
+from rlightning_aio.cli.measuring import Contender, Limits, Rule, take_turn, take_turns
 from rlightning_aio.cli.options import Config, MeasuringSeconds, Overrides, Rounds
 from rlightning_aio.cli.settings import Setting, possible_settings
-from rlightning_aio.cli.sudden_end import explained_sudden_end
 from rlightning_aio.cli.terminal import (
     count,
     counted,
@@ -30,7 +30,7 @@ from rlightning_aio.sharing import num_cores
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rlightning_aio.cli.measuring import Measurable, Place
+    from rlightning_aio.cli.measuring import Stands
     from rlightning_aio.config import EnvConfig
 
 __all__ = ["tune"]
@@ -124,7 +124,7 @@ def tune(
     measurements = rounds * (len(settings) + _FINALISTS * len(_least(search.num_envs)))
     interrupted = False
     try:
-        with explained_sudden_end(), Watch(len(settings), measurements) as watch:
+        with Watch(len(settings), measurements) as watch:
             run_interruptible(_search(search, settings, watch))
     except KeyboardInterrupt:
         interrupted = True
@@ -155,17 +155,15 @@ async def _search(search: _Search, settings: Sequence[Setting], watch: Watch) ->
         await take_turns(stands, search.finals, search.rounds, search.limits, watch.measured)
 
 
-async def _measure_env(
-    search: _Search, settings: Sequence[Setting], stands: dict[Place, Measurable | str]
-) -> None:
+async def _measure_env(search: _Search, settings: Sequence[Setting], stands: Stands) -> None:
     """Measure a step with one worker alone."""
     for setting in settings:
-        stand = stands[setting]
-        if isinstance(stand, Stand):
-            alone = await stand.measure(Rule("step", None), search.limits)
-            steps_per_second = alone.steps_per_second * search.num_envs / search.sub_envs
-            search.step_us = stand.statistics.mean_step_us()
-            search.core_us = alone.cores / steps_per_second * 1e6
+        alone = Contender(setting, Rule("step", None))
+        await take_turn(stands, alone, search.limits)
+        for measured in alone.rounds:
+            steps_per_second = measured.steps_per_second * search.num_envs / search.sub_envs
+            search.step_us = measured.step_us
+            search.core_us = measured.cores / steps_per_second * 1e6
             return
 
 

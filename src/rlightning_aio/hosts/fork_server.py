@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
     from rlightning_aio.hosts.fork_messages import Message
 
-__all__ = ["BOOTSTRAP", "DUMP_SIGNAL", "main"]
+__all__ = ["BOOTSTRAP", "DUMP_SIGNAL", "die_with_parent", "main"]
 
 BOOTSTRAP: Final = """
 import os, sys
@@ -145,7 +145,7 @@ class _Outlet:
             self._poll.unregister(_STDERR)
 
 
-def _die_with_parent() -> None:
+def die_with_parent() -> None:
     """Make the kernel kill this process when its parent dies (Linux)."""
     with contextlib.suppress(OSError, AttributeError):
         pr_set_pdeathsig = 1
@@ -373,7 +373,7 @@ def _run_worker(
         os.dup2(stderr, 2)
         os.close(stderr)
         leave()
-        _die_with_parent()
+        die_with_parent()
         if os.getppid() != parent:
             os._exit(1)
         faulthandler.enable(all_threads=True)

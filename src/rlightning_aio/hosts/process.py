@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from rlightning_aio.hosts.fork_messages import Message
     from rlightning_aio.hosts.messages import AttachOrder, StartOrder
 
-__all__ = ["ForkServer", "ProcessHost"]
+__all__ = ["ForkServer", "ProcessHost", "ending"]
 
 _STDERR: Final = 2
 _ONE_THREAD = dict.fromkeys(
@@ -210,7 +210,7 @@ class ForkServer:
         exit_code = self._end(0.0)
         why = self._failure
         if why is None:
-            why = f"it {_ending(exit_code)}"
+            why = f"it {ending(exit_code)}"
             if not self._ready:
                 why += f" while it was importing {self._imports}"
             if not self._ready and self._interpreter:
@@ -333,7 +333,7 @@ class ProcessHost:
         if self._link is not None:
             self._link.on_readable()
         by_us = self._killed and exit_code == -signal.SIGKILL
-        self._ended(self._killed if by_us else _ending(exit_code), exit_code, stderr_tail)
+        self._ended(self._killed if by_us else ending(exit_code), exit_code, stderr_tail)
 
     def on_refused(self, why: str) -> None:
         """Handle that the worker could not be forked."""
@@ -401,7 +401,8 @@ def _new_channel() -> tuple[socket.socket, socket.socket]:
     return socket.socketpair()
 
 
-def _ending(exit_code: int) -> str:
+def ending(exit_code: int) -> str:
+    """Say in a clause how a process ended; `exit_code` is negative for a signal."""
     if exit_code >= 0:
         return f"exited with code {exit_code}"
     try:
