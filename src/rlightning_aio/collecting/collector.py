@@ -17,7 +17,7 @@ from rlightning_aio.collecting.kind import OWN_NAMES, EnvKind, Part
 from rlightning_aio.collecting.procedure import Procedure, run
 from rlightning_aio.collecting.record import RecordedGroup, ReplayedGroup
 from rlightning_aio.collecting.rollout import Rollout
-from rlightning_aio.errors import EnvBusy
+from rlightning_aio.errors import EnvBusy, EnvFault, NothingPending
 from rlightning_aio.group.aio import EnvGroup as AsyncEnvGroup
 from rlightning_aio.group.sync import EnvGroup as SyncEnvGroup
 
@@ -149,6 +149,7 @@ class Collector(Generic[G, R]):
         self._clock = Clock()
         self._kinds: dict[str, EnvKind] = {}
         self._started = self._start_cut_off = False
+        self._start_fault: EnvFault | None = None
         self._collecting = False
         self._metas: dict[str, EnvMeta] = {}
         # Results in order of progress: received, not yet stored, not yet answered.
@@ -223,19 +224,39 @@ class Collector(Generic[G, R]):
             self._collecting = False
 
     def _start(self) -> Procedure[None]:
-        """Reset all envs; or expect the results of a reset that was sent and then cancelled."""
+        """Reset all envs, and wait for all of them."""
         try:
-            batch, _ = yield partial(self._group.reset, seed=self._seed)
+            self._received, _ = yield partial(self._group.reset, seed=self._seed)
         except EnvBusy:
             if not self._start_cut_off:
                 raise
-            self._started = self._expecting = True
+            yield from self._await_start()
         except BaseException as error:
             self._start_cut_off = not isinstance(error, Exception)
             raise
-        else:
-            self._started = True
-            self._received = batch
+        self._started = True
+
+    def _await_start(self) -> Procedure[None]:
+        """Wait for the results of a reset that was sent and then cancelled.
+
+        As with a reset that is not cancelled, there are results of all envs, or an error.
+        """
+        while True:
+            try:
+                batch, _ = yield partial(self._group.collect_async, wait_all=True, ordered=True)
+            except EnvFault as fault:
+                self._start_fault = self._start_fault or fault
+            except NothingPending:
+                if self._start_fault is None:
+                    raise
+                break
+            else:
+                self._received = batch
+                break
+        fault, self._start_fault = self._start_fault, None
+        if fault is not None:
+            self._received, self._start_cut_off = None, False
+            raise fault
 
     def _receive(self) -> Any:
         if self._block:
