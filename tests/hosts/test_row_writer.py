@@ -148,7 +148,7 @@ def test_the_short_way_writes_the_same_rows(kind: type[Plain], history: list[Any
             env.next = then
             found = runner.step()
             reward, terminated, truncated, info = then
-            writer.write_ends(*writer.checked_ends(float(reward), terminated, truncated), info)
+            writer.write_ends(float(reward), terminated, truncated, info)
             expected = writer.write_data(observation, info)
         assert row.contents(found) == long.contents(expected)
         assert not row.slab.flags[0].any()
@@ -367,7 +367,7 @@ def test_rewards_of_any_container_get_the_shape_of_the_row(
         ends = np.zeros(head, bool)
     if len(head) == 2:
         ends = {agent: np.zeros(head[1], bool) for agent in agents}
-    writer.write_ends(*writer.checked_ends(value, ends, ends), {})
+    writer.write_ends(value, ends, ends, {})
     assert (slab.reward[0] == np.full(head, 2)).all()
 
 
@@ -377,4 +377,4 @@ def test_a_value_with_a_wrong_shape_is_named(what: str) -> None:
     writer, _ = writer_of("disabled", (3,))
     good = {"reward": np.zeros(3), "terminated": np.zeros(3, bool), "truncated": np.zeros(3, bool)}
     with pytest.raises(ValueError, match=rf"{what} of env 'e-0' has shape \(2,\), expected \(3,\)"):
-        writer.checked_ends(*{**good, what: np.zeros(2)}.values())
+        writer.write_ends(*{**good, what: np.zeros(2)}.values(), {})

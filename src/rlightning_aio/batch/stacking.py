@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from rlightning_aio.protocol.columns import as_array
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -16,7 +18,8 @@ __all__ = ["columns_where_possible", "concatenated", "differing", "form_of", "st
 def stacked_values(values: list[Any]) -> Any:
     """Stack `values` to columns: arrays, torch tensors, or dicts and tuples of them.
 
-    Texts, and lists that hold any, stay a list: in an array they would turn numbers into texts.
+    Tensors among other values become arrays. Texts, and lists that hold any, stay a list: in an
+    array they would turn numbers into texts.
 
     Raises:
         ValueError: they differ in structure or shape.
@@ -24,10 +27,10 @@ def stacked_values(values: list[Any]) -> Any:
     first = values[0] if values else None
     if isinstance(first, dict | tuple):
         return _stacked_trees(cast("dict[Any, Any] | tuple[Any, ...]", first), values)
-    if type(first).__module__.partition(".")[0] == "torch":
+    if hasattr(first, "detach") and all(hasattr(value, "detach") for value in values):
         # A process that holds a tensor has imported torch.
         return sys.modules["torch"].stack(values)
-    arrays = [np.asarray(value) for value in values]
+    arrays = [as_array(value) for value in values]
     kinds = {array.dtype.kind for array in arrays}
     if kinds & {"S", "U"} and (len(kinds) > 1 or not all(map(_is_array, values))):
         return values
@@ -85,8 +88,7 @@ def form_of(tree: Any) -> object:
         return np.ndarray, column.shape[1:], "number" if kind in "biufc" else kind
     if isinstance(tree, list):
         return list
-    tensor = cast("Any", tree)
-    return type(tensor), tensor.shape[1:], str(tensor.device)
+    return "tensor", tree.shape[1:], str(tree.device)
 
 
 def concatenated(trees: list[Any], order: NDArray[np.intp] | slice = slice(None)) -> Any:

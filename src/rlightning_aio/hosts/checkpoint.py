@@ -18,6 +18,7 @@ from rlightning_aio.protocol.columns import row_reader
 from rlightning_aio.protocol.entries import Operation
 from rlightning_aio.protocol.info import PICKLED
 from rlightning_aio.protocol.pickling import dumped
+from rlightning_aio.types import EnvRet
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from rlightning_aio.hosts.messages import OutOfBand
     from rlightning_aio.hosts.row_writer import RowWriter
     from rlightning_aio.protocol.slab import Slab
+    from rlightning_aio.types import MultiAgentEnvRet
 
 __all__ = ["Checkpoints", "Saver", "Send"]
 
@@ -64,14 +66,12 @@ class Checkpoints:
 
     Attributes:
         has_result: the env was reset, here or before its checkpoint was taken.
-        whole: the last result, if it was returned without a copy.
     """
 
     def __init__(self, env: BaseEnv, slab: Slab, row: int, writer: RowWriter) -> None:
         self._env, self._slab, self._row, self._writer = env, slab, row, writer
         self._restored: _ShownResult | None = None
         self.has_result = False
-        self.whole: Any = None
 
     def take(self) -> bytes:
         """Return a checkpoint.
@@ -93,7 +93,7 @@ class Checkpoints:
 
     def _read(self) -> _ShownResult:
         """Return a copy of the row and of what was out of band."""
-        slab, row, whole = self._slab, self._row, self.whole
+        slab, row, whole = self._slab, self._row, self._writer.whole
         mark = int(slab.info_mark[row])
         out_of_band = self._writer.out_of_band
         info = out_of_band.get("info", {}) if mark == PICKLED else self._writer.read_info(mark)
@@ -153,10 +153,17 @@ class Checkpoints:
         slab.episode_length[row, ...] = shown_result.lengths
         writer.row_changed()
         writer.write_times(time.monotonic_ns(), 0)
-        self.whole = shown_result.whole
-        if self.whole is not None:
-            return {"ret": self.whole}
+        if (whole := shown_result.whole) is not None:
+            return writer.hand_over_whole(_without_transition(whole))
         return writer.write_data(shown_result.observation, shown_result.info)
+
+
+def _without_transition(result: EnvRet | MultiAgentEnvRet) -> EnvRet | MultiAgentEnvRet:
+    """Copy a result without its reward and ends."""
+    nothing: dict[str, Any] = {}
+    reward, end = (0.0, False) if isinstance(result, EnvRet) else (nothing, nothing)
+    ends = {"last_terminated": end, "last_truncated": end}
+    return result.model_copy(update={"last_reward": reward, **ends})
 
 
 class Saver:

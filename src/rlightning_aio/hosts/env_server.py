@@ -90,13 +90,13 @@ class _ClientRow:
     def write(self, result: RemoteResult) -> OutOfBand | None:
         """Write a result into the row; return the parts that have no place there."""
         writer = self._writer
-        ends = writer.checked_ends(result.reward, result.terminated, result.truncated)
         if result.is_reset or result.is_loss:
             # An episode that a loss has cut short is not counted.
             writer.begin_episode(result.info)
             if result.is_loss:
-                self._slab.truncated[self._row] = ends[2]
+                self._slab.truncated[self._row] = True
         else:
+            ends = result.reward, result.terminated, result.truncated
             writer.write_ends(*ends, result.info)
         writer.write_times(time.monotonic_ns(), result.busy_ns)
         # Statistics use this machine's clock; the result has the time of its client's.

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, cast
 
 import numpy as np
 
+from rlightning_aio.envs.tensors import holds_tensor
 from rlightning_aio.protocol import kernel
 from rlightning_aio.protocol.exchange import Row
 from rlightning_aio.protocol.info import NO_INFO, PICKLED
@@ -78,14 +79,24 @@ class ShortWay:
             self._resets_itself,
         )
 
-    def resetter(self, reset: BareReset, write_observation: Callable[[Any], None]) -> Execute:
-        """Return a function that resets the env by `reset`, with the seed in the row."""
+    def resetter(
+        self,
+        reset: BareReset,
+        write_observation: Callable[[Any], None],
+        store: Callable[[Any, dict[str, Any], int], OutOfBand | None],
+    ) -> Execute:
+        """Return a function that resets the env by `reset`, with the seed in the row.
+
+        Tensors, with the info and the ns that the env took, are given to `store`.
+        """
         slab, row, writer, clock = self._slab, self._row, self._writer, time.monotonic_ns
 
         def execute() -> OutOfBand | None:
             began = clock()
             observation, info = reset(seed=slab.take_seed(row), options=None)
             done = clock()
+            if type(observation) is not np.ndarray and holds_tensor(observation):
+                return store(observation, info, done - began)
             slab.flags[row] = False
             slab.is_reset[row] = True
             slab.reward[row] = slab.episode_return[row] = 0.0

@@ -77,6 +77,8 @@ class RowWriter:
         infos = InfoWriter(memoryview(slab.info[row]), announce)
         self.write_info, self.read_info = infos.write, infos.read
         self.out_of_band: OutOfBand = {}
+        self._whole: Any = None
+        self._whole_since = 0
         # With an ellipsis, an element of a plain column is a view, too.
         self._reward, self._flags = slab.reward[row, ...], slab.flags[row, ...]
         self._terminated, self._truncated = slab.terminated[row, ...], slab.truncated[row, ...]
@@ -103,7 +105,17 @@ class RowWriter:
     def write_ends(
         self, reward: Any, terminated: Any, truncated: Any, info: Mapping[str, Any]
     ) -> None:
-        """Write reward and ends, in the shape of the row, and add the step to the sums."""
+        """Write reward and ends, and add the step to the sums.
+
+        They may be tensors, dicts by agent, or have an extra axis of length one. Values that a
+        result leaves out (0.0 and False, a dict without agents) apply to all.
+
+        Raises:
+            ValueError: a shape doesn't fit; nothing was written.
+        """
+        reward = self._checked("reward", reward)
+        terminated = self._checked("terminated", terminated)
+        truncated = self._checked("truncated", truncated)
         self._reward[...] = reward
         self._terminated[...] = terminated
         self._truncated[...] = truncated
@@ -129,23 +141,10 @@ class RowWriter:
         slab.episode_length[row] = sums.lengths[which]
         slab.over[row] = sums.over[which]
 
-    def checked_ends(self, reward: Any, terminated: Any, truncated: Any) -> tuple[Any, Any, Any]:
-        """Return reward and ends in the shape of the row.
-
-        They may be tensors, dicts by agent, or have an extra axis of length one. Values that a
-        result leaves out (0.0 and False, a dict without agents) apply to all.
-
-        Raises:
-            ValueError: a shape doesn't fit.
-        """
-        return (
-            self._checked("reward", reward),
-            self._checked("terminated", terminated),
-            self._checked("truncated", truncated),
-        )
-
     def _checked(self, what: str, value: Any) -> Any:
         layout = self._slab.layout
+        if type(value) is np.ndarray and value.shape == layout.head:
+            return value
         if type(value) in (float, bool) and not (value and layout.head):
             return value
         if layout.agents and isinstance(value, dict) and not value:
@@ -202,6 +201,17 @@ class RowWriter:
         observation = fitted_tree(space, observation, "observation")
         self.out_of_band = {"observation": observation, "info": info}
         return self.out_of_band
+
+    def hand_over_whole(self, result: Any) -> OutOfBand:
+        """Return a result for the trainer to use without a copy; its times are in the row."""
+        self._whole, self._whole_since = result, int(self._slab.done_ns[self._row])
+        return {"ret": result}
+
+    @property
+    def whole(self) -> Any:
+        """The last result if it was handed over whole, otherwise None."""
+        # Not every path to the row passes here, but all of them write their times.
+        return self._whole if self._slab.done_ns[self._row] == self._whole_since else None
 
     def keep(self, out_of_band: OutOfBand) -> OutOfBand:
         """Return `out_of_band` for the trainer to keep; pickling copies it for other processes."""

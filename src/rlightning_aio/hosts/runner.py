@@ -11,6 +11,9 @@ import time
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import numpy as np
+
+from rlightning_aio.envs.base import result_of
 from rlightning_aio.envs.results import (
     has_preprocess_fn,
     input_of,
@@ -88,6 +91,7 @@ class EnvRunner:
         self.env = env
         self.meta: EnvMeta = env.initialised()
         self._inline = inline
+        self._hands_over_tensors = False
         self.step: Execute = self._not_attached
         self.begin_step: Callable[[], Execute] | None = None
         self._step_with: StepWith
@@ -149,6 +153,7 @@ class EnvRunner:
             self._read_action = row_reader(layout.action_space, slab.action, row)
         # There is a short way, which writes behind the back of the writer.
         self._has_short_way = False
+        self._send_checkpoint = send_checkpoint
         self._bind(layout, send_checkpoint)
         if self._camera is not None:
             self._start_filming(self._camera)
@@ -223,6 +228,9 @@ class EnvRunner:
     def _start_filming(self, camera: Camera) -> None:
         """Have the camera see each result."""
         camera.watch(self._slab, self._row, self.meta.autoreset, self.meta.max_episode_steps)
+        self._film(camera)
+
+    def _film(self, camera: Camera) -> None:
         self._unfilmed = self.step, self._reset_env, self.begin_step
         self.step = followed(self.step, camera.see)
         self._reset_env = followed(self._reset_env, camera.see)
@@ -237,7 +245,8 @@ class EnvRunner:
             return self._plain_stepper(get_input)
         halves = self.env.bare_step_async()
         single = not layout.head and self.meta.autoreset in ("disabled", "same_step")
-        if single and halves is None and self._writer.write_observation is not None:
+        single = single and halves is None and not self._hands_over_tensors
+        if single and self._writer.write_observation is not None:
             return self._short_stepper(bare, get_input, self._writer.write_observation)
         store, clock = self._bare_store(layout), time.monotonic_ns
         if halves is not None:
@@ -284,7 +293,7 @@ class EnvRunner:
         short = ShortWay(self._slab, self._row, self._writer, resets_itself=resets_itself)
         bare_reset = self.env.bare_reset()
         if bare_reset is not None:
-            reset = short.resetter(bare_reset, write_observation)
+            reset = short.resetter(bare_reset, write_observation, self._store_reset)
             self._reset_env = followed(reset, self._checkpoints.note_result)
         return short.stepper(bare, get_input, write_observation)
 
@@ -292,11 +301,14 @@ class EnvRunner:
         """Return a function that puts a bare result, and the ns it took, into the row."""
         writer, slab, row, clock = self._writer, self._slab, self._row, time.monotonic_ns
         done_times, busy_times = view(slab.done_ns), view(slab.busy_ns)
+        env_id = self.env.env_id
         # Not copied: `fresh_results` says that the env doesn't use these arrays again.
         store_data = writer.hand_over if layout.observations_out_of_band else writer.write_data
 
         def store(result: BareResult, busy_ns: int) -> OutOfBand | None:
             observation, reward, terminated, truncated, info = result
+            if type(observation) is not np.ndarray and holds_tensor(observation):
+                return self._store(result_of(env_id, result), busy_ns, stepped=True)
             done_times[row] = clock()
             busy_times[row] = busy_ns
             writer.write_ends(reward, terminated, truncated, info)
@@ -326,7 +338,10 @@ class EnvRunner:
         """Return the restored result; frames that follow aren't of the episode being filmed."""
         if self._camera is not None:
             self._camera.close()
-        return self._checkpoints.show()
+        out_of_band = self._checkpoints.show()
+        if self._has_short_way and self._writer.whole is not None:
+            self._leave_short_way()
+        return out_of_band
 
     def _reset_from_row(self) -> OutOfBand | None:
         return self._reset(self._slab.take_seed(self._row), None)
@@ -340,6 +355,12 @@ class EnvRunner:
         self._checkpoints.note_result()
         return self._store(one_result(self.env, "reset", returned), busy_ns, stepped=False)
 
+    def _store_reset(
+        self, observation: Any, info: dict[str, Any], busy_ns: int
+    ) -> OutOfBand | None:
+        result = result_of(self.env.env_id, (observation, 0.0, False, False, info))
+        return self._store(result, busy_ns, stepped=False)
+
     def _store(
         self, result: EnvRet | MultiAgentEnvRet, busy_ns: int, *, stepped: bool
     ) -> OutOfBand | None:
@@ -348,20 +369,25 @@ class EnvRunner:
         if self._has_short_way:
             writer.row_changed()
         if stepped:
-            ends = writer.checked_ends(
-                result.last_reward, result.last_terminated, result.last_truncated
-            )
+            ends = result.last_reward, result.last_terminated, result.last_truncated
             writer.write_ends(*ends, result.info)
         else:
             writer.begin_episode(result.info)
         observation = result.observation
-        self._checkpoints.whole = None
         if holds_tensor(observation):
             if self._inline:
-                self._checkpoints.whole = result
-                return {"ret": result}
+                if self._has_short_way:
+                    self._leave_short_way()
+                return writer.hand_over_whole(result)
             observation = as_numpy(observation)
         return writer.write_data(observation, result.info, result._extra)  # pyright: ignore[reportPrivateUsage]
+
+    def _leave_short_way(self) -> None:
+        """Step by `_store` from now on: the results hold tensors, which stay in this process."""
+        self._hands_over_tensors, self._has_short_way = True, False
+        self._bind(self.layout, self._send_checkpoint)
+        if self._camera is not None:
+            self._film(self._camera)
 
 
 _Placed = TypeVar("_Placed", "EnvRunner", "EnvStarted")

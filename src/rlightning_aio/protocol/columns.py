@@ -214,7 +214,7 @@ def fitted(value: Any, leaf: Leaf, what: str) -> NDArray[Any]:
         Misfit: it has another shape, another kind of dtype, or numbers out of range.
     """
     try:
-        array = np.asarray(value)
+        array = as_array(value)
     except ValueError:  # Parts of different shapes.
         array = np.asarray(None)
     if array.shape != leaf.shape or not np.can_cast(array.dtype, leaf.dtype, "same_kind"):
