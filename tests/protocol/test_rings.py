@@ -144,9 +144,10 @@ class RingsMachine(RuleBasedStateMachine):
         self.frames[0] += 1
         assert self.trainer.count_frame() == self.asleep
 
-    @precondition(lambda self: self.frames[0])
+    @precondition(lambda self: self.frames[0] >= 0)
     @rule()
     def see_frame(self) -> None:
+        """Also before it is counted: the trainer counts a frame after it has written it."""
         self.frames[0] -= 1
         self.worker.frame_seen()
 
@@ -158,7 +159,7 @@ class RingsMachine(RuleBasedStateMachine):
     @precondition(lambda self: not self.asleep)
     @rule()
     def fall_asleep(self) -> None:
-        something = bool(self.requested or self.frames[0])
+        something = bool(self.requested or self.frames[0] > 0)
         self.asleep = self.worker.fall_asleep()
         assert self.asleep == (not something)
 
@@ -175,8 +176,8 @@ class RingsMachine(RuleBasedStateMachine):
         assert self.bell.unread() == len(self.reported)
         assert self.bell.with_news() == [0] * bool(self.reported)
         assert self.trainer.has_frame() == (self.frames[1] > 0)
-        assert self.worker.has_frame() == bool(self.frames[0])
-        assert self.worker.has_news() == bool(self.frames[0] or self.requested)
+        assert self.worker.has_frame() == (self.frames[0] > 0)
+        assert self.worker.has_news() == bool(self.frames[0] > 0 or self.requested)
 
 
 def test_rings() -> None:

@@ -771,7 +771,7 @@ run_loop(Loop *loop, const int64_t *requests, Py_ssize_t count)
     int64_t *bell = words_of(&loop->views[LOOP_BELL]);
     uint64_t mask = (uint64_t)length(&loop->views[LOOP_REPORTS]) - 1;
     for (Py_ssize_t k = 0; k < count; k++) {
-        if (load(words + FRAMES_TO_WORKER) != own[FRAMES_SEEN] && called(loop->receive) < 0)
+        if (load(words + FRAMES_TO_WORKER) > own[FRAMES_SEEN] && called(loop->receive) < 0)
             return -1;
         int report = execute_entry(loop, requests[k]);
         if (report < 0)

@@ -435,7 +435,7 @@ def serve(  # noqa: C901  # Calls would slow down every step.
     from_trainer, _, reports, own, bell, counter = side
     mask = len(reports) - 1
     for request in requests:
-        if from_trainer[FRAMES_TO_WORKER] != own[FRAMES_SEEN]:
+        if from_trainer[FRAMES_TO_WORKER] > own[FRAMES_SEEN]:
             receive()
         index = (request >> OP_BITS & SLOT_MASK) - first_slot
         if not own[CAREFUL] and request & OP_MASK == _STEP and 0 <= index < len(steps):

@@ -207,7 +207,7 @@ class WorkerRings:
 
     def has_frame(self) -> bool:
         """Return True if the channel has a frame that `frame_seen` has not counted."""
-        return self._words[FRAMES_TO_WORKER] != self.own[FRAMES_SEEN]
+        return self._words[FRAMES_TO_WORKER] > self.own[FRAMES_SEEN]
 
     def frame_seen(self) -> None:
         """Count a frame that was read from the channel."""
@@ -265,7 +265,7 @@ class WorkerRings:
     def has_news(self) -> bool:
         """Return True if an entry or a frame waits."""
         words, own = self._words, self.own
-        return words[REQUESTS_SENT] != own[TAKEN] or words[FRAMES_TO_WORKER] != own[FRAMES_SEEN]
+        return words[REQUESTS_SENT] != own[TAKEN] or words[FRAMES_TO_WORKER] > own[FRAMES_SEEN]
 
     def fall_asleep(self) -> bool:
         """Publish that this worker sleeps; False if an entry or a frame has just come."""
