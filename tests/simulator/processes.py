@@ -154,8 +154,14 @@ class Process(Living):
     def unwind(self) -> None:
         """Leave all its functions, at the end of the world."""
         self.alive = False
-        with suppress(BaseException):  # Of code that would never have run on.
+        # Whatever is raised comes from code that would never have run on.
+        with suppress(BaseException):
             self._greenlet.throw(Killed)
+        for task in asyncio.all_tasks(self._loop) if self._loop is not None else ():
+            task._log_destroy_pending = False  # pyright: ignore[reportAttributeAccessIssue]
+            with suppress(BaseException):
+                task.get_coro().close()
+            task.get_coro().close()  # The code that cleans up may have awaited something.
 
     # -- faults -------------------------------------------------------------------
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections import Counter
 from contextlib import suppress
 from typing import Any
@@ -38,6 +39,27 @@ class CountingEnv(gym.Env[Any, Any]):
         return self.steps
 
 
+class AwaitableEnv:
+    """The same, whose coroutines take a while."""
+
+    observation_space = CountingEnv.observation_space
+    action_space = CountingEnv.action_space
+
+    def __init__(self) -> None:
+        self.env = CountingEnv()
+
+    async def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        await asyncio.sleep(0.01)
+        return self.env.reset(seed=seed, options=options)
+
+    async def step(self, action: Any) -> Any:
+        await asyncio.sleep(0.01 * action)
+        return self.env.step(action)
+
+    def count(self) -> int:
+        return self.env.steps
+
+
 def config(**fields: Any) -> rl.EnvConfig:
     return rl.EnvConfig(
         name="counting",
@@ -69,18 +91,24 @@ def played(world: World, **fields: Any) -> list[float]:
     return seen
 
 
-async def played_async(world: World, **fields: Any) -> list[float]:
-    """Play with an asynchronous group; return all numbers that were seen."""
+async def played_async() -> list[float]:
+    """Play with envs in workers, and with awaitable ones in a worker and on the loop."""
     seen: list[float] = []
-    async with rl.build_env_group(config(**fields)) as group:
+    two = {"backend": "callable", "make_env": AwaitableEnv, "num_workers": 2}
+    kinds = [
+        config(),
+        rl.EnvConfig(name="in-worker", envs_per_process=2, step_timeout=9.0, **two),
+        rl.EnvConfig(name="on-loop", placement="loop", **two),
+    ]
+    async with rl.build_env_group(kinds) as group:
         batch, _ = await group.reset(seed=5)
-        for _ in range(6):
-            group.step_async(batch.respond(action=np.zeros(len(batch), np.int64)))
+        for k in range(9):
+            group.step_async(batch.respond(action=np.full(len(batch), 2 * (k % 3))))
             batch, _ = await group.collect_async(min_results=2)
             seen += batch.observation.ravel().tolist()
         if group.pending:
             await group.collect_async(wait_all=True)
-        assert await group["counting-1"].call("count") > 0
+        assert await group["in-worker-1"].call("count") > 0
     return seen
 
 
@@ -95,10 +123,13 @@ def test_group_runs_over_simulated_processes(implementation: str) -> None:
 
 
 def test_asynchronous_group_runs_on_the_loop_of_the_world() -> None:
-    for seed in range(5):
+    def trace(seed: int) -> list[str]:
         with World(seed) as world:
-            seen = world.run(played_async(world))
-        assert set(seen[::2]) == {5, 6, 7, 8}
+            assert set(world.run(played_async())[::2]) == set(range(5, 13))
+        return world.trace
+
+    for seed in range(5):
+        assert trace(seed) == trace(seed)
 
 
 STORM = Faults(deaths=0.03, stops=0.02, interrupts=0.02, lags=0.02, starts=0.1, fork_servers=0.02)

@@ -35,7 +35,7 @@ import time
 from collections import Counter
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from random import Random
 from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
 from unittest import mock
@@ -62,6 +62,13 @@ _TICK_NS: Final = 200
 _START_NS: Final = 10**12
 _EPOCH_NS: Final = 1_700_000_000 * 10**9
 _MAX_EVENTS: Final = 2_000_000
+
+
+@cache
+def _freeze() -> None:
+    """Exempt what is there before the first world from garbage collection."""
+    gc.collect()
+    gc.freeze()
 
 
 class Deadlock(AssertionError):
@@ -136,6 +143,13 @@ class World:
     # -- life ---------------------------------------------------------------------
 
     def __enter__(self) -> Self:
+        # No garbage of another world may run any code in this one.
+        _freeze()
+        gc.collect()
+        self._patches.callback(gc.collect)
+        if gc.isenabled():
+            gc.disable()
+            self._patches.callback(gc.enable)
         for target, name, replacement in self._replacements():
             self._patches.enter_context(mock.patch.object(target, name, replacement))
         self._patches.callback(kernel.select, kernel.selected)
