@@ -6,7 +6,8 @@
 The environment (shop.py) asks questions and runs tools; observations and actions are messages.
 Results are collected in batches of whatever is ready, and each environment steps as soon as its
 own reply is there. Each task is played 8 times with the same seed; GRPO compares their rewards.
-The rollouts are written as JSON lines, which docs/agents.md describes.
+A rollout that fails has no reward, and is counted. The rollouts are written as JSON lines, which
+docs/agents.md describes.
 """
 
 from __future__ import annotations
@@ -20,40 +21,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from model import Model
 from openai import AsyncOpenAI
-from openai.lib.streaming.chat import ChatCompletionStreamState
 from shop import TASKS, TOOLS
 
 import rlightning_aio as rl
 
 SEEDS, GROUP_SIZE = 4, 8
-MESSAGE = {"role": True, "content": True, "tool_calls": {"__all__": {"id", "type", "function"}}}
 BLANK = {"prompt": [], "completion": [], "messages": [], "is_truncated": False}
 SCORE = {"reward": 0.0, "advantage": None, "error": None}
 TOKENS = ("prompt_tokens", "completion_tokens", "token_ids", "logprobs")
-
-
-async def ask(client: AsyncOpenAI, messages: list[Any], **request: Any) -> dict[str, Any]:
-    """The columns of one row: the model's message, and what the server says of its tokens."""
-    answer: Any = await client.chat.completions.create(messages=messages, tools=TOOLS, **request)
-    token_ids: list[int] = []
-    if request["stream"]:
-        state = ChatCompletionStreamState()
-        async for chunk in answer:
-            state.handle_chunk(chunk)
-            for choice in chunk.choices:
-                token_ids += getattr(choice, "token_ids", None) or []
-        answer = state.get_final_completion()
-    choice = answer.choices[0]
-    if choice.finish_reason is None:
-        raise ConnectionError("the stream ended before the reply")
-    return {
-        "action": choice.message.model_dump(include=MESSAGE, exclude_none=True),
-        "prompt_tokens": getattr(answer.usage, "prompt_tokens", None),
-        "completion_tokens": getattr(answer.usage, "completion_tokens", None),
-        "token_ids": token_ids or getattr(choice, "token_ids", None),
-        "logprobs": choice.logprobs and [one.logprob for one in choice.logprobs.content or ()],
-    }
+LOST = ("worker_restarted", "session_lost", "client_lost")
+"""Keys of the info of an episode that did not end by itself; the values say why."""
 
 
 async def play(group: rl.EnvGroup, policy: Any, rollouts: dict[str, dict[str, Any]]) -> None:
@@ -63,10 +42,9 @@ async def play(group: rl.EnvGroup, policy: Any, rollouts: dict[str, dict[str, An
     async def answer(row: rl.BatchedData) -> None:
         try:
             reply = await policy(row.observation[0])
-        except Exception as error:  # noqa: BLE001  # Whatever a server does ends one episode.
-            rollouts[row.ids()[0]]["error"] = repr(error)
-        else:
             group.step_async(row.respond(**{name: [value] for name, value in reply.items()}))
+        except Exception as error:  # noqa: BLE001  # Whatever a server does ends one episode.
+            fail(rollouts[row.ids()[0]], repr(error))
 
     async with asyncio.TaskGroup() as tasks:
         while True:
@@ -78,11 +56,17 @@ async def play(group: rl.EnvGroup, policy: Any, rollouts: dict[str, dict[str, An
                     return
                 await asyncio.wait(thinking, return_when=asyncio.FIRST_COMPLETED)
                 continue
-            except rl.EnvRaised as error:
-                rollouts[error.env_id]["error"] = str(error)
+            except rl.EnvFault as error:
+                for env_id in getattr(error, "env_ids", (error.env_id,)):
+                    fail(rollouts[env_id], str(error))
                 continue
+            infos = batch.info()
             for k, env_id in enumerate(batch.ids()):
-                add(rollouts[env_id], batch, k)
+                causes = [infos[k][key] for key in LOST if key in infos[k]]
+                if causes:
+                    fail(rollouts[env_id], causes[0])
+                else:
+                    add(rollouts[env_id], batch, k)
                 if not batch.done[k]:
                     thinking.add(task := tasks.create_task(answer(batch.take([k]))))
                     task.add_done_callback(thinking.discard)
@@ -90,12 +74,9 @@ async def play(group: rl.EnvGroup, policy: Any, rollouts: dict[str, dict[str, An
 
 def add(rollout: dict[str, Any], batch: rl.BatchedData, k: int) -> None:
     """Add a row to its rollout."""
-    if batch.restarted[k]:  # The environment took too long, and was replaced.
-        rollout["error"] = batch.info()[k]["worker_restarted"]
-        return
-    rollout["messages"] = batch.observation[k]
+    rollout["messages"] = messages_of(batch.observation[k])
     if batch.is_reset[k]:
-        rollout["prompt"] = batch.observation[k]
+        rollout["prompt"] = rollout["messages"]
         return
     rollout["completion"] = rollout["messages"][len(rollout["prompt"]) :]
     rollout["reward"] += float(batch.reward[k])
@@ -104,8 +85,27 @@ def add(rollout: dict[str, Any], batch: rl.BatchedData, k: int) -> None:
         rollout[name].append(batch.sent[name][k])
 
 
+def fail(rollout: dict[str, Any], cause: str) -> None:
+    """End a rollout without a reward: what it earned so far says nothing about the model."""
+    rollout["error"], rollout["reward"] = cause, None
+
+
+def messages_of(observation: Any) -> Any:
+    """An OpenEnv server sends them as a field."""
+    return observation["observation"] if isinstance(observation, dict) else observation
+
+
+async def over_openenv(model: Model, observation: Any) -> dict[str, Any]:
+    """The columns of a row whose action is a field, too."""
+    reply = await model(messages_of(observation))
+    return {**reply, "action": {"action": reply["action"]}}
+
+
 def compare(group: list[dict[str, Any]]) -> None:
-    """GRPO's advantage: the reward minus the mean of the group, over the standard deviation."""
+    """GRPO's advantage: the reward minus the mean of the group, over the standard deviation.
+
+    Rollouts that failed have none, and count neither for the mean nor for the deviation.
+    """
     whole = [rollout for rollout in group if rollout["error"] is None]
     rewards = np.array([rollout["reward"] for rollout in whole])
     for rollout in whole:
@@ -119,29 +119,36 @@ async def main() -> None:
     parser.add_argument("--stream", action="store_true", help="have the replies streamed")
     parser.add_argument("--body", type=json.loads, help="further fields of requests, as JSON")
     parser.add_argument("--out", type=Path, default=Path("rollouts.jsonl"))
+    parser.add_argument("--patience", type=float, default=600.0, help="seconds for a server away")
+    parser.add_argument("--openenv", metavar="URL", help="OpenEnv server of the environment")
     args = parser.parse_args()
     key = os.environ.get("OPENAI_API_KEY", "none")
-    client = AsyncOpenAI(base_url=args.base_url, api_key=key, max_retries=5)
+    client = AsyncOpenAI(base_url=args.base_url, api_key=key, max_retries=0)
     request = {"model": args.model, "stream": args.stream, "extra_body": args.body}
     if args.stream:
         request["stream_options"] = {"include_usage": True}
+    model: Any = Model(client, args.patience, **request)
     jobs = [(task, seed) for task in TASKS for seed in range(SEEDS) for _ in range(GROUP_SIZE)]
     entry = {"name": "shop", "backend": "shop", "task": "-", "num_workers": len(jobs)}
-    where = {"placement": "loop", "step_timeout": 60}
-    async with client, rl.build_env_group(entry | where) as group:
+    entry |= {"placement": "loop", "step_timeout": 60}
+    if args.openenv is not None:
+        entry |= {"backend": "openenv", "task": args.openenv}
+        entry |= {"env_kwargs": {"truncated_field": "truncated"}}
+        model = partial(over_openenv, model)
+    async with client, rl.build_env_group(entry) as group:
         rollouts: dict[str, dict[str, Any]] = {}
         for env_id, (task, seed) in zip(group.env_ids, jobs, strict=True):
             tokens: dict[str, Any] = {name: [] for name in TOKENS}
             rollouts[env_id] = {"task": task, "seed": seed, **BLANK, **SCORE, **tokens}
             group.reset_async({env_id: seed}, {"task": task}, [env_id])
-        await play(group, partial(ask, client, **request), rollouts)
+        await play(group, model, rollouts)
     lines = list(rollouts.values())
     for first in range(0, len(lines), GROUP_SIZE):
         compare(lines[first : first + GROUP_SIZE])
     with args.out.open("w") as file:
         file.writelines(json.dumps(line | {"tools": TOOLS}) + "\n" for line in lines)
     failed = [line["error"] for line in lines if line["error"]]
-    right = sum(line["reward"] for line in lines)
+    right = sum(line["reward"] or 0.0 for line in lines)
     print(f"{len(lines)} episodes, {right:.0f} right, {len(failed)} failed", *failed[:1], sep=": ")
 
 

@@ -28,17 +28,21 @@ class ChatServer:
 
     Args:
         gate: no request is answered before this many are open at once.
+        outage: what becomes of the first requests: a status, or "cut off".
+        lasts: of so many.
 
     Attributes:
         requests: all bodies, in order.
         most: how many requests were open at once, at most.
+        may_answer: set when that many were; whoever sets it opens the gate.
     """
 
-    def __init__(self, gate: int) -> None:
+    def __init__(self, gate: int, outage: str = "", lasts: int = 0) -> None:
         self.requests: list[dict[str, Any]] = []
         self.most = 0
+        self.may_answer = asyncio.Event()
         self._open = 0
-        self._gate, self._all_here = gate, asyncio.Event()
+        self._gate, self._outage, self._lasts = gate, outage, lasts
         self._begun: dict[str, int] = defaultdict(int)
         self._failed: set[tuple[str, int]] = set()
         app = web.Application()
@@ -56,12 +60,14 @@ class ChatServer:
     async def _complete(self, request: web.Request) -> web.StreamResponse:
         body = await request.json()
         self.requests.append(body)
+        if len(self.requests) <= self._lasts:
+            return await failure(self._outage, request, body)
         self._open += 1
         self.most = max(self.most, self._open)
         if self._open >= self._gate:
-            self._all_here.set()
+            self.may_answer.set()
         try:
-            await self._all_here.wait()
+            await self.may_answer.wait()
             if request.headers.get("Authorization") != f"Bearer {KEY}":
                 return error_reply(401)
             return await self._answer(request, body)
@@ -209,13 +215,13 @@ async def send(response: web.StreamResponse, event: dict[str, Any]) -> None:
 
 
 def error_reply(status: int) -> web.Response:
-    """An error as OpenAI sends them; it asks the client to try again almost at once."""
+    """An error as OpenAI sends them."""
     error = {"message": f"It is a {status}.", "type": "error", "param": None, "code": None}
-    return web.json_response({"error": error}, status=status, headers={"retry-after-ms": "1"})
+    return web.json_response({"error": error}, status=status, headers={"retry-after": "0.01"})
 
 
 async def failure(script: str, request: web.Request, body: dict[str, Any]) -> web.StreamResponse:
-    if script in ("429", "500", "always 500"):
+    if script[-3:].isdecimal():
         return error_reply(int(script[-3:]))
     if script == "no JSON":
         return web.Response(text="<html>Bad gateway</html>", content_type="text/html")

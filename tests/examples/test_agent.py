@@ -9,15 +9,20 @@ import os
 import re
 import sys
 from collections import Counter
+from datetime import UTC, datetime, timedelta
+from email.utils import format_datetime
 from itertools import groupby
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
+import openai
 import pytest
 from examples.chat_server import KEY, ChatServer
 from run_python import output_of
 
 import rlightning_aio as rl
+from rlightning_aio.serving import OpenEnvServer
 from rlightning_aio.spaces import Anything
 
 if TYPE_CHECKING:
@@ -31,8 +36,6 @@ ERRORS = {
     "AttributeError": "no JSON",
     "AssertionError": "no JSON",
     "TypeError": "no choices",
-    "APIConnectionError": "cut off",
-    "ConnectionError": "no end",
     "env ": "no id",
 }
 """What the server did, by the beginning of what the program reports."""
@@ -47,8 +50,9 @@ async def run_agent(url: str, *options: str | Path) -> str:
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE,
     )
-    printed, complaints = await process.communicate()
-    assert process.returncode == 0, complaints.decode()
+    printed, written = await process.communicate()
+    assert process.returncode == 0, written.decode()
+    complaints = [line for line in written.decode().splitlines() if not line.startswith("http")]
     assert not complaints
     return printed.decode()
 
@@ -93,13 +97,13 @@ def test_64_concurrent_episodes_become_groups_of_rollouts(stream: bool, tmp_path
     """Of eight each; whatever the server does ends one episode at most."""
     out = tmp_path / "rollouts.jsonl"
     options = ["--body", '{"logprobs": true, "return_token_ids": true}', "--out", out]
+    options += ["--patience", "1"]
 
     async def played() -> ChatServer:
         async with ChatServer(gate=64) as server:
             printed = await run_agent(server.url, *options, *["--stream"] * stream)
-            # The client repeats a request for which nothing was sent yet; a stream has begun.
-            counts = "24 right, 24 failed: " if stream else "28 right, 20 failed: "
-            assert printed.startswith(f"64 episodes, {counts}")
+            # Of eight, one is refused once, one fails once and two break off; all are asked again.
+            assert printed.startswith("64 episodes, 32 right, 16 failed: ")
         return server
 
     # In asyncio's debug mode the server would take most of the time.
@@ -119,12 +123,11 @@ def test_64_concurrent_episodes_become_groups_of_rollouts(stream: bool, tmp_path
         assert found == {(1.0, False): 4, (0.0, False): 3, (0.0, True): 1}
         for line in group:
             assert line["advantage"] == pytest.approx(2 * line["reward"] - 1, abs=1e-3)
-    cut_off = "cut off" if stream else None
-    fates = {"always 500", "no JSON", "no choices", "no end", "no id", cut_off, None}
+    fates = {"always 500": 1, "no JSON": 1, "no choices": 1, "no id": 1, None: 4}
     for group in groups[4:]:
-        assert {failure(line) for line in group} == fates
+        assert Counter(failure(line) for line in group) == fates
         for line in group:
-            assert line["reward"] == float(line["error"] is None)
+            assert line["reward"] == (1.0 if line["error"] is None else None)
             assert line["advantage"] == (0.0 if line["error"] is None else None)
 
 
@@ -168,12 +171,115 @@ async def test_an_environment_that_hangs_ends_one_episode(agent: ModuleType) -> 
         }
         group.reset_async()
         await agent.play(group, policy, rollouts)
-    ends = sorted((rollout["reward"], str(rollout["error"])) for rollout in rollouts.values())
-    assert ends == [
-        (0.0, "RuntimeError('no model')"),
-        (0.0, "hung in a step and was cancelled"),
-        (1.0, "None"),
-    ]
+    ends = {rollout["error"]: rollout["reward"] for rollout in rollouts.values()}
+    assert ends == {
+        "RuntimeError('no model')": None,
+        "hung in a step and was cancelled": None,
+        None: 1.0,
+    }
+
+
+def test_a_lost_server_of_environments_is_no_reward(tmp_path: Path) -> None:
+    """Every rollout fails: it has neither a reward nor an advantage, and is counted."""
+    out = tmp_path / "rollouts.jsonl"
+    shops = {"name": "shop", "backend": "shop", "task": "-", "num_workers": 64}
+
+    async def played() -> str:
+        async with (
+            ChatServer(gate=65) as chat,
+            rl.build_env_group({**shops, "imports": ["shop"], "placement": "loop"}) as group,
+        ):
+            async with OpenEnvServer(group, "shop", "127.0.0.1", 0) as server:
+                printing = asyncio.create_task(
+                    run_agent(chat.url, "--openenv", server.url, "--out", out)
+                )
+                while chat.most < 64 and not printing.done():  # noqa: ASYNC110
+                    await asyncio.sleep(0.01)
+            chat.may_answer.set()
+            return await printing
+
+    printed = asyncio.run(played(), debug=False)
+    assert printed.startswith("64 episodes, 0 right, 64 failed: http://127.0.0.1:")
+    for line in map(json.loads, out.read_text().splitlines()):
+        assert "was lost" in line["error"]
+        assert (line["reward"], line["advantage"]) == (None, None)
+
+
+def test_environments_of_a_server_are_played_as_those_here(tmp_path: Path) -> None:
+    """Their messages and actions are fields."""
+    out = tmp_path / "rollouts.jsonl"
+    shops = {"name": "shop", "backend": "shop", "task": "-", "num_workers": 64}
+
+    async def played() -> str:
+        async with (
+            ChatServer(gate=64) as chat,
+            rl.build_env_group({**shops, "imports": ["shop"], "placement": "loop"}) as group,
+            OpenEnvServer(group, "shop", "127.0.0.1", 0) as server,
+        ):
+            options = ["--openenv", server.url, "--patience", "1", "--out", out]
+            return await run_agent(chat.url, *options)
+
+    assert asyncio.run(played(), debug=False).startswith("64 episodes, 32 right, 16 failed: ")
+    for line in map(json.loads, out.read_text().splitlines()):
+        check_messages(line)
+
+
+@pytest.mark.parametrize("outage", ["429", "503", "cut off"])
+def test_an_outage_of_the_model_loses_no_episode(
+    outage: str,
+    agent: ModuleType,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Every request fails eight times; a line says that the server is away, one that it is back."""
+    monkeypatch.setattr("agent.SEEDS", 1)
+    monkeypatch.setattr("model.PAUSES", (0.001, 0.01))
+    monkeypatch.setattr("model.QUIET", 0.0)
+    monkeypatch.setenv("OPENAI_API_KEY", KEY)
+
+    async def played() -> None:
+        async with ChatServer(16, outage, lasts=16 * 8) as server:
+            options = [
+                "--base-url",
+                server.url,
+                "--model",
+                "scripted",
+                "--out",
+                str(tmp_path / "o"),
+            ]
+            monkeypatch.setattr(sys, "argv", ["agent.py", *options, "--patience", "1000"])
+            # The server that fails always is not away, so its conversations are right, too.
+            monkeypatch.setattr("examples.chat_server.FAULTS", ("429",) * 8)
+            await agent.main()
+
+    asyncio.run(played(), debug=False)
+    assert capsys.readouterr().out == "16 episodes, 12 right, 0 failed\n"
+    away, back = [record.getMessage() for record in caplog.records if record.name == "model"][:2]
+    assert re.search(r"has not answered since \d\d:\d\d:\d\d \(.+\); .* for up to 1000 s", away)
+    assert "answers again, after" in back
+
+
+def test_a_request_is_sent_again_when_the_server_says_and_not_if_it_is_wrong(
+    agent: ModuleType,
+) -> None:
+    del agent  # It is found on the same path.
+    model = importlib.import_module("model")
+
+    def after(status: int, **headers: str) -> float | None:
+        named = {name.replace("_", "-"): value for name, value in headers.items()}
+        response: Any = SimpleNamespace(status_code=status, headers=named, request=None)
+        error = openai.APIStatusError("no", response=response, body=None)
+        return model.pause_before_next(error, 1.0)
+
+    date = format_datetime(datetime.now(UTC) + timedelta(hours=1), usegmt=True)
+    assert after(429, retry_after="7.5") == 7.5
+    assert 3500 < (after(503, retry_after=date) or 0) <= 3600
+    for status, asked in ((429, "0.1"), (500, "soon"), (503, "nan")):
+        assert 0.5 <= (after(status, retry_after=asked) or 0) <= 1
+    assert 0.5 <= model.pause_before_next(ConnectionError(), 1.0) <= 1
+    assert after(400) is after(401, retry_after="1") is None
 
 
 def test_the_program_with_aiohttp_of_the_page_on_own_envs(tmp_path: Path) -> None:
