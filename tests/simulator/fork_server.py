@@ -13,7 +13,7 @@ import traceback
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from simulator.processes import Living, Process
+from simulator.processes import Killed, Living, Process
 
 from rlightning_aio.hosts.arena import map_shared
 from rlightning_aio.hosts.fork_messages import (
@@ -104,7 +104,7 @@ class ForkServer(Living):
         self._world.note("{} ends with {}", self.name, code)
         self._trainer.close()
         for worker, channel in list(self._children.values()):
-            self._world.sockets.close_if_open(channel)
+            self._world.sockets.close_descriptor(channel)
             worker.end(-signal.SIGKILL)
 
     def wake(self) -> None:
@@ -156,7 +156,7 @@ class ForkServer(Living):
     def _report_exit(self, host_id: int, code: int, stderr: str) -> None:
         _, channel = self._children.pop(host_id)
         self._trainer.send(Exited(host_id, code, stderr))
-        self._world.sockets.close_if_open(channel)
+        self._world.sockets.close_descriptor(channel)
 
     def _leave(self) -> None:
         """End, as the trainer has closed the socket or is gone: first the workers, in time."""
@@ -175,8 +175,6 @@ class ForkServer(Living):
 
 def new_worker(world: World, place: WorkerPlace, channel: int, arena: int, on_exit: Any) -> Process:
     """Fork the worker of `place`."""
-    from simulator.world import Killed, Process  # They import each other.
-
     sockets = world.sockets
 
     def main() -> int:
@@ -193,14 +191,10 @@ def new_worker(world: World, place: WorkerPlace, channel: int, arena: int, on_ex
             return 1
         return 0
 
-    def close() -> None:
-        sockets.close_if_open(channel)
-        sockets.close_if_open(arena)
-
     name = f"worker {place.host_id}"
     process = Process(world, name, main, on_exit)
     world.note("{} is forked", name)
     sockets.by_number[channel].end.name = name
-    process.on_close = close
+    process.descriptors = {channel, arena}
     sockets.by_number[channel].end.holders.append(process)
     return process

@@ -81,7 +81,7 @@ class Process(Living):
 
     Attributes:
         stderr: what it has written there.
-        on_close: closes what it has open, when it ends.
+        descriptors: that it has open.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class Process(Living):
     ) -> None:
         super().__init__(world, name)
         self.stderr = ""
-        self.on_close: Callable[[], object] = lambda: None
+        self.descriptors: set[int] = set()
         self._main = main
         self._on_exit = on_exit
         self._greenlet = greenlet.greenlet(self._run)
@@ -155,6 +155,8 @@ class Process(Living):
         """Leave all its functions, at the end of the world."""
         self.alive = False
         # Whatever is raised comes from code that would never have run on.
+        if self._loop is not None:
+            self._loop.set_exception_handler(lambda *_: None)
         with suppress(BaseException):
             self._greenlet.throw(Killed)
         for task in asyncio.all_tasks(self._loop) if self._loop is not None else ():
@@ -184,7 +186,9 @@ class Process(Living):
         world.counts["deaths" if code else "exits"] += 1
         world.deaths[self.name] += code != 0
         world.note("{} ends with {}", self.name, code)
-        self.on_close()
+        for descriptor in self.descriptors.copy():
+            world.sockets.close_descriptor(descriptor)
+        self.descriptors.clear()
         self._on_exit(code, self.stderr)
         if world.running is self:
             self._give_up_core()
@@ -192,6 +196,9 @@ class Process(Living):
 
 class Nobody:
     """Runs in events of the world, in which nothing else happens and nothing takes time."""
+
+    def __init__(self) -> None:
+        self.descriptors: set[int] = set()
 
     def point(self) -> None: ...
 

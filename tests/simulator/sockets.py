@@ -99,16 +99,14 @@ class Sockets:
 
     def close_descriptor(self, descriptor: int) -> None:
         """See `os.close`."""
+        running = self._world.running
+        if running is not None:
+            running.descriptors.discard(descriptor)
         if descriptor >= _FIRST_DESCRIPTOR:
             self.by_number[descriptor].close()
             return
         self._real.discard(descriptor)
         _close(descriptor)
-
-    def close_if_open(self, descriptor: int) -> None:
-        """Close a descriptor of a process that has ended."""
-        if descriptor in self._real or descriptor in self.by_number:
-            self.close_descriptor(descriptor)
 
     @staticmethod
     def set_inheritable(descriptor: int, inheritable: bool) -> None:
@@ -153,7 +151,7 @@ class SimulatedSocket:
         if end.packets:  # Descriptors on the way to it are closed.
             for _, passed in end.received:
                 for descriptor in passed:
-                    self._world.sockets.close_if_open(descriptor)
+                    self._world.sockets.close_descriptor(descriptor)
 
     def shutdown(self, how: int) -> None:
         del how

@@ -157,7 +157,7 @@ class World:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self.ended = True
+        self.ended, self._until_point = True, 0
         for process in self._processes:
             process.unwind()
         self._patches.close()
@@ -336,9 +336,9 @@ class World:
         self._until_point -= 1
         if self._until_point > 0:
             return
-        self._until_point = self.rng.randrange(1, 2 * self._pieces)
         if self.ended:
             raise Killed
+        self._until_point = self.rng.randrange(1, 2 * self._pieces)
         if self.running is not None:
             self.running.point()
             return
