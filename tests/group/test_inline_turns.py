@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections import Counter
+from typing import Any
 
 import numpy as np
 import pytest
+from group.conftest import INLINE, INLINE_SYNC, Place
 
 import rlightning_aio
 import rlightning_aio.sync
@@ -55,3 +58,32 @@ async def test_a_cancelled_call_that_still_waits_for_its_turn_delays_no_request(
         assert await group["pole-0"].get_attr("gravity") == 1.0
         batch, _ = await group.collect_async()
         assert batch.ids() == ["pole-1"]
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize(
+    ("place", "calls"),
+    [(INLINE, "call_async"), (INLINE, "a handle"), (INLINE_SYNC, "call_async")],
+)
+async def test_a_call_delays_no_ordinary_step_on_one_core(
+    place: Place, calls: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is executed in its turn, though a trainer that has no core to spare never looks around."""
+    monkeypatch.setattr("rlightning_aio.group.build.num_cores", lambda: 1)
+    entry = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1", "num_workers": 2}
+    async with place.build(entry) as group:
+        for _ in range(12):  # As many batches as are compared with their spaces, and more.
+            batch, _ = await group.reset(seed=0)
+        core: Any = getattr(group, "wrapped", group)._core
+        assert not core.parts.tables.conditions.active
+        core.supervisor.look_by = math.inf
+        if calls == "call_async":
+            group.call_async("get_attr", "gravity", env_ids=["pole-0"])
+            values = None
+        else:
+            values = asyncio.create_task(group["pole-0"].get_attr("gravity"))
+            await asyncio.sleep(0)
+        group.step_async(batch.take([1]).respond(action=[0]))
+        batch, _ = await group.collect_async()
+        assert batch.ids() == ["pole-1"]
+        assert (await group.collect_calls() if values is None else [await values]) == [9.8]

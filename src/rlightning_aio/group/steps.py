@@ -310,7 +310,12 @@ class Steps:
             return
         waiting, supervisor, in_flight = self._waiting, self._supervisor, self._requests.in_flight
         at_work = len(in_flight) - in_flight.count(0)
-        if at_work < self._poller.num_cores or supervisor.detector.timed or not at_work:
+        if (
+            at_work < self._poller.num_cores
+            or supervisor.detector.timed
+            or not at_work
+            or self._inline is not None  # It rings no bell; what is next there is a call.
+        ):
             yield from waiting.turn(wanted, None)
             return
         all_wanted = waiting.wanted
