@@ -449,7 +449,7 @@ class FakeGroup:
         )
         poller = Poller(requests, bell, 0, clock=lambda: self.now)
         rings: list[Ring | None] = [None] * len(rows)
-        shared = Shared(completions, arena, bell, bell_memory, rings, len(rows))
+        self.shared = shared = Shared(completions, arena, bell, bell_memory, rings, len(rows))
         self.hosts: list[Any] = []
         for host_id, count in enumerate(rows):
             kind = FakeInline if inline and inline[host_id] else FakeWorker

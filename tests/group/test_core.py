@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from typing import TYPE_CHECKING, Any
+from unittest.mock import Mock
 
 import pytest
 from group.fake_host import PLAIN, RAISES, FakeGroup
@@ -12,12 +13,15 @@ from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import (
     BadAction,
     EnvBusy,
+    EnvFault,
+    EnvHung,
     EnvRaised,
     GroupClosed,
     NothingPending,
     WorkerDied,
 )
 from rlightning_aio.group.wait import CollectRules
+from rlightning_aio.hosts.messages import Failed, Withdrawn
 from rlightning_aio.types import PolicyResponse
 
 if TYPE_CHECKING:
@@ -328,11 +332,88 @@ def test_a_worker_that_dies_at_any_moment_of_a_restore_leaves_the_others_as_they
         assert batch.observation[:, 3].tolist() == [0 if slot in dead else 4]
 
 
+def test_requests_that_show_a_restored_state_are_as_old_as_they_are(new_group: NewGroup) -> None:
+    """Not as old as the call, which has waited for two replies of each env before."""
+    group = new_group(2)
+    run(group, group.core.reset(group.now, None, None, None))
+    snapshot = run(group, group.core.snapshot(group.now, None))
+    restoring = group.begin(group.core.restore(group.now, snapshot, None))
+    for _ in ("snapshot", "restore", "show"):
+        assert group.core.requests.sent_ns.tolist() == [int(group.now * 1e9)] * 2
+        group.pass_time(1.0)
+        group.finish(0)
+        group.finish(1)
+    restoring.result()
+
+
+@pytest.mark.parametrize("kind", [Failed, Withdrawn])
+def test_an_env_whose_marked_reset_did_not_come_is_reset_with_the_others(
+    new_group: NewGroup, kind: type[Any]
+) -> None:
+    """Whatever ended the request that was to report its loss."""
+    group = new_group(1, 1)
+    run(group, group.core.reset(group.now, None, None, None))
+    die(group, 0)
+    stepping = group.begin(group.steps.step(steps(0), group.now))
+    host, entry = group.hosts[0], group.core.requests.numbering.entry.item(0)
+    host.waiting.clear()
+    fault = EnvHung("it hangs", env_id="fake-0", exit_code=None, stderr_tail="")
+    host.answer(Failed(0, entry, fault) if kind is Failed else Withdrawn(0, entry))
+    group.turn()
+    with pytest.raises(EnvFault):
+        stepping.result()
+    batch, _ = run(group, group.core.reset(group.now, None, None, None))
+    assert batch.ids() == ["fake-0", "fake-1"]
+    assert not batch.restarted.any()
+
+
+@pytest.mark.parametrize("ordinary", [True, False])
+@pytest.mark.parametrize("ask", ["step", "step_async", "reset", "snapshot", "call_async"])
+def test_requests_that_were_sent_in_part_disturb_no_other_call(
+    new_group: NewGroup, ask: str, ordinary: bool
+) -> None:
+    """Their results are left to the collector; the value of a call is dropped."""
+    group = new_group(1, 1, 1)
+    if ordinary:
+        group.expect_ordinary_steps()
+    core = group.core
+    batch, _ = run(group, core.reset(group.now, None, None, None))
+    both = batch.take([0, 1]).respond(action=[PLAIN] * 2)
+    ids = ["fake-0", "fake-1"]
+    asked: dict[str, Callable[[], Any]] = {
+        "step": lambda: group.begin(group.steps.step(both, group.now)).result(),
+        "step_async": lambda: group.steps.step_async(both, group.now),
+        "reset": lambda: group.begin(core.reset(group.now, None, None, ids)).result(),
+        "snapshot": lambda: group.begin(core.snapshot(group.now, ids)).result(),
+        "call_async": lambda: core.calls.call_async(group.now, ids, ("who", (), {})),
+    }
+    host: Any = group.hosts[1]
+    with pytest.MonkeyPatch.context() as patch:
+        broken = Mock(side_effect=OSError("no buffer space"))
+        patch.setattr(host, "submit", broken)
+        patch.setattr(host, "take_requests", broken)
+        group.shared.rings[1] = host.rings.ring(broken)
+        with pytest.raises(OSError, match="no buffer space"):
+            asked[ask]()
+    stepping = group.begin(group.steps.step(steps(2), group.now))
+    group.finish(0)
+    assert not stepping.done
+    group.finish(2)
+    assert ids_of(stepping) == ["fake-2"]
+    if ask in ("snapshot", "call_async"):
+        group.steps.step_async(steps(0), group.now)
+        group.finish(0)
+    assert ids_of(collect(group)) == ["fake-0"]
+    with pytest.raises(NothingPending):
+        group.begin(core.calls.collect_calls(group.now, None)).result()
+
+
 def run(group: FakeGroup, procedure: Any) -> Any:
     """Run a procedure, and have its requests executed."""
     running = group.begin(procedure)
     while not running.done:
-        group.finish(next(host.first_slot for host in group.hosts if host.waiting))
+        host = next(host for host in group.hosts if host.waiting)
+        group.finish(host.first_slot + host.waiting[0][0])
     return running.result()
 
 

@@ -433,12 +433,11 @@ class RequestsMachine(RuleBasedStateMachine):
                 self.slots[slot].owner = claim
         self.ask(slots, op, claim)
 
-    @precondition(lambda self: self.those(State.IDLE))
-    @rule(data=st.data())
-    def refuse(self, data: st.DataObject) -> None:
-        """Make a call that sends nothing."""
-        slots = self.some(data, self.those(State.IDLE))
-        self.table.tickets.drop(self.table.tickets.open(np.array(slots)))
+    @rule(data=st.data(), method=st.sampled_from(("", "render")))
+    def refuse(self, data: st.DataObject, method: str) -> None:
+        """Make a call that is refused before it sends anything; the requests of others stay."""
+        slots = self.some(data, list(range(len(self.slots))))
+        self.table.give_up(self.table.tickets.open(np.array(slots), method=method))
 
     @precondition(lambda self: self.those(State.IDLE))
     @rule(data=st.data())

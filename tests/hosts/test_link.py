@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import pickle
 import signal
 import sys
 from collections import deque
 from typing import TYPE_CHECKING, Any
+from unittest.mock import Mock, patch
 
 import numpy as np
 import pytest
@@ -329,6 +331,19 @@ def test_data_that_the_channel_has_no_room_for_is_written_later(started: Scene) 
         assert started.rings.has_frame()
         started.rings.frame_seen()
     assert not started.rings.has_frame()
+
+
+@pytest.mark.parametrize("code", [errno.ENOBUFS, errno.ENOMEM])
+def test_data_that_the_system_has_no_memory_for_is_written_later(started: Scene, code: int) -> None:
+    """A call that has numbered its requests can't take them back."""
+    started.received()
+    link: Any = started.host._link
+    broken = Mock(send=Mock(side_effect=OSError(code, "no memory")))
+    with patch.object(link, "_socket", broken):
+        started.host.submit(steps(1), [b"first", b"second"])
+    assert started.writable == {link}
+    link.on_writable()
+    assert [frame.payload for frame in started.received()] == [b"first", b"second"]
 
 
 def test_catching_up_reads_everything_and_returns_whether_anything_moved(started: Scene) -> None:

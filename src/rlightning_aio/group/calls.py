@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from rlightning_aio.errors import NothingPending, RLightningError
@@ -58,56 +59,49 @@ class Calls:
             yield from self._call(now, self._envs.all, (name, (), {}))
 
     def _call(self, now: float, slots: NDArray[np.intp], call: Call) -> Procedure[list[Any]]:
-        ticket = self._send_calls(now, slots, call)
-        yield from self._waiting.until_replied(ticket)
+        send = partial(self._send_calls, now, slots, call)
+        ticket, _ = yield from self._waiting.ask(now, slots, send, call[0])
         return values_of([ticket])
 
     def call_async(self, now: float, env_ids: Sequence[str] | None, call: Call) -> None:
         """Call a method without waiting; `collect_calls` returns the values."""
         with self._observed.call("call_async", now):
             slots = self._envs.all if env_ids is None else self._dispatch.distinct(env_ids)
-            self._sent.append(self._send_calls(now, slots, call))
+            send = partial(self._send_calls, now, slots, call)
+            self._sent.append(self._waiting.begin(slots, send, call[0]))
 
-    def _send_calls(self, now: float, slots: NDArray[np.intp], call: Call) -> Ticket:
-        return self.ask(
-            now,
-            slots,
-            Operation.CALL,
-            call[0],
-            [call] * len(slots),
-            f"the arguments of {call[0]}()",
-        )
+    def _send_calls(self, now: float, slots: NDArray[np.intp], call: Call, ticket: Ticket) -> None:
+        what = f"the arguments of {call[0]}()"
+        self.send(now, slots, Operation.CALL, [call] * len(slots), what, ticket)
 
-    def ask(
+    def send(
         self,
         now: float,
         slots: NDArray[np.intp],
         op: Operation,
-        name: str,
         arguments: Sequence[Any],
         what: str,
-    ) -> Ticket:
+        ticket: Ticket,
+    ) -> None:
         """Send requests that return a value.
 
         Args:
             now: monotonic seconds.
             slots: of local envs.
             op: the operation.
-            name: of the operation, for messages.
             arguments: of the request to each slot.
             what: describes the arguments in messages.
+            ticket: of the call, with the name of the operation as its method.
         """
         self._intake.drain()
-        self._dispatch.check_local(slots, f"call {name} of")
-        self._dispatch.check_sendable(slots, f"call {name} of")
+        self._dispatch.check_local(slots, f"call {ticket.method} of")
+        self._dispatch.check_sendable(slots, f"call {ticket.method} of")
         packed = [
             self._dispatch.packed(slot, own, what)
             for slot, own in zip(slots.tolist(), arguments, strict=True)
         ]
-        ticket = self._requests.tickets.open(slots, method=name)
         entries = self._requests.submit(slots, op, ticket.owner, now)
         self._dispatch.hand_over(slots, entries, packed)
-        return ticket
 
     def collect_calls(self, now: float, deadline: float | None) -> Procedure[list[Any]]:
         """Wait for all calls of `call_async`, and return their values in order of sending."""

@@ -153,8 +153,8 @@ class CheckedRequests(Requests):
             super().settle(ticket)
 
     def give_up(self, ticket: Ticket) -> None:
-        # An interrupt may have come before the requests were sent.
-        slots = ticket.slots[self.state[ticket.slots] != State.IDLE]
+        slots = ticket.submitted(self.owner)
+        slots = slots[self.state[slots] != State.IDLE]  # An interrupt came before it was sent.
         values = self.owed(slots) if ticket.calls else slots[:0]
         others = np.setdiff1d(slots, values)
         with self.changes((Event.METHOD_GIVEN_UP, values), (Event.GIVEN_UP, others)):

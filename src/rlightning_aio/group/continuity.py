@@ -358,7 +358,9 @@ class Continuity:
         return reports
 
     def raised(self, slot: int) -> str | None:
-        """Record that the env of `slot` raised; return the cause of a loss that it reports."""
+        """Record that the request of `slot` ended without a result; return the cause of a loss that
+        it would have reported.
+        """
         loss = self._losses.get(slot)
         if loss is None or loss.phase is LossPhase.LOST:
             return None

@@ -9,6 +9,7 @@ Rule: no I/O beyond passing bytes to hosts, no clock, no event loop.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -147,7 +148,7 @@ class Core:
     def step_async(self, batch: BatchedData, now: float) -> None:
         """Send a batch of steps, whose results `collect` returns."""
         with self.observed.call("step_async", now):
-            self._send_steps(batch, self._slots_of(batch), None, now)
+            self._send_steps(batch, self._slots_of(batch), now, None)
         # A waiting collector has not armed the bell for these results.
         self.waiting.wake()
 
@@ -162,7 +163,7 @@ class Core:
         return self._dispatch.distinct(_answered(batch)) if slots is None else slots
 
     def _send_steps(
-        self, batch: BatchedData, slots: NDArray[np.intp], ticket: Ticket | None, now: float
+        self, batch: BatchedData, slots: NDArray[np.intp], now: float, ticket: Ticket | None
     ) -> None:
         self.intake.now = now
         self.intake.drain()
@@ -322,13 +323,8 @@ class Core:
     def _step(self, batch: BatchedData, now: float) -> Procedure[tuple[BatchedData, Flags | None]]:
         slots = self._slots_of(batch)
         self._dispatch.check_local(slots, "step")
-        ticket = self.requests.tickets.open(slots)
-        try:
-            self._send_steps(batch, slots, ticket, now)
-        except BaseException:
-            self.requests.tickets.drop(ticket)
-            raise
-        yield from self.waiting.until_replied(ticket)
+        send = partial(self._send_steps, batch, slots, now)
+        ticket, _ = yield from self.waiting.ask(now, slots, send)
         results, flags = self.settled(ticket, slots)
         return results, flags if self.continuity.active else None
 
@@ -396,7 +392,7 @@ class Core:
     ) -> Procedure[tuple[BatchedData, Flags]]:
         """Restore envs, and return their last results as first observations."""
         with self.observed.call("restore", now):
-            slots, positions = yield from self._snapshots.put_back(now, data, env_ids)
+            slots, positions, now = yield from self._snapshots.put_back(now, data, env_ids)
             self.continuity.note_shows(slots.tolist(), positions)
             return self.settled(*(yield from self._resets.show_restored(now, slots)))
 

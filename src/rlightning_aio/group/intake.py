@@ -147,6 +147,7 @@ class Intake:
         slot = self._requests.end(completion.host_id, completion.entry)
         if slot is None:
             return
+        self._continuity.raised(slot)
         if isinstance(completion.fault, WorkerDied):
             self._supervisor.note_lost_env(completion.host_id, slot)
         self._fail(self._requests.alone(slot), lambda _: completion.fault)
@@ -155,6 +156,7 @@ class Intake:
         slot = self._requests.end(completion.host_id, completion.entry)
         if slot is None:
             return
+        self._continuity.raised(slot)
         if self._requests.owner[slot] == COLLECTOR:
             self._arrivals.withdraw(slot)
             return

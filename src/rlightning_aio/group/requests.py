@@ -66,6 +66,10 @@ class Ticket:
     faults: list[EnvFault] = field(default_factory=list["EnvFault"])
     values: dict[int, Any] = field(default_factory=dict[int, Any])
 
+    def submitted(self, owner: NDArray[np.int64]) -> NDArray[np.intp]:
+        """Return the slots whose requests are its own, by the `owner` of each request."""
+        return self.slots[owner[self.slots] == self.owner]
+
     @property
     def calls(self) -> bool:
         """True if the requests are calls of a method."""
@@ -94,10 +98,6 @@ class Tickets:
         self._next_owner += 1
         self.waiting[ticket.owner] = ticket
         return ticket
-
-    def drop(self, ticket: Ticket) -> None:
-        """Drop a ticket for which nothing was submitted."""
-        del self.waiting[ticket.owner]
 
 
 class Numbering:
@@ -286,12 +286,12 @@ class Requests:
     def submit(self, slots: NDArray[np.intp], op: int, owner: int, now: float) -> NDArray[np.int64]:
         """Number the next request of each of `slots`, all idle; return their entries."""
         entries = self.numbering.renew(slots, op)
-        self.state[slots] = _BUSY_CODE
         self.sent_ns[slots] = int(now * 1e9)
         if owner:
             self.owner[slots] = owner
         else:
             self.collector.num_awaited += len(slots)
+        self.state[slots] = _BUSY_CODE
         return entries
 
     def by_host(self, slots: NDArray[np.intp]) -> list[tuple[int, slice]]:
@@ -496,8 +496,8 @@ class Requests:
 
     def give_up(self, ticket: Ticket) -> None:
         """Close a ticket that no longer waits: its steps and resets go to the collector."""
+        slots = ticket.slots = ticket.submitted(self.owner)
         self.settle(ticket)
-        slots = ticket.slots
         if ticket.calls:
             self.owner[self.owed(slots)] = NOBODY
             return

@@ -105,9 +105,12 @@ class Resets:
         self, now: float, slots: NDArray[np.intp]
     ) -> Procedure[tuple[Ticket, NDArray[np.intp]]]:
         """Have restored envs show their states, and wait for all of them."""
-        ticket = self._requests.tickets.open(slots)
-        self._submit_resets(slots, np.full(len(slots), AS_RESTORED), None, ticket.owner, now)
-        yield from self._waiting.until_replied(ticket)
+        seeds = np.full(len(slots), AS_RESTORED)
+
+        def send(ticket: Ticket) -> None:
+            self._submit_resets(slots, seeds, None, ticket.owner, now)
+
+        ticket, _ = yield from self._waiting.ask(now, slots, send)
         return ticket, slots
 
     def _everyone(self) -> NDArray[np.intp]:
@@ -130,15 +133,17 @@ class Resets:
         joined = self._requests.joined(slots)
         self._dispatch.check_sendable(slots[~joined], "reset")
         packed = self._packed_resets(slots, seeds, options)
-        ticket = self._requests.tickets.open(slots)
-        asked = slots
-        if joined.any():
-            enough = seed is None and options is None
-            self._take_first_results(slots[joined], ticket, enough=enough)
-            if enough:
-                asked, seeds = slots[~joined], seeds[~joined]
-        self._send(asked, seeds, options, packed, ticket.owner, now)
-        yield from self._waiting.until_replied(ticket)
+
+        def send(ticket: Ticket) -> None:
+            asked, own_seeds = slots, seeds
+            if joined.any():
+                enough = seed is None and options is None
+                self._take_first_results(slots[joined], ticket, enough=enough)
+                if enough:
+                    asked, own_seeds = slots[~joined], seeds[~joined]
+            self._send(asked, own_seeds, options, packed, ticket.owner, now)
+
+        ticket, _ = yield from self._waiting.ask(now, slots, send)
         return ticket, slots
 
     def _seeds_for(self, slots: NDArray[np.intp], seed: Seeds, now: float) -> NDArray[np.int64]:

@@ -6,6 +6,7 @@ be undone. `Continuity` records what the next results then report; `snapshot_for
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from rlightning_aio.group.continuity import Continuity
     from rlightning_aio.group.dispatch import Dispatch
     from rlightning_aio.group.env_table import EnvTable
+    from rlightning_aio.group.requests import Ticket
     from rlightning_aio.group.supervisor import Supervisor
     from rlightning_aio.group.wait import Procedure
     from rlightning_aio.group.waiting import Waiting
@@ -56,7 +58,7 @@ class Snapshots:
         """See `EnvGroup.snapshot`."""
         slots = self._envs.all if env_ids is None else self._dispatch.distinct(env_ids)
         self._check_restorable(slots)
-        snapshots = yield from self._take(now, slots)
+        snapshots, _ = yield from self._take(now, slots)
         for snapshot, was_reset in snapshots:
             if not was_reset:
                 raise SnapshotError(
@@ -77,11 +79,11 @@ class Snapshots:
 
     def _take(
         self, now: float, slots: NDArray[np.intp]
-    ) -> Procedure[list[tuple[EnvSnapshot, bool]]]:
-        """Take one snapshot per env, and say whether the env was ever reset."""
+    ) -> Procedure[tuple[list[tuple[EnvSnapshot, bool]], float]]:
+        """Take one snapshot per env, and say whether it was ever reset; return the time, too."""
         op, nothing = Operation.SNAPSHOT, [()] * len(slots)
-        ticket = self._calls.ask(now, slots, op, "snapshot", nothing, "nothing")
-        yield from self._waiting.until_replied(ticket)
+        send = partial(self._calls.send, now, slots, op, nothing, "nothing")
+        ticket, now = yield from self._waiting.ask(now, slots, send, "snapshot")
         each: list[int] = slots.tolist()
         replies = zip(each, self._continuity.positions(slots), values_of([ticket]), strict=True)
         snapshots: list[tuple[EnvSnapshot, bool]] = []
@@ -89,32 +91,32 @@ class Snapshots:
             identity = identity_of(self._envs.configs[slot], self._supervisor.metas[slot], versions)
             env_id = self._envs.env_ids[slot]
             snapshots.append((EnvSnapshot(env_id, identity, num_steps, is_cut, state), was_reset))
-        return snapshots
+        return snapshots, now
 
     def put_back(
         self, now: float, data: bytes, env_ids: Sequence[str] | None
-    ) -> Procedure[tuple[NDArray[np.intp], list[Position]]]:
+    ) -> Procedure[tuple[NDArray[np.intp], list[Position], float]]:
         """Put envs into the state of their snapshots, which a reset `AS_RESTORED` then shows.
 
-        Returns their slots and their positions in their episodes.
+        Returns their slots, their positions in their episodes, and the time.
         """
         snapshots = unpack(data)
         slots = self._slots_for(snapshots, env_ids)
         self._check_restorable(slots)
         deaths = self._supervisor.last_deaths(slots)
-        before = yield from self._take(now, slots)
+        before, now = yield from self._take(now, slots)
         for slot, snapshot, (own, _) in zip(slots.tolist(), snapshots, before, strict=True):
             check_same(snapshot, own.identity, self._envs.describe(slot))
         try:
-            yield from self._put_back(
-                now, slots, snapshots, [own.state for own, _ in before], deaths
-            )
+            states = [own.state for own, _ in before]
+            now = yield from self._put_back(now, slots, snapshots, states, deaths)
         except EnvFault:
             raise
         except BaseException:
             self._continuity.lose(slots.tolist(), "was being restored when that was cancelled")
             raise
-        return slots, [Position(snapshot.num_steps, snapshot.is_cut) for snapshot in snapshots]
+        positions = [Position(snapshot.num_steps, snapshot.is_cut) for snapshot in snapshots]
+        return slots, positions, now
 
     def _slots_for(
         self, snapshots: Sequence[EnvSnapshot], env_ids: Sequence[str] | None
@@ -141,14 +143,16 @@ class Snapshots:
         snapshots: Sequence[EnvSnapshot],
         before: Sequence[bytes],
         deaths: NDArray[Any],
-    ) -> Procedure[None]:
+    ) -> Procedure[float]:
         """Load the state of each snapshot; if one fails, load the states from `before` again.
 
-        The envs of a worker that has died since `deaths` were its last can't go back.
+        The envs of a worker that has died since `deaths` were its last can't go back. Returns the
+        time.
         """
         states = [(snapshot.state, True) for snapshot in snapshots]
         try:
-            yield from self._load(now, slots, states)
+            ticket, now = yield from self._load(now, slots, states)
+            values_of([ticket])
             last = self._supervisor.last_deaths(slots)
             for death in last[last != deaths]:
                 raise death(slots[last == death])  # Its envs had replied, so nobody has heard.
@@ -161,13 +165,15 @@ class Snapshots:
                 note += f", but {', '.join(lost)}: to begin a new episode with the next step"
             fault.add_note(note)
             raise
+        return now
 
     def _undo(
         self, now: float, slots: NDArray[np.intp], before: Sequence[bytes]
     ) -> Procedure[list[str]]:
         """Load the states from `before` again; return the ids of envs that can't go back."""
         try:
-            yield from self._load(now, slots, [(state, False) for state in before])
+            ticket, _ = yield from self._load(now, slots, [(state, False) for state in before])
+            values_of([ticket])
         except EnvFault as fault:
             # What a death means for its envs is settled.
             faults = [one for one in (fault, *fault.others) if not isinstance(one, WorkerDied)]
@@ -178,9 +184,7 @@ class Snapshots:
 
     def _load(
         self, now: float, slots: NDArray[np.intp], states: Sequence[tuple[bytes, bool]]
-    ) -> Procedure[None]:
+    ) -> Procedure[tuple[Ticket, float]]:
         """Have envs load states; each comes with whether the env is to show it afterwards."""
-        op = Operation.RESTORE
-        ticket = self._calls.ask(now, slots, op, "restore", states, "its snapshot")
-        yield from self._waiting.until_replied(ticket)
-        values_of([ticket])
+        send = partial(self._calls.send, now, slots, Operation.RESTORE, states, "its snapshot")
+        return self._waiting.ask(now, slots, send, "restore")

@@ -155,17 +155,15 @@ class Steps:
             while ticket.remaining > 0 and not self._conditions.active:
                 yield from self._turn(ticket.remaining)
                 self._complete()
+            if ticket.remaining > 0:
+                yield from self._waiting.until_replied(ticket, now)
         except BaseException:
-            requests.give_up(ticket)
-            self._waiting.wake()
+            self._waiting.give_up(ticket)
             raise
         finally:
             if not self._waiting.wanted:
                 self._bell.disarm()
-        if ticket.remaining > 0:
-            yield from self._waiting.until_replied(ticket)
-        else:
-            requests.settle(ticket)
+        requests.settle(ticket)
         if ticket.faults:
             results, flags = self._core.settled(ticket, slots)
         else:

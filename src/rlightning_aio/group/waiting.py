@@ -11,6 +11,11 @@ from typing import TYPE_CHECKING
 from rlightning_aio.group.wait import TURN, Procedure, Wait
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import numpy as np
+    from numpy.typing import NDArray
+
     from rlightning_aio.group.intake import Intake
     from rlightning_aio.group.poller import Poller
     from rlightning_aio.group.requests import Requests, Ticket
@@ -111,21 +116,56 @@ class Waiting:
         if not self.wanted:
             self._poller.disarm()
 
-    def until_replied(self, ticket: Ticket) -> Procedure[None]:
-        """Wait for all replies of `ticket`.
+    def ask(
+        self,
+        now: float,
+        slots: NDArray[np.intp],
+        send: Callable[[Ticket], object],
+        method: str = "",
+    ) -> Procedure[tuple[Ticket, float]]:
+        """Send requests, and wait for all replies; return them in their ticket, and the time.
 
-        After an error or cancellation, `collect_async` gets them.
+        After an error or cancellation, `collect_async` gets what `give_up` leaves to it.
+
+        Args:
+            now: monotonic seconds.
+            slots: whose requests.
+            send: submits all of them for the ticket that it gets, or raises before the first.
+            method: see `Tickets.open`.
         """
+        ticket = self.begin(slots, send, method)
         try:
             if self._supervisor.members.possible:
                 self.poll()  # Replies of members that were read before cause no wake-up.
-            while ticket.remaining > 0:
-                yield from self.turn(ticket.remaining, None)
-                self.poll()
+            now = yield from self.until_replied(ticket, now)
         except BaseException:
-            self._requests.give_up(ticket)
-            self.wake()
+            self.give_up(ticket)
             raise
         finally:
             self.end()
         self._requests.settle(ticket)
+        return ticket, now
+
+    def begin(
+        self, slots: NDArray[np.intp], send: Callable[[Ticket], object], method: str = ""
+    ) -> Ticket:
+        """Send requests, as `ask` does, and return their ticket."""
+        ticket = self._requests.tickets.open(slots, method=method)
+        try:
+            send(ticket)
+        except BaseException:
+            self.give_up(ticket)
+            raise
+        return ticket
+
+    def give_up(self, ticket: Ticket) -> None:
+        """Close a ticket that nobody waits for any more."""
+        self._requests.give_up(ticket)
+        self.wake()
+
+    def until_replied(self, ticket: Ticket, now: float) -> Procedure[float]:
+        """Wait for all replies of `ticket`; return the time after that."""
+        while ticket.remaining > 0:
+            now = yield from self.turn(ticket.remaining, None)
+            self.poll()
+        return now

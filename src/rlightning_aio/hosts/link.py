@@ -6,6 +6,7 @@ Left out on purpose: the life of the worker (see `process`), and the effects of 
 
 from __future__ import annotations
 
+import errno
 import pickle
 from typing import TYPE_CHECKING, Any
 
@@ -133,6 +134,10 @@ class Link:
         except (BrokenPipeError, ConnectionResetError):
             # The worker is gone; the fork server will report its exit.
             return len(data)
+        except OSError as error:
+            if error.errno not in (errno.ENOBUFS, errno.ENOMEM):
+                raise
+            return 0
 
     def on_writable(self) -> None:
         sent = self._write_some(self._outgoing)
