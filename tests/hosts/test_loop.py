@@ -235,14 +235,14 @@ async def test_an_episode_that_is_cancelled_in_its_reset_leaves_its_env_idle() -
 async def test_a_step_that_takes_too_long_is_cancelled_and_its_env_rebuilt(
     place: dict[str, Any], caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The marked result is a reset of the new env; the others have not noticed."""
+    """The marked result is a reset of the new env with the same seed; the others don't notice."""
     async with rl.build_env_group(entry(num_workers=3, step_timeout=SOON, **place)) as group:
         await group.reset(seed=1)
         batch, _ = await group.step(steps(e_0=STEP, e_1=HANG, e_2=STEP))
         assert batch.restarted.tolist() == batch.is_reset.tolist() == [False, True, False]
         assert batch.truncated.tolist() == [False, True, False]
         assert batch.info("worker_restarted", "") == ["", "hung in a step and was cancelled", ""]
-        assert batch.observation.tolist() == [[1, 1, 1, 1], [2, 1, 0, -1], [1, 1, 1, 3]]
+        assert batch.observation.tolist() == [[1, 1, 1, 1], [2, 1, 0, 2], [1, 1, 1, 3]]
         batch, _ = await group.step(steps(e_0=STEP, e_1=STEP, e_2=END))
         assert batch.observation[:, 2].tolist() == [2, 1, 2]
         assert not batch.restarted.any()
@@ -251,6 +251,34 @@ async def test_a_step_that_takes_too_long_is_cancelled_and_its_env_rebuilt(
         assert Scripted.closed[0] == "e-1"
         assert f"'e-1' took longer than {SOON} s for a step" in caplog.text
         assert "Scripted.step" in caplog.text
+
+
+class Tasked(Scripted):
+    """Can't be reset without a task."""
+
+    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        self.task = options["task"]
+        return await super().reset(seed=seed)
+
+
+@pytest.mark.parametrize("options", [{"task": "a"}, {"task": "b"}], ids=str)
+async def test_a_rebuilt_env_goes_on_with_the_task_of_the_episode_that_was_lost(
+    options: dict[str, Any],
+) -> None:
+    """The one of its last reset, also if several envs were lost in a row."""
+    config = rl.EnvConfig(name="t", make_env=_tasked, step_timeout=SOON, placement="loop")
+    async with rl.build_env_group(config) as group:
+        await group.reset(seed=1, options={"task": "before"})
+        await group.reset(seed=5, options=options)
+        for built in (2, 3):
+            batch, _ = await group.step(steps(t_0=HANG))
+            assert batch.restarted.all()
+            assert batch.observation.tolist() == [[built, 1, 0, 5]]
+            assert await group["t-0"].get_attr("task") == options["task"]
+
+
+def _tasked() -> Tasked:
+    return Tasked(rl.EnvConfig(name="t", backend="scripted", task="-"))
 
 
 async def test_a_step_that_ends_as_its_time_is_up_has_one_end() -> None:
@@ -288,11 +316,38 @@ async def test_a_reset_that_takes_too_long_is_repeated_by_a_new_env(place: dict[
         assert batch.observation.tolist() == [[2, 1, 0, 7], [2, 1, 0, 8]]
 
 
-@pytest.mark.parametrize("fields", [{"on_worker_death": "raise"}, {"max_restarts": 0}], ids=str)
-async def test_an_env_that_is_not_rebuilt_raises_from_then_on(
-    place: dict[str, Any], fields: dict[str, Any]
+@pytest.mark.parametrize("max_restarts", [0, 1])
+@pytest.mark.parametrize("after", ["step", "reset"])
+async def test_an_env_whose_tool_was_away_plays_on_when_it_is_back(
+    place: dict[str, Any], max_restarts: int, after: str
 ) -> None:
-    config = entry(num_workers=2, step_timeout=SOON, **fields, **place)
+    """However often it failed in a row; the episode that was lost is reported, or reset."""
+    config = entry(num_workers=2, step_timeout=SOON, max_restarts=max_restarts, **place)
+    async with rl.build_env_group(config) as group:
+        await group.reset(seed=3)
+        for failed in range(2):
+            for _ in range(0 if failed else max_restarts):
+                batch, _ = await group.step(steps(e_1=HANG))
+                assert batch.restarted.all()
+            with pytest.raises(EnvHung, match=f"after {max_restarts + failed} restarts in a row"):
+                await group.step(steps(e_1=HANG))
+            if after == "step":
+                batch, _ = await group.step(steps(e_1=STEP))
+                assert batch.restarted.tolist() == batch.is_reset.tolist() == [True]
+            else:
+                batch, _ = await group.reset(seed={"e-1": 4}, env_ids=["e-1"])
+                assert batch.restarted.tolist() == [False]
+            assert batch.observation[0, 1:].tolist() == [1, 0, 4]
+        assert group.get_workers()[0]["given_up"] == []
+        batch, _ = await group.step(steps(e_0=STEP, e_1=STEP))
+        assert batch.observation[:, 2].tolist() == [1, 1]
+        for _ in range(max_restarts):
+            batch, _ = await group.step(steps(e_1=HANG))
+            assert batch.restarted.all()
+
+
+async def test_an_env_that_is_not_rebuilt_raises_from_then_on(place: dict[str, Any]) -> None:
+    config = entry(num_workers=2, step_timeout=SOON, on_worker_death="raise", **place)
     async with rl.build_env_group(config) as group:
         batch, _ = await group.reset()
         with pytest.raises(EnvHung, match=rf"'e-1' took longer than {SOON} s for a step") as raised:
@@ -335,12 +390,16 @@ async def test_restarts_in_a_row_are_counted_until_a_step_succeeds() -> None:
             await group.step(steps(e_0=HANG))
 
 
-async def test_an_env_that_can_not_be_rebuilt_is_given_up() -> None:
+async def test_an_env_that_can_not_be_rebuilt_fails_its_requests_until_it_can() -> None:
     config = entry(step_timeout=SOON, max_restarts=2, env_kwargs={"builds": 1})
     async with rl.build_env_group(config) as group:
         await group.reset()
-        with pytest.raises(WorkerDied, match=r"could not be rebuilt: .*no more of these"):
-            await group.step(steps(e_0=HANG))
+        for _ in range(2):
+            with pytest.raises(WorkerDied, match=r"could not be rebuilt: .*no more of these"):
+                await group.step(steps(e_0=HANG))
+        Scripted.built.clear()
+        batch, _ = await group.step(steps(e_0=STEP))
+        assert batch.restarted.all()
 
 
 async def test_a_step_that_ignores_its_cancellation_is_left_behind(
@@ -351,7 +410,7 @@ async def test_a_step_that_ignores_its_cancellation_is_left_behind(
         await group.reset()
         batch, _ = await group.step(steps(e_0=IGNORE))
         assert batch.restarted.all()
-        assert "goes on although it was cancelled" in caplog.text
+        assert "its step or reset goes on although it was cancelled" in caplog.text
         Scripted.let_go.set()
         for _ in range(5):
             await asyncio.sleep(0)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from rlightning_aio.errors import EnvAway, EnvRaised, WorkerDied
+from rlightning_aio.errors import EnvAway, EnvRaised
 from rlightning_aio.group.continuity import Report
 from rlightning_aio.group.request_states import COLLECTOR
 from rlightning_aio.group.supervisor import GivenUp, Replaced
@@ -148,7 +148,7 @@ class Intake:
         if slot is None:
             return
         self._continuity.raised(slot)
-        if isinstance(completion.fault, WorkerDied):
+        if completion.for_good:
             self._supervisor.note_lost_env(completion.host_id, slot)
         self._fail(self._requests.alone(slot), lambda _: completion.fault)
 

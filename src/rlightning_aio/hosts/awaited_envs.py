@@ -1,7 +1,7 @@
 """`AwaitedEnvs`: executes requests on awaitable envs, all at once, on one event loop.
 
-The trainer's loop host and a worker with awaitable envs are both thin layers over it. Each request
-is a task in its env's context. A request that takes longer than its limit is cancelled; the env
+The trainer's loop host and a worker with awaitable envs are both thin layers over it. Each env has
+a task of its own (`AwaitedEnv`). A request that takes longer than its limit is cancelled; the env
 is then closed, rebuilt and reset, and that result answers the request, marked as a restart.
 Invariant: each request ends in one completion, or `done` is called for it, whatever its env does.
 Left out: how requests and completions travel.
@@ -10,18 +10,16 @@ Left out: how requests and completions travel.
 from __future__ import annotations
 
 import asyncio
-import inspect
-import time
 from collections import deque
 from contextvars import Context, copy_context
 from copy import copy
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio.errors import EnvHung, WorkerDied
-from rlightning_aio.hosts.awaited_runner import Abandoned, AwaitedRunner
+from rlightning_aio.hosts.awaited_env import CANCEL_SECONDS, AwaitedEnv, end_all
 from rlightning_aio.hosts.build_env import built_env
 from rlightning_aio.hosts.event_loop import (
-    OWNER,
     TimeLimit,
     cancel,
     cancel_leftovers,
@@ -39,56 +37,53 @@ from rlightning_aio.protocol.entries import Operation, answers_with_value, op_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable
+    from typing import NoReturn
 
+    from rlightning_aio.hosts.awaited_runner import AwaitedRunner
     from rlightning_aio.hosts.messages import Completion, EnvStarted, StartOrder
 
 __all__ = ["AwaitedEnvs"]
 
-_CANCEL_SECONDS: Final = 0.4
-"""How long a task may go on after it was cancelled."""
 _CLOSE_SECONDS: Final = 0.6
-"""How long an env may take to close. A group waits longer than both together for its hosts."""
-_TURN_SECONDS: Final = 0.02
-"""How long envs are built before other tasks of the loop get a turn."""
+"""How long an env may take to close."""
+_LEFTOVERS_SECONDS: Final = 0.1
+"""How long after the end of an env its tasks are looked for, for all that ended meanwhile."""
 
 
-class _Env:
-    """An env of the host, which may be replaced, and the request that it is executing.
+class _Place:
+    """The place of an env in its host, which another env may take, and the request to it.
 
     Attributes:
-        index: of the env in its host.
-        context: in which its code runs.
-        task: executes the request; None while there is none.
-        answering: the coroutine that the task awaits.
-        entry: of the request; 0 while there is none.
-        closing: the task that closes the env, once it has begun.
+        index: in the host.
+        context: of all envs that take the place; each has a copy.
+        env: that has it now; None while there is none.
+        runner: of that env, or of the one before.
+        entry: of the request that is being executed; 0 while there is none.
+        arguments: of that request.
         losses: how often the env was replaced since it last completed a step.
-        fault: why the env was given up, if it was.
+        lost: why there is no env.
+        leaving: the task that puts the env before away.
+        restoring: the task that makes another env.
+        fault: why the place is given up, if it is.
     """
 
-    def __init__(self, index: int, runner: AwaitedRunner | None = None) -> None:
+    def __init__(self, index: int, context: Context) -> None:
         self.index = index
-        self.context = copy_context()
-        self.context.run(OWNER.set, self)
-        self.runner: Any = runner
-        self.task: asyncio.Task[Any] | None = None
-        self.answering: Coroutine[Any, Any, Any] | None = None
+        self.context = context
+        self.env: AwaitedEnv | None = None
+        self.runner: Any = None
         self.entry = 0
-        self.closing: asyncio.Task[None] | None = None
+        self.arguments: Any = None
         self.losses = 0
+        self.lost = ""
+        self.leaving: asyncio.Task[None] | None = None
+        self.restoring: asyncio.Task[None] | None = None
         self.fault: WorkerDied | None = None
 
     @property
     def name(self) -> str:
         """The env's id, for messages."""
         return self.runner.env.env_id
-
-    def close(self) -> asyncio.Task[None]:
-        """Begin to close the env, unless that has begun."""
-        if self.closing is None:
-            loop = asyncio.get_running_loop()
-            self.closing = new_task(_close(self.runner), loop, self.context)
-        return self.closing
 
 
 class AwaitedEnvs:
@@ -117,17 +112,17 @@ class AwaitedEnvs:
         done: Callable[[int], object],
         enter: Callable[[int], object] | None = None,
     ) -> None:
+        time_collector()
         self._host_id = host_id
         self._first_slot = first_slot
         self._order = order
         self._inline = inline
         self._post = post
         self._done = done
-        self._enter = enter
+        self._watch = partial(watched, report=self._report, enter=enter)
         self._loop: asyncio.AbstractEventLoop
-        time_collector()
-        self._all: list[_Env] = []
-        self._queue: deque[tuple[_Env, int, Any]] = deque()
+        self._places: list[_Place] = []
+        self._queue: deque[tuple[_Place, int, Any]] = deque()
         self.num_busy = 0
         self._most_busy = order.config.max_concurrency or len(order.worker_indices)
         self._ending = False
@@ -138,47 +133,72 @@ class AwaitedEnvs:
             for op, seconds in limits.items()
             if seconds is not None
         }
-        # Tasks that replace envs, and tasks that go on although they were cancelled.
-        self._replacing: set[asyncio.Task[None]] = set()
-        self._stray: set[asyncio.Task[Any]] = set()
+        # All envs whose tasks run, and the tasks that replace envs or put them away.
+        self._envs: set[AwaitedEnv] = set()
+        self._tasks: set[asyncio.Task[None]] = set()
+        # Names of envs that have closed, until a timer looks for what they have left.
+        self._closed: dict[object, str] = {}
+        self._look: asyncio.TimerHandle | None = None
 
     @property
     def runners(self) -> list[AwaitedRunner]:
         """The envs' runners, by index."""
-        return [env.runner for env in self._all]
+        return [place.runner for place in self._places]
 
     # -- life ---------------------------------------------------------------------
 
     def adopt(self, runners: Iterable[AwaitedRunner]) -> None:
         """Take over envs that were built elsewhere, by index; they belong to the running loop."""
         self._loop = asyncio.get_running_loop()
-        self._all = [_Env(index, runner) for index, runner in enumerate(runners)]
+        context = copy_context()
+        for index, runner in enumerate(runners):
+            place = _Place(index, context)
+            place.runner = runner
+            place.env = self._new_env(place, lambda runner=runner: runner)
+            self._places.append(place)
 
     async def build(self) -> list[EnvStarted] | None:
-        """Build the envs, a few milliseconds at a time; None if one can't be, which is posted."""
+        """Build the envs, one in each turn of the loop; None if one can't be, which is posted."""
         self._loop = asyncio.get_running_loop()
-        count = len(self._order.worker_indices)
-        turn_ends = 0.0
+        context = copy_context()
+        index = 0
         try:
-            for index in range(count):
-                if time.monotonic() >= turn_ends:
-                    await asyncio.sleep(0)
-                    turn_ends = time.monotonic() + _TURN_SECONDS
-                env = _Env(index)
-                env.runner = self._built(env)
-                self._all.append(env)
+            for index in range(len(self._order.worker_indices)):
+                place = _Place(index, context)
+                if (error := await self._build(place)) is not None:
+                    raise error
+                self._places.append(place)
             return [runner.started() for runner in self.runners]
         except BaseException as error:
-            text, index = ErrorText.of(error), min(len(self._all), count - 1)
-            self._post(NotBuilt(self._host_id, index, text))
+            self._post(NotBuilt(self._host_id, index, ErrorText.of(error)))
             if isinstance(error, KeyboardInterrupt):
                 raise
             return None
 
-    def _built(self, env: _Env) -> AwaitedRunner:
-        runner = env.context.run(built_env, self._order, env.index, inline=self._inline)
-        assert isinstance(runner, AwaitedRunner)
-        return runner
+    def _new_env(self, place: _Place, make: Callable[[], AwaitedRunner]) -> AwaitedEnv:
+        env = AwaitedEnv(place.index, make, place.context, self._watch, self._on_broken)
+        self._envs.add(env)
+        env.task.add_done_callback(lambda _: self._envs.discard(env))
+        return env
+
+    @property
+    def _close_seconds(self) -> float:
+        return _CLOSE_SECONDS
+
+    async def _build(self, place: _Place) -> BaseException | None:
+        """Build an env for a place; return the error if that fails."""
+        make: Any = partial(built_env, self._order, place.index, inline=self._inline)
+        env = self._new_env(place, make)
+        try:
+            error = await asyncio.shield(env.made)
+        except BaseException:
+            env.leave()
+            raise
+        if error is None:
+            if place.runner is not None:
+                env.runner.place_like(place.runner)
+            place.env, place.runner = env, env.runner
+        return error
 
     async def close(self) -> list[tuple[int, ErrorText]]:
         """Cancel all requests and close all envs at the same time.
@@ -186,30 +206,29 @@ class AwaitedEnvs:
         Returns what was wrong, with the env's index.
         """
         self._end()
-        stubborn = await cancel(self._tasks(), _CANCEL_SECONDS)
-        closing = [env.close() for env in self._all]
-        if closing:
-            await asyncio.wait(closing, timeout=_CLOSE_SECONDS)
-        errors = [
-            (env.index, error)
-            for env, task in zip(self._all, closing, strict=True)
-            if (error := _close_error(task, is_stubborn=env.task in stubborn)) is not None
-        ]
-        await cancel([task for task in closing if not task.done()], _CANCEL_SECONDS / 4)
-        await cancel_leftovers({env: env.name for env in self._all}, _CANCEL_SECONDS / 4)
+        await cancel(self._tasks, CANCEL_SECONDS)
+        # Others that still run were closed, and reported, when they were put away.
+        open_ = [env for env in self._envs if not env.has_closed]
+        envs = sorted(open_, key=lambda env: env.index)
+        await end_all(envs, self._close_seconds)
+        errors = [(env.index, error) for env in envs if (error := env.close_error) is not None]
+        closed = {**self._closed, **{env: env.name for env in envs}}
+        await cancel(self._leftovers(closed), CANCEL_SECONDS / 4)
         return errors
 
     def disconnect(self) -> None:
         """Bring the envs to a safe state: the trainer is gone."""
-        disconnect_all(self.runners)
+        disconnect_all([place.runner for place in self._places if place.env is not None])
 
     def release(self) -> None:
         """Cancel everything without waiting, also tasks that envs have started. Idempotent."""
         self._end()
-        if self._all and not self._loop.is_closed():
-            for task in self._tasks() | tasks_of(set(self._all), self._loop).keys():
+        if self._envs and not self._loop.is_closed():
+            for task in self._tasks | tasks_of(self._envs, self._loop).keys():
                 task.cancel()
-        self._all.clear()
+        for env in self._envs:
+            env.forget()
+        self._places.clear()
 
     def _end(self) -> None:
         """Begin nothing more, and post nothing more."""
@@ -217,10 +236,8 @@ class AwaitedEnvs:
         self._queue.clear()
         for limit in self._limits.values():
             limit.end()
-
-    def _tasks(self) -> set[asyncio.Task[Any]]:
-        running = {env.task for env in self._all if env.task is not None}
-        return running | self._replacing | self._stray
+        if self._look is not None:
+            self._look.cancel()
 
     # -- requests -----------------------------------------------------------------
 
@@ -233,76 +250,60 @@ class AwaitedEnvs:
         """
         if self._ending:
             return
-        env = self._all[slot_of(entry) - self._first_slot]
-        self._queue.append((env, entry, arguments))
+        place = self._places[slot_of(entry) - self._first_slot]
+        self._queue.append((place, entry, arguments))
         self._begin_queued()
 
     def _begin_queued(self) -> None:
         while self._queue and self.num_busy < self._most_busy:
-            env, entry, arguments = self._queue.popleft()
-            if env.fault is not None:
+            place, entry, arguments = self._queue.popleft()
+            if place.fault is not None:
                 # Not at once: a completion never comes before its request was handed over.
-                fault = Failed(self._host_id, entry, copy(env.fault))
+                fault = Failed(self._host_id, entry, copy(place.fault), for_good=True)
                 self._loop.call_soon(self._post_unless_ending, fault)
                 continue
             self.num_busy += 1
-            env.entry = entry
-            op = op_of(entry)
-            execution = self._execute(env, env.runner, entry, op, arguments)
-            env.task = new_task(execution, self._loop, env.context)
-            if op in self._limits:
-                self._limits[op].begin(env, self._loop)
+            place.entry, place.arguments = entry, arguments
+            if place.env is None:
+                self._restore(place)
+            else:
+                self._give(place, place.env)
 
     def _post_unless_ending(self, completion: Completion) -> None:
         if not self._ending:
             self._post(completion)
 
-    async def _execute(
-        self, env: _Env, runner: AwaitedRunner, entry: int, op: int, arguments: Any
+    def _give(self, place: _Place, env: AwaitedEnv) -> None:
+        """Have an env execute the request to its place."""
+        op = op_of(place.entry)
+        env.give(op, place.entry, place.arguments, self._on_outcome)
+        if op in self._limits:
+            self._limits[op].begin(place, self._loop)
+
+    def _on_outcome(
+        self, env: AwaitedEnv, entry: int, outcome: Any, error: BaseException | None
     ) -> None:
-        env.answering = answering = runner.answer(op, arguments)
-        try:
-            outcome = await watched(answering, self._report, self._enter, entry)
-        except BaseException as error:
-            if isinstance(error, Abandoned) or self._is_past(env, runner):
-                return
-            # A CancelledError, too, is the env's own.
-            self._ended(env, runner, Raised(self._host_id, entry, ErrorText.of(error)))
+        place, op = self._places[env.index], op_of(entry)
+        if error is not None:
+            self._finish(place, Raised(self._host_id, entry, ErrorText.of(error)))
             # In the trainer it may be the user's Ctrl-C; a worker gets none.
             if self._inline and isinstance(error, KeyboardInterrupt):
-                raise
+                self._loop.call_soon(_reraise, error)
             return
         if op == Operation.STEP:
-            env.losses = 0
+            place.losses = 0
         if answers_with_value(op):
-            self._ended(env, runner, Value(self._host_id, entry, outcome))
+            self._finish(place, Value(self._host_id, entry, outcome))
         elif outcome is None:
-            self._ended(env, runner, entry)
+            self._finish(place, entry)
         else:
-            self._ended(env, runner, Result(self._host_id, entry, outcome))
+            self._finish(place, Result(self._host_id, entry, outcome))
 
-    def _report(self, entry: int, seconds: float) -> None:
-        """Report an env that has held the event loop for long."""
-        env = self._all[slot_of(entry) - self._first_slot]
-        log.warning(
-            "env %r of entry %r blocked the event loop for %.0f ms in a %s; nothing else ran "
-            "meanwhile: await what it waits for, or run it by asyncio.to_thread()",
-            env.name,
-            self._order.config.name,
-            1e3 * seconds,
-            Operation(op_of(entry)).name.lower(),
-        )
-
-    def _is_past(self, env: _Env, runner: AwaitedRunner) -> bool:
-        """Return True if nobody waits for the end of the request any more."""
-        return self._ending or runner.is_abandoned or runner is not env.runner
-
-    def _ended(self, env: _Env, runner: AwaitedRunner, what: Completion | int) -> None:
-        """The request of an env has ended: post `what`, or call `done` for this entry."""
-        if self._is_past(env, runner):
+    def _finish(self, place: _Place, what: Completion | int) -> None:
+        """The request to a place has ended: post `what`, or call `done` for this entry."""
+        if self._ending:
             return
-        env.task = env.answering = None
-        env.entry = 0
+        place.entry, place.arguments = 0, None
         self.num_busy -= 1
         if isinstance(what, int):
             self._done(what)
@@ -310,112 +311,167 @@ class AwaitedEnvs:
             self._post(what)
         self._begin_queued()
 
-    # -- envs that take too long --------------------------------------------------
+    def _report(self, entry: int, seconds: float) -> None:
+        """Report an env that has held the event loop for long."""
+        log.warning(
+            "env %r of entry %r blocked the event loop for %.0f ms in a %s; nothing else ran "
+            "meanwhile: await what it waits for, or run it by asyncio.to_thread()",
+            self._places[slot_of(entry) - self._first_slot].name,
+            self._order.config.name,
+            1e3 * seconds,
+            Operation(op_of(entry)).name.lower(),
+        )
 
-    def _expire(self, env: _Env, seconds: float) -> None:
-        if self._ending:
+    # -- envs that are lost -------------------------------------------------------
+
+    def _expire(self, place: _Place, seconds: float) -> None:
+        """Replace an env whose request takes too long."""
+        env = place.env
+        if self._ending or env is None:
             return
-        # At once: what still comes of the request is too late from now on.
-        env.runner.is_abandoned = True
-        doing = Operation(op_of(env.entry)).name.lower()
-        place = place_of(env.answering)
-        what = f"env {env.name!r} took longer than {seconds} s for a {doing} and was cancelled"
-        message = f"{what} while it waited in {place}" if place else what
-        # In no env's context, or the end of that env would cancel it: the timer may have been set
-        # when a request of another env ended.
-        task = new_task(self._replace(env, message, doing), self._loop, Context())
-        self._replacing.add(task)
-        task.add_done_callback(self._replacing.discard)
+        doing = Operation(op_of(place.entry)).name.lower()
+        waits_in = place_of(env.answering)
+        message = f"env {place.name!r} took longer than {seconds} s for a {doing} and was cancelled"
+        if waits_in:
+            message += f" while it waited in {waits_in}"
+        self._put_away(place, env, f"hung in a {doing} and was cancelled")
+        self._restore(place, message)
 
-    async def _replace(self, env: _Env, message: str, doing: str) -> None:
-        """Replace an env that took too long, and answer its request by a reset of the new one."""
-        entry, kind = env.entry, EnvHung
-        seed = env.runner.reset_with if op_of(entry) == Operation.RESET else (None, None)
-        await self._put_away(env)
-        while not self._is_given_up(env, kind, message):
-            await asyncio.sleep(restart_pause(env.losses))
-            try:
-                runner = self._built(env)
-                runner.place_like(env.runner)
-            except BaseException as error:
-                kind, message = WorkerDied, f"env {env.name!r} could not be rebuilt: {error!r}"
-                continue
-            env.runner, env.closing = runner, None
-            answer = runner.answer(Operation.RESET, seed)
-            env.task = new_task(answer, self._loop, env.context)
-            limit = self._limits.get(Operation.RESET)
-            if not await _ends(env.task, None if limit is None else limit.seconds):
-                kind, message = EnvHung, f"env {env.name!r} took too long for the reset after that"
-                await self._put_away(env)
-                continue
-            cause = f"hung in a {doing} and was cancelled"
-            self._ended(env, runner, _first_result(self._host_id, entry, env.task, cause))
+    def _on_broken(self, env: AwaitedEnv) -> None:
+        """An env has left by itself while it was idle."""
+        place = self._places[env.index]
+        if self._ending or place.env is not env:
             return
-        assert env.fault is not None
-        env.runner.is_abandoned = False  # Only to be heard once more.
-        self._ended(env, env.runner, Failed(self._host_id, entry, env.fault))
+        place.env, place.lost = None, "ended while it was idle: something cancelled its task"
+        place.leaving = env.task
 
-    async def _put_away(self, env: _Env) -> None:
-        """Cancel what an env is doing, and close it."""
-        env.runner.is_abandoned = True
-        assert env.task is not None
-        for stray in await cancel({env.task}, _CANCEL_SECONDS):
-            self._stray.add(stray)
-            stray.add_done_callback(self._stray.discard)
-            log.warning("env %r goes on although it was cancelled; it is replaced", env.name)
-        closing = env.close()
-        await asyncio.wait({closing}, timeout=_CLOSE_SECONDS)
-        error = _close_error(closing, is_stubborn=False)
-        if error is not None:
-            log.warning("env %r, in close() before it is rebuilt: %s", env.name, error.summary)
-        await cancel({closing}, _CANCEL_SECONDS)
-        await cancel_leftovers({env: env.name}, _CANCEL_SECONDS, but=self._stray)
+        late = self._loop.call_later(self._close_seconds, env.cut_short, self._close_seconds)
 
-    def _is_given_up(self, env: _Env, kind: type[WorkerDied], message: str) -> bool:
-        """Count a loss of an env; give the env up if that was one too many."""
-        env.losses += 1
+        def closed(_: object) -> None:
+            late.cancel()
+            if env.close_error is not None:
+                place.lost = f"ended while it was idle: {env.close_error.summary}"
+            self._note_closed(env)
+
+        # No task of ours waits for that: perhaps the event loop ends.
+        env.task.add_done_callback(closed)
+        if place.entry:  # It has come at the same time.
+            self._restore(place)
+
+    def _put_away(self, place: _Place, env: AwaitedEnv, cause: str) -> None:
+        """Cancel what an env is doing, and close it. What it still does goes nowhere."""
+        env.leave()
+        place.env, place.lost = None, cause
+        place.leaving = self._spawn(self._close(env))
+
+    async def _close(self, env: AwaitedEnv) -> None:
+        await end_all([env], self._close_seconds)
+        self._note_closed(env)
+
+    def _note_closed(self, env: AwaitedEnv) -> None:
+        """Report what was wrong with an env that was put away, and look for what it has left."""
+        if (error := env.close_error) is not None and not self._ending:
+            log.warning("env %r, as it was put away to be rebuilt: %s", env.name, error.summary)
+        if self._look is None and not self._ending:
+            look = self._look_for_leftovers
+            self._look = self._loop.call_later(_LEFTOVERS_SECONDS, look, context=Context())
+        self._closed[env] = env.name
+
+    def _look_for_leftovers(self) -> None:
+        closed, self._closed, self._look = self._closed, {}, None
+        self._leftovers(closed)
+
+    def _leftovers(self, names: dict[Any, str]) -> list[asyncio.Task[Any]]:
+        known = [task for env in self._envs for task in env.tasks()]
+        return cancel_leftovers(names, but=known)
+
+    def _spawn(self, coroutine: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        # In no env's context, or the end of that env would cancel it: the caller may be the task of
+        # another env, or a timer that was set there.
+        task = new_task(coroutine, self._loop, Context())
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return task
+
+    def _restore(self, place: _Place, message: str = "") -> None:
+        """Give a place another env, which answers the request to it; see `_restored`."""
+        place.restoring = self._spawn(self._restored(place, message))
+
+    async def _restored(self, place: _Place, message: str) -> None:
+        """Build another env. A step, and what the env before was lost in, is answered by its reset.
+
+        Args:
+            place: without an env, and with a request.
+            message: why the env was lost that has executed the request; empty if it was idle.
+        """
+        entry, kind = place.entry, EnvHung
+        is_reset = bool(message) or op_of(entry) == Operation.STEP
+        while True:
+            if message:
+                failed = self._counted(place, kind, message)
+                if failed is not None:
+                    self._finish(place, failed)
+                    return
+                await asyncio.sleep(restart_pause(place.losses))
+            if place.leaving is not None:
+                await asyncio.wait({place.leaving}, timeout=CANCEL_SECONDS + _CLOSE_SECONDS)
+            error, env = await self._build(place), place.env
+            if env is None:
+                kind, message = WorkerDied, f"env {place.name!r} could not be rebuilt: {error!r}"
+                continue
+            if not is_reset:
+                self._give(place, env)
+                return
+            outcome = await self._reset(place, env)
+            if outcome is not None:
+                self._finish(place, outcome)
+                return
+            kind, message = EnvHung, f"env {place.name!r} took too long for the reset after that"
+
+    async def _reset(self, place: _Place, env: AwaitedEnv) -> Result | Raised | None:
+        """Begin an episode like the one that was lost; None if that takes too long."""
+        entry, cause = place.entry, place.lost
+        ended: asyncio.Future[Result | Raised] = self._loop.create_future()
+
+        def then(_: Any, entry: int, outcome: Any, error: BaseException | None) -> None:
+            if error is None:
+                ended.set_result(Result(self._host_id, entry, outcome or {}, restarted=cause))
+                return
+            text = ErrorText.of(error)
+            message = f"{text.text} (in the reset after its env {cause})"
+            error_text = ErrorText(text.type_name, message, text.traceback)
+            ended.set_result(Raised(self._host_id, entry, error_text))
+
+        env.give(Operation.RESET, entry, env.runner.reset_with, then)
+        limit = self._limits.get(Operation.RESET)
+        await asyncio.wait({ended}, timeout=None if limit is None else limit.seconds)
+        if ended.done():
+            return ended.result()
+        self._put_away(place, env, cause)
+        return None
+
+    def _counted(self, place: _Place, kind: type[WorkerDied], message: str) -> Failed | None:
+        """Count a loss of an env; return what ends its request if that was one too many."""
+        place.losses += 1
         config = self._order.config
-        if config.on_worker_death == "raise":
+        for_good = config.on_worker_death == "raise"
+        if for_good:
             outcome = "on_worker_death is 'raise', so it is not rebuilt"
-        elif env.losses > config.max_restarts:
-            outcome = f"it is not rebuilt after {env.losses - 1} restarts in a row (max_restarts)"
+        elif place.losses > config.max_restarts:
+            outcome = (
+                f"that was after {place.losses - 1} restarts in a row (max_restarts), so this "
+                "request ends here; the next one tries again"
+            )
         else:
-            count = f"restart {env.losses} of {config.max_restarts} in a row"
-            log.warning("%s; %s, in %g s", message, count, restart_pause(env.losses))
-            return False
-        env.fault = kind(f"{message}; {outcome}", env_id=env.name, exit_code=None, stderr_tail="")
-        env.fault.env_ids = (env.name,)
-        return True
+            count = f"restart {place.losses} of {config.max_restarts} in a row"
+            log.warning("%s; %s, in %g s", message, count, restart_pause(place.losses))
+            return None
+        fault = kind(f"{message}; {outcome}", env_id=place.name, exit_code=None, stderr_tail="")
+        fault.env_ids = (place.name,)
+        if for_good:
+            place.fault = fault
+        return Failed(self._host_id, place.entry, fault, for_good)
 
 
-async def _close(runner: AwaitedRunner) -> None:
-    closing: Any = runner.close()
-    if inspect.isawaitable(closing):
-        await closing
-
-
-def _close_error(task: asyncio.Task[None], *, is_stubborn: bool) -> ErrorText | None:
-    """The error of an env that should have closed by now; None if it has closed properly."""
-    if not task.done():
-        text = f"close() took longer than {_CLOSE_SECONDS} s and was cancelled"
-        return ErrorText("TimeoutError", text, text)
-    error = asyncio.CancelledError() if task.cancelled() else task.exception()
-    if error is not None:
-        return ErrorText.of(error)
-    text = "its step or reset goes on although it was cancelled"
-    return ErrorText("TimeoutError", text, text) if is_stubborn else None
-
-
-async def _ends(task: asyncio.Task[Any], seconds: float | None) -> bool:
-    """Wait for a task; False if it takes longer than that."""
-    return not (await asyncio.wait({task}, timeout=seconds))[1]
-
-
-def _first_result(host_id: int, entry: int, task: asyncio.Task[Any], cause: str) -> Result | Raised:
-    """The completion for the reset of an env that was rebuilt."""
-    error = asyncio.CancelledError() if task.cancelled() else task.exception()
-    if error is None:
-        return Result(host_id, entry, task.result() or {}, restarted=cause)
-    text = ErrorText.of(error)
-    message = f"{text.text} (in the reset after its env {cause})"
-    return Raised(host_id, entry, ErrorText(text.type_name, message, text.traceback))
+def _reraise(error: BaseException) -> NoReturn:
+    raise error

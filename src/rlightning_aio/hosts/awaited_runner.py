@@ -34,7 +34,7 @@ class AwaitedRunner(EnvRunner):
 
     Attributes:
         is_abandoned: the env was replaced and may not write to its row any more.
-        reset_with: seed and options of its last reset.
+        reset_with: seed and options of the last reset, of this env or of the one before it.
     """
 
     is_abandoned = False
@@ -48,9 +48,9 @@ class AwaitedRunner(EnvRunner):
         self._store_bare = None if bare is None else self._bare_store(layout)
 
     def place_like(self, other: AwaitedRunner) -> None:
-        """Take over the row of `other`, which this env replaces."""
+        """Take over the row of `other`, which this env replaces, and its episode."""
         self.attach(other._slab, other._row, other._announce)
-        other.is_abandoned = True
+        self.reset_with = other.reset_with
 
     async def answer(self, op: int, arguments: Any) -> Any:
         """Execute one request.
@@ -79,7 +79,9 @@ class AwaitedRunner(EnvRunner):
                 return self._show()
             arguments = self._slab.take_seed(self._row), None
         self._checkpoints.forget_result()
-        self.reset_with = seed, options = arguments
+        seed, options = arguments
+        if not (options and "reset_mask" in options):  # It begins no episode of the whole env.
+            self.reset_with = arguments
         began = time.monotonic_ns()
         resetting: Any = self.env.reset(seed=seed, options=options)
         out_of_band = self._finish(await resetting, "reset", time.monotonic_ns() - began)

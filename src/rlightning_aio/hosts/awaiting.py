@@ -140,7 +140,8 @@ class Awaiting:
             elif isinstance(completion, Raised):
                 kind, payload = FrameKind.ERROR, pickle.dumps(completion.error)
             else:
-                kind, payload = FrameKind.FAILED, pickle.dumps(completion.fault)
+                failure = completion.fault, completion.for_good
+                kind, payload = FrameKind.FAILED, pickle.dumps(failure)
         except Exception as error:
             kind, payload = FrameKind.ERROR, pickle.dumps(ErrorText.of(error))
         self._send(kind, completion.entry, payload)

@@ -84,18 +84,18 @@ def time_collector() -> None:
 @coroutine
 def watched(
     answering: Coroutine[Any, Any, Any],
+    entry: int,
     report: Callable[[int, float], None],
     enter: Callable[[int], object] | None,
-    entry: int,
 ) -> Generator[Any, Any, Any]:
     """Await `answering`.
 
     Args:
         answering: a coroutine that has not begun.
+        entry: of the request.
         report: gets `entry` and the seconds of each turn longer than `LONG_TURN_SECONDS`; after
             `time_collector` without those of the garbage collector.
         enter: gets `entry` before each turn.
-        entry: of the request.
     """
     send, throw, clock = answering.send, answering.throw, time.monotonic
     error: BaseException | None = None
@@ -216,14 +216,13 @@ async def cancel(tasks: Collection[asyncio.Task[Any]], seconds: float) -> set[as
     return (await asyncio.wait(tasks, timeout=seconds))[1] if tasks else set()
 
 
-async def cancel_leftovers(
-    names: Mapping[object, str], seconds: float, *, but: Collection[object] = ()
-) -> None:
-    """Report and cancel the tasks that closed envs have left running.
+def cancel_leftovers(
+    names: Mapping[object, str], but: Collection[object]
+) -> list[asyncio.Task[Any]]:
+    """Report and cancel the tasks that closed envs have left running; return them.
 
     Args:
         names: the envs' names, by what `OWNER` is in their contexts.
-        seconds: how long to wait for the tasks.
         but: tasks that are known already.
     """
     left: dict[str, list[asyncio.Task[Any]]] = {}
@@ -238,7 +237,10 @@ async def cancel_leftovers(
             len(tasks),
             ", ".join(task.get_name() for task in tasks),
         )
-    await cancel([task for tasks in left.values() for task in tasks], seconds)
+    found = [task for tasks in left.values() for task in tasks]
+    for task in found:
+        task.cancel()
+    return found
 
 
 def tasks_of(
@@ -251,6 +253,9 @@ def tasks_of(
 
 
 def _owner_of(task: asyncio.Task[Any]) -> object:
-    # Tasks have `get_context` from Python 3.12 on; but each refers to its context.
-    context = next((one for one in gc.get_referents(task) if type(one) is Context), None)
+    get_context: Any = getattr(task, "get_context", None)
+    if get_context is not None:
+        context = get_context()
+    else:  # Before Python 3.12; but each task refers to its context.
+        context = next((one for one in gc.get_referents(task) if type(one) is Context), None)
     return None if context is None else context.get(OWNER)

@@ -208,7 +208,7 @@ class Link:
             cause, packed = pickle.loads(payload)
             post(Result(host_id, number, packed, restarted=cause))
         elif kind == FrameKind.FAILED:
-            post(Failed(host_id, number, pickle.loads(payload)))
+            post(Failed(host_id, number, *pickle.loads(payload)))
         elif kind == FrameKind.START_ERROR:
             post(NotBuilt(host_id, number, pickle.loads(payload)))
         elif kind == FrameKind.ATTACHED:

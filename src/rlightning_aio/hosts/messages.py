@@ -258,11 +258,16 @@ class Raised(NamedTuple):
 
 
 class Failed(NamedTuple):
-    """A request ended in an error of ours, not of the env."""
+    """A request ended in an error of ours, not of the env.
+
+    Attributes:
+        for_good: no request reaches the env any more.
+    """
 
     host_id: int
     entry: int
     fault: EnvFault
+    for_good: bool = False
 
 
 class Withdrawn(NamedTuple):
