@@ -133,6 +133,7 @@ class State:
     Attributes:
         count: steps since the reset, as returned; cut: the step limit was reached there.
         counted: which sub-environments are within an episode.
+        begun: seed and options of the reset that began the episode.
         infos, finals: as reported with the last result; no infos if they aren't known.
     """
 
@@ -143,6 +144,7 @@ class State:
         self.count, self.cut = 0, False
         self.returns, self.lengths = [0.0] * len(codes), [0] * len(codes)
         self.counted = [False] * len(codes)
+        self.begun: tuple[int | None, dict[str, Any] | None] = None, None
         self.infos: list[dict[str, Any]] = []
         self.finals: list[Words | None] = [None for _ in codes]
 
@@ -195,6 +197,7 @@ class State:
         if request.resets:
             infos = self.scripts.reset(request.seed, request.options)
             self.count, self.cut, self.infos = 0, False, infos
+            self.begun = request.seed, request.options
             self.finals = [None for _ in many]
             self.returns, self.lengths = [0.0 for _ in many], [0 for _ in many]
             self.counted = [True for _ in many]
@@ -332,9 +335,15 @@ class Context:
 
 
 class Model:
-    """The envs of a group, and the `auto_reset` that is open."""
+    """The envs of a group, and the `auto_reset` that is open.
 
-    def __init__(self, envs: Iterable[Env]) -> None:
+    Args:
+        envs: of the group, in its order.
+        starts_fail: replacements may fail, which counts as deaths that nobody sees.
+    """
+
+    def __init__(self, envs: Iterable[Env], *, starts_fail: bool) -> None:
+        self.starts_fail = starts_fail
         self.envs = {env.env_id: env for env in envs}
         self.context: Context | None = None
         self.num_results = self.num_marked = 0
@@ -415,7 +424,7 @@ class Model:
         if restarted[0]:
             self._judge_marked(env, request, row)
             return
-        states = [env.state]
+        states = [env.state, *(state.copy() for state in env.loose)]
         if env.may_be_lost and request.kind == "reset":
             states += env.after_loss()
         limit, marks = self._limit_of(env)
@@ -470,10 +479,13 @@ class Model:
             )  # fmt: skip
         shows = "worker_resumed" in row.info
         require(not (shows and env.entry.every is None), "resumed, and nothing was saved")
-        again = Request("show") if shows else Request("reset")
-        for state in env.after_loss():
+        again = [Request("show") if shows else Request("reset")]
+        if env.entry.form == "awaitable":  # One that hung begins the same episode again.
+            seed, options = (request.seed, request.options) if request.resets else env.state.begun
+            again.append(Request("reset", seed=seed, options=options))
+        for one, state in ((one, state) for one in again for state in env.after_loss()):
             lost = max(env.state.count - state.count, 0)
-            expected = state.play(again, math.inf, marks=False)
+            expected = state.play(one, math.inf, marks=False)
             if expected.outcome.words == row.words:
                 break
         else:
@@ -487,7 +499,7 @@ class Model:
         env.seen = max(env.seen + 1, request.deaths)
         env.state, env.dirty, env.loose = state, False, []
         self.num_marked += 1
-        self._save(env, again)
+        self._save(env, again[0])
 
     # -- errors
 
@@ -539,7 +551,7 @@ class Model:
         in_call = env.request is not None and env.request.kind == "call"
         if entry.on_death == "raise" or not in_call:
             spent = entry.on_death == "raise" or host.deaths > entry.max_restarts
-            require(spent, "given up before its restarts were used up", repr(fault))
+            require(spent or self.starts_fail, "given up, with restarts left", repr(fault))
             for other in self.envs.values():
                 if other.host is host:
                     other.gone = True

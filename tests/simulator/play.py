@@ -17,6 +17,7 @@ import tempfile
 import time
 import warnings
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from random import Random
 from typing import TYPE_CHECKING, Any
@@ -36,6 +37,7 @@ from simulator.model import (
     same,
 )
 from simulator.scripted import DYING, FIXED, TOKENS, Act, encoded
+from simulator.world import Faults
 
 import rlightning_aio
 import rlightning_aio.sync
@@ -56,20 +58,20 @@ if TYPE_CHECKING:
 
     from simulator.program import Op, Program
 
-HANG = 60.0
-"""Seconds after which a call that must end counts as hung."""
-
 
 class Play:
     """One run of a program.
 
     Attributes:
         counts: what was done and what came of it.
+        hang: seconds after which a call that must end counts as hung; processes of a world may be
+            stopped for minutes.
     """
 
     def __init__(self, program: Program, world: Any = None) -> None:
         self.program, self.world = program, world
         self.features = program.features
+        self.hang = 200.0 if world is None else 1e6
         self.is_async = "async" in program.features
         self.counts: Counter[str] = Counter()
         self.model: Model
@@ -111,12 +113,16 @@ class Play:
             if self.world is not None:
                 self.world.calm()
             await self.done(self.group.init())
-            self.model = Model(self.program.envs(self.group.get_workers(), self.world))
+            faults = replace(self.program.faults, deaths=0.0, interrupts=0.0)
+            envs = self.program.envs(self.group.get_workers(), self.world)
+            self.model = Model(envs, starts_fail=faults != Faults())
             require([*self.model.envs] == self.group.env_ids, "ids", self.group.env_ids)
             for number, op in enumerate(self.program.ops):
                 await self.play(number, op)
             await self.finish()
         finally:
+            if self.world is not None:
+                self.world.calm()
             for task in self.tasks:
                 task.cancel()
             if self.tasks:
@@ -129,7 +135,10 @@ class Play:
             self.world.reseed(op.seed)
             self.world.storm()
         self.say(f"{number}: {op.name}")
-        await getattr(self, f"op_{op.name}")(Random(op.seed))
+        try:
+            await getattr(self, f"op_{op.name}")(Random(op.seed))
+        except KeyboardInterrupt:
+            self.counts["KeyboardInterrupt"] += 1
         self.counts[f"op {op.name}"] += 1
         await self.look_at_tasks()
         self.check_pending()
@@ -146,7 +155,7 @@ class Play:
     async def look_at_tasks(self, *, wait: bool = False) -> None:
         """Raise what tasks have raised, and forget those that have ended."""
         if wait and self.tasks:
-            _, late = await asyncio.wait(self.tasks, timeout=HANG)
+            _, late = await asyncio.wait(self.tasks, timeout=self.hang)
             require(not late, "a call hangs", late)
         for task in [task for task in self.tasks if task.done()]:
             self.tasks.remove(task)
@@ -170,7 +179,7 @@ class Play:
         if self.calls:
             await self.op_collect_calls(Random(0))
         while self.model.pending(COLLECTOR):
-            await self.collect(deadline=HANG)
+            await self.collect(deadline=self.hang)
         if self.context is not None:
             self.leave()
         for env in self.model.envs.values():
@@ -216,8 +225,11 @@ class Play:
         except EnvBusy:
             self.refuse_busy(requests)
             return False
-        except (asyncio.CancelledError, KeyboardInterrupt):
+        except asyncio.CancelledError:
             self.model.orphan(owner)
+            raise
+        except KeyboardInterrupt:
+            self.interrupted(requests, owner)
             raise
         take(found)
         return True
@@ -226,6 +238,14 @@ class Play:
         for env_id, request in requests.items():
             request.owner = owner
             self.model.send(self.model.envs[env_id], request)
+
+    def interrupted(self, requests: dict[str, Request], owner: Any) -> None:
+        """Find out what of an interrupted call was sent; its results wait for a collect."""
+        pending = self.group.pending
+        for env_id, request in requests.items():
+            if env_id not in pending and request.kind != "call":
+                self.model.withdraw(self.model.envs[env_id])
+        self.model.orphan(owner)
 
     def withdraw(self, requests: dict[str, Request]) -> None:
         """Note that none of these requests was sent."""
@@ -428,6 +448,9 @@ class Play:
             self.withdraw(requests)
         except EnvBusy:
             self.refuse_busy(requests)
+        except KeyboardInterrupt:
+            self.interrupted(requests, COLLECTOR)
+            raise
 
     async def op_collect(self, rng: Random) -> None:
         rules: dict[str, Any] = {}
@@ -440,7 +463,7 @@ class Play:
         elif "timeouts" in self.features and rng.random() < 0.4:
             rules["timeout"] = rng.choice([0.001, 0.5])
         if "timeouts" in self.features and rng.random() < 0.4:
-            rules["deadline"] = rng.choice([0.001, 0.2, HANG])
+            rules["deadline"] = rng.choice([0.001, 0.2, self.hang])
         if self.program.plans[1:] and rng.random() < 0.2:
             names = [plan.name for plan in self.program.plans]
             rules["entries"] = rng.sample(names, rng.randint(1, len(names)))
@@ -460,7 +483,11 @@ class Play:
             if isinstance(error, EnvFault):
                 self.take_fault(error, rules)
                 return
-            require(rules.get("deadline", HANG) < HANG, "a deadline that has not passed", rules)
+            require(
+                rules.get("deadline", self.hang) < self.hang,
+                "a deadline that has not passed",
+                rules,
+            )
             self.counts["TimeoutError"] += 1
             return
         except EnvFault as fault:
@@ -648,6 +675,12 @@ class Play:
             self.withdraw(requests)
         except EnvBusy:
             self.refuse_busy(requests)
+        except KeyboardInterrupt:
+            if set(requests) <= set(self.group.pending):
+                self.calls.append((envs, token))
+            else:
+                self.withdraw(requests)
+            raise
         else:
             self.calls.append((envs, token))
 
@@ -662,7 +695,7 @@ class Play:
             return
         self.collecting_calls = True
         try:
-            values = await self.done(self.group.collect_calls(HANG))
+            values = await self.done(self.group.collect_calls(self.hang))
         except EnvFault as fault:
             require(isinstance(fault, WorkerDied), "an error of a call that has none", repr(fault))
             self.fail_values(
@@ -697,7 +730,14 @@ class Play:
             require(value in possible, "another attribute", value, mark)
 
         request = {env.env_id: Request("call")}
-        if await self.answer(request, lambda: handle.set_attr("mark", mark), take) and env.idle:
+        try:
+            answered = await self.answer(request, lambda: handle.set_attr("mark", mark), take)
+        except KeyboardInterrupt:
+            env.loose = [env.state.copy()]
+            for sub in env.loose[0].scripts.subs:
+                sub.mark = mark
+            raise
+        if answered and env.idle:
             request = {env.env_id: Request("call")}
             await self.answer(request, lambda: handle.get_attr("mark"), take_mark)
 
@@ -766,7 +806,6 @@ class Play:
         def take(data: bytes) -> None:
             for env in envs:
                 env.request = None
-                require(not env.state.refuses, "a snapshot that was refused", env.env_id)
             self.snapshots.append((data, states))
             del self.snapshots[:-4]
 
@@ -804,7 +843,11 @@ class Play:
             await self.answer(requests, lambda: self.group.restore(data, [*requests]), take)
         except (asyncio.CancelledError, KeyboardInterrupt):
             for env, state, (_, saved) in zip(envs, before, states, strict=True):
-                env.loose = [state.copy(), saved.copy()]
+                if env.env_id in self.group.pending:  # It shows the state to a collect.
+                    env.put_back(saved)
+                    env.request, env.limbo = Request("show"), False
+                else:
+                    env.loose = [state.copy(), saved.copy()]
             raise
         for env in envs:
             env.state.refuses = False

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from simulator.model import Entry, Env, Host, State
 from simulator.scripted import CONTROLS, FIXED, LAYOUTS, MAKERS
+from simulator.world import Faults
 
 if TYPE_CHECKING:
     from simulator.world import World
@@ -22,7 +23,7 @@ FEATURES = (
     "processes",
     "auto_reset", "partial steps", "plain values", "extras", "calls", "handles", "snapshots",
     "cancel", "timeouts", "tasks", "raise", "rubbish", "infos", "ends", "slow", "die", "hang",
-    "raise deaths", "resume", "misuse", "zero_copy", "timeline",
+    "raise deaths", "resume", "misuse", "zero_copy", "timeline", "faults",
 )  # fmt: skip
 
 
@@ -107,12 +108,14 @@ class Program:
 
     Attributes:
         features: what it may use.
+        faults: of the world that it runs in.
     """
 
     seed: int
     features: frozenset[str]
     plans: tuple[Plan, ...]
     ops: tuple[Op, ...]
+    faults: Faults
 
     def configs(self) -> list[dict[str, Any]]:
         return [plan.config(number) for number, plan in enumerate(self.plans)]
@@ -179,7 +182,11 @@ def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 40)
     count = rng.randint(num_ops // 4, num_ops)
     ops = [Op(name, rng.getrandbits(32)) for name in rng.choices(names, weights, k=count)]
     first = [Op("reset", rng.getrandbits(32))] if rng.random() < 0.8 else []
-    return Program(seed, features, tuple(plans), (*first, *ops))
+    kinds = ["deaths", "stops", "lags", "starts", "fork_servers"]
+    kinds += ["interrupts"] * ("async" not in features)
+    chances = {kind: rng.choice([0.02, 0.1, 0.4]) for kind in kinds if rng.random() < 0.4}
+    faults = Faults(**chances) if "faults" in features else Faults()
+    return Program(seed, features, tuple(plans), (*first, *ops), faults)
 
 
 def _plan(rng: Random, features: frozenset[str], name: str) -> Plan:
@@ -201,7 +208,7 @@ def _plan(rng: Random, features: frozenset[str], name: str) -> Plan:
         plan = replace(plan, min_results=rng.randint(1, plan.num_workers))
     places = ["inline"] if form != "awaitable" else ["loop"] if "async" in features else []
     if "processes" in features or not places:
-        places += ["process"] if form == "awaitable" else ["process", "process", "split"]
+        places += ["process"] if form == "awaitable" else ["process"] * 4 + ["split"]
     placement = rng.choice(places)
     if placement in ("inline", "loop"):
         return replace(plan, placement=placement)

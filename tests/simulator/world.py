@@ -34,7 +34,7 @@ import sys
 import time
 from collections import Counter
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from random import Random
 from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
@@ -352,7 +352,8 @@ class World:
             self.interrupt()
 
     def interrupt(self) -> None:
-        """Press Ctrl-C."""
+        """Press Ctrl-C; again only after the next `storm`, as a second one may break a group."""
+        self.faults = replace(self.faults, interrupts=0.0)
         self.counts["interrupts"] += 1
         self.note("Ctrl-C")
         self.running = None  # The trainer handles it.

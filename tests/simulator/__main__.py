@@ -1,0 +1,50 @@
+"""`make simulate`: run many programs, or replay the one of a seed."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections import Counter
+
+from simulator.program import draw
+from simulator.runs import prepare, run, run_many, run_twice, shown, shrunk
+
+
+def main() -> int:
+    """Run the command."""
+    parser = argparse.ArgumentParser(prog="simulate", description=__doc__)
+    parser.add_argument("--seeds", type=int, default=1000, help="how many programs")
+    parser.add_argument("--first", type=int, default=0, help="the first seed")
+    parser.add_argument("--seed", type=int, help="replay the program of this seed")
+    parser.add_argument("--real", action="store_true", help="with real processes")
+    parser.add_argument("--once", action="store_true", help="each once, not twice")
+    arguments = parser.parse_args()
+    again = (lambda p: run(p, real=True)) if arguments.real else run_twice
+    if arguments.seed is not None:
+        prepare()
+        print(shown(found := again(draw(arguments.seed))))
+        return bool(found.error)
+    began, counts, hours, failed = time.perf_counter(), Counter[str](), 0.0, []
+    seeds = range(arguments.first, arguments.first + arguments.seeds)
+    for found in run_many(seeds, real=arguments.real, once=arguments.once):
+        counts += found.counts
+        hours += found.hours
+        if found.error:
+            failed.append(found)
+            print(f"seed {found.program.seed}: {found.kind}", flush=True)
+    seconds = time.perf_counter() - began
+    print(
+        f"{len(seeds)} programs, {len(failed)} failed: {seconds:.0f} s, {hours:.1f} simulated hours"
+    )
+    for name, count in sorted(counts.items()):
+        print(f"{count:9d} {name}")
+    if failed:
+        prepare()
+        print("\nThe first failure, made as small as it gets:\n")
+        print(shown(shrunk(failed[0], again)))
+    return bool(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
