@@ -75,7 +75,7 @@ class ForkServer(Living):
 
     def wait(self, timeout: float | None = None) -> int:
         """See `Popen.wait`."""
-        self._world.wait_for(lambda: not self.alive, timeout)
+        self.world.wait_for(lambda: not self.alive, timeout)
         if self.alive:
             assert timeout is not None
             raise subprocess.TimeoutExpired("fork server", timeout)
@@ -87,7 +87,7 @@ class ForkServer(Living):
     def _begin(self) -> None:
         """Have imported the modules."""
         self._is_ready = True
-        if self._world.refuses():
+        if self.world.refuses():
             self._trainer.send(Ready("ImportError: as the world wants it"))
             self.end(0)
             return
@@ -100,27 +100,27 @@ class ForkServer(Living):
             return
         self.alive = False
         self._exit_code = code
-        self._world.counts["fork servers that ended"] += 1
-        self._world.note("{} ends with {}", self.name, code)
+        self.world.counts["fork servers that ended"] += 1
+        self.world.note("{} ends with {}", self.name, code)
         self._trainer.close()
         for worker, channel in list(self._children.values()):
-            self._world.sockets.close_descriptor(channel)
+            self.world.sockets.close_descriptor(channel)
             worker.end(-signal.SIGKILL)
 
     def wake(self) -> None:
         """Look at its socket, soon."""
         if self._is_ready and not self._is_looking:
             self._is_looking = True
-            self.later(self._world.delay(), self._look)
+            self.later(self.world.delay(), self._look)
 
     def _look(self) -> None:
         self._is_looking = False
-        chance, chances = self._world.rng.random(), self._world.faults.fork_servers
+        chance, chances = self.world.rng.random(), self.world.faults.fork_servers
         if chance < chances / 2:
             self.end(-signal.SIGKILL)
             return
         if chance < chances:
-            self.stop(self._world.long())
+            self.stop(self.world.long())
         try:
             self._trainer.flush()
             while (received := self._trainer.receive()) is not None:
@@ -138,36 +138,36 @@ class ForkServer(Living):
             self.later(_DUMP_SECONDS if message.dump else 0.0, partial(worker.end, -signal.SIGKILL))
 
     def _fork(self, place: WorkerPlace, channel: int, arena: int) -> None:
-        sockets, host_id = self._world.sockets, place.host_id
-        if self._world.refuses():
+        sockets, host_id = self.world.sockets, place.host_id
+        if self.world.refuses():
             sockets.close_descriptor(channel)
             sockets.close_descriptor(arena)
             self._trainer.send(NotForked(host_id, "no more processes"))
             return
         kept = sockets.duplicate(channel)
-        worker = new_worker(self._world, place, channel, arena, partial(self._reap, host_id))
+        worker = new_worker(self.world, place, channel, arena, partial(self._reap, host_id))
         self._children[host_id] = worker, kept
         self._trainer.send(Forked(host_id, worker.pid))
 
     def _reap(self, host_id: int, code: int, stderr: str) -> None:
         """Handle the exit of a worker, soon."""
-        self.later(self._world.delay(), partial(self._report_exit, host_id, code, stderr))
+        self.later(self.world.delay(), partial(self._report_exit, host_id, code, stderr))
 
     def _report_exit(self, host_id: int, code: int, stderr: str) -> None:
         _, channel = self._children.pop(host_id)
         self._trainer.send(Exited(host_id, code, stderr))
-        self._world.sockets.close_descriptor(channel)
+        self.world.sockets.close_descriptor(channel)
 
     def _leave(self) -> None:
         """End, as the trainer has closed the socket or is gone: first the workers, in time."""
         for _, channel in self._children.values():
-            self._world.sockets.by_number[channel].shutdown(0)
+            self.world.sockets.by_number[channel].shutdown(0)
         self._trainer.close()
-        self._until_gone(self._world.now_ns + int(_GRACE_SECONDS * 1e9))
+        self._until_gone(self.world.now_ns + int(_GRACE_SECONDS * 1e9))
 
     def _until_gone(self, until_ns: int) -> None:
         some_live = any(worker.alive for worker, _ in self._children.values())
-        if some_live and self._world.now_ns < until_ns:
+        if some_live and self.world.now_ns < until_ns:
             self.later(0.01, partial(self._until_gone, until_ns))
         else:
             self.end(0)

@@ -32,6 +32,7 @@ class Living:
         name: for the trace.
 
     Attributes:
+        world: as given.
         alive: it has not ended.
     """
 
@@ -39,13 +40,13 @@ class Living:
         self.name = name
         self.pid = next(world.pids)
         self.alive = True
-        self._world = world
+        self.world = world
         self._is_stopped = False
         self._held: list[Callable[[], object]] = []
 
     def later(self, seconds: float, callback: Callable[[], object]) -> list[Any]:
         """Do something later; see `World.after`."""
-        return self._world.after(seconds, partial(self._do, callback))
+        return self.world.after(seconds, partial(self._do, callback))
 
     def _do(self, callback: Callable[[], object]) -> None:
         if self.alive and self._is_stopped:
@@ -55,16 +56,16 @@ class Living:
 
     def stop(self, seconds: float) -> None:
         """Stop it for some time, as by SIGSTOP and SIGCONT."""
-        self._world.counts["stops"] += 1
-        self._world.note("{} is stopped for {:g} s", self.name, seconds)
-        self._world.stopped.append(self)
+        self.world.counts["stops"] += 1
+        self.world.note("{} is stopped for {:g} s", self.name, seconds)
+        self.world.stopped.append(self)
         self._is_stopped = True
-        self._world.after(seconds, self.go_on)
+        self.world.after(seconds, self.go_on)
 
     def go_on(self) -> None:
         """Go on after `stop`."""
         if self._is_stopped:
-            self._world.stopped.remove(self)
+            self.world.stopped.remove(self)
             self._is_stopped = False
             held, self._held = self._held, []
             for callback in held:
@@ -113,7 +114,7 @@ class Process(Living):
     def _resume(self) -> None:
         """Run until it gives its core up, as an event of the world."""
         self._is_parked = False
-        world = self._world
+        world = self.world
         world.running, self._resumer = self, greenlet.getcurrent()
         loop = asyncio._get_running_loop()
         asyncio._set_running_loop(self._loop)
@@ -126,7 +127,7 @@ class Process(Living):
 
     def _give_up_core(self) -> None:
         self._resumer.switch()
-        if self._world.ended:
+        if self.world.ended:
             raise Killed
 
     def sleep(self, seconds: float) -> None:
@@ -136,7 +137,7 @@ class Process(Living):
 
     def wait_for(self, ready: Callable[[], T], until_ns: int | None) -> T:
         """Wait until `ready` returns something true, or until then."""
-        world = self._world
+        world = self.world
         while not (found := ready()) and (until_ns is None or world.now_ns < until_ns):
             self._is_parked = True
             if until_ns is not None:
@@ -148,8 +149,8 @@ class Process(Living):
         """Let it look again at what it waits for."""
         if self._is_parked:
             self._is_parked = False
-            self._world.cancel(self._timer)
-            self._timer = self.later(self._world.delay(), self._resume)
+            self.world.cancel(self._timer)
+            self._timer = self.later(self.world.delay(), self._resume)
 
     def unwind(self) -> None:
         """Leave all its functions, at the end of the world."""
@@ -169,7 +170,7 @@ class Process(Living):
 
     def point(self) -> None:
         """Let something else happen now."""
-        world, faults = self._world, self._world.faults
+        world, faults = self.world, self.world.faults
         chance = world.rng.random()
         if chance < faults.deaths:
             self.end(-signal.SIGKILL)
@@ -179,7 +180,7 @@ class Process(Living):
 
     def end(self, code: int) -> None:
         """End it; everything that it has open is closed. If it ends itself, this doesn't return."""
-        world = self._world
+        world = self.world
         if not self.alive:
             return
         self.alive = False

@@ -66,7 +66,7 @@ class Sockets:
     def __init__(self, world: World) -> None:
         self._world = world
         self._numbers = itertools.count(_FIRST_DESCRIPTOR)
-        self.by_number: dict[int, SimulatedSocket] = {}
+        self.by_number: dict[int, Any] = {}
         self._real: set[int] = set()
         self.stream_room = world.rng.choice((512, 4096, 65536, 212_992))
         self.packet_room = world.rng.choice((2, 10, 200))
@@ -88,6 +88,25 @@ class Sockets:
         made = SimulatedSocket(self._world, end, next(self._numbers))
         self.by_number[made.fileno()] = made
         return made
+
+    def event_descriptor(self, count: int, flags: int = 0) -> int:
+        """See `os.eventfd`."""
+        del flags
+        number = next(self._numbers)
+        self.by_number[number] = _Events(self, number, count)
+        return number
+
+    def write_event(self, descriptor: int, count: int) -> None:
+        """See `os.eventfd_write`."""
+        self.by_number[descriptor].count += count
+
+    def read_event(self, descriptor: int) -> int:
+        """See `os.eventfd_read`."""
+        events = self.by_number[descriptor]
+        if not events.count:
+            raise BlockingIOError(errno.EAGAIN, "it would block")
+        count, events.count = events.count, 0
+        return count
 
     def duplicate(self, descriptor: int) -> int:
         """See `os.dup`."""
@@ -119,6 +138,27 @@ class Sockets:
         for descriptor in self._real:
             _close(descriptor)
         self._real.clear()
+
+
+class _Events:
+    """A descriptor of `os.eventfd`."""
+
+    def __init__(self, sockets: Sockets, number: int, count: int) -> None:
+        self.count = count
+        self._sockets = sockets
+        self._number = number
+
+    def close(self) -> None:
+        del self._sockets.by_number[self._number]
+
+    def is_readable(self) -> bool:
+        return self.count > 0
+
+    def is_writable(self) -> bool:
+        return True
+
+    def is_hung_up(self) -> bool:
+        return False
 
 
 class SimulatedSocket:
@@ -170,6 +210,9 @@ class SimulatedSocket:
 
     def is_writable(self) -> bool:
         return self.end.is_shut or self.end.peer.is_shut or self.room() > 0
+
+    def is_hung_up(self) -> bool:
+        return self.end.peer.is_shut
 
     def _wait(self, ready: Callable[[], bool], flags: int) -> None:
         if ready():
@@ -310,7 +353,7 @@ class Epoll:
         return found
 
 
-def _events(one: SimulatedSocket | None, mask: int) -> int:
+def _events(one: Any, mask: int) -> int:
     if one is None:  # It was closed.
         return 0
     events = 0
@@ -318,7 +361,7 @@ def _events(one: SimulatedSocket | None, mask: int) -> int:
         events |= select.EPOLLIN
     if mask & select.EPOLLOUT and one.is_writable():
         events |= select.EPOLLOUT
-    if one.end.peer.is_shut:
+    if one.is_hung_up():
         events |= select.EPOLLHUP
     return events
 

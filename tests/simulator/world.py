@@ -40,6 +40,7 @@ from random import Random
 from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
 from unittest import mock
 
+from simulator import rays
 from simulator.fork_server import ForkServer
 from simulator.processes import NOBODY, Killed, Process
 from simulator.sockets import Epoll, Loop, Sockets, run_in_process
@@ -152,6 +153,7 @@ class World:
             self._patches.callback(gc.enable)
         for target, name, replacement in self._replacements():
             self._patches.enter_context(mock.patch.object(target, name, replacement))
+        self._patches.enter_context(rays.importable())
         self._patches.callback(kernel.select, kernel.selected)
         kernel.select(self._implementation)
         return self
@@ -179,6 +181,9 @@ class World:
             (socket, "socketpair", self.sockets.pair),
             (subprocess, "Popen", partial(ForkServer, self)),
             (os, "close", self.sockets.close_descriptor),
+            (os, "eventfd", self.sockets.event_descriptor),
+            (os, "eventfd_read", self.sockets.read_event),
+            (os, "eventfd_write", self.sockets.write_event),
             (os, "set_inheritable", self.sockets.set_inheritable),
             (os, "sched_yield", self.give_way),
             (os, "sched_getaffinity", lambda _: cores),
@@ -192,6 +197,7 @@ class World:
             (rings, "IN_ORDER", False),
             (exchange, "new_fence", lambda: self.point),
             (rings, "new_fence", lambda: self.point),
+            (rays.MODULES["rlightning_aio.hosts.ray"], "ray", rays.SimulatedRay(self)),
             (awaiting, "run_loop", lambda main: run_in_process(self, main)),
             *([(scripted, "machine", SimulatedMachine(self))] if scripted else []),
         ]
