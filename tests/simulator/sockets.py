@@ -85,15 +85,19 @@ class Sockets:
 
     def open(self, end: _End) -> SimulatedSocket:
         """Make another descriptor of an end."""
-        made = SimulatedSocket(self._world, end, next(self._numbers))
-        self.by_number[made.fileno()] = made
+        made = SimulatedSocket(self._world, end)
+        made.number = self.adopt(made)
         return made
 
     def event_descriptor(self, count: int, flags: int = 0) -> int:
         """See `os.eventfd`."""
         del flags
+        return self.adopt(_Events(count))
+
+    def adopt(self, source: Any) -> int:
+        """Give something that can be waited for a descriptor."""
         number = next(self._numbers)
-        self.by_number[number] = _Events(self, number, count)
+        self.by_number[number] = source
         return number
 
     def write_event(self, descriptor: int, count: int) -> None:
@@ -122,7 +126,7 @@ class Sockets:
         if running is not None:
             running.descriptors.discard(descriptor)
         if descriptor >= _FIRST_DESCRIPTOR:
-            self.by_number[descriptor].close()
+            self.by_number.pop(descriptor).close()
             return
         self._real.discard(descriptor)
         _close(descriptor)
@@ -143,13 +147,10 @@ class Sockets:
 class _Events:
     """A descriptor of `os.eventfd`."""
 
-    def __init__(self, sockets: Sockets, number: int, count: int) -> None:
+    def __init__(self, count: int) -> None:
         self.count = count
-        self._sockets = sockets
-        self._number = number
 
-    def close(self) -> None:
-        del self._sockets.by_number[self._number]
+    def close(self) -> None: ...
 
     def is_readable(self) -> bool:
         return self.count > 0
@@ -164,24 +165,24 @@ class _Events:
 class SimulatedSocket:
     """A descriptor of an end; see `socket.socket`."""
 
-    def __init__(self, world: World, end: _End, number: int) -> None:
+    def __init__(self, world: World, end: _End) -> None:
         self.end = end
+        self.number = -1
         self._world = world
-        self._number = number
         self._is_blocking = True
         end.descriptors += 1
 
     def fileno(self) -> int:
-        return self._number
+        return self.number
 
     def setblocking(self, is_blocking: bool) -> None:
         self._is_blocking = is_blocking
 
     def close(self) -> None:
-        number, self._number = self._number, -1
+        number, self.number = self.number, -1
         if number < 0:
             return
-        del self._world.sockets.by_number[number]
+        self._world.sockets.by_number.pop(number, None)
         end = self.end
         end.descriptors -= 1
         if end.descriptors:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import asyncio
 from collections import Counter
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from remote.counting import CountingEnv as CountedSteps
 from simulator.world import Faults, World
 
 import rlightning_aio as rl
@@ -132,6 +134,12 @@ def test_asynchronous_group_runs_on_the_loop_of_the_world() -> None:
         assert trace(seed) == trace(seed)
 
 
+class RemoteEnv(CountedSteps):
+    """An env of a client that serves until the program ends."""
+
+    def on_disconnect(self) -> None: ...
+
+
 STORM = Faults(deaths=0.03, stops=0.02, interrupts=0.02, lags=0.02, starts=0.1, fork_servers=0.02)
 
 
@@ -166,3 +174,45 @@ def test_group_survives_every_kind_of_fault() -> None:
 def test_same_seed_gives_the_same_trace() -> None:
     for seed in range(5):
         assert survived(seed).trace == survived(seed).trace
+
+
+def test_actors_of_ray_and_their_deaths_are_simulated() -> None:
+    def world(seed: int, **faults: float) -> World:
+        world = World(seed, Faults(**faults))
+        with world, suppress(StartFailed), sync.build_env_group(config(placement="ray")) as group:
+            batch, _ = group.reset(seed=5)
+            for _ in range(10):
+                batch, _ = group.step(batch.respond(action=np.zeros(4, np.int64)))
+            world.calm()
+            group.reset()
+            if not faults:
+                assert batch.observation.tolist() == [[5, 10], [6, 10], [7, 10], [8, 10]]
+        return world
+
+    world(1)
+    for seed in range(5):
+        faulty = world(seed, deaths=0.05)
+        assert faulty.trace == world(seed, deaths=0.05).trace
+        assert faulty.counts["deaths"]
+
+
+def test_clients_of_an_env_server_are_simulated() -> None:
+    def world(seed: int) -> World:
+        world = World(seed, Faults(cuts=0.05))
+        kwargs = {"heartbeat": 1.0, "min_clients": 2, "connect_timeout": 900.0}
+        entry = {"name": "robots", "backend": "env_server", "env_kwargs": kwargs}
+        with world, sync.build_env_group(entry) as group:
+            for k in range(2):
+                world.network.client(partial(RemoteEnv, k), group["robots-0"].address, f"c{k}")
+            for _ in range(9):
+                batch, _ = group.reset(seed=5)
+                assert batch.observation[:, 0].tolist() == [0, 1]
+                group.step_async(batch.respond(action=np.zeros((2, 2), np.float32)))
+                batch, _ = group.collect_async(wait_all=True)
+                for ret in batch.values():
+                    assert ret.observation[2] == 1 or "client_lost" in ret.info
+        return world
+
+    worlds = [world(seed) for seed in range(5)]
+    assert [one.trace for one in worlds] == [world(seed).trace for seed in range(5)]
+    assert any(one.counts["cuts"] for one in worlds)

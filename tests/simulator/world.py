@@ -26,6 +26,7 @@ import gc
 import heapq
 import itertools
 import os
+import secrets
 import select
 import signal
 import socket
@@ -42,6 +43,7 @@ from unittest import mock
 
 from simulator import rays
 from simulator.fork_server import ForkServer
+from simulator.network import Network
 from simulator.processes import NOBODY, Killed, Process
 from simulator.sockets import Epoll, Loop, Sockets, run_in_process
 
@@ -86,6 +88,7 @@ class Faults:
         interrupts: chance that the user presses Ctrl-C where the world takes the trainer's core.
         lags: chance that the trainer gets its core back late there, by milliseconds to minutes.
         starts: chance of each start that it takes long, or that the system refuses it.
+        cuts: chance of a connection to an env_server to break, at each message.
         fork_servers: chance of a fork server, whenever it looks at its messages, that it is killed
             or stopped.
     """
@@ -95,6 +98,7 @@ class Faults:
     interrupts: float = 0.0
     lags: float = 0.0
     starts: float = 0.0
+    cuts: float = 0.0
     fork_servers: float = 0.0
 
 
@@ -112,6 +116,7 @@ class World:
     Attributes:
         rng: the source of all chances; see `reseed`.
         counts: how often things happened.
+        network: between env_servers and their clients, which `Network.client` starts.
         deaths: of each process that ended with an error, by its name.
         ended: it is no more.
         stopped: processes that are stopped.
@@ -127,6 +132,7 @@ class World:
         self.running: Process | Nobody | None = None
         self.now_ns = _START_NS
         self.sockets = Sockets(self)
+        self.network = Network(self)
         self.pids = itertools.count(10_000)
         self._implementation = implementation
         self._notes: list[tuple[Any, ...]] = []
@@ -198,6 +204,8 @@ class World:
             (exchange, "new_fence", lambda: self.point),
             (rings, "new_fence", lambda: self.point),
             (rays.MODULES["rlightning_aio.hosts.ray"], "ray", rays.SimulatedRay(self)),
+            (secrets, "randbits", self.rng.getrandbits),
+            *self.network.replacements(),
             (awaiting, "run_loop", lambda main: run_in_process(self, main)),
             *([(scripted, "machine", SimulatedMachine(self))] if scripted else []),
         ]
