@@ -170,6 +170,41 @@ def test_a_program_that_handles_ctrl_c_itself_goes_on_doing_so() -> None:
         assert batch.observation.tolist() == [1]
 
 
+class Saved(Pressing):
+    """Presses Ctrl-C when the state of the first of its kind is saved."""
+
+    presses: Iterator[Callable[[], None]]
+
+    def step(self, action: Any) -> Any:
+        return 1, 1.0, False, False, {}
+
+    def save_state(self) -> Any:
+        next(self.presses, int)()
+
+    def load_state(self, state: Any) -> None: ...
+
+
+@pytest.mark.parametrize("use", ["step", "step_async", "reset", "call"])
+def test_an_interrupted_call_of_all_inline_envs_keeps_none_of_them_busy(use: str) -> None:
+    """What is left of it is executed before the next request."""
+    Saved.presses = iter([press])
+    entry = {"name": "a", "make_env": Saved, "placement": "inline", "num_workers": 4}
+    with rlightning_aio.sync.build_env_group(entry) as group:
+        batch, _ = group.reset()
+        with pytest.raises(KeyboardInterrupt):
+            group.snapshot()
+        uses_of(group, batch)[use]()
+
+
+def uses_of(group: Any, batch: BatchedData) -> dict[str, Callable[[], Any]]:
+    return {
+        "step": lambda: group.step(batch.respond(action=[1] * len(batch))),
+        "step_async": lambda: group.step_async(batch.respond(action=[1] * len(batch))),
+        "reset": group.reset,
+        "call": lambda: group["a-0"].get_attr("observation_space"),
+    }
+
+
 class Waiting(Pressing):
     """Presses Ctrl-C in the trainer, and waits for a file."""
 
@@ -201,12 +236,7 @@ def test_an_env_is_free_again_after_a_call_that_was_interrupted(
         batch, _ = group.reset()
         env = group["a-0"]
         env.set_attr("waits_for", waits_for)
-        uses: dict[str, Callable[[], Any]] = {
-            "step": lambda: group.step(batch.respond(action=[1])),
-            "step_async": lambda: group.step_async(batch.respond(action=[1])),
-            "reset": group.reset,
-            "call": lambda: env.get_attr("waits_for"),
-        }
+        uses = uses_of(group, batch)
         with pytest.raises(KeyboardInterrupt):
             env.call("wait", *waits_for) if interrupted == "call" else group.snapshot()
         with pytest.raises(EnvBusy, match="a call that was cancelled still runs in it"):

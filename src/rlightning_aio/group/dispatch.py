@@ -59,10 +59,9 @@ class Dispatch:
         """Raise an error if the group is closed, or an env of `slots` is busy or gone."""
         self._lifetime.check_open()
         self._supervisor.check_usable(slots)
-        slot = self._requests.first_not_idle(slots)
-        if slot is not None and self._requests.owner[slot] == NOBODY:
-            self._end_call(slot)
-            slot = self._requests.first_not_idle(slots)
+        while (slot := self._requests.first_not_idle(slots)) is not None:
+            if self._requests.owner[slot] != NOBODY or not self._end_call(slot):
+                break
         if slot is not None:
             why = "its last request was not collected; collect it first"
             if self._requests.owner[slot] == NOBODY:
@@ -71,15 +70,17 @@ class Dispatch:
                 why = "its last request has not replied yet; collect it first"
             raise EnvBusy(f"can't {what} {self._envs.describe(slot)}: {why}; nothing was sent")
 
-    def _end_call(self, slot: int) -> None:
+    def _end_call(self, slot: int) -> bool:
         """Note the end of a cancelled call that has ended since the group last waited.
 
-        In this process, it is executed now, after the requests that were sent before it.
+        In this process, it is executed now, after the requests that were sent before it. Returns
+        False if it has not ended.
         """
         self._watcher.read()
         self._intake.drain()
         while not self._requests.is_idle(slot) and self._poller.execute(1, None):
             self._intake.drain()
+        return self._requests.is_idle(slot)
 
     def check_local(self, slots: NDArray[np.intp], what: str) -> None:
         """Raise `NotImplementedError` if any of `slots` belongs to a member."""
