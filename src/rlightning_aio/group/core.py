@@ -257,7 +257,7 @@ class Core:
     def _raise_fault(self, among: NDArray[np.bool_] | None) -> None:
         """Raise the collector's oldest error of these slots, if there is one."""
         for fault in self.requests.collector.faults:
-            if among is None or among[self.envs.find_one(fault.env_id)]:
+            if among is None or among[self.envs.one_of_entry(fault.env_id)]:
                 self.requests.collector.take_fault(fault)
                 raise fault
 

@@ -169,6 +169,11 @@ class EnvTable:
         except KeyError:
             raise UnknownEnv(self._unknown(env_id)) from None
 
+    def one_of_entry(self, env_id: str) -> int:
+        """A slot of the entry of `env_id`, which may be of a member that has left."""
+        slot = self._slot_of.get(env_id)
+        return self.names.shared_ids.index(env_id.rpartition("/")[0]) if slot is None else slot
+
     def _unknown(self, env_id: Any) -> str:
         ids = list(self._slot_of)
         known = ", ".join(ids[:8]) + (", …" if len(ids) > 8 else "")
