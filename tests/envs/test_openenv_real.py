@@ -111,7 +111,8 @@ def rows_of(batch: Any) -> list[list[Any]]:
     return rows
 
 
-def test_the_client_of_openenv_uses_our_server(tmp_path: Path) -> None:
+def test_the_clients_of_openenv_use_our_server(tmp_path: Path) -> None:
+    """One kind after the other, so the sessions of each are free again for the next."""
     pole = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1", "num_workers": 4}
     with start("serve", write_config(tmp_path, pole), "--port", 0) as server:
         assert server.stdout is not None
@@ -119,9 +120,11 @@ def test_the_client_of_openenv_uses_our_server(tmp_path: Path) -> None:
         client = [PYTHON, str(HERE / "openenv_client.py"), url, "4"]
         text = subprocess.run(client, stdout=subprocess.PIPE, check=True, env=AS_USUAL).stdout
         interrupt(server)
+    found = json.loads(text)
+    assert found["generic"] == found["sync"] == found["mcp"]
     env = gym.make("CartPole-v1")
-    for seed, (first, *rows) in enumerate(json.loads(text)):
-        assert first == env.reset(seed=seed)[0].tolist()
+    for seed, (first, *rows) in enumerate(found["mcp"]):
+        assert first == [env.reset(seed=seed)[0].tolist(), 0.0, False]
         for number, (observation, reward, done) in enumerate(rows, 1):
             found, gained, terminated, truncated, _ = env.step(number % 2)
             assert (observation, reward) == (found.tolist(), gained)
