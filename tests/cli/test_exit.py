@@ -139,10 +139,26 @@ def test_a_dead_worker_is_code_1(tmp_path: Path) -> None:
 
 @pytest.mark.filterwarnings("ignore:close.. of env 'frail-0' raised WorkerDied")
 def test_a_rollout_continues_after_a_worker_is_replaced(tmp_path: Path) -> None:
-    """A dead worker is replaced by default."""
+    """A dead worker is replaced by default. The table and the document say so."""
     dying = {"name": "frail", "backend": "dying", "task": "any", "max_restarts": 10**6}
-    done = invoke("rollout", write_config(tmp_path, dying), "--steps", 20)
+    config = write_config(tmp_path, dying)
+    done = invoke("rollout", config, "--steps", 4)
     assert done.exit_code == 0, done.stderr
+    note = "entry 'frail': 1 restart, 1 lost step; exited with code 7: 1 result"
+    assert note in done.stdout.splitlines()
+    document = json.loads(invoke("rollout", config, "--steps", 4, "--json").stdout)
+    (entry,) = document["entries"]
+    assert (entry["restarts"], entry["lost_steps"]) == (1, 1)
+    assert entry["losses"] == {"exited with code 7": 1}
+    assert note in document["notes"]
+
+
+def test_a_rollout_without_losses_has_no_note_of_them(tmp_path: Path) -> None:
+    """The counts in the document are 0."""
+    document = json.loads(invoke("rollout", write_config(tmp_path, STUB), "--json").stdout)
+    (entry,) = document["entries"]
+    assert (entry["restarts"], entry["lost_steps"], entry["losses"]) == (0, 0, {})
+    assert not any("restart" in note for note in document["notes"])
 
 
 @pytest.mark.parametrize("placement", ["process", "inline"])

@@ -33,7 +33,7 @@ def display(workers: list[dict[str, Any]], *, idle: float, steps: int = 400) -> 
         idle=lambda now: idle,
         elapsed=lambda now: 10.0,
         recent_step_us=lambda: {"a-0": 20.0},
-        steps_of=len,
+        steps_by_env=dict,
     )
     shown = Display.__new__(Display)
     shown._group, shown._statistics = cast("Any", group), cast("Any", statistics)
@@ -76,13 +76,37 @@ def test_each_worker_has_a_line() -> None:
     """It shows the worker's state, its duration, and the number of restarts."""
     workers = [worker("a", ["a-0"], restarts=2), worker("b", ["b-0"], state="down")]
     shown = display(workers, idle=0.0)
-    table = live._WorkerTable(shown._group, shown._statistics).drawn(10.0, rows=8)
-    console = Console(width=100)
-    with console.capture() as capture:
-        console.print(table)
-    lines = [re.split(r"  +", line.strip()) for line in capture.get().splitlines()]
+    table = live._WorkerTable(shown._group, shown._statistics)
+    lines = [re.split(r"  +", line.strip()) for line in table.drawn(10.0, 8, 100)]
     assert lines[1] == ["here", "a", "1", "0", "20 µs", "-", "2", "a-0 for 5 s"]
     assert lines[2][-2:] == ["0", "down"]
+
+
+@pytest.mark.parametrize("width", [40, 60, 100])
+def test_a_narrow_terminal_gets_fewer_columns_of_workers(width: int) -> None:
+    """Entries are left out first, states never; further workers are counted."""
+    workers = [worker("an entry", [f"a-{k}"]) for k in range(6)]
+    shown = display(workers, idle=0.0)
+    *lines, more = live._WorkerTable(shown._group, shown._statistics).drawn(10.0, 4, width)
+    assert {len(line) for line in lines} == {len(lines[0])}
+    assert len(lines[0]) <= width
+    assert [line.split()[-1] for line in lines] == ["state", *["s"] * 4]
+    assert ("entry" in lines[0]) == (width > 60)
+    assert more == "and 2 more"
+
+
+def test_the_memory_of_one_worker_is_read_in_each_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those that were never read come first, and then the one that was read longest ago."""
+    read: list[int] = []
+    monkeypatch.setattr(live, "memory_bytes", lambda pids: read.append(pids[0]) or 2**20)
+    workers = [worker("a", [f"a-{pid}"], pid=pid) for pid in (5, 6)]
+    shown = display(workers, idle=0.0)
+    table = live._WorkerTable(shown._group, shown._statistics)
+    texts = [table.drawn(float(turn), 8, 100) for turn in range(5)]
+    assert read == [5, 6, 5, 6, 5]
+    assert [text[2].count("1 MiB") for text in texts] == [0, 1, 1, 1, 1]
+    workers[1]["pid"] = 7  # It was replaced.
+    assert table.drawn(6.0, 8, 100)[2].count("1 MiB") == 1
 
 
 @pytest.mark.parametrize("width", [60, 80, 120, 160])

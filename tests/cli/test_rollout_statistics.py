@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
 from cli import stub_envs
 from cli.stub_envs import Stub
@@ -58,7 +61,7 @@ def test_steps_are_actions_that_envs_have_executed(
                 group.step_async(act(batch))
             statistics.add(group.collect_async(wait_all=True)[0])
         stats = group.get_env_stats()
-    assert statistics.steps == Stub.steps
+    assert statistics.steps == Stub.steps == sum(statistics.steps_by_env().values())
     entries = statistics.by_entry(stats)
     assert sum(entry.steps for entry in entries) == statistics.steps
     for entry, length in zip(entries, lengths, strict=True):
@@ -76,3 +79,53 @@ def test_an_entry_without_results_has_no_figures() -> None:
     assert figures.mean_return is None
     assert figures.step_us is None
     assert figures.steps_per_second == pytest.approx(0)
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_losses_are_counted_by_cause(num_envs: int) -> None:
+    """A step in flight is lost, a reset in flight is not; nothing of it counts as a step."""
+    kwargs = {"episode_length": 3, "steps": 10}
+    config = EnvConfig(
+        name="a", backend="dying", task="any", num_workers=2, num_envs=num_envs, env_kwargs=kwargs
+    )
+    statistics = RolloutStatistics([config])
+    with sync.build_env_group(config) as group:
+        metas = {meta.env_id: meta for meta in group.init()}
+        batch, _ = group.reset()
+        statistics.begin(metas.__getitem__)
+        with group.auto_reset(3):
+            # In both envs, the second request and the fourth, a reset, are lost with the worker.
+            for deaths in (False, True, False, False, False, True):
+                for worker in group.get_workers() if deaths else ():
+                    os.kill(worker["pid"], signal.SIGKILL)
+                actions = np.zeros((2, num_envs), np.int64).squeeze()
+                batch, _ = group.step(batch.respond(action=actions))
+                statistics.add(batch)
+        statistics.note_workers(group.get_workers())
+        (figures,) = statistics.by_entry(group.get_env_stats())
+    assert figures.steps == statistics.steps == 4 * 2 * num_envs
+    assert (figures.restarts, figures.lost_steps) == (4, 2 * num_envs)
+    ((cause, results),) = figures.losses.items()
+    assert "SIGKILL" in cause
+    assert results == 4
+
+
+def test_steps_that_a_resumed_env_repeats_are_lost() -> None:
+    """With the one in flight."""
+    config = EnvConfig(
+        name="a", backend="stub", task="any", on_worker_death="resume", snapshot_every=100
+    )
+    statistics = RolloutStatistics([config])
+    with sync.build_env_group(config) as group:
+        metas = {meta.env_id: meta for meta in group.init()}
+        batch, _ = group.reset()
+        statistics.begin(metas.__getitem__)
+        for step in range(6):
+            if step == 5:
+                os.kill(group.get_workers()[0]["pid"], signal.SIGKILL)
+            batch, _ = group.step(act(batch))
+            statistics.add(batch)
+        assert batch.info()[0]["worker_resumed"] == 5
+        statistics.note_workers(group.get_workers())
+        (figures,) = statistics.by_entry(group.get_env_stats())
+    assert (figures.steps, figures.lost_steps) == (5, 6)

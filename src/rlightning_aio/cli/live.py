@@ -2,7 +2,8 @@
 
 Rule: a rate is that of the last seconds. If no result arrives, the display names the envs it waits
 for, and since when. If stderr is no terminal, there are plain lines at the start, and when clients
-join or leave.
+join or leave. Drawing takes time from the envs, so all of it is one plain text, which Rich shows
+unchanged: laying out its tables takes ten times as long.
 """
 
 from __future__ import annotations
@@ -13,11 +14,7 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, Any, Final, Self
 
-from rich.console import Group
 from rich.live import Live
-from rich.progress_bar import ProgressBar
-from rich.spinner import Spinner
-from rich.table import Table
 from rich.text import Text
 
 from rlightning_aio.cli.processes import memory_bytes
@@ -27,29 +24,30 @@ from rlightning_aio.cli.terminal import (
     counted,
     duration,
     err,
-    fitted,
-    named_columns,
     number,
 )
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, Sequence
 
-    from rich.console import RenderableType
-
     from rlightning_aio.cli.rollout_statistics import RolloutStatistics
     from rlightning_aio.group.aio import EnvGroup
 
 __all__ = ["Display"]
 
-_REFRESH_SECONDS: Final = 0.2
+_REFRESH_SECONDS: Final = 0.25
 _PATIENCE_SECONDS: Final = 1.0
 """Seconds without a result after which the display says that it is waiting."""
 _RATE_SECONDS: Final = 3.0
+_SPINNER: Final = "⠋⠙⠹⠸⠼⠴⠦⠧⠇⠏"
 _BAR: Final = 16
 _NAMED: Final = 3
 _FEWEST_ROWS: Final = 4
+_COLUMNS: Final = ("worker", "entry", "envs", "steps/s", "step", "memory", "restarts", "state")
+_TEXTS: Final = ("worker", "entry", "state")
+"""Columns that are aligned on the left."""
 _EXPENDABLE: Final = ("entry", "envs", "memory", "step", "restarts")
+"""Columns that a narrow terminal leaves out, in this order."""
 
 
 class Display:
@@ -76,7 +74,6 @@ class Display:
         self._seconds = seconds
         self._console = err()
         self._workers = _WorkerTable(group, statistics) if workers else None
-        self._spinner = Spinner("dots")
         self._lines = contextlib.ExitStack()
         self._live = Live(console=self._console, auto_refresh=False, transient=True)
         self._doing = f"starting {counted(len(group), 'env')}"
@@ -113,7 +110,8 @@ class Display:
 
     async def _tick(self) -> None:
         while True:
-            self.show()
+            if self.due():
+                self.show()
             await asyncio.sleep(_REFRESH_SECONDS)
 
     def resetting(self) -> None:
@@ -147,21 +145,16 @@ class Display:
             self._recent.popleft()
         self._live.update(self._drawn(now), refresh=True)
 
-    def _drawn(self, now: float) -> RenderableType:
-        grid = Table.grid(padding=(0, 1))
-        cells: list[RenderableType] = [self._spinner]
-        room = self._console.width - 2
+    def _drawn(self, now: float) -> Text:
+        width, height = self._console.size
+        head = _SPINNER[int(now / _REFRESH_SECONDS) % len(_SPINNER)] + " "
         if not self._doing:
-            done = self._share_done(now)
-            cells.append(ProgressBar(total=1.0, completed=done, width=_BAR))
-            room -= _BAR + 1
-        cells.append(Text(_fitting(self._parts(now), room), no_wrap=True))
-        grid.add_row(*cells)
-        if self._workers is None:
-            return grid
-        rows = max(_FEWEST_ROWS, self._console.height - 6)
-        table, _ = fitted(self._console, self._workers.drawn(now, rows), _EXPENDABLE)
-        return Group(grid, table)
+            done = round(self._share_done(now) * _BAR)
+            head += "━" * done + "─" * (_BAR - done) + " "
+        lines = [head + _fitting(self._parts(now), width - len(head))]
+        if self._workers is not None:
+            lines += self._workers.drawn(now, max(_FEWEST_ROWS, height - 6), width)
+        return Text("\n".join(lines), no_wrap=True, overflow="crop")
 
     def _share_done(self, now: float) -> float:
         shares = [0.0]
@@ -232,45 +225,68 @@ class _WorkerTable:
         self._statistics = statistics
         self._before: dict[int, tuple[float, int]] = {}
         self._rates: dict[int, float] = {}
+        self._memory: dict[int, int] = {}
+        """By process id; that of one worker is read anew in each turn."""
 
-    def drawn(self, now: float, rows: int) -> Table:
-        """Return the table of these workers."""
-        table = named_columns(
-            "", "worker", "entry", "envs", "steps/s", "step", "memory", "restarts", "state"
-        )
-        table.title = None
-        table.columns[1].justify = table.columns[-1].justify = "left"
+    def drawn(self, now: float, rows: int, width: int) -> list[str]:
+        """Return the lines of the table, for at most `rows` workers."""
         workers = self._group.get_workers()
-        times = self._statistics.recent_step_us()
-        for number_, worker in enumerate(workers[:rows]):
-            table.add_row(*self._row(number_, worker, times, now))
-        if len(workers) > rows:
-            table.add_row(f"and {len(workers) - rows} more")
-        return table
+        times, steps = self._statistics.recent_step_us(), self._statistics.steps_by_env()
+        visible = workers[:rows]
+        self._read_memory([worker["pid"] for worker in visible if worker["pid"] is not None])
+        table = [
+            self._row(worker, times, self._rate(number_, worker, steps, now))
+            for number_, worker in enumerate(visible)
+        ]
+        more = [f"and {len(workers) - rows} more"] if len(workers) > rows else []
+        return [*_aligned([_COLUMNS, *table], width), *more]
 
-    def _row(
-        self, number_: int, worker: dict[str, Any], times: dict[str, float], now: float
-    ) -> Sequence[str]:
-        ids = worker["env_ids"]
+    def _read_memory(self, pids: Sequence[int]) -> None:
+        """Read the memory of the worker that was read longest ago; each takes a millisecond."""
+        known = {pid: used for pid, used in self._memory.items() if pid in pids}
+        unread = [pid for pid in pids if pid not in known]
+        for pid in [*unread, *known][:1]:
+            known.pop(pid, None)
+            known[pid] = memory_bytes([pid])
+        self._memory = known
+
+    def _row(self, worker: dict[str, Any], times: dict[str, float], rate: float) -> tuple[str, ...]:
+        ids, pid = worker["env_ids"], worker["pid"]
         own = [times[env_id] for env_id in ids if env_id in times]
-        pid = worker["pid"]
         return (
             "here" if pid is None else str(pid),
             worker["entry"],
             count(len(ids)),
-            count(self._rate(number_, self._statistics.steps_of(ids), now)),
+            count(rate),
             duration(sum(own) / len(own) if own else None),
-            "-" if pid is None else f"{memory_bytes([pid]) / 2**20:,.0f} MiB",
+            f"{self._memory[pid] / 2**20:,.0f} MiB" if pid in self._memory else "-",
             count(worker["restarts"]),
             _state(worker),
         )
 
-    def _rate(self, number_: int, steps: int, now: float) -> float:
-        then, before = self._before.setdefault(number_, (now, steps))
+    def _rate(
+        self, number_: int, worker: dict[str, Any], steps: dict[str, int], now: float
+    ) -> float:
+        done = sum(steps.get(env_id, 0) for env_id in worker["env_ids"])
+        then, before = self._before.setdefault(number_, (now, done))
         if now - then >= 1.0:
-            self._rates[number_] = (steps - before) / (now - then)
-            self._before[number_] = (now, steps)
+            self._rates[number_] = (done - before) / (now - then)
+            self._before[number_] = (now, done)
         return self._rates.get(number_, 0.0)
+
+
+def _aligned(rows: Sequence[tuple[str, ...]], width: int) -> list[str]:
+    """Return lines with aligned columns, of which some are left out if `width` is too small."""
+    columns = {name: [row[k] for row in rows] for k, name in enumerate(_COLUMNS)}
+    widths = {name: max(map(len, column)) for name, column in columns.items()}
+    for name in _EXPENDABLE:
+        if sum(widths.values()) + 2 * (len(widths) - 1) <= width:
+            break
+        del columns[name], widths[name]
+    for name, column in columns.items():
+        aligned = str.ljust if name in _TEXTS else str.rjust
+        columns[name] = [aligned(text, widths[name]) for text in column]
+    return ["  ".join(cells) for cells in zip(*columns.values(), strict=True)]
 
 
 def _state(worker: dict[str, Any]) -> str:

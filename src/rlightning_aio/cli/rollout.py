@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import math
 import time
 from dataclasses import asdict, dataclass
@@ -37,6 +38,7 @@ from rlightning_aio.cli.policies import Policy, load_policy
 from rlightning_aio.cli.rollout_statistics import EntryFigures, RolloutStatistics
 from rlightning_aio.cli.terminal import (
     count,
+    counted,
     duration,
     named_columns,
     notes_on_returns,
@@ -50,7 +52,7 @@ from rlightning_aio.config import EnvConfig, load_config
 from rlightning_aio.errors import EnvFault
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import AsyncGenerator, Sequence
 
     from rlightning_aio.group.aio import EnvGroup
 
@@ -173,7 +175,12 @@ async def _collect(
     statistics: RolloutStatistics,
     display: Display,
 ) -> None:
-    async with display.ticking(), group, traced(group, order.trace):
+    async with (
+        display.ticking(),
+        group,
+        traced(group, order.trace),
+        _workers_noted(group, statistics),
+    ):
         roster = Roster(group)
         for server in roster.servers:
             display.say(f"{server.env_id} listens at {server.address}")
@@ -206,6 +213,15 @@ async def _collect(
                     await asyncio.sleep(0)
 
 
+@contextlib.asynccontextmanager
+async def _workers_noted(group: EnvGroup, statistics: RolloutStatistics) -> AsyncGenerator[None]:
+    """Record the workers' restarts at the end, while the group can say them."""
+    try:
+        yield
+    finally:
+        statistics.note_workers(group.get_workers())
+
+
 def _report(
     config: Path,
     group: EnvGroup,
@@ -222,6 +238,7 @@ def _report(
         for env_id, own in env_stats.items()
         if own["episodes"] and not math.isfinite(own["mean_return"])
     )
+    notes += _notes_on_losses(entries)
     if any(entry.episodes for entry in entries):
         notes.append(_BIAS)
     stats = group.get_stats()
@@ -249,6 +266,17 @@ def _report(
             out().print(note, markup=False)
     if plot is not None:
         draw_rollout(str(config), statistics.courses(), plot)
+
+
+def _notes_on_losses(entries: Sequence[EntryFigures]) -> list[str]:
+    """Return a note on each entry whose workers or clients were lost."""
+    return [
+        f"entry {entry.name!r}: {counted(entry.restarts, 'restart')}, "
+        f"{counted(entry.lost_steps, 'lost step')}"
+        + "".join(f"; {cause}: {counted(n, 'result')}" for cause, n in entry.losses.items())
+        for entry in entries
+        if entry.restarts or entry.losses
+    ]
 
 
 _BIAS: Final = (

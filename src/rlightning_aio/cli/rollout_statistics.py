@@ -1,7 +1,8 @@
 """Statistics of a rollout, by config entry.
 
 Rule: a step is an action that an env has executed. Resets, which arrive as results, too, are left
-out. A vectorised env's step counts once for each sub-environment.
+out. A vectorised env's step counts once for each sub-environment. Counting works on whole columns:
+nothing is done for each result, but for those that report a loss.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 from rlightning_aio.batch.contents import parts_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
     from numpy.typing import NDArray
 
@@ -42,6 +43,10 @@ class EntryFigures:
     """A line of the final table; a figure without observations is None.
 
     Attributes:
+        restarts: number of workers that were replaced.
+        lost_steps: steps whose results were lost with a worker or client, and, of envs that
+            continue from a saved state, steps that they repeat.
+        losses: number of results that report a loss, by its cause.
         step_us: time in the env's own step in microseconds, p50 and p99.
     """
 
@@ -52,6 +57,9 @@ class EntryFigures:
     episodes: int
     mean_return: float | None
     mean_length: float | None
+    restarts: int
+    lost_steps: int
+    losses: dict[str, int]
     step_us: dict[str, float] | None
 
 
@@ -74,7 +82,12 @@ class RolloutStatistics:
         }
         self._meta_of: Callable[[str], EnvMeta] | None = None
         self._sub_envs: dict[str, int] = {}
-        self._counts: Counter[str] = Counter()
+        self._names: EnvNames | None = None
+        # By slot: steps so far, and whether the next request is a reset.
+        self._counts = _NOTHING
+        self._over = np.empty(0, np.bool_)
+        self._lost_steps, self._restarts = Counter[str](), Counter[str]()
+        self._losses: dict[str, Counter[str]] = {}
         self._step_times: deque[_StepTimes] = deque(maxlen=_LATENCY_BATCHES)
         self._began = self._ended = 0.0
         self.steps = 0
@@ -101,19 +114,22 @@ class RolloutStatistics:
         """Return the seconds since the last result, or since the first step was sent."""
         return now - self._ended if self._began else 0.0
 
-    def steps_of(self, env_ids: Sequence[str]) -> int:
-        """Return the number of steps of these envs."""
-        return sum(self._counts[env_id] for env_id in env_ids)
+    def steps_by_env(self) -> dict[str, int]:
+        """Return the steps of each env; for a client, with those of earlier ones in its slot."""
+        names = () if self._names is None else self._names.env_ids
+        return dict(zip(names, self._counts.tolist(), strict=True))
 
     def recent_step_us(self) -> dict[str, float]:
         """Return the mean time of each env's own step over the last batches."""
-        sums, numbers = Counter[str](), Counter[str]()
-        for times in list(self._step_times)[-_RECENT_BATCHES:]:
-            env_ids = times.names.ids(times.slots)
-            for env_id, busy_ns in zip(env_ids, times.busy_ns.tolist(), strict=True):
-                sums[env_id] += busy_ns
-                numbers[env_id] += 1
-        return {env_id: total / numbers[env_id] / 1e3 for env_id, total in sums.items()}
+        recent = list(self._step_times)[-_RECENT_BATCHES:]
+        if self._names is None or not recent:
+            return {}
+        slots = np.concatenate([times.slots for times in recent])
+        busy_ns, size = np.concatenate([times.busy_ns for times in recent]), len(self._counts)
+        results = np.bincount(slots, minlength=size)
+        means = np.bincount(slots, busy_ns, size) / np.maximum(results, 1) / 1e3
+        columns = (self._names.env_ids, means.tolist(), results.tolist())
+        return {env_id: mean for env_id, mean, number in zip(*columns, strict=True) if number}
 
     def courses(self) -> list[Course]:
         """Return the course of each entry; empty unless it was recorded."""
@@ -135,13 +151,15 @@ class RolloutStatistics:
         """Count the results of a `collect_async` or `step`."""
         self._ended = time.monotonic()
         for part in parts_of(batch):
+            if part.names is not self._names:
+                self._meet(part.names)
             stepped = ~part.is_reset.reshape(len(part), -1)
-            env_ids = part.names.ids(part.slots)
-            for env_id, count in zip(env_ids, stepped.sum(axis=1).tolist(), strict=True):
-                self._counts[env_id] += count
-                if env_id not in self._sub_envs:
-                    self._meet(env_id)
-            self.steps += int(stepped.sum())
+            counts = stepped.sum(axis=1)
+            self._counts[part.slots] += counts
+            self.steps += int(counts.sum())
+            if part.restarted is not None:
+                self._note_losses(part, stepped.shape[1])
+            self._over[part.slots] = part.over
             self._step_times.append(_StepTimes(part.names, part.slots, part.busy_ns))
             if self._keep_course:
                 self._note_course(part, stepped)
@@ -161,10 +179,27 @@ class RolloutStatistics:
                 returns = part.episode_return.reshape(rows, -1)[mine][ended[mine]]
                 course.returns += [(course.steps, value) for value in returns.tolist()]
 
-    def _meet(self, env_id: str) -> None:
-        """Register an env at its first result."""
+    def _note_losses(self, part: ResultColumns, sub_envs: int) -> None:
+        """Count the results that report a loss, and the steps in flight that they answer."""
+        assert part.restarted is not None
+        for row in np.flatnonzero(part.restarted).tolist():
+            info, slot = part.reported_info_of(row), part.slots[row : row + 1]
+            (entry,) = part.names.names(slot)
+            repeated = info.get("worker_resumed", 0)
+            self._lost_steps[entry] += (repeated + (not self._over[slot])) * sub_envs
+            cause = info.get("worker_restarted", info.get("client_lost", "unknown"))
+            self._losses.setdefault(entry, Counter())[cause] += 1
+
+    def _meet(self, names: EnvNames) -> None:
+        """Register the envs of a group, with clients that have joined since."""
+        if self._names is None:
+            self._counts = np.zeros(len(names.env_ids), np.int64)
+            self._over = np.zeros(len(names.env_ids), np.bool_)
+        self._names = names
         assert self._meta_of is not None
-        self._sub_envs[env_id] = self._meta_of(env_id).num_envs
+        for env_id in names.env_ids:
+            if env_id and env_id not in self._sub_envs:
+                self._sub_envs[env_id] = self._meta_of(env_id).num_envs
 
     def _entry(self, env_id: str) -> str:
         """Return the env's config entry; for a client (``<server id>/<name>``), its server's."""
@@ -172,11 +207,18 @@ class RolloutStatistics:
             return self._entries[env_id]
         return next(name for id_, name in self._entries.items() if env_id.startswith(f"{id_}/"))
 
+    def note_workers(self, workers: Iterable[Mapping[str, Any]]) -> None:
+        """Record the restarts so far, as `EnvGroup.get_workers` describes them."""
+        self._restarts.clear()
+        for worker in workers:
+            self._restarts[worker["entry"]] += worker["restarts"]
+
     def by_entry(self, env_stats: Mapping[str, Mapping[str, Any]]) -> list[EntryFigures]:
         """Return a line for each entry, with the episodes of `EnvGroup.get_env_stats`."""
         steps, episodes = Counter[str](), dict[str, list[Mapping[str, Any]]]()
-        for env_id, count in self._counts.items():
-            steps[self._entry(env_id)] += count
+        if self._names is not None:
+            counts = np.bincount(self._names.entries, self._counts).astype(np.int64).tolist()
+            steps.update(dict(zip(self._names.entry_names, counts, strict=True)))
         for env_id, stats in env_stats.items():
             episodes.setdefault(self._entry(env_id), []).append(stats)
         return [
@@ -196,6 +238,9 @@ class RolloutStatistics:
             episodes=episodes,
             mean_return=_mean(stats, "mean_return", episodes),
             mean_length=_mean(stats, "mean_length", episodes),
+            restarts=self._restarts[config.name],
+            lost_steps=self._lost_steps[config.name],
+            losses=dict(self._losses.get(config.name, {})),
             step_us=self._step_us(config.name),
         )
 
