@@ -253,8 +253,9 @@ class BatchedData:
     def index(self) -> NDArray[np.int64]:
         """Position of each row in the group: ``[n]``, ``[n, num_envs]`` with sub-environments.
 
-        It counts sub-environments in the order of `EnvGroup.env_ids`. Clients of an env_server
-        come after the local envs; each keeps its position during the life of the group.
+        It counts sub-environments in the order of `EnvGroup.env_ids`. Clients come after the local
+        envs, and those of an env_server after those of one that was joined earlier. Each keeps
+        its position during the life of the group.
         """
         return _by_row(self, lambda part: part.index).astype(np.int64, copy=False)
 

@@ -26,7 +26,7 @@ class EnvNames:
         env_ids: id of each env; empty for a slot without a client.
         shared_ids: ids in batches: a client has the id of its env_server.
         entries: number of the config entry of each slot; entry_names: names of the entries.
-        index_offset: number of the group's sub-environments before each slot.
+        index_offset: position in the group of the first sub-environment of each slot.
         turns: True if each result of a slot comes from some of its sub-environments.
     """
 

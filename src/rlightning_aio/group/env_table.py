@@ -57,7 +57,11 @@ class EnvTable:
         self.server_ids = [server_id for server_id, _, _ in servers]
         self.configs = list(configs)
         shared_ids = list(env_ids)
+        # Of each host that envs join, by its first slot: how many may, and the index of the first.
+        self._num_members: dict[int, int] = {}
+        self._first_index: dict[int, int] = {}
         for server_id, config, count in servers:
+            self._num_members[len(self.configs)] = count
             self.configs += [config] * count
             shared_ids += [server_id] * count
         size = len(self.configs)
@@ -82,7 +86,7 @@ class EnvTable:
         self.any_out_of_band = False
         self.num_sub_envs = np.ones(size, np.int64)
         self.seed_offset = np.zeros(size, np.int64)
-        self.num_seeds = 0
+        self.num_seeds = self._next_index = 0
         self.resets_itself = np.zeros(size, np.bool_)
         self.any_resets_itself = False
         self.observation_spaces: list[gym.Space[Any] | None] = []
@@ -110,7 +114,7 @@ class EnvTable:
             self.names.turns[slot] = in_all > env.meta.num_envs
             self.num_sub_envs[slot] = max(env.meta.num_envs, in_all)
         local = self.num_sub_envs[self.all]
-        self.num_seeds = int(local.sum())
+        self.num_seeds = self._next_index = int(local.sum())
         self.seed_offset[self.all] = np.cumsum(local) - local
         self.names.index_offset[:] = self.seed_offset
         self._note_any()
@@ -133,9 +137,12 @@ class EnvTable:
         self.reads_extras[slot] = traits.reads_extras
         self._note_meta(slot, meta)
         self.num_sub_envs[slot] = meta.num_envs
-        # All members of a host have the same number of sub-environments.
-        behind = (first_slot - len(self.all)) + (slot - first_slot) * meta.num_envs
-        self.names = self.names.renamed(slot, meta.env_id, self.num_seeds + behind)
+        # All members of a host have the same number of sub-environments; the first one shows it.
+        if first_slot not in self._first_index:
+            self._first_index[first_slot] = self._next_index
+            self._next_index += self._num_members[first_slot] * meta.num_envs
+        index = self._first_index[first_slot] + (slot - first_slot) * meta.num_envs
+        self.names = self.names.renamed(slot, meta.env_id, index)
         self._note_any()
 
     def _note_meta(self, slot: int, meta: EnvMeta) -> None:
