@@ -6,6 +6,7 @@ import pickle
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from hypothesis import strategies as st
 import rlightning_aio as rl
 from rlightning_aio import sync
 from rlightning_aio.collecting import Collector, Record, RecordedGroup, ReplayedGroup
-from rlightning_aio.errors import EnvRaised, ReplayDiverged
+from rlightning_aio.errors import EnvFault, EnvRaised, ReplayDiverged
 
 if TYPE_CHECKING:
     from rlightning_aio.batch import BatchedData
@@ -164,6 +165,75 @@ def test_errors_are_raised_in_the_recorded_order() -> None:
             batch, _ = chosen.collect_async()
             assert batch.reward.tolist() == [1.0]
             record = getattr(chosen, "record", None)
+
+
+def test_entries_with_different_numbers_of_sub_environments_are_recorded() -> None:
+    """In one group, and replayed in the recorded order."""
+    entries = [
+        {**POLE, "name": f"of {k}", "num_envs": k, "num_workers": 2, "placement": "inline"}
+        for k in (1, 2, 3)
+    ]
+    record, orders = Record(), []
+    for _ in range(2):
+        with sync.build_env_group(entries) as group:
+            chosen: Any = ReplayedGroup(group, record) if orders else RecordedGroup(group)
+            group.reset_async(seed=0)
+            order = []
+            for count in (1, 2, 3):
+                batch, flags = chosen.collect_async(min_results=count, max_results=count)
+                order.append(list(zip(batch.env_ids(), flags, strict=True)))
+            record = getattr(chosen, "record", record)
+            orders.append(order)
+    assert list(map(len, orders[0])) == [1, 2, 3]
+    assert orders[0] == orders[1]
+
+
+@pytest.mark.parametrize("error", [MemoryError, KeyboardInterrupt])
+def test_results_that_could_not_be_recorded_come_with_the_next_call(
+    error: type[BaseException], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And are recorded then, once."""
+    with sync.build_env_group({**POLE, "num_workers": 2, "placement": "inline"}) as group:
+        recorded: Any = RecordedGroup(group)
+        batch, _ = recorded.reset(seed=0)
+        recorded.step_async(batch.respond(action=[0, 1]))
+        with monkeypatch.context() as patched:
+            patched.setattr(recorded.record, "note", Mock(side_effect=error))
+            with pytest.raises(error):
+                recorded.collect_async()
+        assert sorted(recorded.pending) == ["pole-0", "pole-1"]
+        found = [recorded.collect_async()[0].env_ids() for _ in range(2)]
+        assert sorted(found) == [["pole-0"], ["pole-1"]]
+        assert recorded.pending == []
+        assert recorded.record.num_calls == 2
+
+
+def test_an_error_that_could_not_be_recorded_comes_with_the_next_call() -> None:
+    wrapped = Mock(pending=[])
+    fault = EnvFault("it raised", env_id="a-0")
+    wrapped.collect_async.side_effect = fault
+    recorded: Any = RecordedGroup(wrapped)
+    note, recorded.record.note = recorded.record.note, Mock(side_effect=MemoryError)
+    with pytest.raises(MemoryError):
+        recorded.collect_async()
+    assert recorded.pending == ["a-0"]
+    recorded.record.note = note
+    with pytest.raises(EnvFault) as raised:
+        recorded.collect_async()
+    assert raised.value is fault
+    assert recorded.record.num_calls == wrapped.collect_async.call_count == 1
+
+
+def test_a_replay_has_the_deadline_of_the_call_however_it_is_given() -> None:
+    wrapped = Mock()
+    wrapped.collect_async.side_effect = TimeoutError
+    replayed: Any = ReplayedGroup(wrapped, RECORD)
+    for arguments, options in (((None, False, None, None, 3.0), {}), ((), {"deadline": 3.0})):
+        with pytest.raises(TimeoutError):
+            replayed.collect_async(*arguments, **options)
+        assert wrapped.collect_async.call_args.kwargs["deadline"] == 3.0
+    with pytest.raises(TypeError, match="dead_line"):
+        replayed.collect_async(dead_line=3.0)
 
 
 def test_a_file_with_other_content_raises(tmp_path: Path) -> None:

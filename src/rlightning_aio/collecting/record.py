@@ -6,13 +6,17 @@ run can be repeated bit for bit. Both groups here wrap an `EnvGroup` and have al
 
 from __future__ import annotations
 
+import inspect
 import struct
 from array import array
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
+import numpy as np
+
 from rlightning_aio.batch import joined
+from rlightning_aio.batch.contents import parts_of
 from rlightning_aio.collecting.procedure import Procedure, run
 from rlightning_aio.errors import EnvFault, NothingPending, ReplayDiverged
 from rlightning_aio.files import write_file
@@ -34,6 +38,8 @@ _HEAD: Final = struct.Struct("<QQ")
 _STEP, _RESET, _RESTARTED, _FAULT = range(4)
 _NAMES: Final = ("a step", "a reset", "the first result of a replaced worker", "an error")
 
+_COLLECT: Final = inspect.signature(SyncEnvGroup.collect_async)
+
 
 class Record:
     """The order of results, call by call: four bytes for each result, and for each call.
@@ -51,8 +57,7 @@ class Record:
     def note(self, results: Iterable[tuple[str, int]]) -> None:
         """Add one call: the env id and the kind of each result."""
         entries = [4 * self._number(env_id) + kind for env_id, kind in results]
-        self._entries.append(len(entries))
-        self._entries.extend(entries)
+        self._entries.extend([len(entries), *entries])
         self.num_calls += 1
 
     def _number(self, env_id: str) -> int:
@@ -136,19 +141,32 @@ class RecordedGroup(_WrappedGroup[G]):
     def __init__(self, group: G) -> None:
         super().__init__(group)
         self.record = Record()
+        # The outcome of a call that ended before it was recorded; it is that of the next call.
+        self._unrecorded: tuple[BatchedData, list[bool]] | EnvFault | None = None
+
+    @property
+    def pending(self) -> list[str]:
+        """Ids as in `EnvGroup.pending`, with those of results that were not returned yet."""
+        found = self._unrecorded
+        kept = [] if found is None else [env_id for env_id, _ in _outcome(found)]
+        return list(dict.fromkeys([*self.group.pending, *kept]))
 
     def collect_async(self, *args: Any, **options: Any) -> Any:
         """Collect like the wrapped group, awaitable if that is asynchronous."""
         return run(self._collect(lambda: self.group.collect_async(*args, **options)), self.group)
 
     def _collect(self, collect: Callable[[], Any]) -> Procedure[tuple[BatchedData, list[bool]]]:
-        try:
-            batch, flags = yield collect
-        except EnvFault as fault:
-            self.record.note([(fault.env_id, _FAULT)])
-            raise
-        self.record.note(_kinds(batch))
-        return batch, flags
+        if self._unrecorded is None:
+            try:
+                self._unrecorded = yield collect
+            except EnvFault as fault:
+                self._unrecorded = fault
+        found: Any = self._unrecorded
+        self.record.note(_outcome(found))
+        self._unrecorded = None
+        if isinstance(found, EnvFault):
+            raise found
+        return found
 
 
 class ReplayedGroup(_WrappedGroup[G]):
@@ -181,8 +199,8 @@ class ReplayedGroup(_WrappedGroup[G]):
             ReplayDiverged: the record has ended; or an env can't answer as recorded, because it has
                 no request or another one, or because its worker was replaced.
         """
-        deadline = args[4] if len(args) > 4 else options.get("deadline")
-        return run(self._collect(deadline), self.group)
+        given = _COLLECT.bind(self.group, *args, **options).arguments
+        return run(self._collect(given.get("deadline")), self.group)
 
     def _collect(self, deadline: float | None) -> Procedure[tuple[BatchedData, list[bool]]]:
         if self._place == len(self._record):
@@ -241,9 +259,17 @@ class ReplayedGroup(_WrappedGroup[G]):
         )
 
 
+def _outcome(found: tuple[BatchedData, list[bool]] | EnvFault) -> list[tuple[str, int]]:
+    """Return the env id and the kind of each result of a call, or of its error."""
+    return [(found.env_id, _FAULT)] if isinstance(found, EnvFault) else _kinds(found[0])
+
+
 def _kinds(batch: BatchedData) -> list[tuple[str, int]]:
     """Return the env id and the kind of each result."""
-    count = len(batch)
-    resets = batch.is_reset.reshape(count, -1).all(axis=1).astype(int)
-    kinds = resets + batch.restarted.reshape(count, -1).all(axis=1)
+    kinds = np.empty(len(batch), np.intp)
+    for part in parts_of(batch):
+        count = len(part)
+        resets = part.is_reset.reshape(count, -1).all(axis=1).astype(np.intp)
+        lost = 0 if part.restarted is None else part.restarted
+        kinds[slice(None) if part.positions is None else part.positions] = resets + lost
     return list(zip(batch.env_ids(), kinds.tolist(), strict=True))
