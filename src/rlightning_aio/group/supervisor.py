@@ -431,7 +431,11 @@ class Supervisor:
         record.lost_slots.clear()
         assert record.order is not None
         checkpoints = self._continuity.checkpoints(record.slots)
-        record.host.attach(replace(record.order, checkpoints=checkpoints))
+        # What the generators of a seeded group begin with must not be by chance.
+        seed = self._envs.last_seed.item(record.host.first_slot)
+        entropy = (seed, record.restarts) if seed >= 0 else ()
+        order = replace(record.order, checkpoints=checkpoints, entropy=entropy)
+        record.host.attach(order)
 
     def _on_refused(self, record: HostRecord, why: OSError | str, now: float) -> None:
         """Schedule another attempt, because the system refused to start a replacement."""

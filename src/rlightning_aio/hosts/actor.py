@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from rlightning_aio.hosts.messages import StartOrder
+    from rlightning_aio.hosts.messages import AttachOrder, StartOrder
     from rlightning_aio.hosts.row_table import Columns
     from rlightning_aio.hosts.runner import EnvRunner
 
@@ -166,10 +166,10 @@ class EnvActor:
             runner.attach(slab, row, self._schemas.announce, partial(self._save, index))
         self._table = RowTable(self._first_slot, places)
 
-    def resume(self, checkpoints: Sequence[bytes | None]) -> NotStarted | None:
-        """Restore the envs of a replacement."""
+    def resume(self, order: AttachOrder) -> NotStarted | None:
+        """Seed a replacement and restore its envs."""
         try:
-            resume_all(self._runners, checkpoints)
+            resume_all(self._runners, order)
         except BaseException as error:
             return NotStarted(0, ErrorText.of(error))
         return None

@@ -80,6 +80,8 @@ class AwaitedRunner(EnvRunner):
             arguments = self._slab.take_seed(self._row), None
         self._checkpoints.forget_result()
         seed, options = arguments
+        if arguments is not self.reset_with:  # Not after a hang, whose numbers would come again.
+            self._seed_generators(seed)
         if not (options and "reset_mask" in options):  # It begins no episode of the whole env.
             self.reset_with = arguments
         began = time.monotonic_ns()

@@ -10,7 +10,7 @@ from gymnasium.error import UnregisteredEnv
 
 from rlightning_aio.envs.results import is_awaitable
 from rlightning_aio.hosts.known_tasks import register_tasks
-from rlightning_aio.hosts.runner import EnvRunner
+from rlightning_aio.hosts.runner import EnvRunner, seed_generators
 from rlightning_aio.registry import ENVS, placement_of
 
 if TYPE_CHECKING:
@@ -37,7 +37,12 @@ def build_env(
 
 
 def built_envs(order: StartOrder, *, inline: bool = False) -> Iterator[EnvRunner]:
-    """Build the envs of a host one after the other."""
+    """Build the envs of a host one after the other.
+
+    A worker has its own numbers: those that fork servers fork have the same generators.
+    """
+    if not inline:
+        seed_generators()
     for place in range(len(order.worker_indices)):
         yield built_env(order, place, inline=inline)
 

@@ -82,18 +82,19 @@ class ShortWay:
     def resetter(
         self,
         reset: BareReset,
+        take_seed: Callable[[], int | None],
         write_observation: Callable[[Any], None],
         store: Callable[[Any, dict[str, Any], int], OutOfBand | None],
     ) -> Execute:
-        """Return a function that resets the env by `reset`, with the seed in the row.
+        """Return a function that resets the env by `reset`, with the seed that `take_seed` returns.
 
         Tensors, with the info and the ns that the env took, are given to `store`.
         """
         slab, row, writer, clock = self._slab, self._row, self._writer, time.monotonic_ns
 
         def execute() -> OutOfBand | None:
-            began = clock()
-            observation, info = reset(seed=slab.take_seed(row), options=None)
+            seed, began = take_seed(), clock()
+            observation, info = reset(seed=seed, options=None)
             done = clock()
             if type(observation) is not np.ndarray and holds_tensor(observation):
                 return store(observation, info, done - began)

@@ -103,11 +103,13 @@ class AttachOrder:
         rows: index of the slab, and the row in it, for each env.
         checkpoints: of the envs of a replacement (see `Saved`); None for an env that begins a new
             episode. Empty if all do.
+        entropy: numbers that seed the global generators of a replacement; empty for the system's.
     """
 
     slabs: tuple[tuple[int, int], ...]
     rows: tuple[tuple[int, int], ...]
     checkpoints: tuple[bytes | None, ...] = ()
+    entropy: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)

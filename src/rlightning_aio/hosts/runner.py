@@ -7,6 +7,7 @@ Gymnasium env takes a short way (`env_steps.ShortWay`).
 from __future__ import annotations
 
 import contextlib
+import random
 import time
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -65,7 +66,18 @@ __all__ = [
     "disconnect_all",
     "placed",
     "resume_all",
+    "seed_generators",
 ]
+
+
+def seed_generators(*entropy: int) -> None:
+    """Seed the global generators of NumPy and Python, from the system if no numbers are given.
+
+    For processes that only run envs; in the trainer they belong to the program.
+    """
+    words = np.random.SeedSequence(entropy or None).generate_state(8)
+    np.random.seed(words)  # noqa: NPY002
+    random.seed(words.tobytes())
 
 
 class EnvRunner:
@@ -293,7 +305,8 @@ class EnvRunner:
         short = ShortWay(self._slab, self._row, self._writer, resets_itself=resets_itself)
         bare_reset = self.env.bare_reset()
         if bare_reset is not None:
-            reset = short.resetter(bare_reset, write_observation, self._store_reset)
+            take_seed, store = self._take_seed, self._store_reset
+            reset = short.resetter(bare_reset, take_seed, write_observation, store)
             self._reset_env = followed(reset, self._checkpoints.note_result)
         return short.stepper(bare, get_input, write_observation)
 
@@ -346,9 +359,20 @@ class EnvRunner:
     def _reset_from_row(self) -> OutOfBand | None:
         return self._reset(self._slab.take_seed(self._row), None)
 
+    def _take_seed(self) -> int | None:
+        seed = self._slab.take_seed(self._row)
+        self._seed_generators(seed)
+        return seed
+
+    def _seed_generators(self, seed: int | None) -> None:
+        """Seed the global generators for an episode that begins with a seed."""
+        if seed is not None and not self._inline:
+            seed_generators(seed)
+
     def _reset(self, seed: int | None, options: dict[str, Any] | None) -> OutOfBand | None:
         """Start a new episode."""
         self._checkpoints.forget_result()
+        self._seed_generators(seed)
         began = time.monotonic_ns()
         returned = self.env.reset(seed=seed, options=options)
         busy_ns = time.monotonic_ns() - began
@@ -431,7 +455,7 @@ def attach_all(
     """
     for index, (runner, slab, row) in enumerate(placed(runners, order, map_part)):
         runner.attach(slab, row, announce, partial(send_checkpoint, index))
-    resume_all(runners, order.checkpoints)
+    resume_all(runners, order)
 
 
 def attach_here(
@@ -453,9 +477,11 @@ def attach_here(
     post(Attached(host_id))
 
 
-def resume_all(runners: Sequence[EnvRunner], checkpoints: Sequence[bytes | None]) -> None:
-    """Restore the envs of a replacement that have a checkpoint."""
-    for runner, checkpoint in zip(runners, checkpoints, strict=False):
+def resume_all(runners: Sequence[EnvRunner], order: AttachOrder) -> None:
+    """Seed a replacement, and restore its envs that have a checkpoint."""
+    if order.entropy:
+        seed_generators(*order.entropy)
+    for runner, checkpoint in zip(runners, order.checkpoints, strict=False):
         if checkpoint is not None:
             runner.resume(checkpoint)
 
