@@ -185,7 +185,7 @@ class AwaitedEnv:
 
     @property
     def close_error(self) -> ErrorText | None:
-        """What is wrong with an env that should have closed by now."""
+        """Return what is wrong with an env that should have closed by now."""
         if self._close_error is None and not self.stopped.done():
             return _late("its step or reset goes on although it was cancelled")
         return self._close_error
