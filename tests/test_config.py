@@ -423,6 +423,7 @@ VALUES: dict[str, Any] = {
     "step_timeout": 1.0,
     "reset_timeout": 1.0,
     "start_timeout": 120.0,
+    "close_timeout": 2.0,
     "on_worker_death": "restart",
     "snapshot_every": 5,
     "max_restarts": 0,

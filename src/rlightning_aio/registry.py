@@ -206,6 +206,7 @@ PLACEMENTS: dict[str, Placement] = {
             "step_timeout": _NO_LIMIT,
             "reset_timeout": _NO_LIMIT,
             "start_timeout": _NO_LIMIT,
+            "close_timeout": _NO_LIMIT,
             "on_worker_death": _NO_WORKER,
             "snapshot_every": _NO_WORKER,
             "max_restarts": _NO_WORKER,
@@ -224,6 +225,7 @@ PLACEMENTS: dict[str, Placement] = {
             "step_timeout": _NO_LIMIT,
             "reset_timeout": _NO_LIMIT,
             "start_timeout": _NO_LIMIT,
+            "close_timeout": _NO_LIMIT,
             "interpreter": _OWN_SHARE,
             "env_vars": _OWN_SHARE,
             "ray_options": _NOT_RAYS,
@@ -265,6 +267,7 @@ _PLACED_BY_BACKEND: dict[str, Placement] = {
             "max_concurrency": _CLIENTS_OWN,
             "start_timeout": "clients connect at any time; env_kwargs.connect_timeout limits how "
             "long a reset waits for them",
+            "close_timeout": _CLIENTS_OWN,
             "on_worker_death": "it has no workers; a request to a client that is lost gives a "
             "truncated result, and the client may come back",
             "max_restarts": "it has no workers; a client that is lost may come back",

@@ -107,6 +107,9 @@ class EnvConfig(BaseModel):
     """Seconds that one reset may take."""
     start_timeout: float = Field(default=120.0, gt=0)
     """Seconds from the start of a worker until its envs are built."""
+    close_timeout: float | None = Field(default=None, gt=0)
+    """Seconds that all envs of the entry may take to close; None gives awaitable envs 0.6 seconds
+    and others 1.5."""
     on_worker_death: Literal["restart", "raise", "resume"] = "restart"
     """Reaction to a worker that dies or hangs; ``raise`` by default for hardware."""
     snapshot_every: int | None = Field(default=None, ge=1)

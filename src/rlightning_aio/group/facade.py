@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import time
 import warnings
@@ -39,6 +40,11 @@ __all__ = [
     "steps_of",
     "this_process",
 ]
+
+
+_log = logging.getLogger("rlightning_aio")
+_NOT_CLOSED: Final = ("TimeoutError", "WorkerDied")
+"""What is said to be raised where a close was cut short, or by what is as good as that."""
 
 
 def only_result(results: tuple[BatchedData, Any]) -> EnvRet | MultiAgentEnvRet:
@@ -445,7 +451,17 @@ class Facade:
         close_errors = self._core.supervisor.close_errors
         errors = list(close_errors)
         close_errors.clear()  # Warn once, however often `close` is called.
-        for env_id, error in errors:
+        left = [env_id for env_id, error in errors if error.type_name in _NOT_CLOSED]
+        if left:
+            _log.warning(
+                "%d envs were not closed, and what they hold may be left behind (close_timeout of "
+                "an entry gives its envs more time): %s",
+                len(left),
+                ", ".join(left),
+            )
+        # Of envs that were lost with their worker, which have one error, the first.
+        first_of = {id(error): (env_id, error) for env_id, error in reversed(errors)}
+        for env_id, error in reversed(first_of.values()):
             warnings.warn(f"close() of env {env_id!r} raised {error.summary}", stacklevel=3)
 
 

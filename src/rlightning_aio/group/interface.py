@@ -223,12 +223,13 @@ class GroupInterface(Facade):
         raise NotImplementedError
 
     def close(self) -> Any:
-        """Close all envs and end their workers, by force after a second and a half.
+        """Close all envs and end their workers, by force after a second and a half, or after the
+        ``close_timeout`` of their entry.
 
         Idempotent. Calls that wait get `GroupClosed`, and results that were not collected are
         gone. Cancelled, it ends the remaining workers by force. A warning names an env that
-        raises in its own `close`. A signal handler may close a synchronous group; the call that
-        it interrupts raises `GroupClosed`.
+        raises in its own `close`, and the log names those that were not closed in time. A signal
+        handler may close a synchronous group; the call that it interrupts raises `GroupClosed`.
 
         Raises:
             RLightningError: the loop that the group belongs to runs in another thread.

@@ -5,6 +5,7 @@ Rule: it waits only by yielding a `Wait`. Left out: single deaths, which `Superv
 
 from __future__ import annotations
 
+import math
 import warnings
 from typing import TYPE_CHECKING, Final
 
@@ -23,7 +24,10 @@ if TYPE_CHECKING:
 __all__ = ["Shutdown"]
 
 _CLOSE_SECONDS: Final = 1.5
-"""Limit for envs to close before their worker is killed."""
+"""Limit for envs to close before their worker is killed, where their entry has none."""
+_CANCEL_SECONDS: Final = 0.9
+"""What awaitable envs may take in addition to a limit of their entry: requests are cancelled before
+envs are closed, and their tasks after that."""
 _KILL_SECONDS: Final = 0.3
 """Limit for a kill to be reported."""
 _END_SECONDS: Final = 1.5
@@ -67,23 +71,31 @@ class Shutdown:
             else:
                 record.host.close()
         try:
-            yield from self._until_closed(alive, now + _CLOSE_SECONDS)
+            yield from self._until_closed(alive, now)
         finally:
             stuck = any(r.stage not in (Stage.NEW, Stage.CLOSED) for r in self._records)
             self._let_go(_KILL_SECONDS if stuck else _END_SECONDS)
 
-    def _until_closed(self, records: Sequence[HostRecord], by: float) -> Procedure[None]:
-        killed = False
+    def _until_closed(self, records: Sequence[HostRecord], now: float) -> Procedure[None]:
+        """Wait for hosts that close; kill each when its time is up."""
+        by = {r.host.host_id: now + _seconds_for(r.config.close_timeout) for r in records}
+        killed: set[int] = set()
         now = yield Wait(0.0)
-        while any(r.stage is not Stage.CLOSED for r in records):
-            if now >= by:
-                if killed:
-                    return  # A worker that survives the kill ends with its fork server.
-                killed, by = True, now + _KILL_SECONDS
-                for record in records:
-                    if record.stage is not Stage.CLOSED:
-                        record.kill(dump=False)
-            now = yield Wait(by)
+        while still_open := [r for r in records if r.stage is not Stage.CLOSED]:
+            for record in still_open:
+                host_id = record.host.host_id
+                if now < by[host_id]:
+                    continue
+                if host_id in killed:
+                    by[host_id] = math.inf  # A worker that survives ends with its fork server.
+                else:
+                    record.kill(dump=False)
+                    killed.add(host_id)
+                    by[host_id] = now + _KILL_SECONDS
+            until = min(by[r.host.host_id] for r in still_open)
+            if until == math.inf:
+                return
+            now = yield Wait(until)
 
     def _let_go(self, seconds: float) -> None:
         for record in self._records:
@@ -114,3 +126,7 @@ class Shutdown:
             warnings.warn(
                 "an EnvGroup was not closed; its envs were killed", ResourceWarning, stacklevel=1
             )
+
+
+def _seconds_for(close_timeout: float | None) -> float:
+    return _CLOSE_SECONDS if close_timeout is None else close_timeout + _CANCEL_SECONDS

@@ -42,10 +42,10 @@ if TYPE_CHECKING:
     from rlightning_aio.hosts.awaited_runner import AwaitedRunner
     from rlightning_aio.hosts.messages import Completion, EnvStarted, StartOrder
 
-__all__ = ["AwaitedEnvs"]
+__all__ = ["CLOSE_SECONDS", "AwaitedEnvs"]
 
-_CLOSE_SECONDS: Final = 0.6
-"""How long an env may take to close."""
+CLOSE_SECONDS: Final = 0.6
+"""How long envs may take to close, where their entry doesn't say."""
 _LEFTOVERS_SECONDS: Final = 0.1
 """How long after the end of an env its tasks are looked for, for all that ended meanwhile."""
 
@@ -127,6 +127,7 @@ class AwaitedEnvs:
         self._most_busy = order.config.max_concurrency or len(order.worker_indices)
         self._ending = False
         config = order.config
+        self._close_seconds = config.close_timeout or CLOSE_SECONDS
         limits = {Operation.STEP: config.step_timeout, Operation.RESET: config.reset_timeout}
         self._limits = {
             int(op): TimeLimit(seconds, self._expire)
@@ -180,10 +181,6 @@ class AwaitedEnvs:
         self._envs.add(env)
         env.task.add_done_callback(lambda _: self._envs.discard(env))
         return env
-
-    @property
-    def _close_seconds(self) -> float:
-        return _CLOSE_SECONDS
 
     async def _build(self, place: _Place) -> BaseException | None:
         """Build an env for a place; return the error if that fails."""
@@ -414,7 +411,7 @@ class AwaitedEnvs:
                     return
                 await asyncio.sleep(restart_pause(place.losses))
             if place.leaving is not None:
-                await asyncio.wait({place.leaving}, timeout=CANCEL_SECONDS + _CLOSE_SECONDS)
+                await asyncio.wait({place.leaving}, timeout=CANCEL_SECONDS + CLOSE_SECONDS)
             error, env = await self._build(place), place.env
             if env is None:
                 kind, message = WorkerDied, f"env {place.name!r} could not be rebuilt: {error!r}"

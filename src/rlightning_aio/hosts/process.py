@@ -31,7 +31,7 @@ from rlightning_aio.hosts.fork_server import BOOTSTRAP
 from rlightning_aio.hosts.link import Link
 from rlightning_aio.hosts.messages import Closed, Death, Died, ErrorText, WorkerPlace
 from rlightning_aio.hosts.standard_streams import occupy_standard_streams
-from rlightning_aio.protocol.entries import slot_of
+from rlightning_aio.protocol.entries import number_of, slot_of
 from rlightning_aio.protocol.frames import FrameKind
 from rlightning_aio.protocol.pickling import dumped, dumped_with_code
 from rlightning_aio.protocol.rings import rings_size
@@ -358,8 +358,11 @@ class ProcessHost:
             return
         errors = link.close_errors
         if errors is None:
-            index = slot_of(requests[0]) - self.first_slot if requests[0] else 0
-            errors = [(index, ErrorText("WorkerDied", f"its worker {cause}", stderr_tail))]
+            # Before that env it has closed all others, unless it was in a request.
+            is_closing = requests[0] and not number_of(requests[0])
+            first = slot_of(requests[0]) - self.first_slot if is_closing else 0
+            text = ErrorText("WorkerDied", f"its worker {cause}", stderr_tail)
+            errors = [(index, text) for index in range(first, self.num_envs)]
         post(Closed(self.host_id, errors))
 
     # -- requests and replies -----------------------------------------------------

@@ -45,7 +45,7 @@ from rlightning_aio.hosts.ray import (
 )
 from rlightning_aio.hosts.row_table import RowTable
 from rlightning_aio.hosts.runner import placed
-from rlightning_aio.protocol.entries import Operation, op_of, slot_of
+from rlightning_aio.protocol.entries import Operation, op_of
 from rlightning_aio.protocol.pickling import dumped, dumped_with_code
 
 if TYPE_CHECKING:
@@ -215,9 +215,9 @@ class RayHost:
         requests: list[int] = [entry for entries in life.sent for entry in entries.tolist()]
         self.release()
         if self._closing:
-            index = slot_of(requests[0]) - self.first_slot if requests else 0
             text = ErrorText("WorkerDied", f"its worker {cause}", life.stacks)
-            self._post(Closed(self.host_id, [(index, text)]))
+            errors = [(index, text) for index in range(self.num_envs)]
+            self._post(Closed(self.host_id, errors))
         else:
             death = Death(cause, exit_code, life.stacks, tuple(requests))
             self._post(Died(self.host_id, death))
