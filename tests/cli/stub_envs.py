@@ -94,7 +94,7 @@ class Unbuildable(Stub):
 
 @rl.ENVS.register("stuck")
 class Stuck(Stub):
-    """Hangs when built or in its third step, after writing its process id to a file."""
+    """Hangs when built or in the step after ``steps``, after writing its process id to a file."""
 
     def __init__(self, config: rl.EnvConfig, *args: Any, **kwargs: Any) -> None:
         super().__init__(config, *args, **kwargs)
@@ -103,7 +103,7 @@ class Stuck(Stub):
             threading.Event().wait()
 
     def step(self, policy_resp: rl.PolicyResponse) -> rl.EnvRet:
-        if self.count == 2:
+        if self.count == self.options.get("steps", 2):
             threading.Event().wait()
         return super().step(policy_resp)
 
