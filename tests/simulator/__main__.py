@@ -7,6 +7,7 @@ import sys
 import time
 from collections import Counter
 
+from simulator.coverage import report
 from simulator.program import draw
 from simulator.runs import prepare, run, run_many, run_twice, shown, shrunk
 
@@ -38,7 +39,9 @@ def main() -> int:
         f"{len(seeds)} programs, {len(failed)} failed: {seconds:.0f} s, {hours:.1f} simulated hours"
     )
     for name, count in sorted(counts.items()):
-        print(f"{count:9d} {name}")
+        if not name.startswith(("request ", "loss ", "op ")):
+            print(f"{count:9d} {name}")
+    print(*report(counts), sep="\n")
     if failed:
         prepare()
         print("\nThe first failure, made as small as it gets:\n")

@@ -71,6 +71,7 @@ class ForkServer(Living):
 
     def kill(self) -> None:
         """See `Popen.kill`."""
+        self.world.counts["fork servers killed"] += 1
         self.end(-signal.SIGKILL)
 
     def wait(self, timeout: float | None = None) -> int:

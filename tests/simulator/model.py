@@ -29,6 +29,7 @@ from simulator.scripted import (
 from rlightning_aio.errors import EnvHung, EnvRaised, WorkerDied
 
 if TYPE_CHECKING:
+    from collections import Counter
     from collections.abc import Callable, Iterable, Sequence
 
     from rlightning_aio.batch import BatchedData
@@ -339,14 +340,15 @@ class Model:
 
     Args:
         envs: of the group, in its order.
+        counts: what comes of requests.
         starts_fail: replacements may fail, which counts as deaths that nobody sees.
     """
 
-    def __init__(self, envs: Iterable[Env], *, starts_fail: bool) -> None:
+    def __init__(self, envs: Iterable[Env], counts: Counter[str], *, starts_fail: bool) -> None:
+        self.counts = counts
         self.starts_fail = starts_fail
         self.envs = {env.env_id: env for env in envs}
         self.context: Context | None = None
-        self.num_results = self.num_marked = 0
 
     # -- requests
 
@@ -413,7 +415,7 @@ class Model:
                     f"\n  {request}\n  {row}"
                 ) from None
             env.request = None
-            self.num_results += 1
+            self.counts["results"] += 1
 
     def _judge(self, env: Env, request: Request, row: Row) -> None:
         restarted = row.restarted
@@ -457,7 +459,10 @@ class Model:
         if env.entry.every is None:
             return
         env.since_save = 0 if request.kind != "step" or request.due else env.since_save + 1
-        ended = all(sub.over for sub in env.state.scripts.subs)
+        ended = all(
+            sub.over or final is not None
+            for sub, final in zip(env.state.scripts.subs, env.state.finals, strict=True)
+        )
         if not env.since_save or env.since_save >= env.entry.every or ended:
             env.saves, env.since_save = [env.state.copy()], 0
 
@@ -496,9 +501,12 @@ class Model:
         elif request.kind == "step" and not request.due:
             require(not env.saves, "a new episode, and the old one was saved")
         require("episode" not in row.info, "an episode that was lost")
+        was_idle = request.deaths > env.seen
         env.seen = max(env.seen + 1, request.deaths)
         env.state, env.dirty, env.loose = state, False, []
-        self.num_marked += 1
+        self.counts["died"] += 1
+        self.counts["died while idle"] += was_idle
+        self.counts["hung"] += row.info["worker_restarted"].startswith("hung")
         self._save(env, again[0])
 
     # -- errors
@@ -535,6 +543,7 @@ class Model:
         raising = [act for act in acts if act[0] in RAISING]
         if raising:
             check_raised(fault, *raising[0])
+            self.counts["Ctrl-C in an env"] += raising[0][0] == "ctrl-c"
         else:
             rubbish = any(effect == "rubbish" for effect, _ in acts)
             require(rubbish and not request.resets, "an error of nobody", repr(fault), request)
@@ -559,10 +568,14 @@ class Model:
 
 def check_raised(fault: EnvRaised, effect: str, token: int) -> None:
     """Compare an error with what an env was to raise."""
-    text = f"as asked for: {token}" if effect == "raise" else f"odd {token}"
+    text, kind, builtin = {
+        "raise": (f"as asked for: {token}", "ValueError", ValueError),
+        "raise oddly": (f"odd {token}", "Odd", EnvRaised),
+        "ctrl-c": ("", "KeyboardInterrupt", EnvRaised),
+    }[effect]
     require(fault.exception_text == text, "another error", fault.exception_text, text)
-    require(isinstance(fault, ValueError) == (effect == "raise"), "another kind of error")
-    require(fault.exception_type.endswith("ValueError" if effect == "raise" else "Odd"), "its type")
+    require(fault.exception_type.endswith(kind), "another type", fault.exception_type)
+    require(isinstance(fault, builtin), "another class", type(fault))
     require(fault.traceback_text and fault.env_id in str(fault), "an error without its place")
 
 

@@ -36,12 +36,12 @@ from simulator.model import (
     rows_of,
     same,
 )
-from simulator.scripted import DYING, FIXED, TOKENS, Act, encoded
+from simulator.scripted import DYING, FIXED, TOKENS, UNCLOSABLE, Act, encoded
 from simulator.world import Faults
 
 import rlightning_aio
 import rlightning_aio.sync
-from rlightning_aio import BatchedData, PolicyResponse
+from rlightning_aio import BatchedData, PolicyResponse, errors
 from rlightning_aio.errors import (
     BadAction,
     EnvBusy,
@@ -49,6 +49,7 @@ from rlightning_aio.errors import (
     NothingPending,
     RLightningError,
     SnapshotError,
+    StartFailed,
     UnknownEnv,
     WorkerDied,
 )
@@ -87,6 +88,7 @@ class Play:
         self.kept: list[tuple[Any, Any]] = []
         self.owners = 0
         self.nested: set[str] = set()
+        self.unclosable: set[str] = set()
 
     # -- a run
 
@@ -112,10 +114,11 @@ class Play:
         try:
             if self.world is not None:
                 self.world.calm()
-            await self.done(self.group.init())
+            if not await self.start():
+                return
             faults = replace(self.program.faults, deaths=0.0, interrupts=0.0)
             envs = self.program.envs(self.group.get_workers(), self.world)
-            self.model = Model(envs, starts_fail=faults != Faults())
+            self.model = Model(envs, self.counts, starts_fail=faults != Faults())
             require([*self.model.envs] == self.group.env_ids, "ids", self.group.env_ids)
             for number, op in enumerate(self.program.ops):
                 await self.play(number, op)
@@ -127,8 +130,31 @@ class Play:
                 task.cancel()
             if self.tasks:
                 await asyncio.wait(self.tasks)
-            await self.done(self.group.close())
+            await self.close()
         self.check_kept()
+
+    async def close(self) -> None:
+        """Close the group; what is said of envs that don't close must be true."""
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            await self.done(self.group.close())
+        texts = [str(one.message) for one in said if "close() of env" in str(one.message)]
+        self.counts["close raised"] += len(texts)
+        for text in texts:
+            require(any(f"'{env_id}'" in text for env_id in self.unclosable), "a warning", text)
+
+    async def start(self) -> bool:
+        """Start the envs; False if they can't be, as is meant."""
+        broken = [plan.name for plan in self.program.plans if plan.start]
+        try:
+            await self.done(self.group.init())
+        except StartFailed as error:
+            self.count(error)
+            self.counts["start failed"] += 1
+            require(error.env_id.rpartition("-")[0] in broken, "a start failed", repr(error))
+            return False
+        require(not broken, "started, and it can't", broken)
+        return True
 
     async def play(self, number: int, op: Op) -> None:
         if self.world is not None:
@@ -138,7 +164,9 @@ class Play:
         try:
             await getattr(self, f"op_{op.name}")(Random(op.seed))
         except KeyboardInterrupt:
-            self.counts["KeyboardInterrupt"] += 1
+            sends = op.name in ("step_async", "reset_async", "call_async")
+            self.counts[f"Ctrl-C in a {'send' if sends else 'wait'}"] += 1
+            self.say("   Ctrl-C was raised")
         self.counts[f"op {op.name}"] += 1
         await self.look_at_tasks()
         self.check_pending()
@@ -217,6 +245,7 @@ class Play:
         try:
             found = await self.done(call())
         except EnvFault as fault:
+            self.note_faults(fault)
             if next(iter(requests.values())).kind == "call":
                 self.fail_values(fault, requests)
             else:
@@ -272,18 +301,21 @@ class Play:
             self.withdraw(requests)
             return
         require(sorted([*results, *named]) == sorted(requests), "an error of others", repr(fault))
-        self.counts[type(fault).__name__] += 1
         self.model.failed(fault, owner)
         if fault.results is not None:
             self.take(fault.results, None, owner)
 
+    def note_faults(self, fault: EnvFault) -> None:
+        for one in (fault, *fault.others):
+            self.count(one)
+
     def fail_values(self, fault: EnvFault, requests: dict[str, Request]) -> None:
         """Take an error of a call that answers with values: those of other envs are gone."""
         for one in (fault, *fault.others):
-            self.counts[type(one).__name__] += 1
             for env_id in ids_of(one):
                 require(env_id in requests, "an error of another call", repr(one))
                 if isinstance(one, WorkerDied):
+                    self.counts["died in a call"] += 1
                     self.model.gone(self.model.envs[env_id], one)
         for env_id in requests:
             self.model.envs[env_id].request = None
@@ -320,6 +352,21 @@ class Play:
                 mean = sum(total for total, _ in episodes) / len(episodes)
                 require(math.isclose(found["mean_return"], mean), "mean", env_id, found, mean)
 
+    @contextlib.contextmanager
+    def expected(self, kind: Any, what: str) -> Any:
+        """Require an error, by which nothing changes."""
+        try:
+            yield
+        except kind as error:
+            self.count(error)
+            return
+        raise Violation(f"not refused: {what}")
+
+    def count(self, error: BaseException) -> None:
+        """Count an error by its public class."""
+        kinds = [kind.__name__ for kind in type(error).__mro__]
+        self.counts[next((k for k in kinds if k in errors.__all__), kinds[0])] += 1
+
     # -- drawing
 
     def ready(self) -> list[Env]:
@@ -347,6 +394,8 @@ class Play:
         effects = ["keep state"] * ("snapshots" in features and env.entry.every is None)
         if "raise" in features:
             effects += ["raise", "raise oddly", "raise next"]
+        if not self.is_async and self.plan(env).placement == "inline":
+            effects += ["ctrl-c"] * ("raise" in features)
         effects += ["rubbish"] * ("rubbish" in features and env.entry.layout in (*FIXED, "number"))
         plan = self.plan(env)
         if env.host.mortal and "die" in features and plan.placement != "loop":
@@ -473,7 +522,7 @@ class Play:
     async def collect(self, **rules: Any) -> None:
         """Collect by these rules."""
         if self.collecting:
-            with expected(RLightningError, "a second collect"):
+            with self.expected(RLightningError, "a second collect"):
                 await self.done(self.group.collect_async(**rules))
             return
         self.collecting, nothing = True, not self.collectable(rules)
@@ -488,12 +537,13 @@ class Play:
                 "a deadline that has not passed",
                 rules,
             )
-            self.counts["TimeoutError"] += 1
+            self.counts["deadline"] += 1
             return
         except EnvFault as fault:
             self.take_fault(fault, rules)
             return
-        except NothingPending:
+        except NothingPending as error:
+            self.count(error)
             require(nothing or not self.collectable(rules), "nothing pending, and something is")
             return
         finally:
@@ -509,7 +559,7 @@ class Play:
         ]
 
     def take_fault(self, fault: EnvFault, rules: dict[str, Any]) -> None:
-        self.counts[type(fault).__name__] += 1
+        self.note_faults(fault)
         require(fault.results is None and not fault.others, "an error of one request", repr(fault))
         ended = self.model.failed(fault, COLLECTOR)
         names = rules.get("entries")
@@ -598,12 +648,12 @@ class Play:
         on_done, marks = rng.random() < 0.7, rng.random() < 0.3
         context = self.group.auto_reset(limit, on_done, marks)
         if self.context is not None:
-            with expected(RuntimeError, "a nested auto_reset"):
+            with self.expected(RuntimeError, "a nested auto_reset"):
                 context.__enter__()
             return
         entries = [env.entry for env in self.model.envs.values()]
         if limit is None and any(e.limit is None and e.mode == "disabled" for e in entries):
-            with expected(ValueError, "an auto_reset without a limit"):
+            with self.expected(ValueError, "an auto_reset without a limit"):
                 context.__enter__()
             return
         context.__enter__()
@@ -686,17 +736,18 @@ class Play:
 
     async def op_collect_calls(self, rng: Random) -> None:
         if self.collecting_calls:
-            with expected(RLightningError, "a second collect_calls"):
+            with self.expected(RLightningError, "a second collect_calls"):
                 await self.done(self.group.collect_calls())
             return
         if not self.calls:
-            with expected(NothingPending, "a collect of no calls"):
+            with self.expected(NothingPending, "a collect of no calls"):
                 await self.done(self.group.collect_calls())
             return
         self.collecting_calls = True
         try:
             values = await self.done(self.group.collect_calls(self.hang))
         except EnvFault as fault:
+            self.note_faults(fault)
             require(isinstance(fault, WorkerDied), "an error of a call that has none", repr(fault))
             self.fail_values(
                 fault, {env.env_id: env.request for env in self.model.pending("calls")}
@@ -715,7 +766,9 @@ class Play:
         envs = self.model.idle()
         if not envs:
             return
-        env, mark = rng.choice(envs), rng.randrange(99)
+        env, mark = rng.choice(envs), rng.choice([rng.randrange(98), UNCLOSABLE])
+        if mark == UNCLOSABLE:  # Its state may be put into any other.
+            self.unclosable |= {one.env_id for one in self.model.envs.values()}
         handle = self.group[env.env_id]
 
         def take(_: Any) -> None:
@@ -812,6 +865,7 @@ class Play:
         try:
             await self.answer(requests, lambda: self.group.snapshot([*requests]), take)
         except SnapshotError as error:
+            self.count(error)
             require(any(env.may_be_lost for env in envs), "no state", repr(error))
             for env in envs:
                 env.request = None
@@ -948,10 +1002,10 @@ class Play:
             values[fits[0]] = PolicyResponse(ids[fits[0]], np.zeros((3, 3, 7)))
             wrong = BadAction
         else:
-            with expected(BadAction, "columns of another length"):
+            with self.expected(BadAction, "columns of another length"):
                 batch.respond(action=[0] * (len(batch) + 1))
             return
-        with expected((wrong, WorkerDied), kind):
+        with self.expected((wrong, WorkerDied), kind):
             self.group.step_async(BatchedData(ids, values))
 
     async def op_look(self, rng: Random) -> None:
@@ -1008,16 +1062,6 @@ class Play:
 def ids_of(fault: EnvFault) -> Sequence[str]:
     """The envs whose requests an error answers."""
     return getattr(fault, "env_ids", ()) or (fault.env_id,)
-
-
-@contextlib.contextmanager
-def expected(kind: Any, what: str) -> Any:
-    """Require an error, by which nothing changes."""
-    try:
-        yield
-    except kind:
-        return
-    raise Violation(f"not refused: {what}")
 
 
 def _shown(row: Row) -> str:

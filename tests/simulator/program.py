@@ -12,7 +12,7 @@ from random import Random
 from typing import TYPE_CHECKING, Any
 
 from simulator.model import Entry, Env, Host, State
-from simulator.scripted import CONTROLS, FIXED, LAYOUTS, MAKERS
+from simulator.scripted import CONTROLS, FIXED, LAYOUTS, MAKERS, broken
 from simulator.world import Faults
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 FEATURES = (
     "async", "several entries", "several envs", "stacked", "out of band", "base", "awaitable",
-    "processes",
+    "processes", "ray",
     "auto_reset", "partial steps", "plain values", "extras", "calls", "handles", "snapshots",
     "cancel", "timeouts", "tasks", "raise", "rubbish", "infos", "ends", "slow", "die", "hang",
     "raise deaths", "resume", "misuse", "zero_copy", "timeline", "faults",
@@ -54,6 +54,7 @@ class Plan:
     max_restarts: int = 3
     timeout: float | None = None
     min_results: int | None = None
+    start: str = ""
 
     def config(self, number: int) -> dict[str, Any]:
         """The fields of the entry, the `number`-th."""
@@ -87,6 +88,9 @@ class Plan:
             codes = self.codes(number, worker)
             own: tuple[Any, ...] = (codes, self.mode) if self.form == "stacked" else (codes[0],)
             makers.append(partial(make, *own, self.layout, self.controls))
+        if self.start:
+            makers[-1] = partial(broken, self.start, make, *makers[-1].args)
+            found["start_timeout"] = 5.0
         return found | {"make_env": makers}
 
     def codes(self, number: int, worker: int) -> list[int]:
@@ -126,7 +130,8 @@ class Program:
         for number, worker in enumerate(workers):
             plan = next(plan for plan in self.plans if plan.name == worker["entry"])
             here = plan.placement == "inline" or worker["pid"] is None
-            count = None if world is None else partial(world.deaths.__getitem__, f"worker {number}")
+            process = "an actor" if plan.placement == "ray" else f"worker {number}"
+            count = None if world is None else partial(world.deaths.__getitem__, process)
             host = Host(mortal=plan.placement == "ray" or not here, count=count)
             host_of |= dict.fromkeys(worker["env_ids"], host)
         envs: list[Env] = []
@@ -177,6 +182,11 @@ def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 40)
     plans = [_plan(rng, features, "a")]
     if "several entries" in features:
         plans += [_plan(rng, features, name) for name in "bc"[: rng.randint(1, 2)]]
+    remote = ("process", "ray")
+    workers = [k for k, p in enumerate(plans) if p.placement in remote and p.form in MAKERS]
+    if workers and rng.random() < 0.03:
+        k = rng.choice(workers)
+        plans[k] = replace(plans[k], start=rng.choice(["raise", "exit", "hang"]))
     names = [name for name, (_, needs) in OPS.items() if needs is None or needs in features]
     weights = [OPS[name][0] for name in names]
     count = rng.randint(num_ops // 4, num_ops)
@@ -209,6 +219,8 @@ def _plan(rng: Random, features: frozenset[str], name: str) -> Plan:
     places = ["inline"] if form != "awaitable" else ["loop"] if "async" in features else []
     if "processes" in features or not places:
         places += ["process"] if form == "awaitable" else ["process"] * 4 + ["split"]
+    if "ray" in features and form != "awaitable":
+        places += ["ray"] * 3
     placement = rng.choice(places)
     if placement in ("inline", "loop"):
         return replace(plan, placement=placement)

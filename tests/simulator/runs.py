@@ -11,6 +11,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
+from simulator.coverage import watch
 from simulator.play import Play
 from simulator.program import draw
 from simulator.world import World
@@ -19,6 +20,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from simulator.program import Op, Program
+
+
+transitions: Counter[str] = Counter()
+"""What `coverage` has counted in this run."""
 
 
 @dataclass
@@ -61,7 +66,8 @@ def _play(play: Play, found: Run) -> None:
         found.kind = (
             f"{type(error).__name__}: {str(error).splitlines()[0][:40] if str(error) else ''}"
         )
-    found.counts += play.counts
+    found.counts += play.counts + transitions
+    transitions.clear()
 
 
 def run_twice(program: Program) -> Run:
@@ -80,6 +86,7 @@ def run_twice(program: Program) -> Run:
 
 def prepare() -> None:
     """Make a process ready for many runs."""
+    watch(transitions)
     logging.getLogger("rlightning_aio").setLevel(logging.CRITICAL)
     gc.collect()
     gc.freeze()

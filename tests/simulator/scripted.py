@@ -13,6 +13,7 @@ import os
 import signal
 import string
 import time
+from copy import deepcopy
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import gymnasium as gym
@@ -62,12 +63,13 @@ machine = Machine()
 EFFECTS = (
     "plain", "end", "cut", "both", "info", "nested", "slow", "raise", "raise oddly", "rubbish",
     "killed", "exit", "hang", "raise next", "die next", "hang next", "keep state",
+    "ctrl-c",
 )  # fmt: skip
 """What a step does, by number. ``… next`` does it in the next reset; after ``keep state`` the env
 refuses one snapshot."""
 TOKENS = 64
 """Numbers that an action has in addition, to tell it from others."""
-RAISING = ("raise", "raise oddly")
+RAISING = ("raise", "raise oddly", "ctrl-c")
 DYING = ("killed", "exit")
 
 
@@ -109,6 +111,12 @@ def _raise(effect: str, token: int) -> None:
         raise ValueError(f"as asked for: {token}")
     if effect == "raise oddly":
         raise Odd(code=token)
+    if effect == "ctrl-c":
+        signal.raise_signal(signal.SIGINT)
+
+
+UNCLOSABLE = 98
+"""The `mark` of an env that raises when it is closed."""
 
 
 class Words(NamedTuple):
@@ -471,6 +479,10 @@ class _Body:
         """Do to the process what a step would."""
         perform(effect, token)
 
+    def close(self) -> None:
+        if self.mark == UNCLOSABLE:
+            raise RuntimeError("it does not close")
+
     def observed(self, words: Words, effect: str = "plain") -> Any:
         return "rubbish" if effect == "rubbish" else LAYOUTS[self.layout].encode(words)
 
@@ -478,8 +490,8 @@ class _Body:
 class _Single(_Body):
     def __init__(self, code: int, layout: str, controls: str) -> None:
         super().__init__([code], "disabled", layout, controls)
-        self.observation_space = LAYOUTS[layout].space
-        self.action_space = CONTROLS[controls].space
+        self.observation_space = deepcopy(LAYOUTS[layout].space)
+        self.action_space = deepcopy(CONTROLS[controls].space)
 
     def _begun(self, seed: int | None, options: dict[str, Any] | None) -> tuple[Any, Any]:
         (info,) = self.scripts.reset(seed, options)
@@ -534,8 +546,11 @@ class Stacked(_Body, gym.vector.VectorEnv[Any, Any, Any]):
         super().__init__(codes, mode, layout, controls)
         self.num_envs = len(codes)
         self.metadata = {"autoreset_mode": AutoresetMode[mode.upper()]}
-        self.single_observation_space = LAYOUTS[layout].space
-        self.single_action_space = CONTROLS[controls].space
+        self.single_observation_space = deepcopy(LAYOUTS[layout].space)
+        self.single_action_space = deepcopy(CONTROLS[controls].space)
+        # Otherwise they are seeded at random when they are batched.
+        self.single_observation_space.seed(0)
+        self.single_action_space.seed(0)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
@@ -560,7 +575,8 @@ class Stacked(_Body, gym.vector.VectorEnv[Any, Any, Any]):
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         acts = [decoded(self.controls, one) for one in iterate(self.action_space, actions)]
-        for fault in self.scripts.faults_of_step(acts):
+        faults = self.scripts.faults_of_step(acts)
+        for fault in faults:
             perform(*fault)
         found = self.scripts.step(acts)
         infos = [
@@ -568,7 +584,7 @@ class Stacked(_Body, gym.vector.VectorEnv[Any, Any, Any]):
             for info, final in zip(found.infos, found.finals, strict=True)
         ]
         head = map(np.array, (found.rewards, found.terminated, found.truncated))
-        return (self._stacked(found.words, acts), *head, self._joined(infos))
+        return (self._stacked(found.words, faults), *head, self._joined(infos))
 
 
 @ENVS.register("scripted")
@@ -603,12 +619,21 @@ class ScriptedBase(BaseEnv):
     def fault(self, effect: str, token: int) -> None:
         perform(effect, token)
 
+    def close(self) -> None:
+        self.env.close()
+
     def save_state(self) -> Any:
         return [sub.__getstate__() for sub in self.env.scripts.subs]
 
     def load_state(self, state: Any) -> None:
         for sub, own in zip(self.env.scripts.subs, state, strict=True):
             vars(sub).update(own)
+
+
+def broken(effect: str, make: Callable[..., Any], *args: Any) -> Any:
+    """Do something to the process, then make an env."""
+    perform(effect, 0)
+    return make(*args)
 
 
 MAKERS: dict[str, Callable[..., Any]] = {

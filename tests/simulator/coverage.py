@@ -1,0 +1,117 @@
+"""Reached or not: what the programs made happen, of what can happen.
+
+These are the transitions of the tables `LEGAL` (of requests, as the debug mode checks them, and of
+losses of episodes), the classes of errors, the rows of docs/faults.md, and the operations.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from simulator.program import OPS
+
+from rlightning_aio import errors
+from rlightning_aio.group import checked, continuity
+from rlightning_aio.group.request_states import LEGAL, Owner, State
+
+if TYPE_CHECKING:
+    from collections import Counter
+
+FAULTS_PAGE: Final = Path(__file__).parents[2] / "docs" / "faults.md"
+
+ELSEWHERE: Final = "elsewhere: "
+ROWS: Final[dict[str, str]] = {
+    "the environment raises in `reset`": "EnvRaised",
+    "the environment forks": ELSEWHERE + "tests/faults, as a world has no memory to copy",
+    "a worker is killed": "died",
+    "… during a call of a method": "died in a call",
+    "… while it was idle": "died while idle",
+    "a step or reset takes longer": "hung",
+    "… and its fork server hangs": "fork servers killed",
+    "a worker is stopped for a while": "stops",
+    "an environment can't be built": "start failed",
+    "a replacement dies while it starts": "refusals",
+    "an environment raises in `close`": "close raised",
+    "an action of the wrong shape": "BadAction",
+    "a group is used from another": ELSEWHERE + "tests/faults/test_misuse.py, in real threads",
+    "a collect while nothing": "NothingPending",
+    "`deadline` passes": "deadline",
+    "Ctrl-C while a synchronous group waits": "Ctrl-C in a wait",
+    "… while an inline environment steps": "Ctrl-C in an env",
+    "… while the group sends": "Ctrl-C in a send",
+    "the process that drives a robot": ELSEWHERE + "tests/envs/test_piper_guard.py",
+    "the trainer dies": ELSEWHERE + "tests/faults/test_shutdown.py, which kills trainers",
+}
+"""For each row of the table of faults, by its beginning: what is counted where it is reached."""
+
+NOT_OF_GROUPS: Final = {
+    "ClientRefused", "EnvAway", "PolicyServerError", "RemoteTraceback", "ReplayDiverged",
+    "RLightningError", "EnvFault", "ConfigError", "ActionRefused",
+}  # fmt: skip
+"""Errors that are bases of others, or that no group of local envs raises."""
+
+
+def rows() -> list[str]:
+    """The first cells of the table of docs/faults.md."""
+    text = FAULTS_PAGE.read_text()
+    table = text[text.index("| fault |") : text.index("## A marked result")]
+    return [line.split("|")[1].strip() for line in table.splitlines()[2:] if line[:1] == "|"]
+
+
+def row_key(row: str) -> str:
+    """The key of a row in `ROWS`."""
+    found = [key for key in ROWS if row.startswith(key)]
+    assert len(found) == 1, f"docs/faults.md has a row that the simulator does not know: {row}"
+    return found[0]
+
+
+def watch(counts: Counter[str]) -> None:
+    """Count each transition from now on; requests only in the debug mode."""
+    original, owners = checked.CheckedRequests.changes, list(Owner)
+
+    def changes(self: Any, *events: Any) -> Any:
+        if not self._is_changing:
+            for event, slots in events:
+                for code in set(self._known[slots].tolist()):
+                    state, owner = divmod(code, len(owners))
+                    counts[f"request {State(state).name} {owners[owner].name} {event.name}"] += 1
+        return original(self, *events)
+
+    checked.CheckedRequests.changes = changes  # type: ignore[method-assign]
+
+    class Counting(dict[Any, Any]):
+        def get(self, key: Any, default: Any = None) -> Any:
+            counts[f"loss {key[0].name} {key[1].name}"] += 1
+            return super().get(key, default)
+
+    continuity.LEGAL = Counting(continuity.LEGAL)  # type: ignore[misc]
+
+
+def possible() -> dict[str, list[tuple[str, str]]]:
+    """What can be reached, by kind: a name of each, and what is counted where it is."""
+    requests = [f"{state.name} {owner.name} {event.name}" for state, owner, event in LEGAL]
+    losses = [f"{phase.name} {event.name}" for phase, event in continuity.LEGAL]
+    kinds = [name for name in errors.__all__ if name not in NOT_OF_GROUPS]
+    faults = [(re.sub(r"`", "", key), ROWS[key]) for key in map(row_key, rows())]
+    return {
+        "transitions of requests": [(name, f"request {name}") for name in requests],
+        "transitions of losses": [(name, f"loss {name}") for name in losses],
+        "errors": [(name, name) for name in kinds],
+        "rows of docs/faults.md": faults,
+        "operations": [(name, f"op {name}") for name in OPS],
+    }
+
+
+def report(counts: Counter[str]) -> list[str]:
+    """Say what was reached, and name what was not."""
+    lines: list[str] = []
+    for kind, names in possible().items():
+        elsewhere = [name for name, key in names if key.startswith(ELSEWHERE)]
+        here = [(name, key) for name, key in names if name not in elsewhere]
+        missing = [name for name, key in here if not counts[key]]
+        lines.append(f"{len(here) - len(missing)} of {len(here)} {kind} were reached")
+        lines += [f"    not reached: {name}" for name in missing]
+        lines += [f"    {name}: {dict(names)[name]}" for name in elsewhere]
+    return lines
