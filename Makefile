@@ -28,7 +28,7 @@ NEWEST := .venv-newest
 PIP_INSTALL = $(@D)/bin/python -m pip install --quiet --disable-pip-version-check
 
 .DEFAULT_GOAL := help
-.PHONY: help run test test-programs test-newest test-sanitized test-aarch64 test-ray environments test-simulators test-gpu test-lerobot test-peers test-pythons test-site check prose format docs dist bench clean
+.PHONY: help run test simulate test-programs test-newest test-sanitized test-aarch64 test-ray environments test-simulators test-gpu test-lerobot test-peers test-pythons test-site check prose format docs dist bench clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 24
@@ -55,6 +55,12 @@ test-newest: | $(NEWEST)/bin/python ## all of these tests, with the newest versi
 	$(PY) -m pip install --quiet --disable-pip-version-check --upgrade --upgrade-strategy eager --editable '.[test]'
 	$(PY) -m pip list --disable-pip-version-check
 	$(PYTEST)
+
+# SEEDS=1000 programs from FIRST=0 on; SEED=7 replays one; REAL=1 uses real processes.
+simulate: export PYTHONPATH := tests
+simulate: export RLIGHTNING_AIO_DEBUG := 1
+simulate: $(VENV)/installed-test ## random programs in a simulated world, compared with a model: SEEDS=1000, SEED=n, REAL=1
+	$(PY) -m simulator --seeds $(or $(SEEDS),1000) --first $(or $(FIRST),0) $(SEED:%=--seed %) $(REAL:1=--real)
 
 # What is said of every place where envs may live, and what only Ray can be asked.
 test-ray: $(VENV)/installed-ray ## the tests of `placement: ray`, on clusters of this machine

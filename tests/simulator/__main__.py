@@ -9,7 +9,7 @@ from collections import Counter
 
 from simulator.coverage import report
 from simulator.program import draw
-from simulator.runs import prepare, run, run_many, run_twice, shown, shrunk
+from simulator.runs import WORLDLY, prepare, run, run_many, run_twice, shown, shrunk
 
 
 def main() -> int:
@@ -24,7 +24,8 @@ def main() -> int:
     again = (lambda p: run(p, real=True)) if arguments.real else run_twice
     if arguments.seed is not None:
         prepare()
-        print(shown(found := again(draw(arguments.seed))))
+        program = draw(arguments.seed, without=WORLDLY if arguments.real else frozenset())
+        print(shown(found := again(program)))
         return bool(found.error)
     began, counts, hours, failed = time.perf_counter(), Counter[str](), 0.0, []
     seeds = range(arguments.first, arguments.first + arguments.seeds)

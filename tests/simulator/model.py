@@ -99,6 +99,7 @@ class Request:
         due: `auto_reset` resets the env in place of its step.
         sent: the policy's columns, one value of each; None if it was no response.
         kills: it ends the worker, unless that ends before.
+        interrupted: Ctrl-C may have ended it, in an env of this process.
         deaths: of the host, before it was sent.
         before: whether the env was in limbo, and cut, before it was sent.
     """
@@ -111,6 +112,7 @@ class Request:
     due: bool = False
     sent: dict[str, Any] | None = None
     kills: bool = False
+    interrupted: bool = False
     deaths: int = 0
     before: tuple[bool, bool] = (False, False)
 
@@ -538,6 +540,9 @@ class Model:
         require(isinstance(fault, EnvRaised), "an odd error", repr(fault))
         assert isinstance(fault, EnvRaised)
         if request.kind == "call":
+            return
+        if request.interrupted and fault.exception_type == "KeyboardInterrupt":
+            self.counts["Ctrl-C in an env"] += 1
             return
         acts = env.state.faults(request)
         raising = [act for act in acts if act[0] in RAISING]

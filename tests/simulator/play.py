@@ -141,7 +141,8 @@ class Play:
         texts = [str(one.message) for one in said if "close() of env" in str(one.message)]
         self.counts["close raised"] += len(texts)
         for text in texts:
-            require(any(f"'{env_id}'" in text for env_id in self.unclosable), "a warning", text)
+            own = any(f"'{env_id}'" in text for env_id in self.unclosable)
+            require(own or "its worker" in text, "a warning", text)
 
     async def start(self) -> bool:
         """Start the envs; False if they can't be, as is meant."""
@@ -161,15 +162,22 @@ class Play:
             self.world.reseed(op.seed)
             self.world.storm()
         self.say(f"{number}: {op.name}")
-        try:
-            await getattr(self, f"op_{op.name}")(Random(op.seed))
-        except KeyboardInterrupt:
-            sends = op.name in ("step_async", "reset_async", "call_async")
-            self.counts[f"Ctrl-C in a {'send' if sends else 'wait'}"] += 1
-            self.say("   Ctrl-C was raised")
+        await self.interruptible(getattr(self, f"op_{op.name}")(Random(op.seed)), op.name)
         self.counts[f"op {op.name}"] += 1
         await self.look_at_tasks()
         self.check_pending()
+
+    async def interruptible(self, doing: Coroutine[Any, Any, Any], name: str = "") -> Any:
+        """Do something that Ctrl-C may interrupt; None if it did."""
+        try:
+            return await doing
+        except KeyboardInterrupt:
+            sends = name in ("step_async", "reset_async", "call_async")
+            self.counts[f"Ctrl-C in a {'send' if sends else 'wait'}"] += 1
+            self.say("   Ctrl-C was raised")
+            for env in self.model.pending():
+                assert env.request is not None
+                env.request.interrupted = not env.host.mortal
 
     def say(self, text: str) -> None:
         """Add a line to the trace."""
@@ -204,21 +212,27 @@ class Play:
             self.world.calm()
         self.say("calm")
         await self.look_at_tasks(wait=True)
-        if self.calls:
-            await self.op_collect_calls(Random(0))
+        while self.calls:
+            await self.interruptible(self.op_collect_calls(Random(0)))
         while self.model.pending(COLLECTOR):
-            await self.collect(deadline=self.hang)
+            await self.interruptible(self.collect(deadline=self.hang))
         if self.context is not None:
             self.leave()
         for env in self.model.envs.values():
             for _ in range(6):  # Errors of the env, or of a call that was given up, may come first.
-                if env.gone or (await self.reset([env]) and await self.step_on([env])):
+                if env.gone or await self.interruptible(self.use(env)):
                     break
                 await self.rest()
             else:
                 raise Violation(f"env {env.env_id} can't be used any more")
         self.check_stats()
         self.stop_trace()
+
+    async def use(self, env: Env) -> bool:
+        """Reset and step an env."""
+        while env.request is not None:
+            await self.collect(deadline=self.hang)
+        return await self.reset([env]) and await self.step_on([env])
 
     async def rest(self) -> None:
         """Let others do what they still have to do."""

@@ -24,6 +24,7 @@ FEATURES = (
     "auto_reset", "partial steps", "plain values", "extras", "calls", "handles", "snapshots",
     "cancel", "timeouts", "tasks", "raise", "rubbish", "infos", "ends", "slow", "die", "hang",
     "raise deaths", "resume", "misuse", "zero_copy", "timeline", "faults",
+    "interrupts",
 )  # fmt: skip
 
 
@@ -193,7 +194,7 @@ def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 40)
     ops = [Op(name, rng.getrandbits(32)) for name in rng.choices(names, weights, k=count)]
     first = [Op("reset", rng.getrandbits(32))] if rng.random() < 0.8 else []
     kinds = ["deaths", "stops", "lags", "starts", "fork_servers"]
-    kinds += ["interrupts"] * ("async" not in features)
+    kinds += ["interrupts"] * ("async" not in features and "interrupts" in features)
     chances = {kind: rng.choice([0.02, 0.1, 0.4]) for kind in kinds if rng.random() < 0.4}
     faults = Faults(**chances) if "faults" in features else Faults()
     return Program(seed, features, tuple(plans), (*first, *ops), faults)

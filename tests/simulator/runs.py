@@ -9,7 +9,7 @@ import traceback
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from simulator.coverage import watch
 from simulator.play import Play
@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 
     from simulator.program import Op, Program
 
+
+WORLDLY: Final = frozenset({"ray", "faults"})
+"""Features that only a world has."""
 
 transitions: Counter[str] = Counter()
 """What `coverage` has counted in this run."""
@@ -96,7 +99,7 @@ def run_seeds(seeds: Sequence[int], *, real: bool, once: bool) -> list[Run]:
     """Run the programs of some seeds; the runs that went well come without trace."""
     found: list[Run] = []
     for seed in seeds:
-        program = draw(seed)
+        program = draw(seed, without=WORLDLY if real else frozenset())
         one = run(program, real=real) if real or once else run_twice(program)
         if not one.error:
             one.trace = []

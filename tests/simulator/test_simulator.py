@@ -1,0 +1,59 @@
+"""Random programs do to groups what the model says, and the same seed does the same twice."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from simulator.coverage import ROWS, row_key, rows
+from simulator.program import draw
+from simulator.runs import run, run_twice, shown, shrunk
+
+from rlightning_aio.group.continuity import Continuity
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+CHUNKS, SEEDS = 20, 15
+NOT_YET = frozenset({"interrupts"})
+"""A result that arrives with Ctrl-C is lost, which is a defect that is known."""
+
+
+@pytest.fixture(autouse=True)
+def without_logs() -> Iterator[None]:
+    """Deaths would fill them."""
+    log = logging.getLogger("rlightning_aio")
+    level = log.level
+    log.setLevel(logging.CRITICAL)
+    yield
+    log.setLevel(level)
+
+
+@pytest.mark.parametrize("chunk", range(CHUNKS))
+def test_programs_do_what_the_model_says(chunk: int) -> None:
+    """In a world, with faults; `make simulate` runs more of them."""
+    for seed in range(chunk * SEEDS, (chunk + 1) * SEEDS):
+        program = draw(seed, without=NOT_YET)
+        found = run_twice(program) if seed % 5 == 0 else run(program)
+        assert not found.error, shown(shrunk(found, run_twice))
+
+
+def test_a_defect_is_found_and_shrunk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A group that forgets to report the step limit is found soon, by few operations."""
+    original = Continuity.judge
+
+    def forgetful(self: Continuity, slots: Any, flagged: Any) -> Any:
+        return original(self, slots, flagged)._replace(is_cut=None)
+
+    monkeypatch.setattr(Continuity, "judge", forgetful)
+    failed = next(found for seed in range(200) if (found := run(draw(seed))).error)
+    assert "limit_reached" in failed.error
+    small = shrunk(failed, run)
+    assert len(small.program.ops) <= 6
+    assert small.kind == failed.kind
+
+
+def test_every_row_of_the_page_of_faults_is_known() -> None:
+    keys = [row_key(row) for row in rows()]
+    assert len(set(keys)) == len(keys) == len(ROWS)
