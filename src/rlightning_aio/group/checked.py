@@ -32,6 +32,9 @@ DEBUG: Final = os.environ.get("RLIGHTNING_AIO_DEBUG") == "1"
 """Groups check their requests."""
 
 _OWNERS: Final = list(Owner)
+_TICKET: Final = _OWNERS.index(Owner.TICKET)
+_NOBODY: Final = _OWNERS.index(Owner.NOBODY)
+_IDLE: Final = int(State.IDLE)
 _ILLEGAL: Final = -1
 
 
@@ -62,9 +65,9 @@ class CheckedRequests(Requests):
 
     def _situations(self) -> NDArray[np.int64]:
         """Return the situation of each slot; an idle slot has no owner."""
-        kinds = np.where(self.owner > 0, _OWNERS.index(Owner.TICKET), 0)
-        kinds[self.owner < 0] = _OWNERS.index(Owner.NOBODY)
-        kinds[self.state == State.IDLE] = 0
+        kinds = np.where(self.owner > 0, _TICKET, 0)
+        kinds[self.owner < 0] = _NOBODY
+        kinds[self.state == _IDLE] = 0
         return self.state.astype(np.int64) * len(_OWNERS) + kinds
 
     @contextlib.contextmanager
