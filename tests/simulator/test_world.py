@@ -148,7 +148,9 @@ def survived(seed: int) -> World:
     world = World(seed, STORM)
     with world, suppress(StartFailed, KeyboardInterrupt):
         world.calm()
-        with sync.build_env_group(config(step_timeout=5.0, reset_timeout=5.0)) as group:
+        with sync.build_env_group(
+            config(step_timeout=5.0, reset_timeout=5.0, max_restarts=99)
+        ) as group:
             batch, _ = group.reset(seed=5)
             world.storm()
             for _ in range(20):

@@ -4,7 +4,8 @@ It simulates what lies below the package, and nothing of the package: the clock,
 and event loops, processes, their deaths and signals. So the trainer's side is the real one, with
 its drivers, hosts and links, and so is the code of workers. A simulated process is a greenlet. It
 runs until it asks the operating system for something that takes time, or until the world takes the
-core away from it at a *point*: a system call, or a fence between two writes to shared memory.
+core away from it at a *point*: a system call, a look at the clock, or a fence between two writes to
+shared memory.
 
 One seed decides every duration, order and fault, so the same seed gives the same trace.
 
@@ -36,7 +37,7 @@ import time
 from collections import Counter
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import partial
 from random import Random
 from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
 from unittest import mock
@@ -64,14 +65,9 @@ _TICK_NS: Final = 200
 """How long it takes to read the clock. So a loop that only looks at the clock ends."""
 _START_NS: Final = 10**12
 _EPOCH_NS: Final = 1_700_000_000 * 10**9
+_NUMBERS: Final = itertools.count(1)
+"""Of the worlds of this process."""
 _MAX_EVENTS: Final = 2_000_000
-
-
-@cache
-def _freeze() -> None:
-    """Exempt what is there before the first world from garbage collection."""
-    gc.collect()
-    gc.freeze()
 
 
 class Deadlock(AssertionError):
@@ -150,10 +146,12 @@ class World:
     # -- life ---------------------------------------------------------------------
 
     def __enter__(self) -> Self:
-        # No garbage of another world may run any code in this one.
-        _freeze()
+        # No garbage of another world may run any code in this one. What is there in the first
+        # worlds, such as modules, stays.
         gc.collect()
-        self._patches.callback(gc.collect)
+        number = next(_NUMBERS)
+        if not number & number - 1:
+            gc.freeze()
         if gc.isenabled():
             gc.disable()
             self._patches.callback(gc.enable)
@@ -198,6 +196,7 @@ class World:
             # Each process has a heap of its own, so these would act on one that is small.
             (gc, "collect", nothing),
             (gc, "freeze", nothing),
+            (os, "fsync", nothing),
             # As on a processor that reorders accesses to memory, so that there are more fences.
             (exchange, "IN_ORDER", False),
             (rings, "IN_ORDER", False),
@@ -253,6 +252,7 @@ class World:
 
     def clock_ns(self) -> int:
         """Return the time."""
+        self.point()
         self.now_ns += _TICK_NS
         return self.now_ns
 
