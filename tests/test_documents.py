@@ -18,7 +18,7 @@ PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md"), *(ROOT / "benchmarks").
 PACKAGE = ROOT / "src" / "rlightning_aio"
 # Internal packages; other modules export what users need.
 INTERNAL = {"batch", "cli", "config", "envs", "group", "hosts", "protocol", "registry", "sharing"}
-INTERNAL |= {"files", "piper", "sealing", "types", "video", "__init__"}
+INTERNAL |= {"files", "piper", "sealing", "types", "video", "__init__", "__main__"}
 # "The words" of ARCHITECTURE.md.
 WORDS = {"config", "errors", "files", "registry", "sealing", "sharing", "spaces", "types"}
 

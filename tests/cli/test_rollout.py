@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import tomllib
 from typing import TYPE_CHECKING
 
@@ -207,6 +208,12 @@ def test_the_console_script_runs_cli_main() -> None:
     """Its name is rlightning-aio."""
     project = tomllib.loads((TESTS.parent / "pyproject.toml").read_text())["project"]
     assert project["scripts"] == {"rlightning-aio": "rlightning_aio.cli:main"}
+
+
+def test_python_m_runs_the_same_command() -> None:
+    """For example where the scripts of an environment are not on the path."""
+    done = run("--version", program=[sys.executable, "-m", "rlightning_aio"])
+    assert (done.returncode, done.stdout) == (0, invoke("--version").stdout)
 
 
 @pytest.mark.parametrize(
