@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from cli.command import start, write_config
 from envs.test_openenv import on_asyncio
 from websockets.asyncio.client import connect
 from websockets.asyncio.server import serve
@@ -26,6 +27,7 @@ from rlightning_aio.serving import OpenEnvServer
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
+    from pathlib import Path
 
 POLE = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1", "placement": "inline"}
 COLUMN = {"columns": {"observation": {"shape": [4]}}, "truncated_field": "truncated"}
@@ -285,16 +287,16 @@ async def private(url: str) -> AsyncGenerator[tuple[str, list[bytes]]]:
 
 @pytest.mark.parametrize("session", ["own", "keep"])
 def test_a_private_server_gets_headers_that_no_log_has(
-    session: str, caplog: pytest.LogCaptureFixture
+    session: str, caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
     """Both over WebSockets and over HTTP; without them it refuses, and is named."""
     with caplog.at_level(logging.DEBUG):
-        asyncio.run(_use_private(session))
+        asyncio.run(_use_private(session, tmp_path))
     assert KEY not in caplog.text
     assert "websockets" in {record.name.partition(".")[0] for record in caplog.records}
 
 
-async def _use_private(session: str) -> None:
+async def _use_private(session: str, folder: Path) -> None:
     async with (
         rl.build_env_group({**POLE, "num_workers": 2}) as served,
         OpenEnvServer(served, "pole", "127.0.0.1", 0) as server,
@@ -309,8 +311,10 @@ async def _use_private(session: str) -> None:
             assert batch.reward.tolist() == [1, 1]
         calls = sorted({head.split(b" ")[1].partition(b"?")[0] for head in heads})
         assert calls == ([b"/mcp", b"/ws"] if session == "keep" else [b"/ws"])
-        schema = await asyncio.to_thread(get_json, url, "/schema", {"Authorization": KEY})
-        assert "action" in schema
+        with start("check", write_config(folder, config), "--json") as check:
+            printed, complaints = await asyncio.to_thread(check.communicate)
+        assert "schema" in json.loads(printed)["entries"][0]["offers"]
+        assert KEY not in printed + complaints
         config["env_kwargs"] |= {"headers": {}, "connect_timeout": 0.01}
         async with rl.build_env_group(config) as group:
             with pytest.raises(rl.EnvRaised, match=f"{url} can't be reached: .*401"):
