@@ -40,7 +40,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from random import Random
 from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
-from unittest import mock
 
 from simulator import rays
 from simulator.fork_server import ForkServer
@@ -156,7 +155,8 @@ class World:
             gc.disable()
             self._patches.callback(gc.enable)
         for target, name, replacement in self._replacements():
-            self._patches.enter_context(mock.patch.object(target, name, replacement))
+            self._patches.callback(setattr, target, name, getattr(target, name))
+            setattr(target, name, replacement)
         self._patches.enter_context(rays.importable())
         self._patches.callback(kernel.select, kernel.selected)
         kernel.select(self._implementation)
