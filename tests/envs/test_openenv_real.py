@@ -17,6 +17,7 @@ import pytest
 from cli.command import start, write_config
 from cli.test_interrupt import interrupt
 from envs.openenv_actions import STEPS, action_of, seed_of
+from patience import HANG
 
 import rlightning_aio as rl
 
@@ -76,7 +77,7 @@ async def play(
     """Rows of observation, reward, done and metadata: of each session, each episode."""
     kwargs = {"session": session, **(CUT if kind == "dice" else {})}
     entry = {"name": "d", "backend": "openenv", "task": url, "num_workers": count}
-    entry |= {"placement": placement, "env_kwargs": kwargs}
+    entry |= {"placement": placement, "env_kwargs": kwargs, "close_timeout": HANG}
     played: list[list[list[Any]]] = [[] for _ in range(count)]
     async with rl.build_env_group(entry) as group:
         for episode in range(episodes):
