@@ -147,6 +147,10 @@ class Disturbed:
     def __getattr__(self, name: str) -> Any:
         return getattr(self.group, name)
 
+    @property
+    def pending(self) -> list[str]:
+        return [*self.group.pending, *(env_id for row in self.pool for env_id in row.env_ids())]
+
     def collect_async(
         self, min_results: int = 1, wait_all: bool = False, ordered: bool = False
     ) -> tuple[BatchedData, list[bool]]:

@@ -7,22 +7,30 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import inspect
 import itertools
 import math
 import types
 from typing import TYPE_CHECKING, Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from combinations.features import copied, stored
 from combinations.played import Uneven, act, played
+from faults.driven import kill
+from group.conftest import INLINE, INLINE_SYNC, LOOP, SEVERAL, Place
+from patience import HANG
+from remote.counting import ClientThread, CountingEnv
 
 import rlightning_aio as rl
 from rlightning_aio.collecting import Collector
-from rlightning_aio.errors import NothingPending
+from rlightning_aio.errors import EnvRaised, NothingPending, RLightningError, WorkerDied
+from rlightning_aio.evaluation import evaluate
+from rlightning_aio.registry import ENVS
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine, Generator
+    from collections.abc import Callable, Coroutine, Generator
 
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.collecting import Rollout
@@ -156,3 +164,306 @@ async def test_a_collect_of_workers_goes_on_wherever_it_was_cancelled() -> None:
             with contextlib.suppress(NothingPending):
                 while True:
                     await group.collect_async(wait_all=True)
+
+
+# -- envs that raise, and groups that others use between two calls
+
+
+class Numbered(gym.Env[Any, Any]):
+    """Observes [its number, the episode, the step]; raises an error for the action 1."""
+
+    observation_space = gym.spaces.Box(-1, 9999, (3,), np.float64)
+    action_space = gym.spaces.Discrete(2)
+    episode = 0
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+    def observed(self) -> Any:
+        return np.array([self.number, self.episode, self.count], np.float64)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        self.episode = (options or {}).get("episode", self.episode + 1)
+        self.count = 0
+        return self.observed(), {}
+
+    def step(self, action: Any) -> Any:
+        if action == 1:
+            raise LookupError("as it was told")
+        self.count += 1
+        return self.observed(), 1.0, False, False, {}
+
+
+def numbered(place: Place, **fields: Any) -> Any:
+    """A group of two entries with two envs each."""
+    entries = [
+        {
+            "name": name,
+            "make_env": [lambda k=k: Numbered(k) for k in numbers],
+            "num_workers": 2,
+            **fields,
+        }
+        for name, numbers in (("a", (0, 1)), ("b", (2, 3)))
+    ]
+    return place.build(entries)
+
+
+def failing(*numbers: int) -> Callable[[BatchedData], dict[str, Any]]:
+    """A policy at whose action these envs raise in the third step of their first episode."""
+
+    def act_or_fail(batch: BatchedData) -> dict[str, Any]:
+        number, episode, step = batch.observation.T
+        return {"action": (np.isin(number, numbers) & (episode == 1) & (step == 2)).astype(int)}
+
+    return act_or_fail
+
+
+async def done(result: Any) -> Any:
+    return await result if inspect.isawaitable(result) else result
+
+
+def collector_of(group: Any, style: str, answer: Any, **options: Any) -> Any:
+    """A collector of twelve transitions at a time."""
+    answers = {"a": answer, "b": answer} if style.endswith("for each entry") else answer
+    block = {"wait_all": True} if style.startswith("blocks") else options
+    inner = getattr(group, "wrapped", group)
+    return Collector(inner, answers, num_transitions=12, **block)
+
+
+STYLES = ["chains", "chains for each entry", "blocks", "blocks for each entry"]
+
+
+def steps_of(found: list[Rollout]) -> dict[int, list[tuple[int, int]]]:
+    """Episode and step of each env's transitions, in order. Each is one that it has made."""
+    made: dict[int, list[tuple[int, int]]] = {number: [] for number in range(4)}
+    for rollout in found:
+        after = rollout.next_observation
+        for place in np.ndindex(rollout.shape):
+            number, episode, step = map(int, rollout.observation[place])
+            assert after[place].tolist() == [number, episode, step + 1]
+            assert rollout.first[place] or made[number][-1] == (episode, step - 1)
+            made[number].append((episode, step))
+    return made
+
+
+async def reset_it(group: Any, fault: EnvRaised) -> None:
+    await group.reset(env_ids=[fault.env_id])
+
+
+async def reset_it_for_a_task(group: Any, fault: EnvRaised) -> None:
+    await group.reset(options={"episode": 500}, env_ids=[fault.env_id])
+
+
+async def send_a_reset(group: Any, fault: EnvRaised) -> None:
+    group.reset_async(env_ids=[fault.env_id])
+
+
+async def reset_it_by_its_handle(group: Any, fault: EnvRaised) -> None:
+    await group[fault.env_id].reset()
+
+
+async def do_nothing(group: Any, fault: EnvRaised) -> None:
+    """The collector resets it."""
+
+
+GO_ON = [reset_it, reset_it_for_a_task, send_a_reset, reset_it_by_its_handle, do_nothing]
+RAISING = [
+    *itertools.product([INLINE_SYNC], STYLES, GO_ON, [(1,)]),
+    *itertools.product([LOOP, SEVERAL], STYLES[::3], GO_ON[:1], [(1,)]),
+    *itertools.product([INLINE_SYNC], STYLES[::3], [reset_it, do_nothing], [(0, 1, 2, 3)]),
+]
+
+
+@pytest.mark.parametrize(("place", "style", "go_on", "numbers"), RAISING)
+async def test_an_env_that_raised_is_taken_back(
+    place: Place, style: str, go_on: Any, numbers: tuple[int, ...]
+) -> None:
+    """From where it was reset, and also if it was the last one."""
+    found: list[Rollout] = []
+    raised: list[str] = []
+    async with numbered(place) as group:
+        with group.auto_reset(math.inf):
+            collector = collector_of(group, style, failing(*numbers))
+            while len(found) < 8:
+                try:
+                    found += parts_of(await done(collector.collect()))
+                except EnvRaised as fault:
+                    raised.append(fault.env_id)
+                    await go_on(group, fault)
+    assert len(raised) == len(numbers)
+    again = 500 if go_on is reset_it_for_a_task else 2
+    for number, steps in steps_of(found).items():
+        begun = 2 if number in numbers else len(steps)
+        assert steps[:begun] == [(1, step) for step in range(begun)]
+        assert steps[begun:] == [(again, step) for step in range(len(steps) - begun)]
+        assert len(steps) > 4
+
+
+async def reset_two(group: Any) -> None:
+    await group.reset(options={"episode": 500}, env_ids=["a-1", "b-0"])
+
+
+async def reset_all(group: Any) -> None:
+    await group.reset(options={"episode": 500})
+
+
+async def send_resets(group: Any) -> None:
+    group.reset_async(options={"episode": 500}, env_ids=["a-1", "b-0"])
+
+
+async def reset_and_call(group: Any) -> None:
+    await reset_two(group)
+    await group["a-0"].get_attr("episode")
+    await group["a-1"].get_attr("episode")
+
+
+async def reset_twice(group: Any) -> None:
+    await group.reset(options={"episode": 400}, env_ids=["a-1", "b-0"])
+    await reset_two(group)
+
+
+async def step_all(group: Any) -> None:
+    batch, _ = await group.reset(options={"episode": 499})
+    await group.step(batch.respond(action=np.zeros(4, int)))
+    await group["b-1"].get_attr("episode")
+
+
+async def restore(group: Any) -> None:
+    kept = await group.snapshot(env_ids=["a-1", "b-0"])
+    await group.reset(env_ids=["a-1", "b-0"])
+    await group.restore(kept, env_ids=["a-1", "b-0"])
+
+
+async def only_call(group: Any) -> None:
+    for env_id in group.env_ids:
+        await group[env_id].get_attr("episode")
+
+
+BETWEEN = {
+    reset_two: (1, 2), reset_all: (0, 1, 2, 3), send_resets: (1, 2), reset_and_call: (1, 2),
+    reset_twice: (1, 2), step_all: (0, 1, 2, 3), restore: (), only_call: (),
+}  # fmt: skip
+"""What others do between two calls, and numbers of the envs that are in another episode then."""
+
+
+@pytest.mark.parametrize("place", [INLINE_SYNC])
+@pytest.mark.parametrize("between", BETWEEN)
+@pytest.mark.parametrize("style", STYLES)
+async def test_a_collector_goes_on_from_where_others_have_left_the_envs(
+    style: str, between: Any, place: Place
+) -> None:
+    """Its own results from before are old, so no action answers them."""
+    found: list[Rollout] = []
+    async with numbered(place) as group:
+        with group.auto_reset(math.inf):
+            collector = collector_of(group, style, failing(), min_results=4)
+            found += parts_of(await done(collector.collect()))
+            assert not group.pending
+            await between(group)
+            for _ in range(2):
+                found += parts_of(await done(collector.collect()))
+    for number, steps in steps_of(found).items():
+        moved = number in BETWEEN[between]
+        assert steps[:3] == [(1, step) for step in range(3)]
+        again = [(500, step) if moved else (1, 3 + step) for step in range(len(steps) - 3)]
+        assert steps[3:] == again
+        assert len(steps) > 5
+
+
+@pytest.mark.parametrize("style", STYLES[2:])
+async def test_an_evaluation_between_two_blocks_ends_their_chains(style: str) -> None:
+    """The envs are reset after it."""
+    found: list[Rollout] = []
+    async with numbered(INLINE) as group:
+        with group.auto_reset(4):
+            collector = collector_of(group, style, failing())
+            found += parts_of(await collector.collect())
+            await evaluate(group, lambda batch: failing()(batch)["action"], 1)
+            found += parts_of(await collector.collect())
+    for steps in steps_of(found).values():
+        assert steps == [(1, 0), (1, 1), (1, 2), (3, 0), (3, 1), (3, 2)]
+
+
+async def until_it_raises(collector: Any) -> None:
+    while True:
+        await collector.collect()
+
+
+async def test_envs_that_are_given_up_are_left_out() -> None:
+    """Their error is raised once; and again where none is left."""
+    async with numbered(SEVERAL, on_worker_death="raise") as group:
+        with group.auto_reset(math.inf):
+            collector: Any = Collector(group, failing(), num_transitions=4)
+            await collector.collect()
+            for worker, left in zip(group.get_workers(), ({2, 3}, set()), strict=True):
+                kill(worker["pid"])
+                with pytest.raises(WorkerDied, match="SIGKILL"):
+                    await until_it_raises(collector)
+                if left:
+                    rollouts = [await collector.collect() for _ in range(3)]
+                    assert {*rollouts[-1].index.tolist()} <= left
+            for _ in range(2):
+                with pytest.raises(WorkerDied, match=r"SIGKILL.*nothing was sent to a-0"):
+                    await collector.collect()
+
+
+async def test_an_env_that_may_move_something_real_is_reset_by_nobody_else(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(type(ENVS), "is_hardware", lambda self, name: True)
+    async with numbered(INLINE) as group:
+        with group.auto_reset(math.inf):
+            collector: Any = Collector(group, failing(1), num_transitions=12)
+            with pytest.raises(EnvRaised) as raised:
+                await collector.collect()
+            for _ in range(2):
+                with pytest.raises(
+                    RLightningError, match=r"'a-1'.*group\.reset\(env_ids=\['a-1'\]"
+                ):
+                    await collector.collect()
+            await reset_it(group, raised.value)
+            found = [copied(await collector.collect()) for _ in range(4)]
+    assert (2, 0) in steps_of(found)[1]
+
+
+class Leaving(CountingEnv):
+    """Raises in its third step, and leaves in its third step after that."""
+
+    def step(self, policy_resp: Any) -> Any:
+        if self.steps == 2 and self.resets == 1:
+            raise LookupError("as it was told")
+        self.finished = self.resets > 1 and self.steps == 2
+        return super().step(policy_resp)
+
+
+def still(batch: BatchedData) -> dict[str, Any]:
+    return {"action": np.zeros((len(batch), 2), np.float32)}
+
+
+@pytest.mark.parametrize("count", [1, 5])
+async def test_clients_that_raised_or_came_back_are_taken_back(count: int) -> None:
+    """Those that raised, once they were reset; those that left in a collect or between two."""
+    kwargs = {"heartbeat": 5.0, "connect_timeout": HANG}
+    server = {"name": "robots", "backend": "env_server", "env_kwargs": kwargs}
+    async with rl.build_env_group(server) as group:
+        address = group["robots-0"].address
+        client = ClientThread(address, "c0", Leaving(0))
+        with group.auto_reset(math.inf):
+            collector: Any = Collector(group, still, num_transitions=count)
+            found: list[Rollout] = []
+            with pytest.raises(EnvRaised):
+                await until_it_raises(collector)
+            with pytest.raises(RLightningError, match=r"'robots-0/c0'.*reset it yourself"):
+                await collector.collect()
+            await group.reset(seed=5, env_ids=["robots-0/c0"])
+            for _ in range(1 if count == 5 else 3):
+                found += parts_of(await collector.collect())
+            await asyncio.to_thread(client.join)
+            back = ClientThread(address, "c0", CountingEnv(7))
+            while found[-1].observation[0, 0] != 7:
+                found += parts_of(await collector.collect())
+    back.join()
+    observed = np.concatenate([rollout.observation for rollout in found]).tolist()
+    begun = [[0, -1, step] for step in range(2)] if count == 5 else []
+    again = [[7, -1, step] for step in range(count)]
+    assert observed == [*begun, *([0, 5, step] for step in range(3)), *again]

@@ -44,6 +44,7 @@ __all__ = [
     "reported_infos",
     "reported_sub_env_infos",
     "slots_of",
+    "slots_of_results",
     "sources_of",
 ]
 
@@ -111,6 +112,12 @@ def slots_of(batch: BatchedData, group: object) -> NDArray[np.intp] | None:
     if origin is None or origin.group is not group or origin.repeats:
         return None
     return origin.slots
+
+
+def slots_of_results(batch: BatchedData) -> NDArray[np.intp]:
+    """Slots of the envs of a batch of results, in order."""
+    assert batch._origin is not None
+    return batch._origin.slots
 
 
 def origin_of(batch: BatchedData) -> Origin | None:

@@ -1,8 +1,8 @@
 """`Collector`: steps a group with a policy, and returns rollouts.
 
-It uses only the public `EnvGroup`. If it is interrupted between a result and the next request (a
+It uses the public `EnvGroup`. If it is interrupted between a result and the next request (a
 policy raises, a task is cancelled, a rollout is full), it keeps the unanswered results, and the
-next `collect` continues there.
+next `collect` continues there; `Newest` says which of them are old by then.
 """
 
 from __future__ import annotations
@@ -19,12 +19,14 @@ from rlightning_aio.collecting.record import RecordedGroup, ReplayedGroup
 from rlightning_aio.collecting.rollout import Rollout
 from rlightning_aio.errors import EnvBusy, EnvFault, NothingPending
 from rlightning_aio.group.aio import EnvGroup as AsyncEnvGroup
+from rlightning_aio.group.newest import newest_of
 from rlightning_aio.group.sync import EnvGroup as SyncEnvGroup
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence
 
     from rlightning_aio.batch import BatchedData
+    from rlightning_aio.group.newest import Newest
     from rlightning_aio.types import EnvMeta
 
 __all__ = ["Collector"]
@@ -49,7 +51,11 @@ class Collector(Generic[G, R]):
     policy at that time. Resets, transitions that were lost with a worker, and steps of a
     sub-environment that waits for others to end are in no rollout.
 
-    Use the collector inside ``with group.auto_reset():``, and don't step its group otherwise.
+    Use the collector inside ``with group.auto_reset():``. Between two calls, envs may be reset,
+    restored and called by others: their chains end, and new ones begin with what `EnvGroup.reset`
+    or `EnvGroup.restore` returned last. Envs that others have stepped begin a new episode, and so
+    do envs that raised an error and were not reset. A robot's or a client's env does that only if
+    you reset it.
 
         async with rl.build_env_group(config) as group:
             with group.auto_reset():
@@ -150,6 +156,7 @@ class Collector(Generic[G, R]):
         self._kinds: dict[str, EnvKind] = {}
         self._started = self._start_cut_off = False
         self._start_fault: EnvFault | None = None
+        self._newest: Newest
         self._collecting = False
         self._metas: dict[str, EnvMeta] = {}
         # Results in order of progress: received, not yet stored, not yet answered.
@@ -176,10 +183,10 @@ class Collector(Generic[G, R]):
             ValueError, TypeError: the policy's answer doesn't fit; envs differ, and need a policy
                 for each entry; or these envs can't fill a block.
             EnvRaised, WorkerDied, EnvHung: as for `EnvGroup.collect_async`, the answer to one
-                request. An env that raised takes part again after
-                ``group.reset_async(env_ids=[error.env_id])``.
+                request. An env that raised takes part again in the next call, and one whose worker
+                is not replaced doesn't.
+            RLightningError: a robot's or a client's env has raised and was not reset since.
             BadAction: the policy's actions don't fit the action space; nothing was sent.
-            NothingPending: no env has a request to answer.
         """
         group = self._group
         wrapped: Any = group
@@ -204,21 +211,24 @@ class Collector(Generic[G, R]):
         try:
             if not self._started:
                 yield from self._start()
+            is_resumed = False
             while True:
-                if self._expecting:
-                    self._received, _ = yield self._receive
-                    self._expecting = False
                 if self._received is not None:
                     self._split_received(self._received)
                     self._received = None
                 if not self._store():
                     return self._full()
-                if self._block and not self._unanswered:
+                if not is_resumed:
+                    self._resume()
+                    is_resumed = True
+                if self._block and not (self._unanswered or self._expecting):
                     self._plan()
                 while self._unanswered:
                     yield from self._answer(self._unanswered[0])
                     del self._unanswered[0]
                 self._expecting = True
+                self._received, _ = yield self._receive
+                self._expecting = False
         finally:
             self._clock.leave()
             self._collecting = False
@@ -234,7 +244,8 @@ class Collector(Generic[G, R]):
         except BaseException as error:
             self._start_cut_off = not isinstance(error, Exception)
             raise
-        self._started = True
+        self._newest = newest_of(self._group)
+        self._started = self._newest.keeps = True
 
     def _await_start(self) -> Procedure[None]:
         """Wait for the results of a reset that was sent and then cancelled.
@@ -264,9 +275,7 @@ class Collector(Generic[G, R]):
         return self._group.collect_async(min_results=self._min_results, ordered=True)
 
     def _split_received(self, batch: BatchedData) -> None:
-        self._unstored = []
-        for kind, part in self._split(batch):
-            self._unstored.append(kind.part(part))
+        self._unstored = self._parts(batch)
         if not self._block:
             self._unanswered = list(self._unstored)
             return
@@ -275,8 +284,12 @@ class Collector(Generic[G, R]):
         if not self._num_steps:
             self._lay_out()
 
+    def _parts(self, batch: BatchedData) -> list[Part]:
+        """Split a batch by policy, as soon as it was received."""
+        marks = self._newest.marks
+        return [kind.part(own, marks(own)) for kind, own in self._split(batch)]
+
     def _split(self, batch: BatchedData) -> list[tuple[EnvKind, BatchedData]]:
-        """Split a batch by policy."""
         policies = self._policies
         if policies is None:
             return [(self._kind("", self._policy), batch)]
@@ -301,6 +314,59 @@ class Collector(Generic[G, R]):
             for server_id in [meta.env_id for meta in group.metas if _is_server(meta)]:
                 self._metas.update((meta.env_id, meta) for meta in group[server_id].metas)
         return self._metas.get(env_id)
+
+    # -- between two calls ----------------------------------------------------------
+
+    def _resume(self) -> None:
+        """Go on from what has become of the envs since the last call.
+
+        Drop results that are no longer the newest of their envs, which were reset, restored or
+        stepped otherwise. Take envs back that have no request: with the result of the reset that
+        the program has made, or else, after an error, with a new episode.
+        """
+        newest, parts = self._newest, self._unanswered
+        if self._block:
+            parts = [kind.held for kind in self._kinds.values() if kind.held is not None]
+        known = _newest_parts(parts, newest)
+        count = 0
+        for part in known:
+            count += len(part.marks)
+        if known == parts and not self._expecting and count == newest.num_idle():
+            return  # Nobody else has asked any env.
+        for part in parts:
+            part.cut(~part.is_newest(newest))
+        self._unanswered = _newest_parts(self._unanswered, newest)
+        pending = set(self._group.pending)
+        self._expecting = bool(pending) and (self._expecting or known != parts)
+        idle = [id_ for id_ in newest.idle(part.batch for part in known) if id_ not in pending]
+        for batch in newest.take_returned(idle):
+            self._take(batch)
+            idle = [id_ for id_ in idle if id_ not in batch.env_ids()]
+        if idle:
+            self._reset(idle)
+
+    def _take(self, batch: BatchedData) -> None:
+        """Go on from results that a reset has returned to the program."""
+        for part in self._parts(batch):
+            part.store(0)
+            if self._block:
+                part.kind.hold(part)
+            else:
+                self._unanswered.append(part)
+
+    def _reset(self, idle: list[str]) -> None:
+        """Begin episodes of idle envs, except of those that are given up.
+
+        Raises:
+            WorkerDied, EnvHung: all envs are given up.
+            RLightningError: an env may move something real.
+        """
+        gone = {env_id for worker in self._group.get_workers() for env_id in worker["given_up"]}
+        left = [env_id for env_id in idle if env_id not in gone]
+        self._newest.check_resettable(left)
+        if left or not (self._expecting or self._unanswered):
+            self._group.reset_async(env_ids=left or idle)
+            self._expecting = True
 
     # -- blocks -------------------------------------------------------------------
 
@@ -382,6 +448,16 @@ class Collector(Generic[G, R]):
             for name, kind in self._kinds.items()
         }
         return cast("R", found[""] if self._policies is None else found)
+
+
+def _newest_parts(parts: list[Part], newest: Newest) -> list[Part]:
+    """The parts with the envs whose newest results they are."""
+    found: list[Part] = []
+    for part in parts:
+        own = part.only(part.is_newest(newest))
+        if own is not None:
+            found.append(own)
+    return found
 
 
 def _is_server(meta: EnvMeta) -> bool:

@@ -20,23 +20,26 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio.batch import BatchedData
+    from rlightning_aio.group.newest import Newest
     from rlightning_aio.protocol.columns import Tree
     from rlightning_aio.types import EnvMeta
 
 __all__ = ["OWN_NAMES", "EnvKind", "Part"]
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class Part:
     """The results of one batch from envs of one kind.
 
     Attributes:
+        marks: of its envs; see `Newest.marks`.
         unstored: rows of `results` whose transitions are not stored yet.
     """
 
     kind: EnvKind
     batch: BatchedData
     results: ResultRows
+    marks: NDArray[np.int64]
     unstored: NDArray[np.intp]
 
     def store(self, room: int) -> int:
@@ -60,13 +63,27 @@ class Part:
 
     def behind(self, steps: int) -> Part | None:
         """The part whose envs have made fewer than `steps` transitions; None without any."""
-        envs = len(self.batch)
-        fewer = (self.steps() < steps).reshape(envs, -1).any(axis=1)
-        if not np.count_nonzero(fewer):
+        fewer = (self.steps() < steps).reshape(len(self.batch), -1)
+        return self.only(np.logical_or.reduce(fewer, axis=1))
+
+    def only(self, chosen: NDArray[np.bool_]) -> Part | None:
+        """The part of the envs in the mask `chosen`; None without any."""
+        (rows,) = chosen.nonzero()
+        if len(rows) == len(chosen):
+            return self
+        if not len(rows):
             return None
-        return (
-            self if fewer.all() else self.kind.part(self.batch.take(np.flatnonzero(fewer).tolist()))
-        )
+        return self.kind.part(self.batch.take(rows.tolist()), self.marks[rows])
+
+    def is_newest(self, newest: Newest) -> NDArray[np.bool_]:
+        """Mask of the envs whose newest results are here."""
+        return self.marks == newest.marks(self.batch)
+
+    def cut(self, chosen: NDArray[np.bool_]) -> None:
+        """End the chains of the envs in the mask `chosen`: nobody will answer their results."""
+        results = self.results
+        (rows,) = chosen.repeat(results.num_sub_envs).nonzero()
+        self.kind.staging.cut(results.index[rows], gather(results.observation, rows))
 
 
 class EnvKind:
@@ -101,13 +118,16 @@ class EnvKind:
         # Two sets, so that one rollout can be read while the next one is collected.
         self._sets: list[dict[str, Tree]] = [{}, {}]
 
-    def part(self, batch: BatchedData) -> Part:
-        """Convert a batch to rows, and make room for envs that are new."""
+    def part(self, batch: BatchedData, marks: NDArray[np.int64]) -> Part:
+        """Convert a batch to rows, and make room for envs that are new.
+
+        `marks` are those that its envs had when it was received.
+        """
         results = result_rows(batch)
         new = self.staging.newcomers(results.index)
         if len(new):
             self._meet(batch, results, new)
-        return Part(self, batch, results, np.arange(len(results.index)))
+        return Part(self, batch, results, marks, np.arange(len(results.index)))
 
     def _meet(self, batch: BatchedData, results: ResultRows, rows: NDArray[np.intp]) -> None:
         """Record the autoreset mode of envs that are in `rows` for the first time."""
@@ -132,7 +152,8 @@ class EnvKind:
         newer = part.results.index.reshape(len(part.batch), -1)[:, 0]
         rows = np.arange(count)
         rows[np.searchsorted(first, newer)] = count + np.arange(len(newer))
-        self.held = self.part(joined([self.held.batch, part.batch]).take(rows.tolist()))
+        batch = joined([self.held.batch, part.batch]).take(rows.tolist())
+        self.held = self.part(batch, np.concatenate([self.held.marks, part.marks])[rows])
 
     def columns_of(self, part: Part, answer: Any) -> tuple[BatchedData, dict[str, Tree]]:
         """Convert the policy's answer for `part` to a batch of responses, and to columns.

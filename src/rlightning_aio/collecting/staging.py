@@ -213,6 +213,15 @@ class Staging:
         self._fresh[index] = True
         self._over[index] = False
 
+    def cut(self, index: NDArray[np.int64], observation: Tree) -> None:
+        """End the chains of envs that have no step in flight; `observation` is their last."""
+        idle = self._place[index] < 0
+        ending = idle & ~self._fresh[index] & (self._last[index] >= 0)
+        (rows,) = ending.nonzero()
+        if len(rows):
+            self._note_ends(self._last[index[rows]], gather(observation, rows))
+        self._fresh[index[idle]] = True
+
     def _complete(self, results: ResultRows, index: NDArray[np.int64], rows: Rows) -> None:
         self._knows_results = True
         places = self._place[index]

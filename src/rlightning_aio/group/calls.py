@@ -101,6 +101,7 @@ class Calls:
             for slot, own in zip(slots.tolist(), arguments, strict=True)
         ]
         entries = self._requests.submit(slots, op, ticket.owner, now)
+        self._requests.numbering.num_values[slots] += 1
         self._dispatch.hand_over(slots, entries, packed)
 
     def collect_calls(self, now: float, deadline: float | None) -> Procedure[list[Any]]:

@@ -25,6 +25,7 @@ from rlightning_aio.group.dispatch import Dispatch
 from rlightning_aio.group.first_observations import FirstObservations
 from rlightning_aio.group.hint import HINT_AFTER_BATCHES
 from rlightning_aio.group.intake import Intake
+from rlightning_aio.group.newest import Newest
 from rlightning_aio.group.request_states import COLLECTOR, NOBODY, State
 from rlightning_aio.group.resets import Resets
 from rlightning_aio.group.results import Results
@@ -89,7 +90,7 @@ class Core:
         shares_thread: other tasks may use the group while a procedure waits.
 
     Attributes:
-        parts, shares_thread: as given; results, intake, waiting, stats: made of them.
+        parts, shares_thread: as given; results, intake, waiting, stats, newest: made of them.
         collecting: a call of `collect` waits.
     """
 
@@ -122,6 +123,7 @@ class Core:
         self._resets = Resets(
             tables, supervisor, self._dispatch, self.results, self.intake, self.waiting
         )
+        self.newest = Newest(tables, supervisor.members)
         self.collecting = False
 
     # -- life -------------------------------------------------------------------------
@@ -291,6 +293,8 @@ class Core:
             observer.after_results(noted, parts)
         if self._arrivals.held_back:
             self._arrivals.admit(slots, self.intake.now)
+        if synchronous and self.newest.keeps:
+            self.newest.note_returned(batch)
         return batch, flags
 
     def give_hint(self) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.group.slab_layout import check_actions
 from rlightning_aio.group.wait import earliest
@@ -11,6 +13,8 @@ from rlightning_aio.hosts.base import Membership
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from numpy.typing import NDArray
 
     from rlightning_aio.group.env_table import EnvTable
     from rlightning_aio.hosts.base import Host
@@ -54,6 +58,11 @@ class Members:
             for server in self._servers
             for index in server.member_indices()
         ]
+
+    def everyone(self) -> NDArray[np.intp]:
+        """Return the slots of the local envs, and of the members that are present."""
+        members = self.slots()
+        return np.concatenate((self._envs.all, members)) if members else self._envs.all
 
     def rank(self) -> None:
         """Number the members' seeds after those of the local envs, in the order of `slots`."""

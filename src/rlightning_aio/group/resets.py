@@ -67,7 +67,7 @@ class Resets:
         """Reset envs, and wait for all of them; return the ticket and the slots."""
         if env_ids is None and self._members.possible:
             now = yield from self._await_members(now)
-        slots = self._everyone() if env_ids is None else self._dispatch.distinct(env_ids)
+        slots = self._members.everyone() if env_ids is None else self._dispatch.distinct(env_ids)
         return (yield from self._reset(now, seed, options, slots))
 
     def reset_members(
@@ -95,7 +95,7 @@ class Resets:
         env_ids: Sequence[str] | None,
     ) -> None:
         """Send resets, whose results the collector gets."""
-        slots = self._everyone() if env_ids is None else self._dispatch.distinct(env_ids)
+        slots = self._members.everyone() if env_ids is None else self._dispatch.distinct(env_ids)
         seeds = self._seeds_for(slots, seed, now)
         self._dispatch.check_sendable(slots, "reset")
         packed = self._packed_resets(slots, seeds, options)
@@ -112,11 +112,6 @@ class Resets:
 
         ticket, _ = yield from self._waiting.ask(now, slots, send)
         return ticket, slots
-
-    def _everyone(self) -> NDArray[np.intp]:
-        """Return the slots of local envs and of members."""
-        members = self._members.slots()
-        return np.concatenate((self._envs.all, members)) if members else self._envs.all
 
     def _await_members(self, now: float) -> Procedure[float]:
         """Wait until each host that envs join has enough."""
