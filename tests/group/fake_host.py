@@ -192,7 +192,7 @@ class FakeHost:
         action = self.slab.action[at]
         if given is not None:
             self.extras[slot_of(entry)] = given[1]
-            if not (type(given[0]) is str and given[0] == NO_ACTION):
+            if given[0] is not NO_ACTION:
                 action = given[0]
         action = int(action)
         if action == RAISES:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from group import sample_envs
@@ -262,6 +263,28 @@ async def test_actions_without_a_fixed_size_are_sent_out_of_band(start: Any) -> 
     assert batch.observation.shape == (2, 2)
     with pytest.raises(EnvRaised, match=r"'e-1'.*AssertionError"):
         await group["e-1"].step(("far too long a text", 1))
+
+
+class Echo(gym.Env[Any, Any]):
+    """Reports each action."""
+
+    observation_space = spaces.Discrete(2)
+    action_space = spaces.Text(99)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        return 0, {}
+
+    def step(self, action: Any) -> Any:
+        return 0, 0.0, False, False, {"heard": action}
+
+
+@pytest.mark.parametrize("text", ["the action is in the row", "ACTION_IN_ROW", "None", ""])
+async def test_any_text_is_an_action(start: Any, text: str) -> None:
+    """None has a meaning of its own on the way to the env."""
+    group = await start({"name": "e", "backend": "callable", "make_env": Echo, "num_workers": 2})
+    batch, _ = await group.reset()
+    batch, _ = await group.step(batch.respond(action=[text, "other"]))
+    assert batch.info("heard") == [text, "other"]
 
 
 async def test_an_env_that_transforms_actions_takes_any(start: Any) -> None:

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import inspect
 import time
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from rlightning_aio.envs.results import one_result
-from rlightning_aio.hosts.messages import NO_ACTION
+from rlightning_aio.hosts.messages import NO_ACTION, STEP_IN_ROW
 from rlightning_aio.hosts.runner import EnvRunner
 from rlightning_aio.protocol.entries import Operation
 
@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     from rlightning_aio.protocol.slab import RowLayout
 
 __all__ = ["Abandoned", "AwaitedRunner"]
-
-
-_IN_ROW: Final[tuple[Any, dict[str, Any]]] = (NO_ACTION, {})
 
 
 class Abandoned(Exception):
@@ -62,8 +59,8 @@ class AwaitedRunner(EnvRunner):
         Returns the part of the result that is out of band; for a call, its value.
         """
         if op == Operation.STEP:
-            action, extras = _IN_ROW if arguments is None else arguments
-            if type(action) is str and action == NO_ACTION:
+            action, extras = arguments or STEP_IN_ROW
+            if action is NO_ACTION:
                 action = self._read_action() if self._read_action is not None else None
             began = time.monotonic_ns()
             returned = await self._step_env(self._input(action, extras))

@@ -11,7 +11,7 @@ from __future__ import annotations
 import mmap
 import time
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from rlightning_aio.errors import UnknownEnv
 from rlightning_aio.hosts.listener import Listener
 from rlightning_aio.hosts.messages import (
     NO_ACTION,
+    STEP_IN_ROW,
     Attached,
     Built,
     Closed,
@@ -48,8 +49,6 @@ if TYPE_CHECKING:
     from rlightning_aio.types import EnvMeta
 
 __all__ = ["EnvServerHost"]
-
-_IN_ROW: Final[tuple[Any, dict[str, Any]]] = (NO_ACTION, {})
 
 
 class _ClientRow:
@@ -253,7 +252,7 @@ class EnvServerHost:
         row = self._rows[index]
         row.entry = entry
         if op_of(entry) == Operation.STEP:
-            action, extras = given or _IN_ROW
+            action, extras = given or STEP_IN_ROW
             return requests.step(row.name, number, row.action(action), extras, now)
         seed, options = given or (cast("Slab", self._slab).take_seed(index), None)
         return requests.reset(row.name, number, seed, options, now)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 from collections import deque
 from dataclasses import dataclass, field
+from enum import Enum, auto
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 from rlightning_aio.protocol.error_text import ErrorText
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 __all__ = [
     "NO_ACTION",
     "RECORD_VIDEO",
+    "STEP_IN_ROW",
     "AttachOrder",
     "Attached",
     "Built",
@@ -56,8 +58,17 @@ __all__ = [
     "WorkerPlace",
 ]
 
-NO_ACTION: Final = "the action is in the row"
+
+class _Marker(Enum):
+    """What no user can send by chance; each copy is the same object, also one from a pickle."""
+
+    NO_ACTION = auto()
+
+
+NO_ACTION: Final = _Marker.NO_ACTION
 """Sent in place of an action if only its extras travel out of band."""
+STEP_IN_ROW: Final[tuple[Any, dict[str, Any]]] = (NO_ACTION, {})
+"""The action and the extras of a step that has no arguments out of band."""
 RECORD_VIDEO: Final = "rlightning_aio.record_video"
 """The name of a call to the runner instead of the env; no method can have this name."""
 OutOfBand: TypeAlias = dict[str, Any]

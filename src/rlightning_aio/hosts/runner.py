@@ -331,7 +331,7 @@ class EnvRunner:
 
     def _step(self, action: Any, extras: dict[str, Any]) -> OutOfBand | None:
         """Step with an action that didn't come through the row, or with extras."""
-        if type(action) is str and action == NO_ACTION:
+        if action is NO_ACTION:
             action = self._action_in_row()
         return self._step_with(partial(self._input, action, extras))
 
