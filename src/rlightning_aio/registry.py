@@ -12,8 +12,8 @@ import difflib
 import importlib
 import importlib.util
 from dataclasses import dataclass, field
-from functools import cache
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from functools import cache, partial
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
 from rlightning_aio.errors import ConfigError
 
@@ -407,6 +407,13 @@ def did_you_mean(name: str, known: Iterable[str], end: str = "") -> str:
     """Ask whether the nearest of `known` names was meant; empty if none is near `name`."""
     near = difflib.get_close_matches(name, list(known), n=1)
     return f"did you mean {near[0]!r}?{end}" if near else ""
+
+
+def name_of(function: Any) -> str:
+    """Return the qualified name of a callable, or of the one that a `partial` calls."""
+    while isinstance(function, partial):
+        function = cast("partial[Any]", function).func
+    return getattr(function, "__qualname__", type(function).__name__)
 
 
 ENVS = Registry()

@@ -116,6 +116,7 @@ class VecEnv(_Base):
         ConfigError: a callable can't be sent to a worker, `entry` is wrong, or spaces differ.
         StartFailed: a callable raised, or didn't return an env.
         RuntimeError: the vector environments differ in size.
+        TypeError: `env_fns` is no list of callables.
     """
 
     def __init__(
@@ -125,15 +126,10 @@ class VecEnv(_Base):
         **entry: Any,
     ) -> None:
         del start_method
+        limit = entry.pop("max_episode_steps", None)
+        makers = adapted(env_fns, AutoresetMode.SAME_STEP, limit)
         self.group: EnvGroup = build_env_group(
-            {
-                "name": "env",
-                "num_workers": len(env_fns),
-                "make_env": adapted(
-                    env_fns, AutoresetMode.SAME_STEP, entry.pop("max_episode_steps", None)
-                ),
-                **entry,
-            }
+            {"name": "env", "num_workers": len(makers), "make_env": makers, **entry}
         )
         metas = self.group.init()
         try:

@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import signal
 import threading
+from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
@@ -347,6 +348,49 @@ def test_make_vec_takes_the_arguments_of_gymnasiums() -> None:
         one.close()
 
 
+@pytest.mark.parametrize(
+    ("task", "mode"),
+    [("CartPole-v1", None), (POLE, None), (POLE, "async"), ("CartPole-v1", "vector_entry_point")],
+)
+def test_make_vec_passes_on_what_the_runtime_needs(task: str, mode: Any) -> None:
+    """Whatever makes the envs; what the task needs goes to the task."""
+    fields: dict[str, Any] = {"envs_per_process": 1, "step_timeout": HANG, "max_restarts": 0}
+    rendered = {"render_mode": "rgb_array"}
+    modes = {"autoreset_mode": AutoresetMode.SAME_STEP} if mode != "vector_entry_point" else {}
+    env = make_vec(task, 2, mode, vector_kwargs={"max_restarts": 7}, **fields, **modes, **rendered)
+    with contextlib.closing(env):
+        config = env.group._core.envs.configs[0]
+        assert (config.envs_per_process, config.step_timeout) == (1, HANG)
+        assert config.max_restarts == 0
+        assert env.autoreset_mode == modes.get("autoreset_mode", AutoresetMode.NEXT_STEP)
+        assert env.render_mode == "rgb_array"
+        assert env.spec is not None
+        assert env.spec.kwargs.keys() & {*fields, "autoreset_mode"} == set()
+
+
+def test_errors_name_what_the_user_has_given() -> None:
+    """The task, the class or the function, and not what this package puts around it."""
+    with pytest.raises(StartFailed, match=r"make_env CartPole-v1\).*'unknown'"):
+        make_vec("CartPole-v1", 2, unknown=3)
+    with pytest.raises(StartFailed, match=r"make_env Sized\)"):
+        VectorEnv([partial(Sized, high=3)] * 2)
+
+
+def test_callables_are_one_for_each_env() -> None:
+    """A class and a number, and envs in place of callables, say how to write it."""
+    for wrong in ((Plain, 4), (partial(Plain), 4)):
+        with pytest.raises(TypeError, match=r"env_fns must be a list .*\] \* 4"):
+            VectorEnv(*wrong)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"env_fns\[1\] is a Plain, which is not callable"):
+        VectorEnv([Plain, Plain()])  # type: ignore[list-item]
+
+
+def test_an_unknown_autoreset_mode_is_refused_with_the_known_ones() -> None:
+    for make in (partial(VectorEnv, [Plain]), partial(make_vec, POLE)):
+        with pytest.raises(ValueError, match=r"autoreset_mode .*'SameStep'.*not 'same_step'"):
+            make(autoreset_mode="same_step")
+
+
 class Interrupting(Plain):
     """Action 1 presses Ctrl-C while the trainer waits for it."""
 
@@ -414,7 +458,7 @@ def test_make_vec_takes_gymnasiums_modes() -> None:
         make_vec("Pendulum-v1", 1, mode, inline).close()
     make_vec("CartPole-v1", 2, gym.VectorizeMode.VECTOR_ENTRY_POINT, inline).close()
     for mode in (gym.VectorizeMode.SYNC, "sync"):
-        with pytest.raises(ValueError, match="not 'sync'; vector_kwargs="):
+        with pytest.raises(ValueError, match="not 'sync'; placement='inline'"):
             make_vec("Pendulum-v1", 1, mode)  # pyright: ignore[reportArgumentType]
 
 

@@ -1,4 +1,7 @@
-"""Functions that make envs of a task in a worker that does not have the task registered."""
+"""Functions that make envs of a task in a worker that does not have the task registered.
+
+In messages they have the name of the task.
+"""
 
 from __future__ import annotations
 
@@ -30,6 +33,7 @@ class OneOf:
         wrappers: Sequence[Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]]] = (),
     ) -> None:
         self._spec, self._kwargs, self._wrappers = spec, kwargs, wrappers
+        self.__qualname__ = spec.id
 
     def __call__(self) -> gym.Env[Any, Any]:
         env: gym.Env[Any, Any] = gym.make(self._spec, **self._kwargs)
@@ -48,6 +52,7 @@ class BatchOf:
 
     def __init__(self, make_one: OneOf, *arguments: Any, **options: Any) -> None:
         self._make_one, self._arguments, self._options = make_one, arguments, options
+        self.__qualname__ = make_one.__qualname__
 
     def __call__(self) -> gym.vector.VectorEnv[Any, Any, Any]:
         # Imported here because few workers need it.
@@ -61,6 +66,7 @@ class VectorOf:
 
     def __init__(self, spec: EnvSpec, num_envs: int, kwargs: dict[str, Any]) -> None:
         self._spec, self._num_envs, self._kwargs = spec, num_envs, kwargs
+        self.__qualname__ = spec.id
 
     def __call__(self) -> gym.vector.VectorEnv[Any, Any, Any]:
         return gym.make_vec(

@@ -12,6 +12,7 @@ from rlightning_aio.envs.only_sub_env import OnlySubEnv
 from rlightning_aio.envs.same_step import SameStep
 from rlightning_aio.envs.wrappers import ClassName, autoreset_mode_of, has_wrapper
 from rlightning_aio.errors import ConfigError
+from rlightning_aio.registry import name_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -36,7 +37,17 @@ def adapted(
         mode: when an env is reset after the end of its episode.
         max_episode_steps: step limit of the config entry, which an env with same-step autoreset
             must apply itself.
+
+    Raises:
+        TypeError: they are no callables, or there is one in place of one for each env.
     """
+    if callable(makers):
+        raise TypeError(
+            f"env_fns must be a list with a callable for each env: [{name_of(makers)}] * 4, say"
+        )
+    for k, make in enumerate(makers):
+        if not callable(make):
+            raise TypeError(f"env_fns[{k}] is a {type(make).__name__}, which is not callable")
     own = {id(make): _Adapted(make, mode, max_episode_steps) for make in makers}
     return [own[id(make)] for make in makers]
 
@@ -48,6 +59,7 @@ class _Adapted:
         self, make_env: Callable[[], Any], mode: AutoresetMode, max_episode_steps: int | None
     ) -> None:
         functools.update_wrapper(self, make_env)
+        self.__qualname__ = name_of(make_env)
         self._make_env, self._mode, self._limit = make_env, mode, max_episode_steps
 
     def __call__(self) -> Any:

@@ -13,6 +13,7 @@ import numpy as np
 from rlightning_aio.batch.names import EnvNames
 from rlightning_aio.errors import UnknownEnv
 from rlightning_aio.protocol.slab import NO_SEED
+from rlightning_aio.registry import name_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -216,10 +217,5 @@ class EnvTable:
         if isinstance(makers, tuple):
             first = next(k for k, other in enumerate(self.configs) if other is config)
             makers = cast("tuple[Any, ...]", makers)[slot - first]
-        made = f"make_env {_name(makers)}" if makers else f"task {config.task!r}"
+        made = f"make_env {name_of(makers)}" if makers else f"task {config.task!r}"
         return f"env {env_id!r} (entry {config.name!r}, backend {config.backend}, {made})"
-
-
-def _name(function: Any) -> str:
-    """The qualified name of a callable."""
-    return getattr(function, "__qualname__", type(function).__name__)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 import msgspec
 
 from rlightning_aio.errors import SnapshotError
+from rlightning_aio.registry import name_of
 from rlightning_aio.sealing import seal, unseal
 
 if TYPE_CHECKING:
@@ -55,7 +56,7 @@ def identity_of(config: EnvConfig, meta: EnvMeta, versions: Mapping[str, str]) -
     """
     maker: Any = config.make_env
     maker = cast("tuple[Any, ...]", maker)[0] if isinstance(maker, tuple) else maker
-    made_by = getattr(maker, "__qualname__", type(maker).__name__) if maker else config.task
+    made_by = name_of(maker) if maker else config.task
     return {
         "backend": config.backend,
         "task": made_by,

@@ -29,7 +29,7 @@ from rlightning_aio.types import PolicyResponse
 from rlightning_aio.vector.batching import batched, merged, spread
 from rlightning_aio.vector.deaths import Deaths, Stepped
 from rlightning_aio.vector.leftovers import drop_outstanding
-from rlightning_aio.vector.reset_arguments import checked_mask, seeds_of_envs
+from rlightning_aio.vector.reset_arguments import checked_mask, checked_mode, seeds_of_envs
 from rlightning_aio.vector.rows import rows_of
 from rlightning_aio.vector.spaces import adopted_spaces
 
@@ -73,6 +73,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         ConfigError: a callable can't be sent to a worker, or `entry` is wrong.
         StartFailed: a callable raised, or didn't return an env.
         RuntimeError: spaces or numbers of envs don't match.
+        TypeError: `env_fns` is no list of callables.
     """
 
     def __init__(
@@ -101,7 +102,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         self.env_fns = env_fns
         self.copy = copy
         self.observation_mode = observation_mode
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.autoreset_mode = checked_mode(autoreset_mode)
         self.closed = True  # Until it has started.
         self._pending: str | None = None
         self._arguments: Any = None
@@ -109,9 +110,9 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
         self._has_leftovers = False
         # Results of a step or reset were not returned, so no episode can go on.
         self._has_lost = False
-        if max_concurrency is not None:
-            entry = {"envs_per_process": per_worker(max_concurrency, len(env_fns)), **entry}
         makers = adapted(env_fns, self.autoreset_mode, entry.pop("max_episode_steps", None))
+        if max_concurrency is not None:
+            entry = {"envs_per_process": per_worker(max_concurrency, len(makers)), **entry}
         self.group: EnvGroup = build_env_group(
             {"name": "env", "num_workers": len(makers), "make_env": makers, **entry},
             mixed_actions=True,

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from gymnasium.vector import AutoresetMode
 
+from rlightning_aio.config import EnvConfig
 from rlightning_aio.envs.gymnasium import spec_of
 from rlightning_aio.envs.mujoco_tasks import is_batched
 from rlightning_aio.envs.of_spec import BatchOf, OneOf, VectorOf
@@ -14,6 +15,7 @@ from rlightning_aio.errors import ConfigError
 from rlightning_aio.registry import PLACEMENTS
 from rlightning_aio.sharing import check_threads, num_batches, num_cores
 from rlightning_aio.vector.env import VectorEnv, per_worker
+from rlightning_aio.vector.reset_arguments import checked_mode
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -27,6 +29,12 @@ __all__ = ["imports_of", "make_vec", "steps_together", "together", "vector_entry
 Mode = Literal["async", "vector_entry_point"]
 BATCH_OPTIONS: Final = ("num_threads", "randomize")
 """Options of envs that are stepped together, in addition to those of the task."""
+_WHICH_ENVS: Final = {
+    "name", "backend", "task", "make_env", "num_workers", "num_envs", "max_episode_steps",
+    "env_kwargs",
+}  # fmt: skip
+RUNTIME_FIELDS: Final = EnvConfig.model_fields.keys() - _WHICH_ENVS | {"autoreset_mode"}
+"""Arguments that say how envs run, not which: they go to `VectorEnv`, not to the task."""
 
 
 def make_vec(
@@ -47,7 +55,9 @@ def make_vec(
             argument needs them; envs of any other task are separate. ``async``: always separate
             envs. ``vector_entry_point``: each worker has the task's own vector environment, whose
             seeds and infos may differ from those of separate envs.
-        vector_kwargs: further arguments of `VectorEnv`.
+        vector_kwargs: further arguments of `VectorEnv`. Fields of a config entry that say how envs
+            run (``step_timeout``, ``envs_per_process``, …) and ``autoreset_mode`` may also be given
+            without it.
         wrappers: applied to each env, the first innermost; envs with wrappers are separate.
         kwargs: of `gymnasium.make`, or of the task's vector environment; for envs that are stepped
             together also `BATCH_OPTIONS`. ``disable_env_checker`` is True by default, because
@@ -61,7 +71,8 @@ def make_vec(
     """
     mode = getattr(vectorization_mode, "value", vectorization_mode)
     spec = copy.deepcopy(spec_of(id) if isinstance(id, str) else id)
-    given = {**imports_of(spec), **(vector_kwargs or {})}
+    own = {name: kwargs.pop(name) for name in RUNTIME_FIELDS & kwargs.keys()}
+    given = {**imports_of(spec), **(vector_kwargs or {}), **own}
     of_one = {"disable_env_checker": True, **kwargs}
     makers: list[Callable[[], Any]] = [OneOf(spec, of_one, tuple(wrappers))] * num_envs
     if mode == "vector_entry_point":
@@ -73,11 +84,10 @@ def make_vec(
     elif mode not in (None, "async"):
         raise ValueError(
             "vectorization_mode must be None, 'async' or 'vector_entry_point', not "
-            f"{mode!r}; vector_kwargs={{'placement': 'inline'}} keeps envs in this "
-            "process"
+            f"{mode!r}; placement='inline' keeps envs in this process"
         )
     elif steps_together(spec, kwargs, separate=mode == "async" or bool(wrappers)):
-        autoreset = AutoresetMode(given.get("autoreset_mode", AutoresetMode.NEXT_STEP))
+        autoreset = checked_mode(given.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         makers, given = together(spec, of_one, num_envs, autoreset, given)
     env = VectorEnv(makers, **given)
     env.spec = copy.deepcopy(spec)

@@ -1,4 +1,4 @@
-"""Arguments of a vector env's `reset`: one seed for each env, and the mask of envs to reset."""
+"""Arguments of vector envs: autoreset modes, one seed for each env, the mask of envs to reset."""
 
 from __future__ import annotations
 
@@ -6,13 +6,30 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
+from gymnasium.vector import AutoresetMode
 
 from rlightning_aio.group.seeds import checked_seed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["checked_mask", "seeds_of_envs"]
+__all__ = ["checked_mask", "checked_mode", "seeds_of_envs"]
+
+
+def checked_mode(mode: Any) -> AutoresetMode:
+    """Return an autoreset mode that was given as one of Gymnasium's members, or as its value.
+
+    Raises:
+        ValueError: there is no such mode.
+    """
+    try:
+        return AutoresetMode(mode)
+    except ValueError:
+        known = ", ".join(repr(member.value) for member in AutoresetMode)
+        raise ValueError(
+            f"autoreset_mode must be one of {known}, or a member of "
+            f"gymnasium.vector.AutoresetMode, not {mode!r}"
+        ) from None
 
 
 def seeds_of_envs(seed: int | Sequence[int | None] | None, num_envs: int) -> list[Any]:
