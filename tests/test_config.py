@@ -15,9 +15,15 @@ import pytest
 import yaml
 from hypothesis import HealthCheck, example, given, settings
 from omegaconf import OmegaConf
-from pydantic import ValidationError
 
-from rlightning_aio.config import EnvConfig, check_installed, load_config, moved, parse_configs
+from rlightning_aio.config import (
+    EnvConfig,
+    VideoConfig,
+    check_installed,
+    load_config,
+    moved,
+    parse_configs,
+)
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.registry import BACKENDS, ENVS, PLACEMENTS, Backend, placement_of
 
@@ -377,9 +383,10 @@ def test_a_wrong_field_is_named_with_file_and_entry(
 
 def test_a_wrong_field_causes_no_further_messages() -> None:
     """Defaults that depend on it are not checked."""
-    with pytest.raises(ValidationError) as caught:
+    with pytest.raises(ConfigError) as caught:
         EnvConfig(name="pole", backend="gymnasium", task="CartPole-v1", num_workers=0)
-    assert [fault["loc"] for fault in caught.value.errors()] == [("num_workers",)]
+    assert str(caught.value).startswith("EnvConfig: num_workers: should be ")
+    assert "\n" not in str(caught.value)
 
 
 def test_num_envs_of_a_backend_with_single_envs_is_refused() -> None:
@@ -584,8 +591,23 @@ def test_a_path_in_place_of_entries_is_refused_with_a_hint() -> None:
 
 def test_env_config_suggests_the_nearest_field() -> None:
     """It does so when it is made in Python, too."""
-    with pytest.raises(ValidationError, match=r"num_worker: .* did you mean 'num_workers'"):
+    with pytest.raises(ConfigError, match=r"num_worker: .* did you mean 'num_workers'") as caught:
         EnvConfig(**HOPPER, num_worker=3)
+    assert caught.value.__cause__ is caught.value.__context__ is None
+
+
+def test_env_config_lists_everything_that_is_wrong() -> None:
+    """In the words of an entry that is a mapping, also for what is nested."""
+    wrong: dict[str, Any] = {"name": "", "num_workers": "2", "placement": "moon"}
+    with pytest.raises(ConfigError) as caught:
+        EnvConfig(**{**wrong, "video": {"folder": "", "every": 0}})
+    said = str(caught.value)
+    assert said.startswith("EnvConfig: 6 problems\n  name: String should have at least 1 character")
+    for field in ("backend", "num_workers", "video.folder", "video.every", "placement"):
+        assert f"\n  {field}: " in said
+    assert "http" not in said
+    with pytest.raises(ConfigError, match="VideoConfig: every: should be greater"):
+        VideoConfig(folder="films", every=0)
 
 
 @given(text=st.text() | st.text("envs:[]{}-, \n\tab'\"&*!?|>%#0.$"))

@@ -298,7 +298,7 @@ def test_if_an_env_cannot_be_filmed_no_env_is_filmed(tmp_path: Path) -> None:
             rl.record_video(group, ["env-0"], tmp_path, sub_env=2)
         with pytest.raises(rl.UnknownEnv, match="'env_0'"):
             rl.record_video(group, ["env_0"], tmp_path)
-        with pytest.raises(rl.ConfigError, match=r"record_video: every: .* not 0"):
+        with pytest.raises(rl.ConfigError, match=r"record_video: every: .* got 0"):
             rl.record_video(group, ["env-0"], tmp_path, every=0)
         (tmp_path / "file").touch()
         with pytest.raises(rl.EnvRaised, match="File exists"):

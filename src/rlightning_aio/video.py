@@ -11,8 +11,6 @@ from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from pydantic import ValidationError
-
 from rlightning_aio.collecting.procedure import run
 from rlightning_aio.config import VideoConfig
 from rlightning_aio.errors import ConfigError, RLightningError
@@ -79,11 +77,8 @@ def _video(
     numbers = None if episodes is None else tuple(episodes)
     try:
         return VideoConfig(folder=os.fspath(folder), sub_env=sub_env, every=every, episodes=numbers)
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise ConfigError(
-            f"record_video: {first['loc'][0]}: {first['msg']}, not {first['input']!r}"
-        ) from None
+    except ConfigError as error:
+        raise ConfigError(str(error).replace("VideoConfig", "record_video", 1)) from None
 
 
 def _record(handles: Sequence[Any], video: VideoConfig | None) -> Procedure[None]:

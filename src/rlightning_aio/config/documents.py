@@ -5,19 +5,16 @@ from __future__ import annotations
 import difflib
 import itertools
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 from pydantic import ValidationError
 
 from rlightning_aio.config.checks import Entry, check_entry, check_imports, check_names
 from rlightning_aio.config.entry import EnvConfig, with_backend
-from rlightning_aio.config.problems import Problems, as_text, unknown_field
+from rlightning_aio.config.problems import Problems, as_text, explained, unknown_field
 from rlightning_aio.config.yaml_files import TOP_LEVEL, imports_above, plain, read_yaml, sections
-
-if TYPE_CHECKING:
-    from pydantic_core import ErrorDetails
 
 __all__ = ["load_config", "parse_configs"]
 
@@ -173,39 +170,8 @@ def _read_entry(entry: object, place: str, problems: Problems) -> Entry | None:
         return Entry(place, EnvConfig.model_validate(fields), set())
     except ValidationError as error:
         faults = error.errors(include_url=False)
-    for path, text in _explain(faults, fields):
+    for path, text in explained(faults, fields):
         problems.add(f"{place}, {path}", text)
     faulty = {str(fault["loc"][0]) for fault in faults}
     right = {k: v for k, v in fields.items() if k not in faulty}
     return Entry(place, EnvConfig.model_validate({"name": "?", "backend": "?"} | right), faulty)
-
-
-def _explain(
-    faults: Sequence[ErrorDetails], fields: Mapping[str, Any]
-) -> Iterator[tuple[str, str]]:
-    """Yield path and text of each fault. Branches of a union share a path, so they share a text."""
-    texts: dict[str, list[str]] = {}
-    inputs: dict[str, str] = {}
-    for fault in faults:
-        path = _path(fault["loc"], fields)
-        text = fault["msg"].removeprefix("Value error, ").removeprefix("Input ")
-        text = text.replace("valid tuple", "list")
-        texts.setdefault(path, []).append("is required" if fault["type"] == "missing" else text)
-        if fault["type"] not in ("missing", "value_error"):
-            inputs[path] = f", got {as_text(fault['input'])}"
-    for path, (first, *others) in texts.items():
-        alternatives = [first, *(other.removeprefix("should be ") for other in others)]
-        yield path, " or ".join(alternatives) + inputs.get(path, "")
-
-
-def _path(location: Sequence[int | str], fields: Mapping[str, Any]) -> str:
-    """Return the dotted path of a fault, without what pydantic adds for unions and keys."""
-    value: Any = fields
-    parts: list[str] = []
-    for part in location:
-        try:
-            value = value[part]
-        except (KeyError, IndexError, TypeError):
-            break
-        parts.append(str(part))
-    return ".".join(parts or map(str, location[:1]))

@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from typing import Annotated, Any, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
-from rlightning_aio.config.problems import unknown_field
+from rlightning_aio.config.problems import Problems, explained, unknown_field
 from rlightning_aio.registry import ENVS, PLACEMENTS, placement_of
 from rlightning_aio.sharing import num_batches, num_cores
 
@@ -27,7 +34,25 @@ MADE_BY_GYMNASIUM = ("gymnasium", "mujoco", "ale")
 """Backends whose `env_kwargs` go to `gymnasium.make`."""
 
 
-class VideoConfig(BaseModel):
+class _Fields(BaseModel):
+    """Fields whose mistakes raise one `ConfigError`, as those of a mapping do."""
+
+    if not TYPE_CHECKING:  # A type checker would then know none of the fields.
+
+        def __init__(self, **fields):
+            problems = Problems(type(self).__name__)
+            try:
+                super().__init__(**fields)
+            except ValidationError as error:
+                for path, text in explained(error.errors(include_url=False), fields):
+                    problems.add(path, text)
+            problems.raise_any()
+
+        # As that of pydantic's classes, so that validation doesn't call it.
+        __init__.__pydantic_base_init__ = True
+
+
+class VideoConfig(_Fields):
     """The episodes of an entry's envs to film, and the folder for the files."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, defer_build=True)
@@ -58,7 +83,7 @@ class VideoConfig(BaseModel):
         return episode % self.every == 0
 
 
-class EnvConfig(BaseModel):
+class EnvConfig(_Fields):
     """One entry of ``envs:``, which makes ``num_workers`` envs of one kind."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, defer_build=True)

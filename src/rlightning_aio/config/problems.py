@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import reprlib
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.registry import did_you_mean
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-__all__ = ["Problems", "as_text", "unknown_field"]
+    from pydantic_core import ErrorDetails
+
+__all__ = ["Problems", "as_text", "explained", "unknown_field"]
 
 
 @dataclass(slots=True)
@@ -44,3 +46,37 @@ def unknown_field(name: object, known: Iterable[str]) -> str:
 def as_text(value: object) -> str:
     """Return the value as messages show it, shortened."""
     return reprlib.repr(value)
+
+
+def explained(
+    faults: Sequence[ErrorDetails], fields: Mapping[str, Any]
+) -> Iterator[tuple[str, str]]:
+    """Yield path and text of each fault that pydantic has found in `fields`.
+
+    Branches of a union share a path, so they share a text.
+    """
+    texts: dict[str, list[str]] = {}
+    inputs: dict[str, str] = {}
+    for fault in faults:
+        path = _path(fault["loc"], fields)
+        text = fault["msg"].removeprefix("Value error, ").removeprefix("Input ")
+        text = text.replace("valid tuple", "list")
+        texts.setdefault(path, []).append("is required" if fault["type"] == "missing" else text)
+        if fault["type"] not in ("missing", "value_error"):
+            inputs[path] = f", got {as_text(fault['input'])}"
+    for path, (first, *others) in texts.items():
+        alternatives = [first, *(other.removeprefix("should be ") for other in others)]
+        yield path, " or ".join(alternatives) + inputs.get(path, "")
+
+
+def _path(location: Sequence[int | str], fields: Mapping[str, Any]) -> str:
+    """Return the dotted path of a fault, without what pydantic adds for unions and keys."""
+    value: Any = fields
+    parts: list[str] = []
+    for part in location:
+        try:
+            value = value[part]
+        except (KeyError, IndexError, TypeError):
+            break
+        parts.append(str(part))
+    return ".".join(parts or map(str, location[:1]))
