@@ -24,6 +24,7 @@ __all__ = [
     "EnvHung",
     "EnvRaised",
     "GroupClosed",
+    "NotInitialised",
     "NothingPending",
     "PolicyServerError",
     "RLightningError",
@@ -96,7 +97,11 @@ class ReplayDiverged(RLightningError, RuntimeError):
 
 
 class GroupClosed(RLightningError, RuntimeError):
-    """The group was used before ``init`` or after ``close``."""
+    """The group isn't open: it was used after ``close``, or before ``init`` (`NotInitialised`)."""
+
+
+class NotInitialised(GroupClosed):
+    """The group was used before ``init``."""
 
 
 class SnapshotError(RLightningError, ValueError):

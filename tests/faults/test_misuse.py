@@ -21,6 +21,7 @@ from rlightning_aio.errors import (
     EnvBusy,
     GroupClosed,
     NothingPending,
+    NotInitialised,
     RLightningError,
     UnknownEnv,
 )
@@ -182,13 +183,14 @@ def test_use_before_init_and_after_close_is_refused(build: Start) -> None:
     """It doesn't hang, and the error says what to do."""
     group = build(entry())
     for use in USES.values():
-        with pytest.raises(GroupClosed, match="call init"):
+        with pytest.raises(NotInitialised, match="call init"):
             use(group)
     group.init()
     group.close()
     for use in USES.values():
-        with pytest.raises(GroupClosed, match="build a new one"):
+        with pytest.raises(GroupClosed, match="build a new one") as raised:
             use(group)
+        assert type(raised.value) is GroupClosed
     with pytest.raises(GroupClosed, match="build a new one"):
         group.init()
 

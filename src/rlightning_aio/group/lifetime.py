@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rlightning_aio.errors import GroupClosed
+from rlightning_aio.errors import GroupClosed, NotInitialised
 from rlightning_aio.group.conditions import CLOSED
 
 if TYPE_CHECKING:
@@ -37,11 +37,10 @@ class Lifetime:
         self._conditions.note(CLOSED, True)
 
     def check_open(self) -> None:
-        """Raise `GroupClosed` before `init` and after `close`."""
+        """Raise `NotInitialised` before `init`, and `GroupClosed` after `close`."""
+        if self.closed:
+            raise GroupClosed("this group is closed; build a new one")
         if not self.open:
-            raise GroupClosed(
-                "this group is closed; build a new one"
-                if self.closed
-                else "this group has not been initialised; call init() first, or use it in a "
-                "with block"
+            raise NotInitialised(
+                "this group has not been initialised; call init() first, or use it in a with block"
             )
