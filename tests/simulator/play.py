@@ -1,22 +1,12 @@
-"""Plays a program: does its operations to a group and to the model, and compares the two.
-
-Each operation is a coroutine, for groups of both kinds: `Play.done` awaits what must be awaited.
-An operation that a program's state doesn't allow does nothing, so any part of a program is one.
-"""
+"""Plays a program of a group: does its operations to the group and to the model, and compares."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import inspect
 import math
-import os
 import pickle
-import signal
 import tempfile
-import time
-import warnings
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from random import Random
@@ -36,12 +26,11 @@ from simulator.model import (
     rows_of,
     same,
 )
-from simulator.scripted import DYING, FIXED, TOKENS, UNCLOSABLE, Act, encoded
+from simulator.scripted import DYING, TOKENS, UNCLOSABLE
+from simulator.session import Session, action_of, stacked
 from simulator.world import Faults
 
-import rlightning_aio
-import rlightning_aio.sync
-from rlightning_aio import BatchedData, PolicyResponse, errors
+from rlightning_aio import BatchedData, PolicyResponse
 from rlightning_aio.errors import (
     BadAction,
     EnvBusy,
@@ -49,7 +38,6 @@ from rlightning_aio.errors import (
     NothingPending,
     RLightningError,
     SnapshotError,
-    StartFailed,
     UnknownEnv,
     WorkerDied,
 )
@@ -57,26 +45,15 @@ from rlightning_aio.errors import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence
 
-    from simulator.program import Op, Program
+    from simulator.program import Op
 
 
-class Play:
-    """One run of a program.
+class Play(Session):
+    """A run of a program that does everything to a group that its model knows."""
 
-    Attributes:
-        counts: what was done and what came of it.
-        hang: seconds after which a call that must end counts as hung; processes of a world may be
-            stopped for minutes.
-    """
+    model: Model
 
-    def __init__(self, program: Program, world: Any = None) -> None:
-        self.program, self.world = program, world
-        self.features = program.features
-        self.hang = 200.0 if world is None else 1e6
-        self.is_async = "async" in program.features
-        self.counts: Counter[str] = Counter()
-        self.model: Model
-        self.group: Any
+    def begin(self) -> None:
         # Results that may be answered again, states that may be put back, calls in flight.
         self.batches: list[BatchedData] = []
         self.snapshots: list[tuple[bytes, list[tuple[Env, Any]]]] = []
@@ -88,105 +65,30 @@ class Play:
         self.kept: list[tuple[Any, Any]] = []
         self.owners = 0
         self.nested: set[str] = set()
-        self.unclosable: set[str] = set()
-
-    # -- a run
-
-    def run(self) -> None:
-        """Play the program; raises `Violation`."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            main = self.main()
-            if not self.is_async:
-                with contextlib.suppress(StopIteration):
-                    main.send(None)
-                    raise Violation("a synchronous group has to be awaited")
-            elif self.world is None:
-                asyncio.run(main)
-            else:
-                self.world.run(main)
-
-    async def main(self) -> None:
-        build = rlightning_aio if self.is_async else rlightning_aio.sync
-        self.group = build.build_env_group(
-            self.program.configs(), mixed_actions=True, zero_copy="zero_copy" in self.features
-        )
-        try:
-            if self.world is not None:
-                self.world.calm()
-            if not await self.start():
-                return
-            faults = replace(self.program.faults, deaths=0.0, interrupts=0.0)
-            envs = self.program.envs(self.group.get_workers(), self.world)
-            self.model = Model(envs, self.counts, starts_fail=faults != Faults())
-            require([*self.model.envs] == self.group.env_ids, "ids", self.group.env_ids)
-            for number, op in enumerate(self.program.ops):
-                await self.play(number, op)
-            await self.finish()
-        finally:
-            if self.world is not None:
-                self.world.calm()
-            for task in self.tasks:
-                task.cancel()
-            if self.tasks:
-                await asyncio.wait(self.tasks)
-            await self.close()
-        self.check_kept()
-
-    async def close(self) -> None:
-        """Close the group; what is said of envs that don't close must be true."""
-        with warnings.catch_warnings(record=True) as said:
-            warnings.simplefilter("always")
-            await self.done(self.group.close())
-        texts = [str(one.message) for one in said if "close() of env" in str(one.message)]
-        self.counts["close raised"] += len(texts)
-        for text in texts:
-            own = any(f"'{env_id}'" in text for env_id in self.unclosable)
-            require(own or "its worker" in text, "a warning", text)
-
-    async def start(self) -> bool:
-        """Start the envs; False if they can't be, as is meant."""
-        broken = [plan.name for plan in self.program.plans if plan.start]
-        try:
-            await self.done(self.group.init())
-        except StartFailed as error:
-            self.count(error)
-            self.counts["start failed"] += 1
-            require(error.env_id.rpartition("-")[0] in broken, "a start failed", repr(error))
-            return False
-        require(not broken, "started, and it can't", broken)
-        return True
+        faults = replace(self.program.faults, deaths=0.0, interrupts=0.0)
+        self.model = Model(self.envs, self.counts, starts_fail=faults != Faults())
+        require([*self.model.envs] == self.group.env_ids, "ids", self.group.env_ids)
 
     async def play(self, number: int, op: Op) -> None:
-        if self.world is not None:
-            self.world.reseed(op.seed)
-            self.world.storm()
-        self.say(f"{number}: {op.name}")
-        await self.interruptible(getattr(self, f"op_{op.name}")(Random(op.seed)), op.name)
-        self.counts[f"op {op.name}"] += 1
+        await super().play(number, op)
         await self.look_at_tasks()
         self.check_pending()
 
-    async def interruptible(self, doing: Coroutine[Any, Any, Any], name: str = "") -> Any:
-        """Do something that Ctrl-C may interrupt; None if it did."""
-        try:
-            return await doing
-        except KeyboardInterrupt:
-            sends = name in ("step_async", "reset_async", "call_async")
-            self.counts[f"Ctrl-C in a {'send' if sends else 'wait'}"] += 1
-            self.say("   Ctrl-C was raised")
-            for env in self.model.pending():
-                assert env.request is not None
-                env.request.interrupted = not env.host.mortal
+    def note_interrupt(self) -> None:
+        for env in self.model.pending():
+            assert env.request is not None
+            env.request.interrupted = not env.host.mortal
 
-    def say(self, text: str) -> None:
-        """Add a line to the trace."""
-        if self.world is not None:
-            self.world.note(text)
+    async def close(self) -> None:
+        for task in getattr(self, "tasks", ()):
+            task.cancel()
+        if getattr(self, "tasks", ()):
+            await asyncio.wait(self.tasks)
+        await super().close()
 
-    async def done(self, answer: Any) -> Any:
-        """What a call returns, whichever kind of group it is of."""
-        return await answer if inspect.isawaitable(answer) else answer
+    def end(self) -> None:
+        for columns, copies in self.kept:
+            require(same(columns, copies), "a result was overwritten", columns, copies)
 
     async def look_at_tasks(self, *, wait: bool = False) -> None:
         """Raise what tasks have raised, and forget those that have ended."""
@@ -207,10 +109,6 @@ class Play:
         require(found == pending, "pending", sorted(found), "must be", sorted(pending))
 
     async def finish(self) -> None:
-        """Faults are over: everything that is pending ends, and every env is usable."""
-        if self.world is not None:
-            self.world.calm()
-        self.say("calm")
         await self.look_at_tasks(wait=True)
         while self.calls:
             await self.interruptible(self.op_collect_calls(Random(0)))
@@ -233,13 +131,6 @@ class Play:
         while env.request is not None:
             await self.collect(deadline=self.hang)
         return await self.reset([env]) and await self.step_on([env])
-
-    async def rest(self) -> None:
-        """Let others do what they still have to do."""
-        if self.is_async:
-            await asyncio.sleep(0.1)
-        else:
-            time.sleep(0.1)  # noqa: ASYNC251  # Nothing else waits.
 
     # -- comparing
 
@@ -353,10 +244,6 @@ class Play:
             columns.append({name: part.sent[name] for name in part.sent})
             self.kept.append((columns, pickle.loads(pickle.dumps(columns))))
 
-    def check_kept(self) -> None:
-        for columns, copies in self.kept:
-            require(same(columns, copies), "a result was overwritten", columns, copies)
-
     def check_stats(self) -> None:
         """Compare the figures of the group with the episodes that were seen."""
         for env_id, found in self.group.get_env_stats().items():
@@ -365,21 +252,6 @@ class Play:
             if episodes:
                 mean = sum(total for total, _ in episodes) / len(episodes)
                 require(math.isclose(found["mean_return"], mean), "mean", env_id, found, mean)
-
-    @contextlib.contextmanager
-    def expected(self, kind: Any, what: str) -> Any:
-        """Require an error, by which nothing changes."""
-        try:
-            yield
-        except kind as error:
-            self.count(error)
-            return
-        raise Violation(f"not refused: {what}")
-
-    def count(self, error: BaseException) -> None:
-        """Count an error by its public class."""
-        kinds = [kind.__name__ for kind in type(error).__mro__]
-        self.counts[next((k for k in kinds if k in errors.__all__), kinds[0])] += 1
 
     # -- drawing
 
@@ -392,34 +264,6 @@ class Play:
         if "partial steps" not in self.features or rng.random() < 0.4:
             return envs
         return rng.sample(envs, rng.randint(1, len(envs))) if envs else []
-
-    def acts(self, rng: Random, env: Env, *, plain: bool = False) -> list[Act]:
-        return [self.act(rng, env, plain=plain) for _ in env.codes]
-
-    def act(self, rng: Random, env: Env, *, plain: bool) -> Act:
-        features, token = self.features, rng.randrange(TOKENS)
-        effects = ["plain"] * 6
-        effects += ["end", "cut", "both"] * ("ends" in features)
-        effects += ["info", "nested"] * ("infos" in features)
-        effects += ["slow"] * ("slow" in features)
-        effect = rng.choice(effects)
-        if plain or rng.random() > 0.15:
-            return effect, token
-        effects = ["keep state"] * ("snapshots" in features and env.entry.every is None)
-        if "raise" in features:
-            effects += ["raise", "raise oddly", "raise next"]
-        if not self.is_async and self.plan(env).placement == "inline":
-            effects += ["ctrl-c"] * ("raise" in features)
-        effects += ["rubbish"] * ("rubbish" in features and env.entry.layout in (*FIXED, "number"))
-        plan = self.plan(env)
-        if env.host.mortal and "die" in features and plan.placement != "loop":
-            effects += [*DYING] + ["die next"] * (env.entry.every is None)
-        if env.host.mortal and plan.timeout is not None:
-            effects += ["hang"] + ["hang next"] * (env.entry.every is None)
-        return (rng.choice(effects) if effects else effect), token
-
-    def plan(self, env: Env) -> Any:
-        return next(plan for plan in self.program.plans if plan.name == env.entry.name)
 
     def response(
         self, rng: Random, envs: list[Env], *, plain: bool = False
@@ -1054,24 +898,6 @@ class Play:
             self.trace.cleanup()
             self.trace = None
 
-    async def op_kill(self, rng: Random) -> None:
-        """End a worker from outside."""
-        envs = [
-            env
-            for env in self.model.envs.values()
-            if env.host.mortal and not env.gone and self.plan(env).placement != "loop"
-        ]
-        if not envs:
-            return
-        env = rng.choice(envs)
-        env.host.ask()
-        pids = [w["pid"] for w in self.group.get_workers() if env.env_id in w["env_ids"]]
-        if self.world is not None:
-            self.world.kill(pids)
-        elif pids[0] is not None:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pids[0], signal.SIGKILL)
-
 
 def ids_of(fault: EnvFault) -> Sequence[str]:
     """The envs whose requests an error answers."""
@@ -1089,21 +915,3 @@ def _shown(row: Row) -> str:
         if column is not None and any(column)
     ]  # fmt: skip
     return " ".join([row.env_id, words, *marks])
-
-
-def action_of(env: Env, acts: Sequence[Act]) -> Any:
-    """The action that has an env do this."""
-    actions = [encoded(env.entry.controls, *act) for act in acts]
-    return actions[0] if env.entry.form != "stacked" else stacked(actions)
-
-
-def stacked(actions: Sequence[Any]) -> Any:
-    """Actions of the same space as columns; a list of those that have no fixed size."""
-    first = actions[0]
-    if isinstance(first, dict) and "do" not in first:
-        return {key: stacked([one[key] for one in actions]) for key in first}
-    if isinstance(first, tuple):
-        return tuple(stacked(column) for column in zip(*actions, strict=True))
-    if isinstance(first, str | dict):
-        return list(actions)
-    return np.array(actions)

@@ -112,11 +112,13 @@ class Program:
     """One run.
 
     Attributes:
+        kind: of `KINDS`.
         features: what it may use.
         faults: of the world that it runs in.
     """
 
     seed: int
+    kind: str
     features: frozenset[str]
     plans: tuple[Plan, ...]
     ops: tuple[Op, ...]
@@ -173,7 +175,18 @@ OPS: dict[str, tuple[int, str | None]] = {
     "trace": (2, "timeline"),
     "kill": (3, "die"),
 }
-"""Weight of each operation, and the feature that it needs."""
+"""Weight of each operation of a group, and the feature that it needs."""
+ROWS: dict[str, tuple[int, str | None]] = {
+    "reset": (1, None), "step": (12, None), "kill": (2, "die"),
+}  # fmt: skip
+KINDS: dict[str, tuple[int, dict[str, tuple[int, str | None]]]] = {
+    "group": (12, OPS),
+    "training": (4, {"rollout": (6, None), "learn": (2, None), "kill": (2, "die")}),
+    "evaluations": (2, {"evaluate": (6, None), "kill": (2, "die")}),
+    "vectors": (4, ROWS | {"mask": (3, None), "call": (1, "calls")}),
+    "sb3": (2, ROWS),
+}
+"""Kinds of programs: the weight of each, and its operations."""
 
 
 def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 40) -> Program:
@@ -188,16 +201,37 @@ def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 40)
     if workers and rng.random() < 0.03:
         k = rng.choice(workers)
         plans[k] = replace(plans[k], start=rng.choice(["raise", "exit", "hang"]))
-    names = [name for name, (_, needs) in OPS.items() if needs is None or needs in features]
-    weights = [OPS[name][0] for name in names]
-    count = rng.randint(num_ops // 4, num_ops)
+    weights = [weight for weight, _ in KINDS.values()]
+    kind = rng.choices([*KINDS], weights)[0]
+    if kind in ("vectors", "sb3"):
+        features, plans = _as_rows(rng, features, kind)
+    ops_of_kind = KINDS[kind][1]
+    names = [name for name, (_, needs) in ops_of_kind.items() if needs is None or needs in features]
+    weights = [ops_of_kind[name][0] for name in names]
+    most = num_ops if kind in ("group", "vectors", "sb3") else num_ops // 5
+    count = rng.randint(most // 4, most)
     ops = [Op(name, rng.getrandbits(32)) for name in rng.choices(names, weights, k=count)]
-    first = [Op("reset", rng.getrandbits(32))] if rng.random() < 0.8 else []
+    begins = kind in ("group", "vectors", "sb3") and rng.random() < 0.8
+    first = [Op("reset", rng.getrandbits(32))] if begins else []
     kinds = ["deaths", "stops", "lags", "starts", "fork_servers"]
     kinds += ["interrupts"] * ("async" not in features and "interrupts" in features)
     chances = {kind: rng.choice([0.02, 0.1, 0.4]) for kind in kinds if rng.random() < 0.4}
     faults = Faults(**chances) if "faults" in features else Faults()
-    return Program(seed, features, tuple(plans), (*first, *ops), faults)
+    return Program(seed, kind, features, tuple(plans), (*first, *ops), faults)
+
+
+def _as_rows(rng: Random, features: frozenset[str], kind: str) -> tuple[frozenset[str], list[Plan]]:
+    """What a vector interface is made of: envs of one kind, in a synchronous group."""
+    features -= {"async", "base", "awaitable", "several entries", "rubbish"}
+    if kind == "sb3":
+        features -= {"out of band"}
+    plan = replace(_plan(rng, features, "env"), min_results=None)
+    if plan.form == "stacked" and plan.mode == "next_step" and plan.on_death == "resume":
+        plan = replace(plan, on_death="restart", every=None)
+    if plan.form == "stacked" and kind == "sb3":  # It takes no Dict actions of several together.
+        controls = "digits" if plan.controls == "tree" else plan.controls
+        plan = replace(plan, mode="same_step", controls=controls)
+    return features, [plan]
 
 
 def _plan(rng: Random, features: frozenset[str], name: str) -> Plan:

@@ -14,16 +14,27 @@ from typing import TYPE_CHECKING, Final
 from simulator.coverage import watch
 from simulator.play import Play
 from simulator.program import draw
+from simulator.training import Evaluations, Training
+from simulator.vectors import Singles, Vectors
 from simulator.world import World
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from simulator.program import Op, Program
+    from simulator.session import Session
 
 
 WORLDLY: Final = frozenset({"ray", "faults"})
 """Features that only a world has."""
+
+SESSIONS: Final[dict[str, type[Session]]] = {
+    "group": Play,
+    "training": Training,
+    "evaluations": Evaluations,
+    "vectors": Vectors,
+    "sb3": Singles,
+}
 
 transitions: Counter[str] = Counter()
 """What `coverage` has counted in this run."""
@@ -50,18 +61,18 @@ def run(program: Program, *, real: bool = False) -> Run:
     """Play a program, with real processes or in a world."""
     found = Run(program)
     if real:
-        _play(Play(program), found)
+        _play(SESSIONS[program.kind](program), found)
         return found
     # Both implementations of the hot path must do the same.
     implementation = "python" if program.seed % 2 else "c"
     with World(program.seed, program.faults, implementation=implementation) as world:
-        _play(Play(program, world), found)
+        _play(SESSIONS[program.kind](program, world), found)
         found.trace, found.hours = world.trace, world.hours
         found.counts += world.counts
     return found
 
 
-def _play(play: Play, found: Run) -> None:
+def _play(play: Session, found: Run) -> None:
     try:
         play.run()
     except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001  # Whatever it is, it is the result.

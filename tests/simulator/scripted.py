@@ -186,7 +186,10 @@ class Script:
         self.episode, self.steps, self.over = (self.episode + 1) % 128, 0, False
         self.elapsed = 0
         token = (options or {}).get("token", 0)
-        self.mix = mixed(self.code, self.seed, self.episode, token, self.mark)
+        # With a seed, what follows depends on nothing that was before.
+        self.mix = mixed(
+            self.code, self.seed, 0 if seed is not None else self.episode, token, self.mark
+        )
         return {"seed": -1 if seed is None else int(seed), **({"token": token} if token else {})}
 
     def step(self, effect: str, token: int) -> tuple[float, bool, bool, dict[str, Any]]:

@@ -1,0 +1,266 @@
+"""What the runs of all kinds of programs have in common: a group, its life, and one operation after
+the other.
+
+Each operation is a coroutine, for groups of both kinds: `Session.done` awaits what must be awaited.
+An operation that a program's state doesn't allow does nothing, so any part of a program is one.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import inspect
+import os
+import signal
+import time
+import warnings
+from collections import Counter
+from random import Random
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from simulator.model import Env, Violation, require
+from simulator.scripted import DYING, FIXED, TOKENS, Act, encoded
+
+import rlightning_aio
+import rlightning_aio.sync
+from rlightning_aio import errors
+from rlightning_aio.errors import StartFailed
+
+if TYPE_CHECKING:
+    from collections.abc import Coroutine, Iterator, Sequence
+
+    from simulator.program import Op, Plan, Program
+
+
+class Session:
+    """One run of a program.
+
+    Attributes:
+        counts: what was done and what came of it.
+        hang: seconds after which a call that must end counts as hung; processes of a world may be
+            stopped for minutes.
+        envs: of the group, as the model knows them.
+        unclosable: envs that may raise when they are closed.
+    """
+
+    group: Any
+    envs: list[Env]
+
+    def __init__(self, program: Program, world: Any = None) -> None:
+        self.program, self.world = program, world
+        self.features = program.features
+        self.hang = 200.0 if world is None else 1e6
+        self.is_async = "async" in program.features
+        self.counts: Counter[str] = Counter()
+        self.unclosable: set[str] = set()
+
+    # -- a run
+
+    def run(self) -> None:
+        """Play the program; raises `Violation`."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            main = self.main()
+            if not self.is_async:
+                with contextlib.suppress(StopIteration):
+                    main.send(None)
+                    raise Violation("a synchronous group has to be awaited")
+            elif self.world is None:
+                asyncio.run(main)
+            else:
+                self.world.run(main)
+
+    async def main(self) -> None:
+        """Start the group, do the operations, and close it."""
+        self.build()
+        try:
+            self.calm()
+            if not await self.start():
+                return
+            self.envs = self.program.envs(self.group.get_workers(), self.world)
+            self.begin()
+            for number, op in enumerate(self.program.ops):
+                await self.play(number, op)
+            self.calm()
+            self.say("calm")
+            await self.finish()
+        finally:
+            self.calm()
+            await self.close()
+        self.end()
+
+    def build(self) -> None:
+        """Make the group."""
+        build = rlightning_aio if self.is_async else rlightning_aio.sync
+        self.group = build.build_env_group(
+            self.program.configs(), mixed_actions=True, zero_copy="zero_copy" in self.features
+        )
+
+    def begin(self) -> None:
+        """Look at the group before the first operation."""
+
+    async def finish(self) -> None:
+        """Faults are over: whatever is pending must end, and every env be usable."""
+
+    def end(self) -> None:
+        """Look at what is left when the group is closed."""
+
+    async def start(self) -> bool:
+        """Start the envs; False if they can't be, as is meant."""
+        broken = [plan.name for plan in self.program.plans if plan.start]
+        try:
+            await self.done(self.group.init())
+        except StartFailed as error:
+            self.count(error)
+            self.counts["start failed"] += 1
+            require(error.env_id.rpartition("-")[0] in broken, "a start failed", repr(error))
+            return False
+        require(not broken, "started, and it can't", broken)
+        return True
+
+    async def close(self) -> None:
+        """Close the group; what is said of envs that don't close must be true."""
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            await self.done(self.group.close())
+        texts = [str(one.message) for one in said if "close() of env" in str(one.message)]
+        self.counts["close raised"] += len(texts)
+        for text in texts:
+            own = any(f"'{env_id}'" in text for env_id in self.unclosable)
+            require(own or "its worker" in text, "a warning", text)
+
+    async def play(self, number: int, op: Op) -> None:
+        """Do an operation."""
+        if self.world is not None:
+            self.world.reseed(op.seed)
+            self.world.storm()
+        self.say(f"{number}: {op.name}")
+        await self.interruptible(getattr(self, f"op_{op.name}")(Random(op.seed)), op.name)
+        self.counts[f"op {op.name}"] += 1
+
+    async def interruptible(self, doing: Coroutine[Any, Any, Any], name: str = "") -> Any:
+        """Do something that Ctrl-C may interrupt; None if it did."""
+        try:
+            return await doing
+        except KeyboardInterrupt:
+            sends = name in ("step_async", "reset_async", "call_async")
+            self.counts[f"Ctrl-C in a {'send' if sends else 'wait'}"] += 1
+            self.say("   Ctrl-C was raised")
+            self.note_interrupt()
+
+    def note_interrupt(self) -> None:
+        """Ctrl-C was raised."""
+
+    async def done(self, answer: Any) -> Any:
+        """What a call returns, whichever kind of group it is of."""
+        return await answer if inspect.isawaitable(answer) else answer
+
+    # -- the world
+
+    def say(self, text: str) -> None:
+        """Add a line to the trace."""
+        if self.world is not None:
+            self.world.note(text)
+
+    def calm(self) -> None:
+        """Let nothing go wrong by itself."""
+        if self.world is not None:
+            self.world.calm()
+
+    async def rest(self) -> None:
+        """Let others do what they still have to do."""
+        if self.is_async:
+            await asyncio.sleep(0.1)
+        else:
+            time.sleep(0.1)  # noqa: ASYNC251  # Nothing else waits.
+
+    async def op_kill(self, rng: Random) -> None:
+        """End a worker from outside."""
+        envs = [env for env in self.envs if self.is_killable(env) and not env.gone]
+        if not envs:
+            return
+        env = rng.choice(envs)
+        env.host.ask()
+        pids = [w["pid"] for w in self.group.get_workers() if env.env_id in w["env_ids"]]
+        if self.world is not None:
+            self.world.kill(pids)
+        elif pids[0] is not None:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pids[0], signal.SIGKILL)
+
+    # -- errors
+
+    @contextlib.contextmanager
+    def expected(self, kind: Any, what: str) -> Iterator[None]:
+        """Require an error, by which nothing changes."""
+        try:
+            yield
+        except kind as error:
+            self.count(error)
+            return
+        raise Violation(f"not refused: {what}")
+
+    def count(self, error: BaseException) -> None:
+        """Count an error by its public class."""
+        kinds = [kind.__name__ for kind in type(error).__mro__]
+        self.counts[next((k for k in kinds if k in errors.__all__), kinds[0])] += 1
+
+    # -- drawing
+
+    def plan(self, env: Env) -> Plan:
+        return next(plan for plan in self.program.plans if plan.name == env.entry.name)
+
+    def is_killable(self, env: Env) -> bool:
+        """The env is in another process."""
+        return env.host.mortal and self.plan(env).placement != "loop"
+
+    def acts(self, rng: Random, env: Env, *, plain: bool = False) -> list[Act]:
+        """What the sub-environments of an env are to do."""
+        return [self.act(rng, env, plain=plain) for _ in env.codes]
+
+    def act(self, rng: Random, env: Env, *, plain: bool) -> Act:
+        features, token = self.features, rng.randrange(TOKENS)
+        effects = ["plain"] * 6
+        effects += ["end", "cut", "both"] * ("ends" in features)
+        effects += ["info", "nested"] * ("infos" in features)
+        effects += ["slow"] * ("slow" in features)
+        effect = rng.choice(effects)
+        if plain or rng.random() > 0.15:
+            return effect, token
+        faults = self.faults_of(env)
+        return (rng.choice(faults) if faults else effect), token
+
+    def faults_of(self, env: Env) -> list[str]:
+        """The faults that an env may have."""
+        features, entry = self.features, env.entry
+        faults = ["keep state"] * ("snapshots" in features and entry.every is None)
+        if "raise" in features:
+            faults += ["raise", "raise oddly", "raise next"]
+            if not self.is_async and self.plan(env).placement == "inline":
+                faults.append("ctrl-c")
+        if "rubbish" in features and entry.layout in (*FIXED, "number"):
+            faults.append("rubbish")
+        if "die" in features and self.is_killable(env):
+            faults += [*DYING] + ["die next"] * (entry.every is None)
+        if env.host.mortal and self.plan(env).timeout is not None:
+            faults += ["hang"] + ["hang next"] * (entry.every is None)
+        return faults
+
+
+def action_of(env: Env, acts: Sequence[Act]) -> Any:
+    """The action that has an env do this."""
+    actions = [encoded(env.entry.controls, *act) for act in acts]
+    return actions[0] if env.entry.form != "stacked" else stacked(actions)
+
+
+def stacked(actions: Sequence[Any]) -> Any:
+    """Actions of the same space as columns; a list of those that have no fixed size."""
+    first = actions[0]
+    if isinstance(first, dict) and "do" not in first:
+        return {key: stacked([one[key] for one in actions]) for key in first}
+    if isinstance(first, tuple):
+        return tuple(stacked(column) for column in zip(*actions, strict=True))
+    if isinstance(first, str | dict):
+        return list(actions)
+    return np.array(actions)

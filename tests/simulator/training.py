@@ -1,0 +1,369 @@
+"""Programs of `Collector`, in recorded and replayed order, and of `evaluate`."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import pickle
+from random import Random
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from simulator.model import Violation, require, same
+from simulator.scripted import TOKENS, Script, decoded, element, mixed, words_of
+from simulator.session import Session, action_of, stacked
+from simulator.trails import Trail, Transition
+
+from rlightning_aio.collecting import Collector, RecordedGroup, ReplayedGroup
+from rlightning_aio.errors import (
+    EnvFault,
+    EnvRaised,
+    NothingPending,
+    RLightningError,
+    WorkerDied,
+)
+from rlightning_aio.evaluation import EpisodeSpec, evaluate
+
+if TYPE_CHECKING:
+    from simulator.model import Env
+    from simulator.scripted import Act, Words
+
+    from rlightning_aio.batch import BatchedData
+    from rlightning_aio.collecting import Rollout
+
+
+class PolicyFailed(Exception):
+    """As a policy may."""
+
+
+class InContext(Session):
+    """A run within one `auto_reset`.
+
+    Attributes:
+        limit: of that; none with envs that reset themselves, which count in their own way.
+    """
+
+    def begin(self) -> None:
+        rng = Random(self.program.seed)
+        alone = all(plan.mode == "disabled" for plan in self.program.plans)
+        self.limit = rng.choice([math.inf, math.inf, 3, 5]) if alone else math.inf
+        self.by_id = {env.env_id: env for env in self.envs}
+        self.context = self.group.auto_reset(self.limit)
+        self.context.__enter__()
+
+    async def finish(self) -> None:
+        self.context.__exit__(None, None, None)
+
+    def own_limit(self, env: Env) -> float:
+        """Steps after which an env truncates its episodes by itself."""
+        entry = env.entry
+        return entry.limit if entry.form == "gym" and entry.limit else math.inf
+
+    def lose(self, fault: WorkerDied) -> None:
+        """Note envs whose worker is not replaced."""
+        for env_id in fault.env_ids:
+            require(self.by_id[env_id].deaths > 0, "dead, and nothing has died", repr(fault))
+            self.by_id[env_id].gone = True
+
+
+class Training(InContext):
+    """A run of a program that collects rollouts.
+
+    Its policy chooses at random what each env does next, and attaches what it has seen. So the
+    rollouts themselves say what they must hold.
+    """
+
+    def begin(self) -> None:
+        super().begin()
+        self.raised = dict.fromkeys(self.by_id, 0)
+        self.kept: list[tuple[Any, Any]] = []
+        self.disturbed = False
+        rng = Random(self.program.seed)
+        self.options = self._options(rng)
+        self.recorded = RecordedGroup(self.group)
+        self._begin_with(self.recorded)
+
+    def _begin_with(self, group: Any) -> None:
+        self.trails = {
+            env.first + k: Trail(code, self.own_limit(env), self.limit)
+            for env in self.envs
+            for k, code in enumerate(env.codes)
+        }
+        self.env_of = {env.first + k: env for env in self.envs for k in range(len(env.codes))}
+        single = len(self.program.plans) == 1
+        policy: Any = self.policy if single else {p.name: self.policy for p in self.program.plans}
+        self.collector: Any = Collector(group, policy, **self.options)
+
+    def _options(self, rng: Random) -> dict[str, Any]:
+        width = sum(len(env.codes) for env in self.envs)
+        options: dict[str, Any] = {"seed": rng.choice([None, 7]), "infos": ("extra",)}
+        blocks = all(
+            plan.form != "stacked" or plan.mode == "same_step" for plan in self.program.plans
+        )
+        if blocks and rng.random() < 0.3:
+            return options | {"wait_all": True, "num_transitions": width * rng.randint(1, 4)}
+        if rng.random() < 0.7:
+            options["min_results"] = rng.randint(1, 4)
+        return options | {"num_transitions": rng.randint(1, 4 * width)}
+
+    def policy(self, batch: BatchedData) -> Any:
+        """Choose actions; sometimes it fails."""
+        if "raise" in self.features and self.rng.random() < 0.03:
+            raise PolicyFailed
+        envs = [self.by_id[env_id] for env_id in batch.env_ids()]
+        actions = [action_of(env, self.acts(self.rng, env, plain=self.plain)) for env in envs]
+        shape = batch.is_reset.shape
+        log_prob = np.array([self.rng.random() for _ in range(batch.is_reset.size)]).reshape(shape)
+        return {"action": stacked(actions), "log_prob": log_prob, "seen": batch.observation}
+
+    # -- operations
+
+    plain = False
+
+    async def op_rollout(self, rng: Random) -> bool:
+        """Collect a rollout, or be disturbed meanwhile."""
+        self.rng = rng
+        cancels = self.is_async and "cancel" in self.features and rng.random() < 0.3
+        seconds = rng.choice([1e-5, 1e-3, 0.1]) if cancels and not self.plain else None
+        try:
+            if seconds is None:
+                found = await self.done(self.collector.collect())
+            else:
+                async with asyncio.timeout(seconds):
+                    found = await self.collector.collect()
+        except EnvFault as fault:
+            self.count(fault)
+            self.restore_order(fault)
+        except NothingPending as error:
+            self.count(error)
+            require(all(env.gone for env in self.envs), "nothing to collect, and envs are there")
+        except (PolicyFailed, TimeoutError):
+            self.counts["disturbed rollouts"] += 1
+        else:
+            self.take(found)
+            return True
+        self.disturbed = True
+        return False
+
+    def note_interrupt(self) -> None:
+        self.disturbed = True
+
+    def restore_order(self, fault: EnvFault) -> None:
+        """Reset the env that raised, as the error says; those of a worker that is gone are lost."""
+        if isinstance(fault, WorkerDied):
+            self.lose(fault)
+            return
+        require(isinstance(fault, EnvRaised), "an odd error", repr(fault))
+        self.raised[fault.env_id] += 1
+        try:
+            self.group.reset_async(env_ids=[fault.env_id])
+        except WorkerDied as died:
+            self.lose(died)
+
+    async def op_learn(self, rng: Random) -> None:
+        """Time passes, and the policy is another one."""
+        self.collector.policy_version += 1
+        await self.rest()
+
+    async def finish(self) -> None:
+        self.plain = True
+        for _ in range(20):
+            if await self.interruptible(self.op_rollout(Random(1))) or self.any_gone():
+                break
+        else:
+            raise Violation("no rollout is collected any more")
+        if not self.disturbed and not any(env.deaths for env in self.envs):
+            await self.replay()
+        await super().finish()
+
+    def any_gone(self) -> bool:
+        return any(env.gone for env in self.envs)
+
+    async def replay(self) -> None:
+        """Do the same with other envs in the recorded order: the rollouts are the same."""
+        rollouts = [copies for _, copies in self.kept]
+        record = pickle.loads(pickle.dumps(self.recorded.record))
+        self.context.__exit__(None, None, None)
+        await self.close()
+        self.build()
+        await self.start()
+        self.context = self.group.auto_reset(self.limit)
+        self.context.__enter__()
+        self.kept, self.plain = [], False
+        self._begin_with(ReplayedGroup(self.group, record))
+        for op in self.program.ops:
+            if op.name == "rollout":
+                await self.op_rollout(Random(op.seed))
+            self.collector.policy_version += op.name == "learn"
+        self.plain = True
+        await self.op_rollout(Random(1))
+        require(not self.disturbed, "the replay was disturbed")
+        require(same([copies for _, copies in self.kept], rollouts), "the replay differs")
+        self.counts["replays"] += 1
+
+    # -- rollouts
+
+    def take(self, found: Any) -> None:
+        """Check rollouts, and that the one before was left alone."""
+        self.counts["rollouts"] += 1
+        parts = [found] if len(self.program.plans) == 1 else [found[name] for name in sorted(found)]
+        total = sum(part.index.size for part in parts)
+        require(total == self.options["num_transitions"], "the size of a rollout", total)
+        for env in self.envs:
+            for k in range(len(env.codes)):
+                trail = self.trails[env.first + k]
+                trail.allow(env.deaths + self.raised[env.env_id])
+                trail.resumes = env.entry.every is not None
+        for part in parts:
+            self._take(part)
+        if self.kept:
+            columns, copies = self.kept[-1]
+            require(same(columns, copies), "a rollout was overwritten too soon")
+        own = [[part[name] for name in part] for part in parts]
+        self.kept.append((own, pickle.loads(pickle.dumps(own))))
+
+    def _take(self, rollout: Rollout) -> None:
+        after = rollout.next_observation
+        ended: dict[int, list[tuple[float, int]]] = {}
+        for place in np.ndindex(rollout.shape):
+            index = int(rollout.index[place])
+            env, trail = self.env_of[index], self.trails[index]
+            layout, number = env.entry.layout, len(trail.ended)
+            words = words_of(layout, _at(rollout.observation, place))
+            require(words_of(layout, _at(rollout.seen, place)) == words, "another seen", words)
+            trail.add(
+                Transition(
+                    words,
+                    decoded(env.entry.controls, _at(rollout.action, place)),
+                    float(rollout.reward[place]),
+                    bool(rollout.terminated[place]),
+                    bool(rollout.truncated[place]),
+                    words_of(layout, _at(after, place)),
+                    bool(rollout.first[place]),
+                )
+            )
+            self.counts["transitions"] += 1
+            ended.setdefault(index, []).extend(trail.ended[number:])
+        found: dict[int, list[tuple[float, int]]] = {index: [] for index in ended}
+        for episode in rollout.episodes:
+            found.setdefault(episode.index, []).append((episode.total_reward, episode.length))
+        require(found == ended, "episodes", found, ended)
+
+
+class Evaluations(InContext):
+    """A run of a program that evaluates a policy, whose actions follow from what it sees."""
+
+    def choose(self, words: Words) -> Act:
+        kind = mixed(words.seed, words.step, words.mix)
+        return ("end" if kind % 6 == 0 else "cut" if kind % 11 == 0 else "plain"), kind % TOKENS
+
+    def policy(self, batch: BatchedData) -> Any:
+        actions: list[Any] = []
+        rets = batch.values()
+        for ret in rets:
+            env = self.by_id[ret.env_id]
+            many = env.entry.form == "stacked"
+            each = (
+                [_at(ret.observation, (k,)) for k in range(len(env.codes))]
+                if many
+                else [ret.observation]
+            )
+            actions.append(
+                action_of(env, [self.choose(words_of(env.entry.layout, one)) for one in each])
+            )
+        return batch.respond(action=actions)
+
+    async def op_evaluate(self, rng: Random) -> None:
+        singles = all(plan.form != "stacked" for plan in self.program.plans)
+        await self.drain()
+        if self.any_gone():
+            return
+        try:
+            if singles and rng.random() < 0.6:
+                await self._queue(rng)
+            else:
+                await self._number(rng)
+        except WorkerDied as fault:
+            self.count(fault)
+            self.lose(fault)
+        except RLightningError as error:
+            self.count(error)
+            require(any(env.deaths >= 3 for env in self.envs), "given up", repr(error))
+
+    async def drain(self) -> None:
+        """Take what an evaluation has left that did not end."""
+        while self.group.pending:
+            try:
+                await self.done(self.group.collect_async())
+            except WorkerDied as fault:
+                self.lose(fault)
+
+    def any_gone(self) -> bool:
+        return any(env.gone for env in self.envs)
+
+    async def _number(self, rng: Random) -> None:
+        """As many episodes of each env."""
+        count, seed = rng.randint(1, 3), rng.randrange(1000)
+        found = await self.done(evaluate(self.group, self.policy, count, seed=seed))
+        width = sum(len(env.codes) for env in self.envs)
+        places = {
+            (e.env_id, e.sub_env, e.number): (e.total_reward, e.length) for e in found.episodes
+        }
+        require(len(places) == len(found.episodes) == count * width, "as many of each", found)
+        for env in self.envs:
+            for k in range(len(env.codes)):
+                # Of those that reset themselves only the first is seeded, and again after a loss.
+                seeded = count if env.entry.mode == "disabled" else int(env.deaths == 0)
+                for number in range(seeded):
+                    own = seed + number * width + env.first + k
+                    right = self.played(env, k, own, None)
+                    shown = places[env.env_id, k, number]
+                    require(shown == right, "an episode", env.env_id, k, number, shown, right)
+        self.counts["episodes"] += len(places)
+
+    async def _queue(self, rng: Random) -> None:
+        """A queue of episodes, for any env of their entries."""
+        metas = {meta.env_id.rpartition("-")[0]: meta for meta in self.group.metas}
+        specs: list[EpisodeSpec] = []
+        for k in range(rng.randint(1, 8)):
+            name, options = rng.choice([*metas]), rng.choice([None, {"token": 1 + k}])
+            seed = 100 * k + rng.randrange(100)
+            specs.append(EpisodeSpec(metas[name].task, seed, options, name))
+        found = await self.done(evaluate(self.group, self.policy, specs))
+        keys = sorted(record.key for record in found.records)
+        require(keys == sorted(spec.key for spec in specs), "other episodes", keys)
+        for record in found.records:
+            env = self.by_id[record.env_id]
+            require(env.entry.name == record.entry, "an env of another entry", record)
+            if record.lost:
+                require(any(e.deaths for e in self.envs), "lost, and nothing has died", record)
+            if record.cause is None:
+                shown = record.total_reward, record.length
+                right = self.played(env, 0, record.seed, record.options)
+                require(shown == right, "an episode", record, right)
+            else:
+                require(record.total_reward is None, "a failure with a reward", record)
+        self.counts["episodes"] += len(specs)
+
+    def played(self, env: Env, k: int, seed: int, options: Any) -> tuple[float, int]:
+        """Return and length of an episode that is played alone."""
+        script = Script(env.codes[k], self.own_limit(env))
+        script.reset(seed, options)
+        total, length = 0.0, 0
+        while True:
+            reward, ended, cut, _ = script.step(*self.choose(script.words))
+            total, length = total + reward, length + 1
+            if ended or cut or length >= self.limit:
+                return total, length
+
+    async def finish(self) -> None:
+        await self.drain()
+        if not self.any_gone():
+            await self.op_evaluate(Random(1))
+        await super().finish()
+
+
+def _at(column: Any, place: tuple[int, ...]) -> Any:
+    for k in place:
+        column = element(column, k)
+    return column

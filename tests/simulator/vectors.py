@@ -1,0 +1,383 @@
+"""Programs of `VectorEnv` and `sb3.VecEnv`, as loops use them that know of no worker."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from functools import partial
+from importlib import import_module
+from random import Random
+from types import ModuleType
+from typing import Any, ClassVar
+from unittest import mock
+
+import numpy as np
+from gymnasium.error import ResetNeeded
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import iterate
+from simulator.model import Violation, require, same, sub_info
+from simulator.scripted import (
+    Scripted,
+    Stacked,
+    Words,
+    element,
+    encoded,
+    words_of,
+)
+from simulator.session import Session, stacked
+from simulator.trails import Trail, Transition, is_begun
+
+from rlightning_aio.errors import EnvFault, StartFailed, WorkerDied
+from rlightning_aio.vector import VectorEnv
+
+
+class Vectors(Session):
+    """A run of a program that steps a `VectorEnv`.
+
+    Attributes:
+        shown: the state that each row showed last; over: its episode has ended.
+    """
+
+    envs_: Any
+
+    def build(self) -> None:
+        """Nothing: making the envs starts them."""
+
+    def make(self, makers: list[Any], fields: dict[str, Any]) -> Any:
+        self.copies = "zero_copy" not in self.features
+        mode = AutoresetMode[self.mode.upper()]
+        return VectorEnv(makers, copy=self.copies, autoreset_mode=mode, **fields)
+
+    async def start(self) -> bool:
+        (plan,) = self.program.plans
+        self.mode = self.mode_of(plan.mode)
+        makers: list[Any] = []
+        for worker in range(plan.num_workers):
+            codes = plan.codes(0, worker)
+            tail = plan.layout, plan.controls
+            if plan.form == "stacked":
+                makers.append(partial(Stacked, codes, plan.mode, *tail))
+            else:
+                makers.append(partial(Scripted, codes[0], *tail))
+        fields = plan.config(0)
+        for name in ("name", "num_workers", "make_env", "min_results"):
+            fields.pop(name, None)
+        try:
+            self.rows = self.make(makers, fields)
+        except StartFailed as error:
+            self.count(error)
+            raise
+        self.group = self.rows.group
+        return True
+
+    def mode_of(self, mode: str) -> str:
+        """The autoreset mode: that of several together, or any."""
+        if self.program.plans[0].form == "stacked":
+            return mode
+        return Random(self.program.seed).choice(["next_step", "same_step", "disabled"])
+
+    async def close(self) -> None:
+        if hasattr(self, "rows"):
+            self.rows.close()
+
+    def begin(self) -> None:
+        (plan,) = self.program.plans
+        self.layout, self.controls = plan.layout, plan.controls
+        limit = float(plan.limit or np.inf)
+        self.env_of = [env for env in self.envs for _ in env.codes]
+        codes = [code for env in self.envs for code in env.codes]
+        either = isinstance(self, Singles)
+        self.trails = [Trail(code, limit, cut_or_ended=either) for code in codes]
+        self.shown: list[Words] = []
+        self.over = [False] * len(codes)
+        self.lost = [False] * len(codes)
+        self.breaks = 0
+        self.kept: list[tuple[Any, Any]] = []
+        self.is_whole = False
+        require(self.rows.num_envs == len(codes), "as many rows", self.rows.num_envs)
+
+    # -- operations
+
+    async def op_reset(self, rng: Random) -> None:
+        """Reset all."""
+        seed = rng.choice([None, rng.randrange(1000)])
+        self.is_whole = False
+        try:
+            observation, infos = self.reset_rows(seed)
+        except EnvFault as fault:
+            self.fail(fault)
+            return
+        words = self.words(observation)
+        self.say(f"   {words}")
+        for k, one in enumerate(words):
+            require(is_begun(one) and one.code == self.trails[k].code, "no reset", k, one)
+            seeded = seed is None or one.seed == seed + k + 1
+            require(seeded or self.has_cause(infos, k), "another seed", k, one)
+        self.shown, self.over, self.lost = words, [False] * len(words), [False] * len(words)
+        # What was not over is abandoned.
+        self.breaks += 1
+        self.is_whole = True
+        self.keep(observation)
+
+    def reset_rows(self, seed: int | None) -> tuple[Any, Any]:
+        return self.rows.reset(seed=seed)
+
+    async def op_step(self, rng: Random) -> None:
+        if not self.shown:
+            return
+        if any(self.lost):
+            await self.op_mask(rng)
+            if any(self.lost):
+                self.is_whole = False
+                await self.op_reset(rng)
+            return
+        acts = [self.act(rng, env, plain=self.plain) for env in self.env_of]
+        actions = self.actions([encoded(self.controls, *act) for act in acts])
+        if not self.is_whole:
+            with self.expected(ResetNeeded, "a step of envs that were not reset"):
+                self.step_rows(actions, rng)
+            return
+        self.is_whole = False
+        try:
+            found = self.step_rows(actions, rng)
+        except EnvFault as fault:
+            self.fail(fault)
+            return
+        self.is_whole = True
+        self.take(acts, found)
+
+    plain = False
+
+    def step_rows(self, actions: Any, rng: Random) -> Any:
+        if rng.random() < 0.5:
+            return self.rows.step(actions)
+        self.rows.step_async(actions)
+        return self.rows.step_wait()
+
+    async def op_mask(self, rng: Random) -> None:
+        """Reset those that are over, where nobody else does."""
+        if not self.is_whole or self.mode != "disabled" or self.program.plans[0].form == "stacked":
+            return
+        mask = np.array(self.over)
+        if not mask.any():
+            return
+        self.is_whole = False
+        try:
+            observation, _ = self.rows.reset(options={"reset_mask": mask})
+        except EnvFault as fault:
+            self.fail(fault)
+            return
+        self.is_whole = True
+        for k, one in enumerate(self.words(observation)):
+            if mask[k]:
+                require(is_begun(one), "no reset", k, one)
+            else:
+                require(one == self.shown[k], "a row that was not reset", k, one)
+            self.shown[k], self.over[k], self.lost[k] = one, False, False
+
+    async def op_call(self, rng: Random) -> None:
+        """Call a method of all."""
+        if self.program.plans[0].form == "stacked":
+            return
+        try:
+            values = self.rows.call("peek", 7)
+        except WorkerDied as fault:
+            self.fail(fault)
+            return
+        for k, (words, echo) in enumerate(values):
+            require(tuple(echo) == (7,), "another call's arguments", echo)
+            died = self.env_of[k].deaths > 0
+            require(
+                died or not self.is_whole or tuple(words[0]) == self.shown[k], "state", k, words
+            )
+
+    # -- checks
+
+    def fail(self, fault: EnvFault) -> None:
+        """Take an error; after that of a step or a reset, all rows must be reset."""
+        self.count(fault)
+        for one in (fault, *fault.others):
+            if isinstance(one, WorkerDied):
+                require(
+                    any(env.deaths for env in self.envs), "dead, and nothing has died", repr(one)
+                )
+                for env_id in one.env_ids:
+                    next(env for env in self.envs if env.env_id == env_id).gone = True
+
+    def has_cause(self, infos: Any, k: int) -> bool:
+        return bool(infos.get("_worker_restarted", np.zeros(k + 1, bool))[k])
+
+    def words(self, observation: Any) -> list[Words]:
+        each = iterate(self.rows.observation_space, observation)
+        return [words_of(self.layout, one) for one in each]
+
+    def results(self, found: Any) -> tuple[Any, Any, list[tuple[bool, bool]], list[Any]]:
+        """Observations, rewards, ends and infos of a step, of each row."""
+        observation, rewards, terminated, truncated, infos = found
+        rows = range(self.rows.num_envs)
+        ends = [(bool(terminated[k]), bool(truncated[k])) for k in rows]
+        return observation, rewards, ends, [sub_info(infos, k) for k in rows]
+
+    def actions(self, each: list[Any]) -> Any:
+        """The actions of all rows, as a loop passes them."""
+        return stacked(each)
+
+    def keep(self, observation: Any) -> None:
+        """Keep an observation, to see at the end that nobody wrote to it."""
+        if self.copies:
+            self.kept.append((observation, _copied(observation)))
+
+    def take(self, acts: list[Any], found: Any) -> None:
+        observation, rewards, ends, infos = self.results(found)
+        words = self.words(observation)
+        self.say(f"   {words} {ends}")
+        for k, one in enumerate(words):
+            self._row(k, acts[k], one, float(rewards[k]), ends[k], infos[k])
+            self.counts["rows"] += 1
+        self.keep(observation)
+
+    def _row(
+        self, k: int, act: Any, now: Words, reward: float, ends: tuple[bool, bool], info: Any
+    ) -> None:
+        env, trail, before = self.env_of[k], self.trails[k], self.shown[k]
+        died = "worker_restarted" in info
+        if died:
+            self.counts["died"] += 1
+            require(env.host.mortal and env.deaths > 0, "marked, and nothing has died", info)
+        trail.resumes = env.entry.every is not None
+        was_over, stays = self.over[k], self.mode == "disabled" and not died
+        self.over[k] = any(ends) or (was_over and stays)
+        self.shown[k] = now
+        if self.mode == "next_step" and was_over:
+            # Several that are stepped together are reset together, once more.
+            again = died and env.entry.form == "stacked"
+            require((reward, ends) == (0.0, (False, again)), "a reset", k, reward, ends)
+            require(is_begun(now) or died, "no reset", k, now)
+            return
+        after = now
+        if self.mode == "same_step" and any(ends):
+            require("final_obs" in info, "an end without final_obs", k, info)
+            after = words_of(self.layout, info["final_obs"])
+        if died:
+            require((reward, ends) == (0.0, (False, True)), "a lost step", k, reward, ends)
+            require(after == before, "another last observation", k, after, before)
+            if self.mode == "same_step":
+                require("worker_restarted" in info["final_info"], "final_info", info)
+            trail.last = None  # The episode ends with the step before.
+            self.lost[k] = self.mode == "disabled"
+            return
+        trail.allow(self.breaks + env.deaths)
+        trail.add(Transition(before, act, reward, *ends, after), goes_on=was_over and stays)
+
+    async def finish(self) -> None:
+        self.plain = True
+        for _ in range(6):
+            if any(env.gone for env in self.envs):
+                return
+            await self.op_reset(Random(1))
+            if self.is_whole:
+                await self.op_step(Random(1))
+            if self.is_whole:
+                return
+        raise Violation("the envs can't be used any more")
+
+    def end(self) -> None:
+        for observation, copies in self.kept:
+            require(same(observation, copies), "an observation was overwritten")
+
+
+class Singles(Vectors):
+    """A run of a program that steps an `sb3.VecEnv`."""
+
+    def make(self, makers: list[Any], fields: dict[str, Any]) -> Any:
+        self.copies = True
+        return VecEnv(makers, **fields)
+
+    def mode_of(self, mode: str) -> str:
+        return "same_step"
+
+    def reset_rows(self, seed: int | None) -> tuple[Any, Any]:
+        if seed is not None:
+            self.rows.seed(seed)
+        return self.rows.reset(), self.rows.reset_infos
+
+    def has_cause(self, infos: Any, k: int) -> bool:
+        return "worker_restarted" in infos[k]
+
+    def words(self, observation: Any) -> list[Words]:
+        rows = range(self.rows.num_envs)
+        return [words_of(self.layout, element(observation, k)) for k in rows]
+
+    def actions(self, each: list[Any]) -> Any:
+        return each if isinstance(each[0], dict) else stacked(each)
+
+    async def op_call(self, rng: Random) -> None:
+        """Call a method of all, or get an attribute."""
+
+    def results(self, found: Any) -> tuple[Any, Any, list[tuple[bool, bool]], list[Any]]:
+        observation, rewards, dones, infos = found
+        ends: list[tuple[bool, bool]] = []
+        each: list[Any] = []
+        for k, info in enumerate(infos):
+            cut = info["TimeLimit.truncated"]
+            require(not cut or dones[k], "cut, and not done", info)
+            # It says nothing of truncation where the env has terminated.
+            ends.append((bool(dones[k] and not cut), bool(cut)))
+            own = {name: info[name] for name in ("worker_restarted",) if name in info}
+            if dones[k]:
+                own |= {"final_obs": info["terminal_observation"], "final_info": info}
+            each.append(own)
+        return observation, rewards, ends, each
+
+
+class _Base:
+    """What `sb3.VecEnv` uses of its base class, where Stable-Baselines3 is not installed."""
+
+    metadata: ClassVar[dict[str, Any]] = {}
+
+    def __init__(self, num_envs: int, observation_space: Any, action_space: Any) -> None:
+        self.num_envs = num_envs
+        self.observation_space, self.action_space = observation_space, action_space
+        self.reset_infos: list[dict[str, Any]] = [{} for _ in range(num_envs)]
+        self._reset_seeds()
+        self._reset_options()
+
+    def _reset_seeds(self) -> None:
+        self._seeds: list[int | None] = [None] * self.num_envs
+
+    def _reset_options(self) -> None:
+        self._options: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+
+    def _get_indices(self, indices: Any) -> Any:
+        return range(self.num_envs) if indices is None else [indices]
+
+    def seed(self, seed: int) -> None:
+        self._seeds = [seed + k for k in range(self.num_envs)]
+
+    def step(self, actions: Any) -> Any:
+        self.step_async(actions)  # type: ignore[attr-defined]
+        return self.step_wait()  # type: ignore[attr-defined]
+
+
+def _vec_env() -> Any:
+    """Import `sb3.VecEnv`, with a base class of ours if there is no other."""
+    name = "stable_baselines3.common.vec_env.base_vec_env"
+    if importlib.util.find_spec("stable_baselines3") is not None:
+        return import_module("rlightning_aio.sb3").VecEnv
+    base = ModuleType(name)
+    vars(base)["VecEnv"] = _Base
+    with mock.patch.dict(sys.modules, {name: base}):
+        found = import_module("rlightning_aio.sb3").VecEnv
+    sys.modules.pop("rlightning_aio.sb3", None)
+    return found
+
+
+VecEnv = _vec_env()
+
+
+def _copied(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _copied(part) for key, part in value.items()}
+    if isinstance(value, tuple):
+        return tuple(map(_copied, value))
+    return value.copy() if isinstance(value, np.ndarray) else value
