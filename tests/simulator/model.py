@@ -295,8 +295,13 @@ class Env:
 
     def after_loss(self) -> list[State]:
         """The states in which a replacement may be: as saved, or newly built."""
-        loose = [state.copy() for state in self.loose]
-        return loose + ([save.copy() for save in self.saves] or [self.fresh()])
+        states = [state.copy() for state in self.loose]
+        states += [save.copy() for save in self.saves] or [self.fresh()]
+        marked = [state.copy() for state in states]  # Its mark may have been set since then.
+        for state in marked:
+            for sub, own in zip(state.scripts.subs, self.state.scripts.subs, strict=True):
+                sub.mark = own.mark
+        return states + marked
 
     def put_back(self, state: State) -> None:
         """Note a state that was restored."""
