@@ -297,6 +297,8 @@ class Evaluations(InContext):
                 await self.done(self.group.collect_async())
             except WorkerDied as fault:
                 self.lose(fault)
+            except EnvRaised as fault:  # In an env of this process.
+                require(fault.exception_type == "KeyboardInterrupt", "an error", repr(fault))
 
     def any_gone(self) -> bool:
         return any(env.gone for env in self.envs)
