@@ -189,7 +189,7 @@ class VecEnv(_Base):
                 "call reset(), or model.set_env(env), after which learn() begins with a reset"
             )
         if isinstance(self.action_space, gym.spaces.Dict | gym.spaces.Tuple):
-            pairs = zip(self.group.env_ids, actions, strict=True)
+            pairs = zip(self.group.env_ids, self._rows.action_list(actions), strict=True)
             each = [PolicyResponse(env_id, action) for env_id, action in pairs]
             responses = BatchedData(self.group.env_ids, each)
         else:

@@ -216,6 +216,39 @@ def test_a_method_of_some_envs_leaves_the_others_alone(make: Any) -> None:
     env.close()
 
 
+class Pushed(gym.Env[Any, Any]):
+    """Its action is a tree."""
+
+    observation_space = gym.spaces.Box(-9, 9, (2,), np.float64)
+    action_space = gym.spaces.Dict(
+        push=gym.spaces.Box(-1, 1, (2,), np.float64), times=gym.spaces.Discrete(5)
+    )
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        return np.zeros(2), {}
+
+    def step(self, action: Any) -> Any:
+        return action["push"] * action["times"], 0.0, False, False, {}
+
+
+@pytest.mark.parametrize("together", [1, 2])
+def test_actions_may_be_trees(together: int) -> None:
+    """One for each env, as in Stable-Baselines3, also for envs that are stepped together."""
+    from rlightning_aio.sb3 import VecEnv
+
+    def batch() -> Any:
+        return gym.vector.SyncVectorEnv([Pushed] * together, autoreset_mode=AutoresetMode.SAME_STEP)
+
+    envs = VecEnv([Pushed if together == 1 else batch] * (4 // together))
+    envs.reset()
+    actions = [{"push": np.array([0.5, k / 4]), "times": k} for k in range(4)]
+    found = envs.step(actions)[0]
+    assert found.tolist() == [(one["push"] * one["times"]).tolist() for one in actions]
+    with pytest.raises(ValueError, match="3 actions"):
+        envs.step(actions[:3])
+    envs.close()
+
+
 def test_a_step_limit_of_the_entry_ends_episodes() -> None:
     """In the step that reaches it, and again the same number of steps later."""
     from rlightning_aio.sb3 import VecEnv

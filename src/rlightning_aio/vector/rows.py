@@ -13,6 +13,7 @@ import numpy as np
 
 from rlightning_aio.batch.contents import reported_info_list, reported_infos, reported_sub_env_infos
 from rlightning_aio.batch.infos import listed
+from rlightning_aio.batch.stacking import stacked_values
 from rlightning_aio.envs.sub_envs import SEEDS
 from rlightning_aio.envs.wrappers import name_of
 from rlightning_aio.protocol.columns import leaves, mapped
@@ -105,6 +106,16 @@ class Singles:
         Raises:
             ValueError, TypeError: the number of actions is wrong.
         """
+        return actions
+
+    def action_list(self, actions: Sequence[Any]) -> Sequence[Any]:
+        """Arrange actions, one for each of `num_envs`, as one for each env of the group.
+
+        Raises:
+            ValueError: the number of actions is wrong, or they differ in structure.
+        """
+        if len(actions) != self.num_envs:
+            raise ValueError(f"{len(actions)} actions for num_envs={self.num_envs}")
         return actions
 
     def send_resets(
@@ -226,6 +237,11 @@ class Batches(Singles):
 
     def actions(self, actions: Any) -> Any:
         return mapped(self._folded, actions)
+
+    def action_list(self, actions: Sequence[Any]) -> Sequence[Any]:
+        each = super().action_list(actions)
+        firsts = range(0, self.num_envs, self._each)
+        return [stacked_values(list(each[k : k + self._each])) for k in firsts]
 
     def _folded(self, column: Any) -> NDArray[Any]:
         array = np.asarray(column)
