@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
-import sys
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from faults.striking import hear_of_interrupt, interrupt, press, struck
 from patience import HANG
 
 import rlightning_aio.sync
-from rlightning_aio.errors import EnvBusy
+from rlightning_aio.errors import EnvBusy, GroupClosed
 from rlightning_aio.vector.leftovers import drop_outstanding
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-    from pathlib import Path
-    from types import FrameType
 
     from rlightning_aio.batch import BatchedData
 
@@ -30,58 +30,9 @@ PLACES = {
     "inline": {"placement": "inline", "num_workers": 3},
     "workers": {"num_workers": 3, "envs_per_process": 2},
 }
+pytestmark = pytest.mark.usefixtures("python_raises")
 NUM_LINES = 3000
 """More lines than any of the calls below executes."""
-
-
-@pytest.fixture(autouse=True)
-def python_raises() -> Iterator[None]:
-    """Have Ctrl-C raise KeyboardInterrupt, also where the shell has it ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
-def press() -> None:
-    """Press Ctrl-C."""
-    signal.raise_signal(signal.SIGINT)
-
-
-def interrupt() -> None:
-    """Raise what a second Ctrl-C raises at once, also where the first one is held back."""
-    raise KeyboardInterrupt
-
-
-class Strike:
-    """A trace function that calls `strike` at the n-th line of this library."""
-
-    def __init__(self, line: int, strike: Callable[[], None]) -> None:
-        self.left = line
-        self.strike = strike
-
-    def __call__(self, frame: FrameType, event: str, arg: Any) -> Any:
-        return self._line if "/rlightning_aio/" in frame.f_code.co_filename else None
-
-    def _line(self, frame: FrameType, event: str, arg: Any) -> Any:
-        if event == "line":
-            self.left -= 1
-            if self.left == 0:
-                self.strike()
-        return self._line
-
-
-def struck(line: int, call: Callable[[], object], how: Callable[[], None] = press) -> bool:
-    """Make a call with Ctrl-C at that line; return True if the line was reached."""
-    strike, interrupted = Strike(line, how), False
-    sys.settrace(strike)
-    try:
-        call()
-    except KeyboardInterrupt:
-        interrupted = True
-    finally:
-        sys.settrace(None)
-    assert interrupted == (strike.left <= 0)
-    return interrupted
 
 
 def step(group: Any, batch: BatchedData) -> None:
@@ -116,7 +67,9 @@ def test_a_group_goes_on_wherever_a_call_was_interrupted(
         expected = np.array([alone.reset(seed=7 + k)[0] for k in range(count)])
         batch, _ = group.reset(seed=7)
         for line in range(1, NUM_LINES, 23):
-            reached = struck(line, lambda last=batch: use(group, last))
+            reached, interrupted, _ = struck(line, lambda last=batch: use(group, last))
+            if reached and not interrupted:
+                hear_of_interrupt(group)
             drop_outstanding(group)
             batch, _ = group.reset(seed=7)
             np.testing.assert_array_equal(batch.observation, expected)
@@ -136,7 +89,8 @@ def test_a_group_can_be_closed_wherever_a_second_ctrl_c_interrupts_its_step(line
     entry = {**ENTRY, "num_workers": 2, "envs_per_process": 1}
     with rlightning_aio.sync.build_env_group(entry) as group:
         batch, _ = group.reset(seed=0)
-        struck(line, lambda: step(group, batch), interrupt)
+        reached, interrupted, _ = struck(line, lambda: step(group, batch), interrupt)
+        assert interrupted == reached
 
 
 class Pressing(gym.Env[Any, Any]):
@@ -251,3 +205,72 @@ def test_an_env_is_free_again_after_a_call_that_was_interrupted(
                 assert time.monotonic() < until
             else:
                 break
+
+
+def test_an_interrupt_names_the_env_that_was_waited_for() -> None:
+    """And `close` then names the env that hangs."""
+    entry = {"name": "a", "make_env": Waiting, "num_workers": 3, "envs_per_process": 3}
+    group = rlightning_aio.sync.build_env_group(entry)
+    group.init()
+    group.reset()
+    with pytest.raises(KeyboardInterrupt) as caught:
+        group["a-1"].call("wait", os.getpid(), "/never")
+    (note,) = caught.value.__notes__
+    assert re.fullmatch(r"no reply yet from a-1 \(for \d\.\d s\)", note)
+    with pytest.warns(UserWarning, match="did not close in time and was killed; a-1 owed a reply"):
+        group.close()
+
+
+def test_an_interrupted_start_names_the_envs_that_have_not_started() -> None:
+    entry = {"name": "a", "make_env": Starting, "num_workers": 10, "envs_per_process": 10}
+    group = rlightning_aio.sync.build_env_group(entry)
+    with pytest.raises(KeyboardInterrupt) as caught:
+        group.init()
+    names = ", ".join(f"a-{k}" for k in range(8))
+    assert caught.value.__notes__ == [f"not started yet: {names} and 2 more"]
+
+
+def trainer_of_worker() -> int:
+    """Return the parent of this worker's fork server."""
+    return int(Path(f"/proc/{os.getppid()}/stat").read_text().rpartition(")")[2].split()[1])
+
+
+class Starting(Waiting):
+    """Presses Ctrl-C in the trainer while it is made, and goes on making itself."""
+
+    def __init__(self) -> None:
+        self.wait(trainer_of_worker(), "/never")
+
+
+class Closing(Waiting):
+    """Presses Ctrl-C in the trainer while it is closed, and goes on closing."""
+
+    def close(self) -> None:
+        self.wait(trainer_of_worker(), "/never")
+
+
+def test_an_interrupted_close_does_all_that_a_close_does(tmp_path: Path) -> None:
+    """A timeline that was begun is written."""
+    group = rlightning_aio.sync.build_env_group({"name": "a", "make_env": Closing})
+    group.init()
+    group.trace(tmp_path / "timeline.json").start()
+    with pytest.raises(KeyboardInterrupt):
+        group.close()
+    assert (tmp_path / "timeline.json").exists()
+    group.close()
+
+
+def test_an_interrupt_after_the_last_result_is_raised_when_the_group_is_closed() -> None:
+    """Not before."""
+    entry = {**ENTRY, **PLACES["workers"]}
+    group = rlightning_aio.sync.build_env_group(entry)
+    group.init()
+    interrupted, line = True, 2
+    while interrupted:  # At last, Ctrl-C comes too late for the reset to raise it.
+        drop_outstanding(group)
+        _, interrupted, _ = struck(line, group.reset, held_back=True)
+        line += 20
+    with pytest.raises(KeyboardInterrupt):
+        group.close()
+    with pytest.raises(GroupClosed):
+        group.reset()

@@ -511,6 +511,9 @@ class FakeGroup:
     def read(self) -> None:
         """See `hosts.base.Watcher`: there is nothing to read."""
 
+    def check_interrupt(self) -> None:
+        """See `hosts.base.Watcher`: nobody interrupts it."""
+
     def wake(self) -> None:
         """See `hosts.base.Watcher.wake`."""
         for running in self.running:

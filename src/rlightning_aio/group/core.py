@@ -145,6 +145,11 @@ class Core:
             self.waiting.poll()  # Results that are ready are no longer outstanding.
         return self.supervisor.workers.describe(now_ns)
 
+    def awaited(self, now: float) -> str:
+        """Say which envs a call waits for."""
+        self.waiting.poll()
+        return self.supervisor.workers.awaited(int(now * 1e9))
+
     # -- requests ---------------------------------------------------------------------
 
     def step_async(self, batch: BatchedData, now: float) -> None:
@@ -280,6 +285,7 @@ class Core:
                 self._first_observations.check(parts)
                 self._conditions.note(FIRST_RESULTS, bool(self._first_observations.left))
             flags = [False] * len(slots) if judged.is_cut is None else judged.is_cut.tolist()
+            self.parts.watcher.check_interrupt()
             self.stats.account(parts, synchronous=synchronous)
             self.continuity.returned(slots, flagged, judged)
             self.results.let_go(slots)

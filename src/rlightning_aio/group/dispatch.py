@@ -63,11 +63,11 @@ class Dispatch:
             if self._requests.owner[slot] != NOBODY or not self._end_call(slot):
                 break
         if slot is not None:
-            why = "its last request was not collected; collect it first"
+            why = "its last request was not collected; collect it first, with collect_async"
             if self._requests.owner[slot] == NOBODY:
                 why = "a call that was cancelled still runs in it; try again when that has ended"
             elif self._requests.state[slot] == State.BUSY:
-                why = "its last request has not replied yet; collect it first"
+                why = "its last request has not replied yet; collect it first, with collect_async"
             raise EnvBusy(f"can't {what} {self._envs.describe(slot)}: {why}; nothing was sent")
 
     def _end_call(self, slot: int) -> bool:

@@ -268,8 +268,9 @@ class Requests:
         return int(slots[np.flatnonzero(states)[0]]) if np.count_nonzero(states) else None
 
     def owed(self, slots: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Return the slots of `slots` whose replies are outstanding."""
-        return slots[self.state[slots] == _BUSY_CODE]
+        """Return the slots of `slots` whose replies are outstanding, the oldest request first."""
+        busy = slots[self.state[slots] == _BUSY_CODE]
+        return busy[np.argsort(self.sent_ns[busy], kind="stable")]
 
     def ready(self, slots: NDArray[np.intp]) -> NDArray[np.intp]:
         """Return the slots of `slots` whose results are ready."""

@@ -274,9 +274,11 @@ class Steps:
         try:
             out_of_band = host.step_now()
         except BaseException as error:
-            if isinstance(error, KeyboardInterrupt):
+            fault = self._intake.raised(0, ErrorText.of(error))
+            if isinstance(error, KeyboardInterrupt):  # The step has ended, too: see `InlineHost`.
+                self._requests.collector.note_faults([fault])
                 raise
-            raise self._intake.raised(0, ErrorText.of(error)) from None
+            raise fault from None
         if out_of_band:
             self._results.keep_at_once(0, out_of_band)
         self._requests.answer_at_once(0)
@@ -380,6 +382,7 @@ class Steps:
             if flagged or is_cut is not None:
                 results.add_episodes(part)
             batch = batch_of_results(parts, self._core, slots, part.names, results.sources(slots))
+            self._watcher.check_interrupt()
             self._stats.account(parts, synchronous=synchronous)
             continuity.returned(slots, flagged, judged)
             if self._inline is not None:

@@ -269,7 +269,11 @@ class Supervisor:
             was_built = record.stage is not Stage.BUILDING
             record.stage = Stage.CLOSED
             # The start error of a host that was killed while it started is known already.
+            owed = self._requests.owed(np.array(record.slots, np.intp))
             for index, error in completion.errors if was_built else ():
+                if len(owed) and error.type_name == "WorkerDied":
+                    late = self._envs.env_ids[owed.item(0)]
+                    error = replace(error, text=f"{error.text}; {late} owed a reply")  # noqa: PLW2901
                 env_id = self._envs.env_ids[record.host.first_slot + index]
                 self.close_errors.append((env_id, error))
 

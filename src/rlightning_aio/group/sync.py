@@ -3,9 +3,10 @@
 It runs the same core as the asynchronous group, without an event loop and without a thread, so it
 works in a script, in a thread, and in a notebook cell whose loop is running.
 
-Rule: Ctrl-C never stops a call between two changes of the group's state. It is raised where the
-call waits or runs an env in this process, or else once the call has done what it can without
-waiting; a second one is raised at once.
+Rule: Ctrl-C never stops a call between two changes of the group's state, nor takes its result. It
+is raised where the call waits or runs an env in this process, or once the call has done what it can
+without waiting, before it hands out results. If it comes after that, the call returns, and the next
+one raises it. A second one is raised at once.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import threading
 import time
 from functools import partial
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Self, TypeVar, TypeVarTuple
 
 from rlightning_aio.errors import RLightningError
 from rlightning_aio.group.facade import forked_from, only_result, steps_of, this_process
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from types import FrameType
 
     from rlightning_aio.batch import BatchedData
+    from rlightning_aio.group.plan import Plan
     from rlightning_aio.group.wait import Procedure
     from rlightning_aio.hosts.base import Source
     from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
@@ -41,6 +43,7 @@ if TYPE_CHECKING:
 __all__ = ["EnvGroup", "EnvHandle", "ServerHandle", "SyncDriver"]
 
 T = TypeVar("T")
+A = TypeVarTuple("A")
 
 # The functions of `signal` take ten times as long, because they make enums.
 _signal: Any = import_module("_signal")
@@ -52,17 +55,19 @@ class SyncDriver:
     """Watches sources with one persistent epoll, and runs procedures until they return."""
 
     def __init__(self) -> None:
-        # The queue of completions, and the function that applies them; set by the group.
+        # The queue of completions, the function that applies them, and the one that names the envs
+        # for which a call waits; set by the group.
         self.completions: Sized = ()
         self.drain: Callable[[], None]
+        self.awaited: Callable[[float], str]
         self._epoll: select.epoll | None = None
         self._sources: dict[int, Source] = {}
         self._descriptors: dict[Source, int] = {}
         self._pid = os.getpid()
         # The thread that is in a call now; 0 if none is.
         self._thread = 0
-        # Ctrl-C may be raised; there was one when it could not be.
-        self._is_interruptible = self._is_interrupted = False
+        # Ctrl-C may be raised; there was one when it could not be; the next call raises it.
+        self._is_interruptible = self._is_interrupted = self._was_interrupted = False
 
     def check_caller(self) -> None:
         """Check the thread as `facade.Driver` says; signal handlers of the waiting thread pass."""
@@ -120,46 +125,64 @@ class SyncDriver:
         Raises:
             RLightningError: another thread is using the group, or it belongs to another process.
         """
-        outermost, holds_back = self._enter()
+        return self.call(self._run, procedure)
+
+    def run_last(self, procedure: Procedure[None]) -> None:
+        """Run the procedure that closes the group; raise an earlier interrupt after that."""
+        was_interrupted, self._was_interrupted = self._was_interrupted, False
+        self.run(procedure)
+        if was_interrupted:
+            raise KeyboardInterrupt
+
+    def _run(self, procedure: Procedure[T]) -> T:
         try:
             wait = procedure.send(None)  # pyright: ignore[reportArgumentType]
             while True:
                 try:
-                    if self._is_interrupted:
-                        self._raise_interrupt()
                     if wait is not TURN:  # No other procedure can run.
                         self._block(wait.until)
                         if self.completions:
                             self.drain()
+                    self.check_interrupt()
                 except BaseException as error:
+                    if isinstance(error, KeyboardInterrupt):
+                        error.add_note(self.awaited(time.monotonic()))
                     # Thrown, as a closed generator couldn't wait while cleaning up.
                     wait = procedure.throw(error)
                 else:
                     wait = procedure.send(time.monotonic())
         except StopIteration as stop:
             return stop.value
-        finally:
-            self._leave(outermost, holds_back)
 
-    def call(self, function: Callable[..., None], *args: Any) -> None:
-        """Call a function that doesn't wait; errors are those of `run`."""
-        outermost, holds_back = self._enter()
+    def call(self, function: Callable[[*A], T], *args: *A) -> T:
+        """Call a function of the group; errors are those of `run`.
+
+        Of an interrupt that it has not raised, the next call hears: it must not take a result or an
+        error. Where there is none of these, it is raised at once.
+        """
+        state = self._enter()
         try:
-            function(*args)
+            result = function(*args)
         finally:
-            self._leave(outermost, holds_back)
+            self._leave(*state)
+        if result is None and self._was_interrupted:
+            self._was_interrupted = False
+            raise KeyboardInterrupt
+        return result
 
     # -- one thread at a time, and Ctrl-C ---------------------------------------------
 
-    def _enter(self) -> tuple[bool, bool]:
-        """Begin a call. Return True if it is no call within another, and True if it holds back
-        Ctrl-C; a program that handles SIGINT in its own way goes on doing so.
+    def _enter(self) -> tuple[bool, bool, bool]:
+        """Begin a call.
+
+        Returns True if it is no call within another; True if it holds back Ctrl-C, as a program
+        that handles SIGINT in its own way goes on doing so; and True if it was allowed before.
         """
         me = threading.get_ident()
         # No function call before the assignment, so no other thread can run in between.
         if this_process[0] != self._pid or self._thread not in (0, me):
             raise self._refusal()
-        outermost = not self._thread
+        outermost, was_interruptible = not self._thread, self._is_interruptible
         try:
             self._thread = me
             holds_back = (
@@ -168,42 +191,55 @@ class SyncDriver:
                 and _signal.getsignal(_SIGINT) is signal.default_int_handler
             )
             if holds_back:
-                self._is_interruptible = self._is_interrupted = False
+                if self._was_interrupted:
+                    self._was_interrupted = False
+                    raise KeyboardInterrupt
+                self._is_interrupted = False
                 _signal.signal(_SIGINT, self._on_interrupt)
+            self._is_interruptible = False
         except BaseException:  # Ctrl-C, just before it is held back.
             if outermost:
                 self._thread = 0
             raise
-        return outermost, holds_back
+        return outermost, holds_back, was_interruptible
 
-    def _leave(self, outermost: bool, holds_back: bool) -> None:
+    def _leave(self, outermost: bool, holds_back: bool, was_interruptible: bool) -> None:
+        self._is_interruptible = was_interruptible
         if outermost:
             self._thread = 0
         if holds_back:
-            if _signal.getsignal(_SIGINT) == self._on_interrupt:  # An env may have set another.
-                _signal.signal(_SIGINT, signal.default_int_handler)
-            if self._is_interrupted:
-                self._raise_interrupt()
+            try:
+                self._stop_holding_back()
+            except KeyboardInterrupt:  # It came before the call could return.
+                self._is_interrupted = True
+                self._stop_holding_back()
+            # Nothing is called from here on, so Python handles no signal before the call returns.
+            self._was_interrupted, self._is_interrupted = self._is_interrupted, False
+
+    def _stop_holding_back(self) -> None:
+        if _signal.getsignal(_SIGINT) == self._on_interrupt:  # An env may have set another.
+            _signal.signal(_SIGINT, signal.default_int_handler)
 
     def _on_interrupt(self, number: int, frame: FrameType | None) -> None:
         """Handle Ctrl-C during a call."""
         del number, frame
         if self._is_interruptible or self._is_interrupted:
-            self._raise_interrupt()
+            self._is_interrupted = False
+            raise KeyboardInterrupt
         self._is_interrupted = True
 
-    def _raise_interrupt(self) -> None:
-        self._is_interrupted = False
-        raise KeyboardInterrupt
+    def check_interrupt(self) -> None:
+        if self._is_interrupted:
+            self._is_interrupted = False
+            raise KeyboardInterrupt
 
     def interruptible(self, execute: Callable[[], T]) -> T:
-        self._is_interruptible = True
+        before, self._is_interruptible = self._is_interruptible, True
         try:
-            if self._is_interrupted:  # A moment ago.
-                self._raise_interrupt()
+            self.check_interrupt()  # Of a moment ago.
             return execute()
         finally:
-            self._is_interruptible = False
+            self._is_interruptible = before
 
     # -- waiting ----------------------------------------------------------------------
 
@@ -238,12 +274,16 @@ class EnvGroup(GroupInterface):
             batch, _ = group.reset(seed=0)
 
     Each method blocks the calling thread until it is done. Ctrl-C raises KeyboardInterrupt, leaves
-    outstanding results to `collect_async`, and the group remains usable (docs/faults.md). Any
-    thread may use the group, one at a time: a call while another thread is in one raises
-    RLightningError.
+    outstanding results to `collect_async`, and the group remains usable (docs/faults.md). If it
+    comes while results are being handed out, the next call raises it. Any thread may use the group,
+    one at a time: a call while another thread is in one raises RLightningError.
     """
 
     _driver: SyncDriver
+
+    def __init__(self, plan: Plan) -> None:
+        super().__init__(plan)
+        self._driver.awaited = self._core.awaited
 
     def _new_driver(self) -> SyncDriver:
         return SyncDriver()
@@ -319,8 +359,10 @@ class EnvGroup(GroupInterface):
         self._driver.run(self._core.calls.call_all(time.monotonic(), "reload"))
 
     def close(self) -> None:
-        self._driver.run(self._core.close(time.monotonic()))
-        self._closed()
+        try:
+            self._driver.run_last(self._core.close(time.monotonic()))
+        finally:
+            self._closed()
 
 
 class EnvHandle(EnvHandleInterface):
@@ -333,10 +375,14 @@ class EnvHandle(EnvHandleInterface):
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> EnvRet | MultiAgentEnvRet:
         seeds = None if seed is None else [seed]
-        return only_result(self._group.reset(seeds, options, [self.env_id]))
+        return self._only(partial(self._group.reset, seeds, options, [self.env_id]))
 
     def step(self, response: PolicyResponse | Any) -> EnvRet | MultiAgentEnvRet:
-        return only_result(self._group.step(steps_of(self.env_id, response)))
+        return self._only(partial(self._group.step, steps_of(self.env_id, response)))
+
+    def _only(self, ask: Callable[[], Any]) -> EnvRet | MultiAgentEnvRet:
+        """Return the only result of `ask`; a Ctrl-C after the reply doesn't take it."""
+        return self._driver.call(lambda: only_result(ask()))
 
     def call(self, name: str, /, *args: Any, **kwargs: Any) -> Any:
         slot = self._core.envs.find_one(self._env_id)
@@ -355,7 +401,11 @@ class ServerHandle(ServerHandleInterface, EnvHandle):
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> list[EnvRet | MultiAgentEnvRet]:
         procedure = self._core.reset_members(time.monotonic(), self._server, seed, options)
-        return self._driver.run(procedure)[0].values()
+
+        def results() -> list[EnvRet | MultiAgentEnvRet]:
+            return self._driver.run(procedure)[0].values()
+
+        return self._driver.call(results)
 
 
 def build_env_group(

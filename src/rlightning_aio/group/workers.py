@@ -23,6 +23,7 @@ __all__ = ["Workers"]
 
 _log = logging.getLogger("rlightning_aio")
 
+_MOST_LISTED: Final = 8
 _STATES: Final = {
     Stage.NEW: "new",
     Stage.UP: "up",
@@ -56,7 +57,6 @@ class Workers:
         env_ids, requests = self._envs.env_ids, self._requests
         slots = np.array(record.slots, np.intp)
         busy = requests.owed(slots)
-        busy = busy[np.argsort(requests.sent_ns[busy], kind="stable")]
         lost = record.slots if record.stage is Stage.FAILED else sorted(record.lost_slots)
         return {
             "entry": record.config.name,
@@ -68,6 +68,20 @@ class Workers:
             "owed_seconds": (now_ns - int(requests.sent_ns[busy[0]])) / 1e9 if len(busy) else 0.0,
             "restarts": record.restarts,
         }
+
+    def awaited(self, now_ns: int) -> str:
+        """Name the envs that have not started, or else those that owe a reply, the oldest first.
+
+        `now_ns` is from the monotonic clock.
+        """
+        starting = [r for r in self._records if r.stage.value < Stage.UP.value]
+        if starting:
+            names = [self._envs.env_ids[slot] for record in starting for slot in record.slots]
+            return f"not started yet: {_listed(names)}"
+        env_ids, sent_ns = self._envs.env_ids, self._requests.sent_ns
+        busy: list[int] = self._requests.owed(np.arange(len(self._envs))).tolist()
+        names = [f"{env_ids[k]} (for {(now_ns - sent_ns.item(k)) / 1e9:.1f} s)" for k in busy]
+        return f"no reply yet from {_listed(names)}" if names else "no env owes a reply"
 
     def summary(self) -> str:
         """Summarise entries, envs, placement and worker processes in one line."""
@@ -92,6 +106,11 @@ class Workers:
         text = hint(configs, workers, num_cores, latency_us)
         if text is not None:
             _log.info("%s; `rlightning-aio tune` measures what is best", text)
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _MOST_LISTED} more" if len(names) > _MOST_LISTED else ""
+    return ", ".join(names[:_MOST_LISTED]) + more
 
 
 def _entry(records: Sequence[HostRecord]) -> str:

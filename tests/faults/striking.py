@@ -1,0 +1,81 @@
+"""Ctrl-C at a chosen line of this library, in a call of a synchronous group."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import FrameType
+
+
+def press() -> None:
+    """Press Ctrl-C."""
+    signal.raise_signal(signal.SIGINT)
+
+
+def interrupt() -> None:
+    """Raise what a second Ctrl-C raises at once, also where the first one is held back."""
+    raise KeyboardInterrupt
+
+
+class Strike:
+    """A trace function that calls `strike` at the n-th line of this library.
+
+    Attributes:
+        left: lines until then; 0 afterwards.
+    """
+
+    def __init__(self, line: int, strike: Callable[[], None], *, held_back: bool) -> None:
+        self.left = line
+        self._strike = strike
+        self._held_back = held_back
+
+    def __call__(self, frame: FrameType, event: str, arg: Any) -> Any:
+        return self._line if "/rlightning_aio/" in frame.f_code.co_filename else None
+
+    def _line(self, frame: FrameType, event: str, arg: Any) -> Any:
+        if event == "line" and self.left and self._counts():
+            self.left -= 1
+            if not self.left:
+                self._strike()
+        return self._line
+
+    def _counts(self) -> bool:
+        return (
+            not self._held_back or signal.getsignal(signal.SIGINT) is not signal.default_int_handler
+        )
+
+
+def struck(
+    line: int,
+    call: Callable[[], Any],
+    how: Callable[[], None] = press,
+    *,
+    held_back: bool = False,
+) -> tuple[bool, bool, Any]:
+    """Make a call with Ctrl-C at that line, counting only lines where it is held back, or all.
+
+    Returns True if the line was reached, True if the call was interrupted, and what it returned.
+    """
+    strike, interrupted, returned = Strike(line, how, held_back=held_back), False, None
+    sys.settrace(strike)
+    try:
+        returned = call()
+    except KeyboardInterrupt:
+        interrupted = True
+    finally:
+        sys.settrace(None)
+    reached = strike.left == 0
+    assert reached or not interrupted
+    return reached, interrupted, returned
+
+
+def hear_of_interrupt(group: Any) -> None:
+    """Check that the next call raises an interrupt that the last one has not raised."""
+    with pytest.raises(KeyboardInterrupt):
+        group.collect_async()
