@@ -11,6 +11,7 @@ import functools
 import json
 import logging
 import math
+import os
 import re
 import signal
 import sys
@@ -150,11 +151,18 @@ class ResultStream:
             return None
         try:
             return method(*args)
-        except BrokenPipeError:
-            raise
         except OSError as error:
+            self._discard_rest()
+            if isinstance(error, BrokenPipeError):
+                raise
             self._is_lost = True
             raise ConfigError(f"stdout: results can't be written: {error.strerror}") from error
+
+    def _discard_rest(self) -> None:
+        """Let the stream's end, which writes what it still holds, succeed."""
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, self._stream.fileno())
+        os.close(null)
 
 
 @contextlib.contextmanager
