@@ -80,7 +80,7 @@ class Plan:
             kwargs = {"layout": self.layout, "controls": self.controls}
             kwargs["first_code"] = self.codes(number, 0)[0]
             return found | {
-                "backend": "scripted", "task": "-", "imports": ["simulator.scripted"],
+                "backend": "simulated", "task": "-", "imports": ["simulator.scripted"],
                 "env_kwargs": kwargs,
             }  # fmt: skip
         make = MAKERS[self.form]

@@ -590,7 +590,7 @@ class Stacked(_Body, gym.vector.VectorEnv[Any, Any, Any]):
         return (self._stacked(found.words, faults), *head, self._joined(infos))
 
 
-@ENVS.register("scripted")
+@ENVS.register("simulated")
 class ScriptedBase(BaseEnv):
     """A script as an env of this package; a response's `shift` is added to the token."""
 
