@@ -173,7 +173,7 @@ def collector_of_infos(value: Any, infos: Any) -> Any:
 @pytest.mark.parametrize("value", [True, np.False_, 0.5, np.float32(0.5), np.array(1)])
 def test_an_info_becomes_a_column_that_is_nan_where_it_is_missing(value: Any) -> None:
     group, collector = collector_of_infos(value, ["success", "absent"])
-    with group, group.auto_reset():
+    with group, group.auto_reset(), pytest.warns(match="'absent'"):
         rollout = collector.collect()
     assert rollout.done.any()
     np.testing.assert_array_equal(rollout.success, np.where(rollout.done, float(value), np.nan))
@@ -190,6 +190,36 @@ def test_an_info_that_is_not_a_number_raises(value: Any) -> None:
         for _ in range(2):
             with pytest.raises(ValueError, match=r"info 'success' .* one number"):
                 collector.collect()
+
+
+def test_an_info_that_no_env_reports_is_warned_of_once() -> None:
+    """At the end of the first rollout with an episode that has ended, with the names there are."""
+    group, collector = collector_of_infos(True, ["sucess", "success"])
+    with group, group.auto_reset():
+        with pytest.raises(UserWarning, match=r"no info has had 'sucess'.*mean 'success'"):
+            collector.collect()  # Warnings are errors here; they lose nothing.
+        rollouts = [collector.collect() for _ in range(2)]
+    lengths = [episode.length for rollout in rollouts for episode in rollout.episodes]
+    assert rollouts[0].first[0]
+    assert sum(lengths) <= 120
+    assert rollouts[0].success[rollouts[0].done].all()
+
+
+def test_infos_that_come_later_or_from_some_entries_only_are_not_warned_of() -> None:
+    """Nothing is known before an episode has ended."""
+    entries = [
+        {"name": name, "make_env": maker, "placement": "inline"}
+        for name, maker in (
+            ("judged", lambda: Judged(1.0)),
+            ("plain", lambda: gym.make("CartPole-v1")),
+        )
+    ]
+    with sync.build_env_group(entries) as group, group.auto_reset():
+        policies = {"judged": zeros, "plain": zeros}
+        collector = Collector(group, policies, num_transitions=6, infos=["success"], seed=0)
+        while not (rollout := collector.collect())["judged"].done.any():
+            pass
+    assert rollout["judged"].success[rollout["judged"].done].all()
 
 
 def test_infos_with_the_name_of_a_rollouts_column_raise() -> None:

@@ -8,6 +8,7 @@ next `collect` continues there; `Newest` says which of them are old by then.
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast, overload
@@ -21,6 +22,7 @@ from rlightning_aio.errors import EnvBusy, EnvFault, NothingPending
 from rlightning_aio.group.aio import EnvGroup as AsyncEnvGroup
 from rlightning_aio.group.newest import newest_of
 from rlightning_aio.group.sync import EnvGroup as SyncEnvGroup
+from rlightning_aio.registry import did_you_mean
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence
@@ -82,7 +84,8 @@ class Collector(Generic[G, R]):
             sum of ``min_results`` of the config entries, or 1.
         wait_all: collect blocks ``[T, N]``.
         infos: names of numbers in infos, such as ``("success",)``. Each becomes a float64 column
-            of the rollout, NaN where the info of a transition has no such number.
+            of the rollout, NaN where the info of a transition has no such number. A name that no
+            info has had when the first episode ends is warned of.
         seed: of the first reset; see `EnvGroup.reset`.
 
     Attributes:
@@ -143,6 +146,7 @@ class Collector(Generic[G, R]):
         self.policy_version = 0
         self._group = group
         self._infos = infos
+        self._are_infos_known = not infos
         self._policy: Any = policy
         self._policies: Mapping[str, Callable[[BatchedData], Any]] | None = (
             policy if isinstance(policy, Mapping) else None
@@ -436,7 +440,23 @@ class Collector(Generic[G, R]):
         part.kind.staging.note_sent()
         self._clock.note_answered(part.batch)
 
+    def _warn_of_unknown_infos(self) -> None:
+        """Warn once of names in `infos` that no env has reported up to the end of an episode."""
+        stagings = [kind.staging for kind in self._kinds.values()]
+        if not self._are_infos_known and any(staging.episodes for staging in stagings):
+            self._are_infos_known = True
+            found = set[str]().union(*(staging.info_names for staging in stagings))
+            for name in set(self._infos) - found:
+                known = ", ".join(map(repr, sorted(found))) or "nothing"
+                warnings.warn(
+                    f"no info has had {name!r}, one of Collector(infos=…), up to the end of the "
+                    "first episode, so its column holds NaN; "
+                    + (did_you_mean(name, found) or f"infos had {known}"),
+                    stacklevel=2,
+                )
+
     def _full(self) -> R:
+        self._warn_of_unknown_infos()
         seconds = self._clock.seconds()
         waiting = {id(part.kind): part.results for part in self._unanswered}
         found = {
