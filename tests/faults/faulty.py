@@ -214,6 +214,12 @@ FAULTS: dict[str, Callable[[], object]] = {
     "interrupt": lambda: (os.kill(os.getpid(), signal.SIGINT), time.sleep(60)),
     "generator exit": _raise(GeneratorExit),
     "stop iteration": _raise(StopIteration, 1),
+    "group of one": _raise(
+        ExceptionGroup,
+        "unhandled errors in a TaskGroup",
+        [ExceptionGroup("inner", [KeyError("the task")])],
+    ),
+    "debug": breakpoint,
     "surrogates": _raise(ValueError, "\udcff"),
     "a megabyte": _raise(ValueError, "x" * 2**20),
     "broken pipe": _raise(BrokenPipeError, "the simulator's, not ours"),

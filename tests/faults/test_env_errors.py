@@ -44,6 +44,7 @@ RAISED = {
     "interrupt": ("KeyboardInterrupt", ""),
     "generator exit": ("GeneratorExit", ""),
     "stop iteration": ("StopIteration", "1"),
+    "group of one": ("KeyError", "'the task'"),
     "surrogates": ("ValueError", "\udcff"),
     "a megabyte": ("ValueError", "x" * 2**20),
     "broken pipe": ("BrokenPipeError", "the simulator's, not ours"),
@@ -119,6 +120,19 @@ def test_an_error_of_a_reset_is_reported_and_the_next_reset_works(start: Start) 
         group.call("faulty-1", "arm", "resetting", "nothing")
         group.reset()
         tokens.check(group.step(tokens.steps(group.group.env_ids))[0])
+
+
+@on_one_driver
+def test_a_debugger_in_a_worker_says_where_it_has_a_terminal(build: Start) -> None:
+    """In a step, and while the env is built."""
+    group, tokens = build(two_workers()), Tokens()
+    group.init()
+    group.reset()
+    where = r"a worker has no terminal: debug with placement='inline'"
+    with pytest.raises(EnvRaised, match=rf"raised in step: bdb.BdbQuit \({where}\)"):
+        group.step(tokens.steps(group.group.env_ids, {"faulty-1": "debug"}))
+    with pytest.raises(StartFailed, match=rf"could not be built: bdb.BdbQuit \({where}\)"):
+        build(entry(env_kwargs={"faults": {"building": "debug"}})).init()
 
 
 @on_one_driver

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rlightning_aio.errors import EnvHung, StartFailed, WorkerDied
+from rlightning_aio.hosts.base import Killable
 from rlightning_aio.protocol.entries import Operation, slot_of
 
 if TYPE_CHECKING:
@@ -15,7 +16,8 @@ if TYPE_CHECKING:
     from rlightning_aio.group.env_table import EnvTable
     from rlightning_aio.group.host_record import HostRecord
     from rlightning_aio.group.requests import Requests
-    from rlightning_aio.hosts.messages import Death
+    from rlightning_aio.hosts.base import Host
+    from rlightning_aio.hosts.messages import Death, ErrorText
 
 __all__ = [
     "DeathReport",
@@ -24,6 +26,7 @@ __all__ = [
     "death_report",
     "late_fault",
     "start_fault",
+    "without_terminal",
 ]
 
 
@@ -95,6 +98,13 @@ def _doing(requests: Requests, slot: int) -> str:
     if op in (Operation.STEP, Operation.RESET, Operation.SNAPSHOT, Operation.RESTORE):
         return f"a {Operation(op).name.lower()}"
     return f"a call of {method}()" if method else "a call"
+
+
+def without_terminal(error: ErrorText, host: Host) -> str:
+    """A hint for the error of a debugger in a worker; empty for any other error."""
+    if error.type_name != "bdb.BdbQuit" or not isinstance(host, Killable):
+        return ""
+    return " (a worker has no terminal: debug with placement='inline')"
 
 
 @dataclass(frozen=True)

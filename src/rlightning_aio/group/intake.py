@@ -13,6 +13,7 @@ import numpy as np
 
 from rlightning_aio.errors import EnvAway, EnvRaised
 from rlightning_aio.group.continuity import Report
+from rlightning_aio.group.fault_messages import without_terminal
 from rlightning_aio.group.request_states import COLLECTOR
 from rlightning_aio.group.supervisor import GivenUp, Replaced
 from rlightning_aio.hosts.messages import (
@@ -128,6 +129,7 @@ class Intake:
         """Make the error for the current request of `slot`, which ended in `error`."""
         cause = self._continuity.raised(slot)
         after = f" (its worker {cause}, and was replaced)" if cause else ""
+        after += without_terminal(error, self._supervisor.hosts[self._requests.hosts.item(slot)])
         op = self._requests.numbering.op(slot)
         doing = Operation(op).name.lower()
         go_on = "reset the env to go on"

@@ -24,6 +24,7 @@ from rlightning_aio.group.fault_messages import (
     death_report,
     late_fault,
     start_fault,
+    without_terminal,
 )
 from rlightning_aio.group.hang_detector import HangDetector, has_news
 from rlightning_aio.group.host_record import HostRecord, Stage
@@ -306,8 +307,8 @@ class Supervisor:
             self._fail_start(ConfigError(error.text))
             return
         fault = StartFailed(
-            f"{self._envs.describe(slot)} could not be built: {error.summary}; its "
-            f"__cause__ is the remote traceback",
+            f"{self._envs.describe(slot)} could not be built: {error.summary}"
+            f"{without_terminal(error, record.host)}; its __cause__ is the remote traceback",
             env_id=self._envs.env_ids[slot],
         )
         fault.__cause__ = RemoteTraceback(error.traceback)

@@ -24,16 +24,11 @@ class ErrorText:
 
     @classmethod
     def of(cls, error: BaseException) -> ErrorText:
-        """Describe `error` in plain text, even if methods of its class raise."""
-        kind = type(error)
-        name = _plain(_NAME.__get__(kind))
-        module = _MODULE.__get__(kind)
-        if isinstance(module, str) and module != "builtins":
-            name = f"{_plain(module)}.{name}"
-        try:
-            text = _plain(str(error))
-        except BaseException as broken:  # noqa: BLE001  # It is the author's code, as below.
-            text = f"<its __str__ raised {_plain(_NAME.__get__(type(broken)))}>"
+        """Describe `error` in plain text, even if methods of its class raise.
+
+        A group of one exception is described as that exception.
+        """
+        name, text = _described(error)
         try:
             lines = _plain("".join(traceback.format_exception(error)))
         except BaseException:  # noqa: BLE001
@@ -42,6 +37,34 @@ class ErrorText:
         return cls(name, text, lines)
 
 
+def _described(error: BaseException) -> tuple[str, str]:
+    """Return the name of the class of `error`, and its text."""
+    parts = _parts_of(error)
+    if len(parts) == 1:
+        return _described(parts[0])
+    kind = type(error)
+    name = _plain(_NAME.__get__(kind))
+    module = _MODULE.__get__(kind)
+    if isinstance(module, str) and module != "builtins":
+        name = f"{_plain(module)}.{name}"
+    try:
+        text = _plain(str(error))
+    except BaseException as broken:  # noqa: BLE001  # It is the author's code, as above.
+        text = f"<its __str__ raised {_plain(_NAME.__get__(type(broken)))}>"
+    if parts:
+        named = [": ".join(filter(None, _described(part))) for part in parts[:_MOST_PARTS]]
+        text += ": " + "; ".join(named + ["…"] * (len(parts) > _MOST_PARTS))
+    return name, text
+
+
+def _parts_of(error: BaseException) -> tuple[BaseException, ...]:
+    """Return the exceptions in a group of exceptions; any other has none."""
+    return _PARTS.__get__(error) if issubclass(type(error), BaseExceptionGroup) else ()
+
+
+_MOST_PARTS: Final = 3
+"""Exceptions of a group that are named."""
+_PARTS: Final[Any] = vars(BaseExceptionGroup)["exceptions"]
 _NAME: Final[Any] = vars(type)["__qualname__"]
 _MODULE: Final[Any] = vars(type)["__module__"]
 _TRACEBACK: Final[Any] = vars(BaseException)["__traceback__"]
