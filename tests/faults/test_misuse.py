@@ -179,6 +179,18 @@ USES: dict[str, Callable[[Any], Any]] = {
 }
 
 
+def test_options_for_each_env_are_refused_with_the_way_to_give_them(build: Start) -> None:
+    """They would reach each env as a whole. Nothing is sent."""
+    group = build(two_workers())
+    group.init()
+    options: Any = [{"level": k} for k in range(4)]
+    for reset in (group.reset, group.reset_async):
+        with pytest.raises(TypeError, match=r"options must be a dict.*not a list.*env_ids="):
+            reset(options=options)
+    assert group.group.pending == []
+    group.reset(options={"fault": "nothing"})
+
+
 def test_use_before_init_and_after_close_is_refused(build: Start) -> None:
     """It doesn't hang, and the error says what to do."""
     group = build(entry())

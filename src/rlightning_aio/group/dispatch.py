@@ -5,6 +5,7 @@ Rule: all or nothing. All checks are done and all arguments packed before the fi
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -109,8 +110,13 @@ class Dispatch:
             raise BadAction(str(error)) from error
 
     def packed_resets(
-        self, slots: NDArray[np.intp], seeds: NDArray[np.int64], options: dict[str, Any]
+        self, slots: NDArray[np.intp], seeds: NDArray[np.int64], options: Any
     ) -> list[Any]:
+        if not isinstance(options, Mapping):
+            raise TypeError(
+                f"options must be a dict, which each env gets, not a {type(options).__name__}; for "
+                "options of its own, reset an env by itself: reset(options={…}, env_ids=[env_id])"
+            )
         packed: list[Any] = []
         for slot, seed in zip(slots.tolist(), seeds.tolist(), strict=True):
             given = (None if seed == NO_SEED else seed, options)

@@ -239,14 +239,14 @@ class Facade:
 
         Args:
             seed: as for `reset`.
-            options: passed to each env.
+            options: a dict, passed to each env.
             env_ids: the envs to reset; None for all local ones and all connected clients.
 
         Raises (before anything is sent):
             EnvBusy: an env has a reply outstanding, or appears twice.
             UnknownEnv: no env of this group has that id.
             ValueError: a seed is not an int from 0 to 2**62 - 1, or there isn't one for each env.
-            TypeError: the options can't be sent to a worker or a client.
+            TypeError: the options are no dict, or can't be sent to a worker or a client.
             WorkerDied, EnvHung: an env's worker is gone and is not replaced.
             GroupClosed: the group was not initialised, or is closed.
             RLightningError: another thread is using the group, or it belongs to another loop.

@@ -49,7 +49,7 @@ class GroupInterface(Facade):
         Args:
             seed: env k of the group gets ``seed + k`` (k counts sub-environments); a sequence
                 gives one seed for each env, a mapping seeds by id.
-            options: passed to each env.
+            options: a dict, passed to each env.
             env_ids: the envs to reset; the results have this order. None: all local envs, then
                 the clients of env_servers, after waiting until enough have joined.
 
@@ -61,7 +61,7 @@ class GroupInterface(Facade):
             EnvBusy: an env has a reply outstanding, or appears twice; nothing was sent.
             UnknownEnv: no env of this group has that id.
             ValueError: a seed is not an int from 0 to 2**62 - 1, or there isn't one for each env.
-            TypeError: the options can't be sent to a worker or a client.
+            TypeError: the options are no dict, or can't be sent to a worker or a client.
             TimeoutError: too few clients of an env_server have joined in time.
             EnvRaised, WorkerDied, EnvHung, EnvAway: an env failed, or its client is away; the
                 others' results are in the error's ``results``.
