@@ -1,15 +1,20 @@
-"""The hint that a group logs once about slow settings."""
+"""The hints that a group logs about slow settings, each once."""
 
 from __future__ import annotations
 
 import logging
+import time
+from dataclasses import dataclass, field
+from typing import Any
 from unittest.mock import patch
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
 from rlightning_aio import EnvConfig, sync
-from rlightning_aio.group.hint import HINT_AFTER_BATCHES, hint
+from rlightning_aio.group.hint import HINT_AFTER_BATCHES, Hints, hint
+from rlightning_aio.group.host_record import HostRecord
 from rlightning_aio.group.stats import Stats
 
 
@@ -61,3 +66,177 @@ def test_the_hint_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
             for _ in range(2 * HINT_AFTER_BATCHES + 10):
                 batch, _ = group.step(batch.respond(np.zeros(1, np.int64)))
     assert len([r for r in caplog.records if "rlightning-aio tune" in r.getMessage()]) == 1
+
+
+MS = 1_000_000
+
+
+@dataclass
+class Worker:
+    """A host, and what the kernel's accounts say of its threads."""
+
+    first_slot: int
+    num_envs: int
+    ran: int | None = 10 * MS
+    queued: int = 0
+    host_id: int = 0
+
+    def processor_times(self) -> tuple[int, int] | None:
+        return None if self.ran is None else (self.ran, self.queued)
+
+
+@dataclass
+class Machine:
+    """Two workers of a group, and the measurements of its results, in place of `Stats`.
+
+    `at_ns` is the time.
+    """
+
+    per_worker: int = 4
+    num_batches: int = 0
+    at_ns: int = 5 * MS
+    steps: list[tuple[int, int, int]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        count = self.per_worker
+        self.workers = [Worker(0, count), Worker(count, count)]
+        config = entry(num_workers=2 * count)
+        self.records = [HostRecord(worker, config) for worker in self.workers]
+        self.hints = Hints(self.records)
+
+    def executed(self, since_ns: int) -> Any:
+        return np.array([step for step in self.steps if step[1] >= since_ns]).reshape(-1, 3).T
+
+    def summary(self) -> Any:
+        return {"latency_us": {}}
+
+    def look(self, num_cores: int = 2) -> None:
+        with patch.object(time, "monotonic_ns", lambda: self.at_ns):
+            self.hints.look(self, num_cores)
+
+    def step_all(self, times: int, busy: int, *, ran: int, queued: int = 0, idle: int = 0) -> None:
+        """Let each worker step its envs, one after the other; times in ns, of one step."""
+        for _ in range(times):
+            for k in range(self.per_worker):
+                for worker in self.workers:
+                    slot = worker.first_slot + k
+                    self.steps.append((slot, self.at_ns, self.at_ns + busy))
+                    worker.ran = (worker.ran or 0) + ran
+                    worker.queued += queued
+                self.at_ns += busy
+            self.at_ns += idle
+
+
+def warned(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [r.getMessage() for r in caplog.records if r.levelno == logging.WARNING]
+
+
+@pytest.mark.parametrize("queued", [0, 70 * MS], ids=["alone", "on a busy machine"])
+def test_envs_that_share_workers_and_wait_get_one_warning(
+    queued: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It has the setting, and comes before each env has made twenty steps."""
+    machine = Machine()
+    machine.look()
+    for _ in range(3):
+        machine.step_all(8, 10 * MS + queued, ran=MS, queued=queued)
+        machine.look()
+    (text,) = warned(caplog)
+    assert "entry 'pole': 4 envs share each worker" in text
+    assert "10 % of their time keeps a core busy" in text
+    assert "set envs_per_process: 1 (in VectorEnv, envs_per_process=1)" in text
+
+
+def test_many_envs_that_wait_need_not_have_a_worker_each(caplog: pytest.LogCaptureFixture) -> None:
+    """Thirty-two on two cores: sixteen workers are eight for each core."""
+    machine = Machine(per_worker=16)
+    machine.look()
+    machine.step_all(8, 10 * MS, ran=MS)
+    machine.look()
+    assert "envs_per_process: 2" in warned(caplog)[0]
+
+
+OTHERS: dict[str, dict[str, Any]] = {
+    "they compute": {"ran": 9 * MS},
+    "they compute on a busy machine": {"ran": MS, "queued": 9 * MS},
+    "they compute half of the time": {"ran": 5 * MS},
+    "their trainer is slow": {"ran": MS, "idle": 400 * MS},
+}
+
+
+@pytest.mark.parametrize("case", OTHERS)
+def test_other_envs_that_share_workers_get_no_warning(
+    case: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    machine = Machine()
+    machine.look()
+    for _ in range(3):
+        machine.step_all(8, 10 * MS, **OTHERS[case])
+        machine.look()
+    assert not warned(caplog)
+
+
+def test_too_few_measurements_are_no_reason(caplog: pytest.LogCaptureFixture) -> None:
+    """Of few steps, of short ones, without accounts, or of a worker that was replaced."""
+    few, short, unknown, replaced, alone = (Machine(k) for k in (1, 4, 4, 4, 1))
+    few.workers[0].num_envs = 2
+    unknown.workers[1].ran = None
+    for machine in (few, short, unknown, replaced, alone):
+        machine.look()
+    few.step_all(4, 100 * MS, ran=MS)
+    short.step_all(8, MS // 10, ran=MS // 100)
+    replaced.step_all(8, 10 * MS, ran=MS)
+    replaced.records[0].restarts += 1
+    alone.step_all(32, 10 * MS, ran=MS)
+    for machine in (few, short, unknown, replaced, alone):
+        machine.look()
+    assert not warned(caplog)
+    replaced.step_all(8, 10 * MS, ran=MS)
+    replaced.look()
+    assert len(warned(caplog)) == 1
+
+
+def test_envs_that_wait_at_the_same_time_get_no_warning(caplog: pytest.LogCaptureFixture) -> None:
+    """Awaitable ones."""
+    machine = Machine()
+    machine.look()
+    machine.step_all(8, 10 * MS, ran=MS)
+    machine.steps = [(slot, begun - 8 * MS * (slot % 4), end) for slot, begun, end in machine.steps]
+    machine.look()
+    assert not warned(caplog)
+
+
+def test_a_look_comes_early_and_then_ever_more_rarely() -> None:
+    machine = Machine()
+    found: list[float] = []
+    while machine.hints.due < float("inf"):
+        found.append(machine.hints.due)
+        machine.look()
+    assert found == [8, 16, 32, 64, 128, 256, 512, HINT_AFTER_BATCHES]
+
+
+class Sleeper(gym.Env[Any, Any]):
+    """Waits in each step."""
+
+    observation_space = action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        return 0, {}
+
+    def step(self, action: Any) -> Any:
+        time.sleep(0.02)
+        return 0, 0.0, False, False, {}
+
+
+def test_envs_that_truly_wait_get_the_warning(caplog: pytest.LogCaptureFixture) -> None:
+    """A sleep takes hardly any time of a core, however slow the machine is."""
+    config = {"name": "bed", "make_env": Sleeper, "num_workers": 2, "envs_per_process": 2}
+    with sync.build_env_group(config) as group:
+        batch, _ = group.reset()
+        while not warned(caplog):
+            batch, _ = group.step(batch.respond(action=np.zeros(2, np.int64)))
+        for _ in range(40):
+            batch, _ = group.step(batch.respond(action=np.zeros(2, np.int64)))
+    (text,) = warned(caplog)
+    assert "entry 'bed': 2 envs share each worker" in text
+    assert "envs_per_process: 1" in text

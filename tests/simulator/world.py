@@ -49,6 +49,7 @@ from simulator.sockets import Epoll, Loop, Sockets, run_in_process
 
 from rlightning_aio import sharing
 from rlightning_aio.hosts import awaiting
+from rlightning_aio.hosts import process as process_hosts
 from rlightning_aio.protocol import exchange, kernel, rings
 
 if TYPE_CHECKING:
@@ -171,6 +172,7 @@ class World:
 
     def _replacements(self) -> list[tuple[Any, str, Any]]:
         nothing = lambda *_: 0  # noqa: E731
+        nothing_known = lambda _: None  # noqa: E731
         cores = set(range(self._cores))
         scripted = sys.modules.get("simulator.scripted")
         return [
@@ -193,6 +195,7 @@ class World:
             (os, "sched_getaffinity", lambda _: cores),
             (os, "sched_setaffinity", nothing),
             (sharing, "_time_limit", lambda _: None),
+            (process_hosts, "processor_times", nothing_known),
             # Each process has a heap of its own, so these would act on one that is small.
             (gc, "collect", nothing),
             (gc, "freeze", nothing),

@@ -23,7 +23,6 @@ from rlightning_aio.group.calls import Calls
 from rlightning_aio.group.conditions import FIRST_RESULTS
 from rlightning_aio.group.dispatch import Dispatch
 from rlightning_aio.group.first_observations import FirstObservations
-from rlightning_aio.group.hint import HINT_AFTER_BATCHES
 from rlightning_aio.group.intake import Intake
 from rlightning_aio.group.newest import Newest
 from rlightning_aio.group.request_states import COLLECTOR, NOBODY, State
@@ -293,8 +292,8 @@ class Core:
         except BaseException:
             self.requests.put_back(slots)
             raise
-        if self.stats.num_batches == HINT_AFTER_BATCHES:
-            self.give_hint()
+        if self.stats.num_batches >= self.supervisor.hints.due:
+            self.give_hints()
         if observer is not None:
             observer.after_results(noted, parts)
         if self._arrivals.held_back:
@@ -303,10 +302,9 @@ class Core:
             self.newest.note_returned(batch)
         return batch, flags
 
-    def give_hint(self) -> None:
+    def give_hints(self) -> None:
         """Log if the measured times suggest other settings."""
-        latency_us = self.stats.summary()["latency_us"]
-        self.supervisor.workers.give_hint(self.parts.poller.num_cores, latency_us)
+        self.supervisor.hints.look(self.stats, self.parts.poller.num_cores)
 
     def _batch(
         self,

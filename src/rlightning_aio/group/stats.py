@@ -209,6 +209,22 @@ class Stats:
             "latency_us": self._latencies(samples),
         }
 
+    def executed(
+        self, since_ns: int
+    ) -> tuple[NDArray[np.intp], NDArray[np.int64], NDArray[np.int64]]:
+        """Return when envs executed what they began after `since_ns`, at most a window of it.
+
+        Slots, beginnings and ends (ns of the monotonic clock), in the order of the results.
+        """
+        samples = [sample for sample in self._samples if sample.at_ns >= since_ns]
+        if not samples:
+            nothing = np.zeros(0, np.int64)
+            return nothing, nothing, nothing
+        slots = np.concatenate([sample.slots for sample in samples])
+        done, busy = np.concatenate([sample.times for sample in samples]).T
+        later = done - busy >= since_ns
+        return slots[later], (done - busy)[later], done[later]
+
     def _window(self) -> list[_Sample]:
         if not self._samples:
             return []

@@ -18,7 +18,6 @@ import numpy as np
 from rlightning_aio.batch.data import BatchedData, answer_of, batch_of_results
 from rlightning_aio.group.actions import number_limits, write_column
 from rlightning_aio.group.conditions import UNLIKE_ENVS
-from rlightning_aio.group.hint import HINT_AFTER_BATCHES
 from rlightning_aio.group.supervisor import LOOK_SECONDS
 from rlightning_aio.group.wait import ANY, TURN, Procedure
 from rlightning_aio.hosts.messages import ErrorText
@@ -88,6 +87,7 @@ class Steps:
         self._results = core.results
         self._continuity = tables.continuity
         self._stats = core.stats
+        self._hints = parts.supervisor.hints
         self._intake = core.intake
         self._waiting = core.waiting
         self._fence = exchange.new_fence()
@@ -391,6 +391,6 @@ class Steps:
         except BaseException:
             requests.put_back(slots)
             raise
-        if self._stats.num_batches == HINT_AFTER_BATCHES:
-            self._core.give_hint()
+        if self._stats.num_batches >= self._hints.due:
+            self._core.give_hints()
         return batch, [False] * len(slots) if is_cut is None else is_cut.tolist()

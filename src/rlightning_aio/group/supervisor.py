@@ -27,6 +27,7 @@ from rlightning_aio.group.fault_messages import (
     without_terminal,
 )
 from rlightning_aio.group.hang_detector import HangDetector, has_news
+from rlightning_aio.group.hint import Hints
 from rlightning_aio.group.host_record import HostRecord, Stage
 from rlightning_aio.group.members import Members
 from rlightning_aio.group.shutdown import Shutdown
@@ -119,7 +120,7 @@ class Supervisor:
         hosts: in the order of their slots.
         members: the envs that join and leave.
         detector: finds workers that hang.
-        shutdown: ends the hosts; workers: describes them.
+        shutdown: ends the hosts; workers: describes them; hints: on their number.
         metas: one for each local env, and for each host that envs join; empty before the start.
         any_deaths: a worker died, and its replacement has not completed a step yet.
         close_errors: env id and error of each env whose `close` raised.
@@ -158,6 +159,7 @@ class Supervisor:
         self.detector = HangDetector(self._records, self._requests, self._observed)
         self.shutdown = Shutdown(self._lifetime, self._records, self.resources, self._layout, arena)
         self.workers = Workers(self._records, self._envs, self._requests)
+        self.hints = Hints(self._records)
         self._start_fault: Exception | None = None
         self._now = 0.0
         self._any_given_up = False

@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-import logging
-from collections import Counter
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from rlightning_aio.group.hint import hint
 from rlightning_aio.group.host_record import Stage
 from rlightning_aio.registry import placement_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from rlightning_aio.group.env_table import EnvTable
     from rlightning_aio.group.host_record import HostRecord
     from rlightning_aio.group.requests import Requests
 
 __all__ = ["Workers"]
-
-_log = logging.getLogger("rlightning_aio")
 
 _MOST_LISTED: Final = 8
 _STATES: Final = {
@@ -89,23 +84,6 @@ class Workers:
         for record in self._records:
             entries.setdefault(record.config.name, []).append(record)
         return "; ".join(f"{name}: {_entry(own)}" for name, own in entries.items())
-
-    def give_hint(self, num_cores: int, latency_us: Mapping[str, Mapping[str, Any]]) -> None:
-        """Log at INFO if the measured times suggest other settings.
-
-        Args:
-            num_cores: cores that this process and its workers may use.
-            latency_us: from `EnvGroup.get_stats`.
-        """
-        workers = Counter(
-            record.config.name
-            for record in self._records
-            if record.killable is not None and record.is_local
-        )
-        configs = [record.config for record in self._records]
-        text = hint(configs, workers, num_cores, latency_us)
-        if text is not None:
-            _log.info("%s; `rlightning-aio tune` measures what is best", text)
 
 
 def _listed(names: Sequence[str]) -> str:

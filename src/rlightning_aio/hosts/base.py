@@ -31,6 +31,7 @@ __all__ = [
     "Host",
     "HostFactory",
     "Killable",
+    "Measured",
     "Membership",
     "Polled",
     "SharesThread",
@@ -149,6 +150,15 @@ class Host(Protocol):
 
     def release(self) -> None:
         """Release descriptors and memory immediately; no completion follows. Idempotent."""
+        ...
+
+
+@runtime_checkable
+class Measured(Protocol):
+    """A host whose envs are in a process of this machine."""
+
+    def processor_times(self) -> tuple[int, int] | None:
+        """Return the ns for which its threads have run, and have waited for a core, or None."""
         ...
 
 

@@ -30,6 +30,7 @@ from rlightning_aio.hosts.fork_messages import (
 from rlightning_aio.hosts.fork_server import BOOTSTRAP
 from rlightning_aio.hosts.link import Link
 from rlightning_aio.hosts.messages import Closed, Death, Died, ErrorText, WorkerPlace
+from rlightning_aio.hosts.processor_times import processor_times
 from rlightning_aio.hosts.standard_streams import occupy_standard_streams
 from rlightning_aio.protocol.entries import number_of, slot_of
 from rlightning_aio.protocol.frames import FrameKind
@@ -380,6 +381,9 @@ class ProcessHost:
 
     def executing(self) -> tuple[int, int]:
         return (0, 0) if self._link is None else self._link.executing()
+
+    def processor_times(self) -> tuple[int, int] | None:
+        return None if self.pid is None else processor_times(self.pid)
 
     @property
     def traffic(self) -> int:
