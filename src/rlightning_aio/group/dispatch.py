@@ -110,9 +110,9 @@ class Dispatch:
             raise BadAction(str(error)) from error
 
     def packed_resets(
-        self, slots: NDArray[np.intp], seeds: NDArray[np.int64], options: Any
+        self, slots: NDArray[np.intp], seeds: NDArray[np.int64], options: dict[str, Any]
     ) -> list[Any]:
-        if not isinstance(options, Mapping):
+        if not isinstance(cast("object", options), Mapping):
             raise TypeError(
                 f"options must be a dict, which each env gets, not a {type(options).__name__}; for "
                 "options of its own, reset an env by itself: reset(options={…}, env_ids=[env_id])"
