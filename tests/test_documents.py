@@ -18,9 +18,19 @@ PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md"), *(ROOT / "benchmarks").
 PACKAGE = ROOT / "src" / "rlightning_aio"
 # Internal packages; other modules export what users need.
 INTERNAL = {"batch", "cli", "config", "envs", "group", "hosts", "protocol", "registry", "sharing"}
-INTERNAL |= {"files", "piper", "sealing", "types", "video", "__init__", "__main__"}
+INTERNAL |= {"files", "json_text", "piper", "sealing", "types", "video", "__init__", "__main__"}
 # "The words" of ARCHITECTURE.md.
-WORDS = {"config", "errors", "files", "registry", "sealing", "sharing", "spaces", "types"}
+WORDS = {
+    "config",
+    "errors",
+    "files",
+    "json_text",
+    "registry",
+    "sealing",
+    "sharing",
+    "spaces",
+    "types",
+}
 
 
 def named(page: Path) -> str:

@@ -24,6 +24,7 @@ from websockets.frames import Frame, Opcode
 import rlightning_aio as rl
 from rlightning_aio.envs.openenv_session import get_json, post_json
 from rlightning_aio.serving import OpenEnvServer
+from rlightning_aio.spaces import Anything
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
@@ -133,6 +134,49 @@ async def test_invalid_messages_do_not_change_the_session() -> None:
                 assert (await ask('{"type": "reset"}'))["type"] == "observation"
                 return
         pytest.fail("the session's env was not given back")
+
+
+class Unstable(gym.Env[Any, Any]):
+    """Its observations hold NaN and infinity; action 1 has a reward of NaN."""
+
+    observation_space = Anything()
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        observation = {"place": np.array([1, np.nan, np.inf], np.float32), "note": [-math.inf]}
+        return observation, {"speed": np.float64("nan"), "spread": np.full(2, np.nan)}
+
+    def step(self, action: Any) -> Any:
+        observation, info = self.reset()
+        return observation, math.nan if action else 1.0, False, False, info
+
+
+@on_asyncio
+async def test_its_frames_are_json() -> None:
+    """NaN and infinity of observations and infos are null; such a reward is an error."""
+
+    def loaded(text: str | bytes) -> Any:
+        return json.loads(text, parse_constant=pytest.fail)
+
+    async def ask(kind: str, **data: Any) -> Any:
+        await socket.send(json.dumps({"type": kind, "data": data}))
+        return loaded(await socket.recv())
+
+    entry = {"name": "unstable", "make_env": Unstable, "placement": "inline"}
+    async with (
+        rl.build_env_group(entry) as served,
+        OpenEnvServer(served, "unstable", "127.0.0.1", 0) as server,
+        connect(server.url.replace("http", "ws") + "/ws", proxy=None) as socket,
+    ):
+        for kind, data in (("reset", {"episode_id": math.nan}), ("step", {"action": 0})):
+            reply = (await ask(kind, **data))["data"]
+            assert reply["observation"] == {"place": [1.0, None, None], "note": [None]}
+            assert reply["metadata"] == {"speed": None, "spread": [None, None]}
+        assert (await ask("state"))["data"]["episode_id"] is None
+        refused = (await ask("step", action=1))["data"]
+        assert refused["code"] == "EXECUTION_ERROR"
+        assert "reward of env 'unstable-0' is nan" in refused["message"]
+        assert loaded((await server._post("/mcp", b'{"id": NaN}'))[1])["id"] is None
 
 
 async def rpc(server: OpenEnvServer, method: str, **params: Any) -> Any:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import uuid
 from collections import deque
 from functools import partial
@@ -28,6 +29,7 @@ from websockets.http11 import Response
 from rlightning_aio.envs.openenv_session import keep_alive_by_system
 from rlightning_aio.envs.post_connection import PostConnection
 from rlightning_aio.errors import ConfigError, RLightningError
+from rlightning_aio.json_text import json_of
 from rlightning_aio.protocol.columns import as_array, is_dict, is_tuple
 from rlightning_aio.spaces import Anything
 
@@ -137,7 +139,7 @@ class OpenEnvServer:
         answers = {"/health": self._health, "/metadata": self._metadata, "/schema": self._schema}
         found = answers.get(path)
         status = HTTPStatus.NOT_FOUND if found is None else HTTPStatus.OK
-        body = _not_found(path) if found is None else json.dumps(found()).encode()
+        body = _not_found(path) if found is None else json_of(found()).encode()
         headers = {"Content-Type": "application/json", "Content-Length": str(len(body))}
         return Response(status, status.phrase, Headers(headers), body)
 
@@ -166,7 +168,7 @@ class OpenEnvServer:
             answer = _rpc_error(None, _PARSE_ERROR, "Parse error")
         else:
             answer = self._rpc(request, None)
-        return HTTPStatus.OK, json.dumps(answer).encode()
+        return HTTPStatus.OK, json_of(answer).encode()
 
     # -- sessions -----------------------------------------------------------------
 
@@ -291,7 +293,7 @@ class OpenEnvServer:
                 if reply is None:
                     await _send_error(socket, "UNKNOWN_TYPE", f"Unknown message type: {kind}")
                 else:
-                    await socket.send(json.dumps({"type": reply[0], "data": reply[1]}))
+                    await socket.send(json_of({"type": reply[0], "data": reply[1]}))
 
     async def _reply(
         self, session: _Session, kind: Any, data: dict[str, Any]
@@ -319,7 +321,7 @@ class OpenEnvServer:
 
 
 def _not_found(path: str) -> bytes:
-    return json.dumps({"detail": f"there is no {path}; sessions are at /ws"}).encode()
+    return json_of({"detail": f"there is no {path}; sessions are at /ws"}).encode()
 
 
 def _rpc_result(number: Any, **result: Any) -> dict[str, Any]:
@@ -333,11 +335,15 @@ def _rpc_error(number: Any, code: int, message: str, **data: Any) -> dict[str, A
 
 async def _send_error(socket: ServerConnection, code: str, message: str, **more: Any) -> None:
     data = {"message": message, "code": code, **more}
-    await socket.send(json.dumps({"type": "error", "data": data}))
+    await socket.send(json_of({"type": "error", "data": data}))
 
 
 def _observed(ret: Any) -> dict[str, Any]:
-    """A result as the data of OpenEnv's observation message."""
+    """A result as the data of OpenEnv's observation message; NaN and infinity become null.
+
+    Raises:
+        RLightningError: the reward is not finite.
+    """
     observation = _jsonable(ret.observation)
     if not isinstance(observation, dict):
         observation = {"observation": observation}
@@ -345,11 +351,12 @@ def _observed(ret: Any) -> dict[str, Any]:
     if ret.last_truncated:
         metadata["truncated"] = True
     done = bool(ret.last_terminated or ret.last_truncated)
-    data: dict[str, Any] = {
-        "observation": observation,
-        "reward": float(ret.last_reward),
-        "done": done,
-    }
+    reward = float(ret.last_reward)
+    if not math.isfinite(reward):  # As null it would be taken for no reward.
+        raise RLightningError(
+            f"the reward of env {ret.env_id!r} is {reward}, which JSON has no number for"
+        )
+    data: dict[str, Any] = {"observation": observation, "reward": reward, "done": done}
     return {**data, "metadata": metadata} if metadata else data
 
 

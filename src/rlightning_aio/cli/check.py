@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -15,6 +14,7 @@ from rlightning_aio.cli.options import Config, Overrides
 from rlightning_aio.cli.terminal import counted, out, print_json, run_interruptible
 from rlightning_aio.config import check_installed, load_config
 from rlightning_aio.errors import ConfigError
+from rlightning_aio.json_text import json_of
 from rlightning_aio.registry import ENVS
 
 if TYPE_CHECKING:
@@ -145,7 +145,7 @@ def _lines(found: _Finding) -> list[str]:
     if found.skipped is not None:
         return [head, f"  not started: {found.skipped}"]
     if found.offers is not None:
-        return [head, *json.dumps(found.offers, indent=2).splitlines()]
+        return [head, *json_of(found.offers, indent=2).splitlines()]
     limit = found.max_episode_steps
     return [
         head,

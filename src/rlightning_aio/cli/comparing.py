@@ -17,6 +17,7 @@ from rlightning_aio.cli.option_files import naming_option
 from rlightning_aio.cli.terminal import count, named_columns, print_table
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.files import check_folder, check_regular, write_file
+from rlightning_aio.json_text import json_of
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -124,7 +125,7 @@ def save(name: str, document: dict[str, Any]) -> None:
         ConfigError: it can't be written.
     """
     with naming_option("--save", _path(name)):
-        write_file(_path(name), json.dumps(document, indent=2).encode())
+        write_file(_path(name), json_of(document, indent=2).encode())
 
 
 def compared(name: str, document: dict[str, Any]) -> Comparison:

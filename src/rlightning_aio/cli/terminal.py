@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import json
 import logging
 import math
 import os
 import re
 import signal
 import sys
-from typing import TYPE_CHECKING, Any, TextIO, cast
+from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
 from rich.console import Console
@@ -24,6 +23,7 @@ from rich.table import Column, Table
 
 import rlightning_aio
 from rlightning_aio.errors import ConfigError, EnvFault, RemoteTraceback, RLightningError
+from rlightning_aio.json_text import json_of
 from rlightning_aio.protocol.net.limited_log import LOG
 
 if TYPE_CHECKING:
@@ -36,7 +36,6 @@ __all__ = [
     "counted",
     "duration",
     "err",
-    "finite",
     "fitted",
     "guarded",
     "in_words",
@@ -106,18 +105,7 @@ def print_result(text: str) -> None:
 
 def print_json(value: Any) -> None:
     """Print `value` as the one JSON document on stdout."""
-    print_result(json.dumps(finite(value), indent=2, allow_nan=False))
-
-
-def finite(value: Any) -> Any:
-    """Return `value` with None in place of NaN and infinity, which JSON lacks."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, dict):
-        return {key: finite(held) for key, held in cast("dict[Any, Any]", value).items()}
-    if isinstance(value, (list, tuple)):
-        return [finite(held) for held in cast("list[Any]", value)]
-    return value
+    print_result(json_of(value, indent=2))
 
 
 def notes_on_returns(env_ids: Iterable[str]) -> list[str]:
