@@ -19,22 +19,28 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument("--seed", type=int, help="replay the program of this seed")
     parser.add_argument("--real", action="store_true", help="with real processes")
+    parser.add_argument("--without", default="", help="features, separated by commas")
+    parser.add_argument("--stop", action="store_true", help="at the first failure")
     parser.add_argument("--once", action="store_true", help="each once, not twice")
     arguments = parser.parse_args()
+    without = frozenset(filter(None, arguments.without.split(",")))
+    without |= WORLDLY if arguments.real else frozenset()
     again = (lambda p: run(p, real=True)) if arguments.real else run_twice
     if arguments.seed is not None:
         prepare()
-        program = draw(arguments.seed, without=WORLDLY if arguments.real else frozenset())
+        program = draw(arguments.seed, without=without)
         print(shown(found := again(program)))
         return bool(found.error)
     began, counts, hours, failed = time.perf_counter(), Counter[str](), 0.0, []
     seeds = range(arguments.first, arguments.first + arguments.seeds)
-    for found in run_many(seeds, real=arguments.real, once=arguments.once):
+    for found in run_many(seeds, without, real=arguments.real, once=arguments.once):
         counts += found.counts
         hours += found.hours
         if found.error:
             failed.append(found)
             print(f"seed {found.program.seed}: {found.kind}", flush=True)
+            if arguments.stop:
+                return 1
     seconds = time.perf_counter() - began
     print(
         f"{len(seeds)} programs, {len(failed)} failed: {seconds:.0f} s, {hours:.1f} simulated hours"

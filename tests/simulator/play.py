@@ -65,6 +65,7 @@ class Play(Session):
         self.kept: list[tuple[Any, Any]] = []
         self.owners = 0
         self.nested: set[str] = set()
+        self.written: dict[str, Any] = {}
         faults = replace(self.program.faults, deaths=0.0, interrupts=0.0)
         self.model = Model(self.envs, self.counts, starts_fail=faults != Faults())
         require([*self.model.envs] == self.group.env_ids, "ids", self.group.env_ids)
@@ -286,7 +287,9 @@ class Play(Session):
             sent.append(own)
             requests[env.env_id] = Request("step", acts=acts, sent=own)
         if batch is not None:
-            return batch.respond(**self.columns(rng, envs, sent)), requests
+            self.written = self.columns(rng, envs, sent)
+            return batch.respond(**self.written), requests
+        self.written = {}
         values = [PolicyResponse(env.env_id, **own) for env, own in zip(envs, sent, strict=True)]
         return BatchedData([env.env_id for env in envs], values), requests
 
@@ -349,6 +352,7 @@ class Play(Session):
         self.send(requests, COLLECTOR)
         try:
             call()
+            self.scribble()
         except WorkerDied as fault:
             for env_id in fault.env_ids:
                 self.model.gone(self.model.envs[env_id], fault)
@@ -358,6 +362,14 @@ class Play(Session):
         except KeyboardInterrupt:
             self.interrupted(requests, COLLECTOR)
             raise
+
+    def scribble(self) -> None:
+        """Write to the columns of a response, which was sent."""
+        for column in self.written.values():
+            if isinstance(column, np.ndarray):
+                column[...] = 1
+            elif isinstance(column, list):
+                column.clear()
 
     async def op_collect(self, rng: Random) -> None:
         rules: dict[str, Any] = {}
@@ -737,6 +749,10 @@ class Play(Session):
         envs = self.targets(rng, [env for env, _ in states])
         if not all(env.idle for env in envs):
             return
+        if len(states) < len(self.envs) and rng.random() < 0.1:
+            with self.expected(SnapshotError, "a snapshot of fewer envs"):
+                await self.done(self.group.restore(data))
+            return
         # Until it returns, it is a call: it answers with the states or changes nothing.
         requests = {env.env_id: Request("call") for env in envs}
         before = [env.state for env in envs]
@@ -830,7 +846,7 @@ class Play(Session):
             return
         batch, _ = self.response(rng, envs)
         ids, values = list(batch.env_ids()), list(batch.values())
-        kind = rng.choice(["unknown", "double", "shape", "count", "busy"])
+        kind = rng.choice(["unknown", "double", "shape", "count", "busy", "foreign"])
         busy = [env.env_id for env in self.model.pending()]
         wrong: Any = EnvBusy
         if kind == "unknown":
@@ -840,6 +856,9 @@ class Play(Session):
         elif kind == "double":
             ids.append(ids[0])
             values.append(values[0])
+        elif kind == "foreign" and len(ids) > 1:
+            ids[0], ids[1] = ids[1], ids[0]
+            wrong = BadAction
         elif kind == "busy" and busy:
             ids.append(busy[0])
             values.append(

@@ -106,11 +106,13 @@ def prepare() -> None:
     gc.freeze()
 
 
-def run_seeds(seeds: Sequence[int], *, real: bool, once: bool) -> list[Run]:
+def run_seeds(
+    seeds: Sequence[int], without: frozenset[str], *, real: bool, once: bool
+) -> list[Run]:
     """Run the programs of some seeds; the runs that went well come without trace."""
     found: list[Run] = []
     for seed in seeds:
-        program = draw(seed, without=WORLDLY if real else frozenset())
+        program = draw(seed, without=without)
         one = run(program, real=real) if real or once else run_twice(program)
         if not one.error:
             one.trace = []
@@ -118,14 +120,19 @@ def run_seeds(seeds: Sequence[int], *, real: bool, once: bool) -> list[Run]:
     return found
 
 
-def run_many(seeds: Sequence[int], *, real: bool, once: bool) -> Iterator[Run]:
+def run_many(
+    seeds: Sequence[int], without: frozenset[str], *, real: bool, once: bool
+) -> Iterator[Run]:
     """Run the programs of many seeds on all cores."""
     size = max(1, min(20, len(seeds) // (os.cpu_count() or 1)))
     pieces = [seeds[k : k + size] for k in range(0, len(seeds), size)]
     with ProcessPoolExecutor(initializer=prepare) as pool:
-        futures = [pool.submit(run_seeds, piece, real=real, once=once) for piece in pieces]
-        for future in futures:
-            yield from future.result()
+        futures = [pool.submit(run_seeds, piece, without, real=real, once=once) for piece in pieces]
+        try:
+            for future in futures:
+                yield from future.result()
+        finally:  # Whoever asks may have seen enough.
+            pool.shutdown(cancel_futures=True)
 
 
 def shrunk(failed: Run, runs: Callable[[Program], Run]) -> Run:
