@@ -515,6 +515,47 @@ def test_an_env_that_raised_takes_part_again_after_a_reset() -> None:
             assert rollout.end_observation[-1][1:3].tolist() == [1, 2]
 
 
+@pytest.mark.parametrize("sent", [1, 2])
+def test_ctrl_c_after_a_step_was_sent_loses_nothing(sent: int) -> None:
+    """A synchronous group raises it when the requests are on their way."""
+    group = poles(2)
+    with group, group.auto_reset():
+        collector = Collector(group, zeros, num_transitions=6, seed=3)
+        original, calls = group.step_async, []
+
+        def interrupted(batch: BatchedData) -> None:
+            original(batch)
+            calls.append(batch)
+            if len(calls) == sent:
+                raise KeyboardInterrupt
+
+        group.step_async = interrupted
+        with pytest.raises(KeyboardInterrupt):
+            collector.collect()
+        found = collector.collect()
+    with poles(2) as again, again.auto_reset():
+        expected = Collector(again, zeros, num_transitions=6, seed=3).collect()
+    np.testing.assert_array_equal(found.observation, expected.observation)
+
+
+@pytest.mark.parametrize("name", ["enter", "leave"])
+def test_ctrl_c_around_a_rollout_leaves_the_collector_usable(
+    monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """It may be raised wherever the collector looks at the clock."""
+    with poles(2) as group, group.auto_reset():
+        collector = Collector(group, zeros, num_transitions=6)
+
+        def interrupt() -> None:
+            raise KeyboardInterrupt
+
+        with monkeypatch.context() as patch:
+            patch.setattr(collector._clock, name, interrupt)
+            with pytest.raises(KeyboardInterrupt):
+                collector.collect()
+        assert len(collector.collect()) == 6
+
+
 def test_a_policy_must_give_the_same_columns_each_time() -> None:
     """With the same shape and kind of number: 0.5 is not an integer."""
     for more in (

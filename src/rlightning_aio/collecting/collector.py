@@ -211,8 +211,8 @@ class Collector(Generic[G, R]):
                 "`with group.auto_reset():`"
             )
         self._collecting = True
-        self._clock.enter()
         try:
+            self._clock.enter()
             if not self._started:
                 yield from self._start()
             is_resumed = False
@@ -234,8 +234,8 @@ class Collector(Generic[G, R]):
                 self._received, _ = yield self._receive
                 self._expecting = False
         finally:
-            self._clock.leave()
             self._collecting = False
+            self._clock.leave()
 
     def _start(self) -> Procedure[None]:
         """Reset all envs, and wait for all of them."""
@@ -436,7 +436,13 @@ class Collector(Generic[G, R]):
         responses, columns = part.kind.columns_of(part, answer)
         # Copy before sending: the columns may be views of rows that envs will overwrite.
         part.kind.staging.begin(part.results.index, columns, version)
-        self._group.step_async(responses)
+        try:
+            self._group.step_async(responses)
+        except KeyboardInterrupt:
+            # A synchronous group raises it once the requests are sent.
+            if part.batch.env_ids()[0] in self._group.pending:
+                part.kind.staging.note_sent()
+            raise
         part.kind.staging.note_sent()
         self._clock.note_answered(part.batch)
 
