@@ -548,6 +548,9 @@ class Model:
             return
         if request.interrupted and fault.exception_type == "KeyboardInterrupt":
             self.counts["Ctrl-C in an env"] += 1
+            after = env.state.copy()  # It may have been done with it.
+            after.play(request, math.inf, marks=False)
+            env.loose, env.dirty = [after], True
             return
         acts = env.state.faults(request)
         raising = [act for act in acts if act[0] in RAISING]

@@ -236,7 +236,8 @@ class Session:
         features, entry = self.features, env.entry
         faults = ["keep state"] * ("snapshots" in features and entry.every is None)
         if "raise" in features:
-            faults += ["raise", "raise oddly", "raise next"]
+            # What resumes has a grudge again, or never had it.
+            faults += ["raise", "raise oddly"] + ["raise next"] * (entry.every is None)
             if not self.is_async and self.plan(env).placement == "inline":
                 faults.append("ctrl-c")
         if "rubbish" in features and entry.layout in (*FIXED, "number"):

@@ -111,7 +111,10 @@ class Training(InContext):
         if "raise" in self.features and self.rng.random() < 0.03:
             raise PolicyFailed
         envs = [self.by_id[env_id] for env_id in batch.env_ids()]
-        actions = [action_of(env, self.acts(self.rng, env, plain=self.plain)) for env in envs]
+        acts = [self.acts(self.rng, env, plain=self.plain) for env in envs]
+        for env, own in zip(envs, acts, strict=True):
+            env.hangs += env.entry.form == "awaitable" and own[0][0].startswith("hang")
+        actions = [action_of(env, own) for env, own in zip(envs, acts, strict=True)]
         shape = batch.is_reset.shape
         log_prob = np.array([self.rng.random() for _ in range(batch.is_reset.size)]).reshape(shape)
         return {"action": stacked(actions), "log_prob": log_prob, "seen": batch.observation}
@@ -155,6 +158,8 @@ class Training(InContext):
             return
         require(isinstance(fault, EnvRaised), "an odd error", repr(fault))
         self.raised[fault.env_id] += 1
+        if self.rng.random() < 0.5:
+            return  # The collector does it.
         try:
             self.group.reset_async(env_ids=[fault.env_id])
         except WorkerDied as died:

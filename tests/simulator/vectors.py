@@ -250,7 +250,7 @@ class Vectors(Session):
         self.shown[k] = now
         if self.mode == "next_step" and was_over:
             # Several that are stepped together are reset together, once more.
-            again = died and env.entry.form == "stacked"
+            again = died and env.entry.form == "stacked" and ends[1]
             require((reward, ends) == (0.0, (False, again)), "a reset", k, reward, ends)
             require(is_begun(now) or died, "no reset", k, now)
             return
