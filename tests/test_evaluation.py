@@ -51,6 +51,15 @@ class Scripted(gym.Env[Any, Any]):
         return observation, 1.0, over, False, {self._key: success and over}
 
 
+class Patient(SyncVectorEnv):
+    """Steps envs whose episode has ended, until all are reset, if none is reset by itself."""
+
+    def step(self, actions: Any) -> Any:
+        if self.metadata["autoreset_mode"] is AutoresetMode.DISABLED:
+            self._autoreset_envs[:] = False
+        return super().step(actions)
+
+
 def group_of(*makers: Callable[[], Any], **fields: Any) -> sync.EnvGroup:
     fields = {"placement": "inline", **fields}
     entry = {"name": "env", "make_env": list(makers), "num_workers": len(makers), **fields}
@@ -186,6 +195,27 @@ def test_an_episode_that_is_lost_with_its_worker_is_repeated() -> None:
     found = evaluated(group, 3, seed=0, policy=dies_once)
     assert found.lost == 1
     assert [one.length for one in found.episodes] == [SHORT, LONG, SHORT]
+
+
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_the_first_of_two_episodes_to_end_is_not_repeated(mode: AutoresetMode) -> None:
+    """A worker that is lost in between begins again with the one that is missing."""
+    calls = 0
+
+    def dies_once(batch: rl.BatchedData) -> Any:
+        nonlocal calls
+        calls += 1
+        return nothing(batch) | (calls == 5)
+
+    make = scripted(lambda seed: seed in (0, 3))
+    both = lambda: Patient([make] * 2, autoreset_mode=mode)  # noqa: E731
+    whole = evaluated(group_of(both), 2, seed=0)
+    assert [one.length for one in by_number(whole.episodes) if one.number == 0] == [SHORT, LONG]
+    found = evaluated(group_of(both, placement="process"), 2, seed=0, policy=dies_once)
+    assert found.lost
+    assert by_number(found.episodes) == by_number(whole.episodes)
+    rest = evaluated(group_of(both), 2, seed=0, played=whole.episodes[:1])
+    assert by_number(rest.episodes) == by_number(whole.episodes)
 
 
 @pytest.mark.parametrize("together", [1, 2])

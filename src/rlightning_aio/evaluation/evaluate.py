@@ -214,6 +214,8 @@ class _Play:
         self._reward = np.zeros(self._size)
         self._length = np.zeros(self._size, np.int64)
         self._lost: set[str] = set()
+        # The number of the episodes that a reset begins, until its result has come.
+        self._begins: dict[str, int] = {}
         self._losses = Counter[str]()
         # Results of different shapes don't stack.
         self._separate = len({(meta.num_envs, meta.agents) for meta in metas}) > 1
@@ -238,11 +240,9 @@ class _Play:
         env_ids = [env_id for env_id in self._metas if self._left(env_id)]
         if not env_ids:
             return self._found
-        seeds = self._seeds(env_ids)
         batch: BatchedData
-        batch, _ = yield lambda: self._group.reset(
-            None if seeds is None else list(seeds.values()), env_ids=env_ids
-        )
+        seeds = self._next_seeds(env_ids)
+        batch, _ = yield lambda: self._group.reset(seeds, env_ids=env_ids)
         pending = yield from self._continue(batch)
         while pending:
             batch, _ = yield lambda: self._group.collect_async(min_results=self._min_results)
@@ -263,7 +263,7 @@ class _Play:
             else:
                 steps.append(row)
         if resets:
-            self._group.reset_async(seed=self._seeds(resets), env_ids=resets)
+            self._group.reset_async(seed=self._next_seeds(resets), env_ids=resets)
         if steps:
             stepped = batch if len(steps) == len(batch) else batch.take(steps)
             answer = yield lambda: self._policy(stepped)
@@ -285,14 +285,18 @@ class _Play:
         self._lost.discard(env_id)
         return lost or not (resets_itself or self._open[self._places(env_id)].any())
 
-    def _seeds(self, env_ids: list[str]) -> dict[str, int] | None:
-        """Seeds of the next episodes of envs."""
+    def _next_seeds(self, env_ids: list[str]) -> dict[str, int] | None:
+        """Seeds of the next episodes of envs that are about to be reset.
+
+        Sub-environments may have finished different numbers, because of a loss. The reset then
+        begins the first that is missing, and others play one that isn't counted.
+        """
+        for env_id in env_ids:
+            self._begins[env_id] = int(self._count[self._places(env_id)].min())
         if self._seed is None:
             return None
         return {
-            env_id: self._seed
-            + int(self._count[self._places(env_id)].max()) * self._size
-            + self._first[env_id]
+            env_id: self._seed + self._begins[env_id] * self._size + self._first[env_id]
             for env_id in env_ids
         }
 
@@ -315,16 +319,27 @@ class _Play:
         if ended.any():
             self._note_ends(batch, ended.reshape(shape))
         self._open[places[ended]] = False
-        again = self._begun_again(batch, ended.reshape(shape)).reshape(-1)
+        again = self._begun_again(batch, done.reshape(shape)).reshape(-1)
+        counted = self._counted(batch).reshape(-1)
+        self._open[places[begins]] = counted[begins]
+        self._open[places[again]] = True
         for begun in (places[begins], places[again]):
-            self._open[begun] = True
             self._reward[begun] = self._length[begun] = 0
 
-    def _begun_again(self, batch: BatchedData, ended: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Mask of `ended` episodes whose env has begun the next one in the same step."""
+    def _counted(self, batch: BatchedData) -> NDArray[np.bool_]:
+        """Mask of the episodes that count if they begin; see `_next_seeds`."""
+        found = np.ones(batch.is_reset.shape, np.bool_)
+        for row, env_id in enumerate(batch.env_ids() if self._begins else ()):
+            number = self._begins.pop(env_id, None)
+            if number is not None:
+                found[row] = self._count[batch.index[row]] == number
+        return found
+
+    def _begun_again(self, batch: BatchedData, done: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Mask of episodes that are `done` and whose env has begun the next in the same step."""
         modes = [self._metas[env_id].autoreset for env_id in batch.env_ids()]
         same_step = np.array([mode == "same_step" for mode in modes], np.bool_)
-        return (ended.T & same_step).T
+        return (done.T & same_step).T
 
     def _note_ends(self, batch: BatchedData, ended: NDArray[np.bool_]) -> None:
         rows = np.flatnonzero(ended.reshape(len(batch), -1).any(axis=1))
