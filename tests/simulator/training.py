@@ -319,8 +319,8 @@ class Evaluations(InContext):
         require(len(places) == len(found.episodes) == count * width, "as many of each", found)
         for env in self.envs:
             for k in range(len(env.codes)):
-                # Of those that reset themselves only the first is seeded, and again after a loss.
-                seeded = count if env.entry.mode == "disabled" else int(env.deaths == 0)
+                # Of those that reset themselves only the first is seeded.
+                seeded = count if env.entry.mode == "disabled" else 1
                 for number in range(seeded):
                     own = seed + number * width + env.first + k
                     right = self.played(env, k, own, None)
