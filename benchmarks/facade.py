@@ -50,6 +50,9 @@ class RawDriver:
     def wake(self) -> None:
         """Do nothing: `run` resumes after every read."""
 
+    def check_interrupt(self) -> None:
+        """Do nothing: it holds no Ctrl-C back."""
+
     def run(self, procedure: Procedure[Any]) -> Any:
         try:
             wait = procedure.send(None)  # pyright: ignore[reportArgumentType]

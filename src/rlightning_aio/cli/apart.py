@@ -71,8 +71,9 @@ async def opened(
 
 @contextlib.asynccontextmanager
 async def _opened_here(place: Place, policy: str | None, seed: int) -> AsyncGenerator[Measurable]:
-    for module in {module for config in place.configs for module in config.imports}:
-        importlib.import_module(module)  # A child has not loaded the config itself.
+    for config in place.configs:
+        for module in config.imports:
+            importlib.import_module(module)  # A child has not loaded the config itself.
     if isinstance(place, Setting):
         chosen = None if policy is None else load_policy(policy)
         async with opened_group(place, chosen, seed) as stand:
