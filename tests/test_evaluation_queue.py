@@ -321,6 +321,17 @@ def test_chosen_or_failed_episodes_are_filmed(tmp_path: Path, failed_only: bool)
     assert names == [f"env-2-seed-{seed}.mp4" for seed in seeds]
 
 
+def test_films_of_an_entry_whose_name_is_a_path_stay_in_their_folder(tmp_path: Path) -> None:
+    """Nothing outside is deleted, before the film or after it."""
+    films, outside = tmp_path / "films", tmp_path / "mine-0.partial"
+    outside.mkdir()
+    (outside / "notes").touch()
+    evaluated(group_of(name="../mine"), QUEUE[:1], video=EpisodeVideo(films))
+    assert (outside / "notes").exists()
+    assert [path.suffix for path in films.iterdir()] == [".mp4"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["films", "mine-0.partial"]
+
+
 @pytest.mark.parametrize("limit", [1, 2, 9])
 def test_episodes_that_a_step_limit_cuts_are_filmed(tmp_path: Path, limit: int) -> None:
     """The limit is the trainer's, so the film is still open when the episode ends."""

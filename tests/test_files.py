@@ -15,13 +15,24 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from rlightning_aio.files import check_folder, check_writable, finish_file, write_file
+from rlightning_aio.files import check_folder, check_writable, file_name, finish_file, write_file
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 BEFORE, AFTER = b"what was there", b"what is written"
 MEBIBYTE = bytes(2**20)
+
+
+def test_a_file_name_leads_to_no_other_folder_and_keeps_texts_apart() -> None:
+    """Most are unchanged."""
+    for text in ("env-0", "a b", "..", "ä-1.partial"):
+        assert file_name(text) == text
+    texts = ["../../home", ".._.._home", "/etc", "a/b", "a_b", "a\0b"]
+    names = [file_name(text) for text in texts]
+    assert len(set(names)) == len(texts)
+    assert not any("/" in name or "\0" in name for name in names)
+    assert names[3].startswith("a_b-")
 
 
 def test_a_new_file_is_written_in_parts(tmp_path: Path) -> None:

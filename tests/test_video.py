@@ -91,6 +91,17 @@ def filmed(make_env: Callable[[], Any], folder: Path, **video: Any) -> dict[str,
     return entry(make_env, video={"folder": str(folder), **video})
 
 
+def test_films_of_an_entry_whose_name_is_a_path_stay_in_their_folder(tmp_path: Path) -> None:
+    """A second run continues their numbers."""
+    config = {**filmed(Brighter, tmp_path / "films"), "name": "../mine"}
+    for _ in range(2):
+        with sync.build_env_group(config) as group:
+            play(group, 3)
+    assert [path.name for path in tmp_path.iterdir()] == ["films"]
+    names = sorted(path.name for path in (tmp_path / "films").iterdir())
+    assert [name.partition("-episode-")[2] for name in names] == ["0.mp4", "1.mp4"]
+
+
 def play(group: sync.EnvGroup, num_steps: int, action: Any = 0) -> None:
     """Reset and step all envs; reset those whose episode has ended."""
     batch, _ = group.reset()

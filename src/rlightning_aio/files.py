@@ -11,15 +11,24 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import re
 import secrets
 import stat
+import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Final
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterable
 
-__all__ = ["check_folder", "check_regular", "check_writable", "finish_file", "write_file"]
+__all__ = [
+    "check_folder",
+    "check_regular",
+    "check_writable",
+    "file_name",
+    "finish_file",
+    "write_file",
+]
 
 _PROBE: Final = bytes(4096)
 """One block, because an empty file fits even a full disk."""
@@ -30,6 +39,15 @@ _KINDS: Final = {
     stat.S_IFCHR: "a character device",
     stat.S_IFBLK: "a block device",
 }
+
+
+def file_name(text: str) -> str:
+    """Return `text` as the beginning of a file name, unchanged unless it holds a slash or NUL.
+
+    Those are replaced, and a checksum keeps different texts apart.
+    """
+    plain = re.sub("[/\0]", "_", text)
+    return text if plain == text else f"{plain}-{zlib.crc32(text.encode()):08x}"
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:

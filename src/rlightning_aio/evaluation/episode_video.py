@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rlightning_aio.config import VideoConfig
-from rlightning_aio.files import check_folder, finish_file
+from rlightning_aio.files import check_folder, file_name, finish_file
 from rlightning_aio.hosts.messages import RECORD_VIDEO
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ class Filming:
             shutil.rmtree(self._folder(env_id), ignore_errors=True)
 
     def _folder(self, env_id: str) -> Path:
-        return Path(self.video.folder, f"{env_id}.partial").absolute()
+        return Path(self.video.folder, f"{file_name(env_id)}.partial").absolute()
 
 
 def _name(record: EpisodeRecord) -> str:

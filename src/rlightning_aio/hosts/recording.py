@@ -16,7 +16,7 @@ import gymnasium as gym
 import numpy as np
 
 from rlightning_aio.envs.tensors import as_numpy
-from rlightning_aio.files import check_folder
+from rlightning_aio.files import check_folder, file_name
 from rlightning_aio.hosts.video_file import VideoFile, find_ffmpeg
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ class Camera:
         _check_renders(env, config.sub_env)
         check_folder(config.folder)
         self._env, self._config = env, config
-        self._name = env.env_id
+        self._name = file_name(env.env_id)
         if env.num_envs > 1:
             self._name += f"-sub-{config.sub_env}"
         self._fps = _fps(env)
