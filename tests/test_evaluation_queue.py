@@ -299,6 +299,22 @@ def test_an_open_file_knows_what_was_added_to_it(tmp_path: Path) -> None:
         assert len(results.played) == 12
 
 
+def test_a_file_whose_first_line_was_cut_is_begun_again(tmp_path: Path) -> None:
+    """Anything else without a whole line is left as it is."""
+    path, subject = tmp_path / "results.jsonl", {"policy": "act-1", "seeds": [1, 2]}
+    ResultsFile(path, subject).close()
+    line = path.read_bytes()
+    for length in range(len(line)):
+        path.write_bytes(line[:length])
+        ResultsFile(path, subject).close()
+        assert path.read_bytes() == line
+    for foreign in (b"shopping list", line[:-1] + b"}", b" "):
+        path.write_bytes(foreign)
+        with pytest.raises(rl.ConfigError, match="is not a file written by eval"):
+            ResultsFile(path, subject)
+        assert path.read_bytes() == foreign
+
+
 def test_a_subject_is_compared_as_it_is_read(tmp_path: Path) -> None:
     """JSON has no tuples, and no keys but texts."""
     for _ in range(2):

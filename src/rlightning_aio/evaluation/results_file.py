@@ -89,7 +89,11 @@ class EpisodeFile(abc.ABC, Generic[E]):
         self._file.seek(0)
         foreign = ConfigError(f"{self._name}: is not a file written by eval")
         try:
-            text = self._file.read()
+            text, first = self._file.read(), _line_of(subject)
+            if len(text) < len(first) and first.startswith(text):  # Empty, or cut in that line.
+                self._file.truncate(0)
+                self._write(subject)
+                return
             whole = text[: text.rfind(b"\n") + 1]
             values: list[Any] = [json.loads(line) for line in whole.splitlines()]
             before: dict[str, Any] = {**values[0]} if values else {}
@@ -97,9 +101,6 @@ class EpisodeFile(abc.ABC, Generic[E]):
             self.played = [episode for episode in decoded if episode is not None]
         except (ValueError, TypeError, KeyError):
             raise foreign from None
-        if not text:
-            self._write(subject)
-            return
         if not values or before.keys() != subject.keys():
             raise foreign
         if before != subject:
@@ -131,7 +132,7 @@ class EpisodeFile(abc.ABC, Generic[E]):
         self.played.append(episode)
 
     def _write(self, value: dict[str, Any]) -> None:
-        line = f"{json.dumps(value, allow_nan=False)}\n".encode()
+        line = _line_of(value)
         with self._writing():
             end = self._file.seek(0, os.SEEK_END)
             try:
@@ -150,6 +151,10 @@ class EpisodeFile(abc.ABC, Generic[E]):
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+
+def _line_of(value: dict[str, Any]) -> bytes:
+    return f"{json.dumps(value, allow_nan=False)}\n".encode()
 
 
 class ResultsFile(EpisodeFile[EpisodeRecord]):
