@@ -120,7 +120,11 @@ class RemoteEnvClient:
         self._client: OurClient | None = None
 
     def connect(self) -> None:
-        """Connect, and wait until the server has accepted the client and the env is reset."""
+        """Connect, and wait until the server has accepted the client.
+
+        An env without an observation space is reset before, to find one. The server gets the first
+        result in `run`, and its `reset` waits for that.
+        """
         if self._client is None:
             self._client = OurClient(
                 _DialledEnv(self.env), self.hostname, self.port, name=self._name
