@@ -189,6 +189,8 @@ def test_each_entry_of_a_mixed_batch_stacks() -> None:
     assert split["grid-world"].reward.tolist() == [0.5, 1.5]
     responses = split["grid-world"].respond(action=np.array([3, 4]))
     assert [(id_, r.action) for id_, r in responses] == [("grid-world-1", 3), ("grid-world-0", 4)]
+    ids = ["robots-0/arm-left", "a/b-10", "robots-1/left-3/x", "own-id", "id"]
+    assert list(BatchedData(ids, ids).by_name()) == ["robots", "a/b", "own", "id"]
     plain = BatchedData(["grid-world-0", "pendulum-1"], [1, 2]).by_name()
     assert {name: part.values() for name, part in plain.items()} == {
         "grid-world": [1],

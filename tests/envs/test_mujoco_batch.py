@@ -236,6 +236,14 @@ def test_a_simulation_that_fails_ends_its_own_episode(
     alone.close()
 
 
+@pytest.mark.parametrize("values", [[], (3,), [3, 3, 3]])
+def test_an_attribute_needs_one_value_for_each_simulation(values: Any) -> None:
+    batch = MujocoBatch(make("Hopper-v5", {})(), 2)
+    with pytest.raises(ValueError, match=f"{len(values)} values for num_envs=2"):
+        batch.set_attr("frame_skip", values)
+    batch.close()
+
+
 def test_a_failure_and_an_end_in_one_step_have_infos_of_their_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -5,8 +5,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, Final, overload
 
 import numpy as np
 
@@ -43,6 +44,8 @@ __all__ = [
 ]
 
 _MISSING: Any = object()
+_ID_IN_ENTRY: Final = re.compile("-[0-9]+(?:/.*)?$", re.DOTALL)
+"""The end of an env's id: its number in the entry, and the name of a client."""
 
 
 @dataclass(slots=True)
@@ -333,7 +336,7 @@ class BatchedData:
     def by_name(self) -> dict[str, BatchedData]:
         """Split by config entry, in the order of first appearance; values keep their order."""
         if self._origin is None:
-            names = [id_.rpartition("-")[0] or id_ for id_ in self.ids()]
+            names = [_entry_of(id_) for id_ in self.ids()]
         else:
             names = self._origin.names.names(self._origin.slots)
         positions: dict[str, list[int]] = {}
@@ -387,6 +390,12 @@ class BatchedData:
         if self._columns is not None:
             return self._columns["action"]
         return stacked_values([value.action for value in self.values()])
+
+
+def _entry_of(env_id: str) -> str:
+    """Return the name of the entry in the id of an env or a client."""
+    found = _ID_IN_ENTRY.search(env_id)
+    return env_id[: found.start()] if found else env_id.rpartition("-")[0] or env_id
 
 
 def batch_of_results(

@@ -355,11 +355,14 @@ class MujocoBatch(gym.vector.VectorEnv[Any, Any, Any]):
         """Set attribute `name` of all envs to one value.
 
         Raises:
-            ValueError: the simulations, which share a model and all options, would differ.
+            ValueError: the simulations, which share a model and all options, would differ, or there
+                isn't one value for each.
         """
         different: Iterator[bool] = iter(())
         if isinstance(values, list | tuple):
             each = cast("list[Any]", values)
+            if len(each) != self.num_envs:
+                raise ValueError(f"{len(each)} values for num_envs={self.num_envs}")
             values, different = each[0], (not _same(each[0], other) for other in each)
         if name in _FIXED or any(different):
             raise _shared(name)
