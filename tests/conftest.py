@@ -187,6 +187,14 @@ async def no_task_left_behind() -> AsyncIterator[None]:
 
 
 @pytest.fixture
+def python_raises() -> Iterator[None]:
+    """Have Ctrl-C raise KeyboardInterrupt, also where the shell has it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
     """Mount a file system of one mebibyte and yield its folder."""
     folder = tmp_path / "disk"

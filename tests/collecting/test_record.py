@@ -19,6 +19,7 @@ import rlightning_aio as rl
 from rlightning_aio import sync
 from rlightning_aio.collecting import Collector, Record, RecordedGroup, ReplayedGroup
 from rlightning_aio.errors import EnvFault, EnvRaised, ReplayDiverged
+from rlightning_aio.group.sync import SyncDriver
 
 if TYPE_CHECKING:
     from rlightning_aio.batch import BatchedData
@@ -209,7 +210,7 @@ def test_results_that_could_not_be_recorded_come_with_the_next_call(
 
 
 def test_an_error_that_could_not_be_recorded_comes_with_the_next_call() -> None:
-    wrapped = Mock(pending=[])
+    wrapped = Mock(pending=[], _driver=SyncDriver())
     fault = EnvFault("it raised", env_id="a-0")
     wrapped.collect_async.side_effect = fault
     recorded: Any = RecordedGroup(wrapped)
@@ -225,7 +226,7 @@ def test_an_error_that_could_not_be_recorded_comes_with_the_next_call() -> None:
 
 
 def test_a_replay_has_the_deadline_of_the_call_however_it_is_given() -> None:
-    wrapped = Mock()
+    wrapped = Mock(_driver=SyncDriver())
     wrapped.collect_async.side_effect = TimeoutError
     replayed: Any = ReplayedGroup(wrapped, RECORD)
     for arguments, options in (((None, False, None, None, 3.0), {}), ((), {"deadline": 3.0})):

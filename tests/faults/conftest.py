@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -14,14 +13,6 @@ if TYPE_CHECKING:
 
 # The first loop opens a pipe that libuv keeps, so it is made before the tests.
 uvloop.new_event_loop().close()
-
-
-@pytest.fixture
-def python_raises() -> Iterator[None]:
-    """Have Ctrl-C raise KeyboardInterrupt, also where the shell has it ignored."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture(params=["sync", "uvloop"])

@@ -26,43 +26,40 @@ def interrupt() -> None:
 class Strike:
     """A trace function that calls `strike` at the n-th line of this library.
 
+    Lines of the driver count only while it holds Ctrl-C back: where it doesn't any more, nothing is
+    called before it returns, so Python doesn't look for signals there.
+
     Attributes:
         left: lines until then; 0 afterwards.
     """
 
-    def __init__(self, line: int, strike: Callable[[], None], *, held_back: bool) -> None:
+    def __init__(self, line: int, strike: Callable[[], None]) -> None:
         self.left = line
         self._strike = strike
-        self._held_back = held_back
 
     def __call__(self, frame: FrameType, event: str, arg: Any) -> Any:
         return self._line if "/rlightning_aio/" in frame.f_code.co_filename else None
 
     def _line(self, frame: FrameType, event: str, arg: Any) -> Any:
-        if event == "line" and self.left and self._counts():
+        if event == "line" and self.left and self._counts(frame.f_code.co_filename):
             self.left -= 1
             if not self.left:
                 self._strike()
         return self._line
 
-    def _counts(self) -> bool:
-        return (
-            not self._held_back or signal.getsignal(signal.SIGINT) is not signal.default_int_handler
-        )
+    def _counts(self, path: str) -> bool:
+        holds_back = signal.getsignal(signal.SIGINT) is not signal.default_int_handler
+        return holds_back or not path.endswith("/group/sync.py")
 
 
 def struck(
-    line: int,
-    call: Callable[[], Any],
-    how: Callable[[], None] = press,
-    *,
-    held_back: bool = False,
+    line: int, call: Callable[[], Any], how: Callable[[], None] = press
 ) -> tuple[bool, bool, Any]:
-    """Make a call with Ctrl-C at that line, counting only lines where it is held back, or all.
+    """Make a call with Ctrl-C at that line.
 
     Returns True if the line was reached, True if the call was interrupted, and what it returned.
     """
-    strike, interrupted, returned = Strike(line, how, held_back=held_back), False, None
+    strike, interrupted, returned = Strike(line, how), False, None
     sys.settrace(strike)
     try:
         returned = call()
@@ -75,7 +72,7 @@ def struck(
     return reached, interrupted, returned
 
 
-def hear_of_interrupt(group: Any) -> None:
+def hear_of_interrupt(call: Callable[[], object]) -> None:
     """Check that the next call raises an interrupt that the last one has not raised."""
     with pytest.raises(KeyboardInterrupt):
-        group.collect_async()
+        call()

@@ -69,7 +69,7 @@ def test_a_group_goes_on_wherever_a_call_was_interrupted(
         for line in range(1, NUM_LINES, 23):
             reached, interrupted, _ = struck(line, lambda last=batch: use(group, last))
             if reached and not interrupted:
-                hear_of_interrupt(group)
+                hear_of_interrupt(group.collect_async)
             drop_outstanding(group)
             batch, _ = group.reset(seed=7)
             np.testing.assert_array_equal(batch.observation, expected)
@@ -268,7 +268,7 @@ def test_an_interrupt_after_the_last_result_is_raised_when_the_group_is_closed()
     interrupted, line = True, 2
     while interrupted:  # At last, Ctrl-C comes too late for the reset to raise it.
         drop_outstanding(group)
-        _, interrupted, _ = struck(line, group.reset, held_back=True)
+        _, interrupted, _ = struck(line, group.reset)
         line += 20
     with pytest.raises(KeyboardInterrupt):
         group.close()

@@ -133,7 +133,7 @@ def test_no_result_is_lost_wherever_a_call_is_interrupted(
         num_returned = num_raised = 0
         for line in range(1, NUM_LINES, STRIDE):
             try:
-                found = struck(line, lambda: use(group, batch), held_back=True)
+                found = struck(line, lambda: use(group, batch))
             except EnvRaised as fault:
                 answers.fail(fault)
                 continue
@@ -144,7 +144,7 @@ def test_no_result_is_lost_wherever_a_call_is_interrupted(
                 break
             num_raised, num_returned = num_raised + interrupted, num_returned + (not interrupted)
             if not interrupted:
-                hear_of_interrupt(group)
+                hear_of_interrupt(group.collect_async)
             answers.take_outstanding()
         else:
             pytest.fail(f"a call executes more than {NUM_LINES} lines")

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast, overload
 
 from rlightning_aio.collecting.clock import Clock
 from rlightning_aio.collecting.kind import OWN_NAMES, EnvKind, Part
-from rlightning_aio.collecting.procedure import Procedure, run
+from rlightning_aio.collecting.procedure import BREAK, Interruptible, Procedure, run_as_one_call
 from rlightning_aio.collecting.record import RecordedGroup, ReplayedGroup
 from rlightning_aio.collecting.rollout import Rollout
 from rlightning_aio.errors import EnvBusy, EnvFault, NothingPending
@@ -179,8 +179,8 @@ class Collector(Generic[G, R]):
     def collect(self) -> Any:
         """Step the envs until a rollout is full, and return it; await it if the group is async.
 
-        The rollout owns its arrays until the second call after it. Cancellation and errors lose
-        nothing: the next call continues.
+        The rollout owns its arrays until the second call after it. Cancellation, Ctrl-C and errors
+        lose nothing: the next call continues.
 
         Raises:
             RuntimeError: the group has no open `auto_reset` context, or a call is in progress.
@@ -196,7 +196,7 @@ class Collector(Generic[G, R]):
         wrapped: Any = group
         if isinstance(group, RecordedGroup | ReplayedGroup):
             wrapped = cast("RecordedGroup[Any] | ReplayedGroup[Any]", group).group
-        return run(self._collect(), wrapped)
+        return run_as_one_call(self._collect(), wrapped)
 
     # -- the loop -----------------------------------------------------------------
 
@@ -221,6 +221,7 @@ class Collector(Generic[G, R]):
                     self._split_received(self._received)
                     self._received = None
                 if not self._store():
+                    yield BREAK  # After this, it would wait for the learner's next collect.
                     return self._full()
                 if not is_resumed:
                     self._resume()
@@ -431,7 +432,7 @@ class Collector(Generic[G, R]):
         version = self.policy_version
         began = time.monotonic_ns()
         with self._group.span("policy"):
-            answer = yield partial(part.kind.policy, part.batch)
+            answer = yield Interruptible(partial(part.kind.policy, part.batch))
         self._clock.note_policy(time.monotonic_ns() - began)
         responses, columns = part.kind.columns_of(part, answer)
         # Copy before sending: the columns may be views of rows that envs will overwrite.

@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Generator
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
 
 from rlightning_aio.group.aio import EnvGroup as AsyncEnvGroup
+from rlightning_aio.group.sync import driver_of
 
-__all__ = ["Procedure", "run"]
+__all__ = ["BREAK", "Interruptible", "Procedure", "run", "run_as_one_call"]
 
 if TYPE_CHECKING:
     from rlightning_aio.group.sync import EnvGroup as SyncEnvGroup
+    from rlightning_aio.group.sync import SyncDriver
 
 T = TypeVar("T")
 
@@ -23,12 +26,40 @@ Procedure: TypeAlias = Generator[Callable[[], Any], Any, T]
 """Yields functions to call, is sent their results (awaited if awaitable), returns its result."""
 
 
+@dataclass(frozen=True)
+class Interruptible:
+    """A call of the program's own code, such as a policy, which Ctrl-C may interrupt."""
+
+    function: Callable[[], Any]
+
+    def __call__(self) -> Any:
+        return self.function()
+
+
+BREAK: Final = Interruptible(lambda: None)
+"""Does nothing: if Ctrl-C was pressed, it is raised here."""
+
+
 def run(procedure: Procedure[Any], group: AsyncEnvGroup | SyncEnvGroup) -> Any:
     """Run `procedure` to its end: synchronously, or as a coroutine if `group` is asynchronous."""
-    return _awaited(procedure) if isinstance(group, AsyncEnvGroup) else _called(procedure)
+    if isinstance(group, AsyncEnvGroup):
+        return _awaited(procedure)
+    return _called(procedure, driver_of(group))
 
 
-def _called(procedure: Procedure[T]) -> T:
+def run_as_one_call(procedure: Procedure[Any], group: AsyncEnvGroup | SyncEnvGroup) -> Any:
+    """Run `procedure` as `run` does, for procedures that go on where an earlier one was cut off.
+
+    In a synchronous group it is one call: Ctrl-C interrupts it only where the group waits, and in
+    calls that are `Interruptible`.
+    """
+    if isinstance(group, AsyncEnvGroup):
+        return _awaited(procedure)
+    driver = driver_of(group)
+    return driver.call(_called, procedure, driver)
+
+
+def _called(procedure: Procedure[T], driver: SyncDriver) -> T:
     """Run `procedure` to its end, synchronously.
 
     Raises:
@@ -38,7 +69,7 @@ def _called(procedure: Procedure[T]) -> T:
         call = next(procedure)
         while True:
             try:
-                value = call()
+                value = driver.interruptible(call) if type(call) is Interruptible else call()
                 if hasattr(value, "__await__"):
                     _discard(value)
                     raise TypeError(

@@ -17,7 +17,7 @@ import numpy as np
 
 from rlightning_aio.batch import joined
 from rlightning_aio.batch.contents import parts_of
-from rlightning_aio.collecting.procedure import Procedure, run
+from rlightning_aio.collecting.procedure import Procedure, run_as_one_call
 from rlightning_aio.errors import EnvFault, NothingPending, ReplayDiverged
 from rlightning_aio.files import write_file
 from rlightning_aio.group.aio import EnvGroup as AsyncEnvGroup
@@ -153,7 +153,9 @@ class RecordedGroup(_WrappedGroup[G]):
 
     def collect_async(self, *args: Any, **options: Any) -> Any:
         """Collect like the wrapped group, awaitable if that is asynchronous."""
-        return run(self._collect(lambda: self.group.collect_async(*args, **options)), self.group)
+        return run_as_one_call(
+            self._collect(lambda: self.group.collect_async(*args, **options)), self.group
+        )
 
     def _collect(self, collect: Callable[[], Any]) -> Procedure[tuple[BatchedData, list[bool]]]:
         if self._unrecorded is None:
@@ -200,7 +202,7 @@ class ReplayedGroup(_WrappedGroup[G]):
                 no request or another one, or because its worker was replaced.
         """
         given = _COLLECT.bind(self.group, *args, **options).arguments
-        return run(self._collect(given.get("deadline")), self.group)
+        return run_as_one_call(self._collect(given.get("deadline")), self.group)
 
     def _collect(self, deadline: float | None) -> Procedure[tuple[BatchedData, list[bool]]]:
         if self._place == len(self._record):

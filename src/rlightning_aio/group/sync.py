@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from rlightning_aio.hosts.base import Source
     from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
 
-__all__ = ["EnvGroup", "EnvHandle", "ServerHandle", "SyncDriver"]
+__all__ = ["EnvGroup", "EnvHandle", "ServerHandle", "SyncDriver", "driver_of"]
 
 T = TypeVar("T")
 A = TypeVarTuple("A")
@@ -406,6 +406,11 @@ class ServerHandle(ServerHandleInterface, EnvHandle):
             return self._driver.run(procedure)[0].values()
 
         return self._driver.call(results)
+
+
+def driver_of(group: EnvGroup) -> SyncDriver:
+    """Return the driver of a group, for code that makes one call of several calls."""
+    return group._driver  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]  # Same module.
 
 
 def build_env_group(
