@@ -8,10 +8,11 @@ know of it.
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import time
 import warnings
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Concatenate, ParamSpec, TypeVar
 
 from rlightning_aio.errors import EnvFault, UnknownEnv
 from rlightning_aio.legacy.counter import EnvStepCounter, ThroughputTracker
@@ -31,7 +32,23 @@ if TYPE_CHECKING:
 
 __all__ = ["EnvGroup", "build_env_group", "define_env_instance_cfgs"]
 
+P = ParamSpec("P")
+T = TypeVar("T")
+
 _log = logging.getLogger(__name__)
+
+
+def _one_call(
+    method: Callable[Concatenate[EnvGroup, P], T],
+) -> Callable[Concatenate[EnvGroup, P], T]:
+    """Let Ctrl-C interrupt a method only where it waits, so that it takes no result."""
+
+    @functools.wraps(method)
+    def in_one_call(self: EnvGroup, *args: P.args, **kwargs: P.kwargs) -> T:
+        group = self._group  # pyright: ignore[reportPrivateUsage]  # Same module.
+        return group.in_one_call(functools.partial(method, self, *args, **kwargs))
+
+    return in_one_call
 
 
 class EnvGroup:
@@ -144,6 +161,7 @@ class EnvGroup:
 
     # -- resets and steps
 
+    @_one_call
     def reset(self, *args: Any, **kwargs: Any) -> tuple[Any, list[bool]]:
         """Reset every env with exactly these arguments. Return results in the group's order.
 
@@ -166,6 +184,7 @@ class EnvGroup:
             raise
         return self._batch_and_flags(rows)
 
+    @_one_call
     def step(self, batched_policy_resp: Any) -> tuple[Any, list[bool] | None]:
         """Step the envs of a batch and wait for them. Return the results in the batch's order.
 
@@ -193,12 +212,14 @@ class EnvGroup:
             raise faults[0]
         return rows
 
+    @_one_call
     def step_async(self, batched_policy_resp: Any) -> None:
         """Send a step to the envs of a batch; `collect_async` returns the results."""
         if not self._group.pending.isdisjoint(batched_policy_resp.ids()):
             self._group.settle()
         self._send(batched_policy_resp)
 
+    @_one_call
     def collect_async(
         self, timeout: float | None = None, wait_all: bool = False
     ) -> tuple[Any, list[bool]]:
@@ -213,7 +234,7 @@ class EnvGroup:
         if timeout is not None and timeout <= 0:
             raise ValueError(f"timeout must be a positive number of seconds, not {timeout!r}")
         if wait_all and timeout is not None:
-            warnings.warn("collect_async(wait_all=True) ignores timeout", stacklevel=2)
+            warnings.warn("collect_async(wait_all=True) ignores timeout", stacklevel=5)
             timeout = None
         end = time.monotonic() + (timeout or 0.0)
         self._group.end_calls()

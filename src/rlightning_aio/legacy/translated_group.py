@@ -7,7 +7,7 @@ for them. What RLightning's operations mean is in `group`.
 from __future__ import annotations
 
 import contextlib
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 
@@ -16,13 +16,14 @@ from rlightning_aio.batch.contents import parts_of
 from rlightning_aio.batch.parts import rows_in_order
 from rlightning_aio.envs.tensors import as_numpy
 from rlightning_aio.errors import EnvFault, NothingPending, WorkerDied
+from rlightning_aio.group.sync import driver_of
 from rlightning_aio.legacy.hosted import restored
 from rlightning_aio.legacy.names import names_in_use
 from rlightning_aio.sync import build_env_group
 from rlightning_aio.types import PolicyResponse
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Sequence
+    from collections.abc import Callable, Generator, Sequence
 
     from numpy.typing import NDArray
 
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
     from rlightning_aio.legacy.plan import Plan
 
 __all__ = ["ResultRow", "TranslatedGroup"]
+
+T = TypeVar("T")
 
 
 class ResultRow(NamedTuple):
@@ -78,6 +81,10 @@ class TranslatedGroup:
         env_ids = [*self.local_ids, *self.server_ids]
         self._id_of = dict(zip(plan.core_ids, env_ids, strict=True))
         self._core_id_of = dict(zip(env_ids, plan.core_ids, strict=True))
+
+    def in_one_call(self, function: Callable[[], T]) -> T:
+        """Call a function that uses this group; Ctrl-C interrupts it only where it waits."""
+        return driver_of(self._core).call(function)
 
     # -- steps and resets of local envs, steps of clients
 
