@@ -71,7 +71,7 @@ async def test_an_env_whose_scope_is_cancelled_while_it_is_idle_is_replaced(
         batch, _ = await group.step(steps(e_0=CRASH, e_1=CRASH))
         batch, _ = await group.step(steps(e_0=ADD))
         assert batch.restarted.tolist() == batch.is_reset.tolist() == [True]
-        assert "ended while it was idle: ExceptionGroup" in batch.info("worker_restarted")[0]
+        assert "ended while it was idle: hosts.spanning.Crash" in batch.info("worker_restarted")[0]
         assert (batch.info("seed"), batch.info("options")) == ([5], [None])
         batch, _ = await group.reset(seed=7, env_ids=["e-1"])
         assert batch.restarted.tolist() == [False]
