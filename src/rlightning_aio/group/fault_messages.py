@@ -1,9 +1,15 @@
-"""Error messages about dead, hung and late workers: the env at fault, the cause, lost replies."""
+"""Messages about dead, hung and late workers: the env at fault, the cause, lost replies.
+
+`CrashLog` keeps those about deaths from filling the log.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+import logging
+import math
+from collections import Counter, deque
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
 
 from rlightning_aio.errors import EnvHung, StartFailed, WorkerDied
 from rlightning_aio.hosts.base import Killable
@@ -20,6 +26,7 @@ if TYPE_CHECKING:
     from rlightning_aio.hosts.messages import Death, ErrorText
 
 __all__ = [
+    "CrashLog",
     "DeathReport",
     "cause_of",
     "culprit_of",
@@ -28,6 +35,15 @@ __all__ = [
     "start_fault",
     "without_terminal",
 ]
+
+_LINES: Final = 3
+_QUIET_SECONDS: Final = 300.0
+"""Time without so many deaths, after which each has a line of its own again."""
+_SECONDS: Final = 60.0
+"""Between lines about deaths that are counted."""
+_MOST_NAMED: Final = 3
+
+_log = logging.getLogger("rlightning_aio")
 
 
 def start_fault(envs: EnvTable, record: HostRecord, death: Death) -> StartFailed:
@@ -185,3 +201,93 @@ def death_report(
 def _said(stderr_tail: str) -> str:
     lines = stderr_tail.strip().splitlines()[-20:]
     return ("\nThe last lines it wrote:\n  " + "\n  ".join(lines)) if lines else ""
+
+
+@dataclass
+class _Deaths:
+    """The deaths of one entry.
+
+    Attributes:
+        recent: times of the last three.
+        causes, at_fault: those that were counted since the time `since`, by cause and env.
+    """
+
+    recent: deque[float] = field(default_factory=lambda: deque[float](maxlen=_LINES))
+    since: float = math.inf
+    causes: Counter[str] = field(default_factory=Counter[str])
+    at_fault: Counter[str] = field(default_factory=Counter[str])
+
+
+class CrashLog:
+    """Deaths of workers in the log, each in a line of its own at first, then counted.
+
+    Of each entry, the first three deaths within five minutes have a line each, and further ones one
+    line a minute together. Callers pass the time in (monotonic seconds). A death after which an env
+    is given up is no part of it, as it is raised.
+
+    Attributes:
+        due: when `flush` has something to log.
+    """
+
+    def __init__(self) -> None:
+        self.due = math.inf
+        self._entries: dict[str, _Deaths] = {}
+
+    def note(self, entry: str, message: str, cause: str, at_fault: str | None, now: float) -> None:
+        """Log a death, or count it.
+
+        Args:
+            entry: of the worker.
+            message: all about the death, for a line of its own.
+            cause: in a clause, for a count.
+            at_fault: the id of the env that the worker was executing, if it is known.
+            now: the time.
+        """
+        deaths = self._entries.setdefault(entry, _Deaths())
+        recent = deaths.recent
+        if len(recent) < _LINES or now - recent[0] >= _QUIET_SECONDS:
+            recent.append(now)
+            then = ""
+            if len(recent) == _LINES and now - recent[0] < _QUIET_SECONDS:
+                then = f"; further deaths in entry {entry!r} are counted, in one line a minute"
+            _log.warning("%s%s", message, then)
+            return
+        recent.append(now)
+        if not deaths.causes:
+            deaths.since = now
+            self.due = min(self.due, now + _SECONDS)
+        deaths.causes[cause.partition(" (")[0]] += 1
+        if at_fault is not None:
+            deaths.at_fault[at_fault] += 1
+        if now >= self.due:
+            self.flush(now)
+
+    def flush(self, now: float, *, everything: bool = False) -> None:
+        """Log counts that are a minute old, or `everything`, as the group is about to close."""
+        self.due = math.inf
+        for entry, deaths in self._entries.items():
+            if not deaths.causes:
+                continue
+            if not everything and now < deaths.since + _SECONDS:
+                self.due = min(self.due, deaths.since + _SECONDS)
+                continue
+            count = deaths.causes.total()
+            whose = f"; while executing {_counted(deaths.at_fault)}" if deaths.at_fault else ""
+            _log.warning(
+                "entry %r: %d further death%s of workers within %.0f s, all replaced: %s%s",
+                entry,
+                count,
+                "s" if count > 1 else "",
+                max(now - deaths.since, 1.0),
+                _counted(deaths.causes),
+                whose,
+            )
+            deaths.causes.clear()
+            deaths.at_fault.clear()
+
+
+def _counted(counts: Counter[str]) -> str:
+    most = counts.most_common(_MOST_NAMED)
+    named = ", ".join(f"{what} ({count})" for what, count in most)
+    rest = counts.total() - sum(count for _, count in most)
+    return f"{named}, others ({rest})" if rest else named

@@ -19,6 +19,7 @@ import numpy as np
 from rlightning_aio.errors import ConfigError, GroupClosed, RemoteTraceback, StartFailed, WorkerDied
 from rlightning_aio.group.conditions import DEATH
 from rlightning_aio.group.fault_messages import (
+    CrashLog,
     cause_of,
     culprit_of,
     death_report,
@@ -120,7 +121,8 @@ class Supervisor:
         hosts: in the order of their slots.
         members: the envs that join and leave.
         detector: finds workers that hang.
-        shutdown: ends the hosts; workers: describes them; hints: on their number.
+        shutdown: ends the hosts; workers: describes them; hints: on their number; crash_log: of
+            their deaths.
         metas: one for each local env, and for each host that envs join; empty before the start.
         any_deaths: a worker died, and its replacement has not completed a step yet.
         close_errors: env id and error of each env whose `close` raised.
@@ -160,6 +162,7 @@ class Supervisor:
         self.shutdown = Shutdown(self._lifetime, self._records, self.resources, self._layout, arena)
         self.workers = Workers(self._records, self._envs, self._requests)
         self.hints = Hints(self._records)
+        self.crash_log = CrashLog()
         self._start_fault: Exception | None = None
         self._now = 0.0
         self._any_given_up = False
@@ -374,6 +377,8 @@ class Supervisor:
             self.members.tick(now)
         if self.detector.timed or self.detector.any_dying:
             self.detector.check(now)
+        if now >= self.crash_log.due:
+            self.crash_log.flush(now)
 
     # -- deaths -------------------------------------------------------------------
 
@@ -407,13 +412,15 @@ class Supervisor:
             self._requests.lose_host(exited.host_id)
             self._give_up(record, partial(report.refusal, owed))
             return GivenUp(record.host, owed, report.error)
-        _log.warning("%s", report.message(owed))
+        at_fault = None if record.culprit is None else self._envs.env_ids[record.culprit]
+        self.crash_log.note(
+            record.config.name, report.message(owed), cause, at_fault, self._clock()
+        )
         self._schedule_restart(record)
         if not was_up:
             return None
         self._requests.lose_host(exited.host_id)
         resets = not record.is_hardware
-        at_fault = None if record.culprit is None else self._envs.env_ids[record.culprit]
         return Replaced(record.host, owed, report.error, cause, at_fault, resets)
 
     def _schedule_restart(self, record: HostRecord) -> None:
