@@ -53,15 +53,16 @@ DICE = pytest.mark.parametrize("make", [Dice, AwaitableDice])
 
 
 def rolled(make: Any, seed: int | None, *, options: Any = None, count: int = 3) -> list[Any]:
-    """The numbers of a reset, three steps, a death, and three steps, by env."""
+    """The numbers of a reset, three steps, a death, three steps, and all of it again, by env."""
     found: list[Any] = []
     config = EnvConfig(name="d", make_env=make, num_workers=count, envs_per_process=1)
     with sync.build_env_group(config) as group:
-        batch, _ = group.reset(seed=seed, options=options)
-        for deadly in (0, 0, 0, 1, 0, 0, 0):
-            found.append(batch.observation)
-            batch, _ = group.step(batch.respond(action=np.full(count, deadly)))
-        assert batch.restarted.sum() == 0
+        for _ in range(2):
+            batch, _ = group.reset(seed=seed, options=options)
+            for deadly in (0, 0, 0, 1, 0, 0, 0):
+                found.append(batch.observation)
+                batch, _ = group.step(batch.respond(action=np.full(count, deadly)))
+            assert batch.restarted.sum() == 0
     return np.array(found).tolist()
 
 

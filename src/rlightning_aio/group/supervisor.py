@@ -447,8 +447,12 @@ class Supervisor:
         checkpoints = self._continuity.checkpoints(record.slots)
         # What the generators of a seeded group begin with must not be by chance.
         seed = self._envs.last_seed.item(record.host.first_slot)
-        entropy = (seed, record.restarts) if seed >= 0 else ()
-        order = replace(record.order, checkpoints=checkpoints, entropy=entropy)
+        order = replace(
+            record.order,
+            checkpoints=checkpoints,
+            restarts=record.restarts,
+            seed=seed if seed >= 0 else None,
+        )
         record.host.attach(order)
 
     def _on_refused(self, record: HostRecord, why: OSError | str, now: float) -> None:

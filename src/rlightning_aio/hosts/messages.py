@@ -114,13 +114,15 @@ class AttachOrder:
         rows: index of the slab, and the row in it, for each env.
         checkpoints: of the envs of a replacement (see `Saved`); None for an env that begins a new
             episode. Empty if all do.
-        entropy: numbers that seed the global generators of a replacement; empty for the system's.
+        restarts: how many workers had these envs before; seed: of the last reset of the first env
+            that had one. They seed the global generators of a replacement.
     """
 
     slabs: tuple[tuple[int, int], ...]
     rows: tuple[tuple[int, int], ...]
     checkpoints: tuple[bytes | None, ...] = ()
-    entropy: tuple[int, ...] = ()
+    restarts: int = 0
+    seed: int | None = None
 
 
 @dataclass(frozen=True)

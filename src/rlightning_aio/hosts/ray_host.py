@@ -166,7 +166,7 @@ class RayHost:
             map_part = partial(map_shared, self._wiring.arena.descriptor)
             places = [(slab, row) for _, slab, row in placed(self._started, order, map_part)]
             self._table = RowTable(self.first_slot, places)
-        elif self._life is not None and (order.entropy or any(order.checkpoints)):
+        elif self._life is not None and order.restarts:
             self._life.call(self._life.actor.resume, self._on_resumed, order)
         # A replacement is not built yet.
         if self._life is not None and self._life.is_built:

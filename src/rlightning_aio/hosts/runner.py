@@ -90,6 +90,7 @@ class EnvRunner:
         video: what to film from the first episode on; None films nothing.
 
     Attributes:
+        restarts: how many workers had this env before.
         step: steps with the action in the row.
         begin_step: starts a step that the simulator computes by itself, and returns a function
             that ends it. None if the env has no such step.
@@ -102,6 +103,7 @@ class EnvRunner:
     ) -> None:
         self.env = env
         self.meta: EnvMeta = env.initialised()
+        self.restarts = 0
         self._inline = inline
         self._hands_over_tensors = False
         self.step: Execute = self._not_attached
@@ -365,9 +367,13 @@ class EnvRunner:
         return seed
 
     def _seed_generators(self, seed: int | None) -> None:
-        """Seed the global generators for an episode that begins with a seed."""
+        """Seed the global generators for an episode that begins with a seed.
+
+        An episode that is repeated after a death gets other numbers: an env that crashes by chance
+        would crash at the same step again.
+        """
         if seed is not None and not self._inline:
-            seed_generators(seed)
+            seed_generators(seed, self.restarts)
 
     def _reset(self, seed: int | None, options: dict[str, Any] | None) -> OutOfBand | None:
         """Start a new episode."""
@@ -479,8 +485,11 @@ def attach_here(
 
 def resume_all(runners: Sequence[EnvRunner], order: AttachOrder) -> None:
     """Seed a replacement, and restore its envs that have a checkpoint."""
-    if order.entropy:
-        seed_generators(*order.entropy)
+    if order.seed is not None:
+        # Not the numbers of an episode that begins with that seed.
+        seed_generators(order.seed, order.restarts, 1)
+    for runner in runners:
+        runner.restarts = order.restarts
     for runner, checkpoint in zip(runners, order.checkpoints, strict=False):
         if checkpoint is not None:
             runner.resume(checkpoint)
