@@ -7,7 +7,7 @@ import math
 import multiprocessing
 import warnings
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 import gymnasium as gym
 import numpy as np
@@ -23,6 +23,7 @@ from rlightning_aio.batch import BatchedData
 from rlightning_aio.envs.sub_envs import adapted
 from rlightning_aio.errors import BadAction, ConfigError, EnvFault
 from rlightning_aio.group.continuity import as_int
+from rlightning_aio.group.sync import driver_of
 from rlightning_aio.protocol.columns import leaves
 from rlightning_aio.sync import EnvGroup, build_env_group
 from rlightning_aio.types import PolicyResponse
@@ -42,6 +43,8 @@ if TYPE_CHECKING:
     from rlightning_aio.vector.rows import Singles
 
 __all__ = ["VectorEnv", "per_worker"]
+
+T = TypeVar("T")
 
 _NOT_TO_BE_CALLED: Final = ("reset", "step", "close")
 
@@ -178,8 +181,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
             AlreadyPendingCallError: another call is pending.
             ClosedEnvironmentError: the vector env is closed.
         """
-        self.reset_async(seed, options)
-        return self.reset_wait()
+        return _in_one_call(self.group, partial(self.reset_async, seed, options), self.reset_wait)
 
     def reset_async(
         self,
@@ -243,8 +245,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
             ClosedEnvironmentError: the vector env is closed.
         """
         if self._deaths.unfinished:
-            self.step_async(actions)
-            return self.step_wait()
+            return _in_one_call(self.group, partial(self.step_async, actions), self.step_wait)
         responses = self._responses(actions)
         self._has_leftovers = self._has_lost = True  # Until they are returned.
         try:
@@ -511,6 +512,16 @@ class _SubEnvProxy:
 
     def __setattr__(self, name: str, value: Any) -> None:
         self._call("set_wrapper_attr", name, value)
+
+
+def _in_one_call(group: EnvGroup, send: Callable[[], None], wait: Callable[[], T]) -> T:
+    """Send and wait; Ctrl-C comes in the wait, and leaves nothing pending."""
+
+    def ask() -> T:
+        send()
+        return wait()
+
+    return driver_of(group).call(ask)
 
 
 def _check_name(name: str) -> None:
