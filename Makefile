@@ -28,7 +28,7 @@ NEWEST := .venv-newest
 PIP_INSTALL = $(@D)/bin/python -m pip install --quiet --disable-pip-version-check
 
 .DEFAULT_GOAL := help
-.PHONY: help run test simulate test-programs test-newest test-sanitized test-aarch64 test-ray environments test-simulators test-gpu test-lerobot test-peers test-pythons test-site check prose format docs dist bench clean
+.PHONY: help run test simulate mutations test-programs test-newest test-sanitized test-aarch64 test-ray environments test-simulators test-gpu test-lerobot test-peers test-pythons test-site check prose format docs dist bench clean
 
 help: ## this list
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 24
@@ -61,6 +61,11 @@ simulate: export PYTHONPATH := tests
 simulate: export RLIGHTNING_AIO_DEBUG := 1
 simulate: $(VENV)/installed-test ## random programs in a simulated world, compared with a model: SEEDS=1000, SEED=n, REAL=1
 	$(PY) -m simulator --seeds $(or $(SEEDS),1000) --first $(or $(FIRST),0) $(SEED:%=--seed %) $(REAL:1=--real)
+
+# One defect: ONLY='late replies'. It takes an hour of one core.
+mutations: export PYTHONPATH := tests
+mutations: $(VENV)/installed-test ## defects that were fixed, put back one at a time: how many random programs find each
+	$(PY) -m simulator.mutations --most $(or $(SEEDS),2000) $(ONLY:%=--only '%')
 
 # What is said of every place where envs may live, and what only Ray can be asked.
 test-ray: $(VENV)/installed-ray ## the tests of `placement: ray`, on clusters of this machine
