@@ -1,16 +1,13 @@
-"""Episode continuity: the transition table, and random use compared with a naive model."""
+"""Episode continuity: its transition table, and losses and checkpoints step by step."""
 
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.group.continuity import (
@@ -156,90 +153,3 @@ def test_an_env_that_was_not_built_anew_does_not_resume() -> None:
     continuity.lose([0], "could not be put back")
     _, seeds = continuity.report_losses(SLOT, STEP)
     assert seeds.tolist() == [NO_SEED]
-
-
-@dataclass
-class ModelEnv:
-    """The model's view of one env."""
-
-    num_steps: int = 0
-    cut: bool = False
-    ended: bool = False
-
-
-class ContextMachine(RuleBasedStateMachine):
-    """Steps, resets and ends of a few envs inside and outside contexts, in random batches."""
-
-    @initialize(size=st.integers(1, 4))
-    def start(self, size: int) -> None:
-        self.continuity = new_continuity(size)
-        self.model = [ModelEnv() for _ in range(size)]
-        self.limit: int | None = None
-        self.on_done = True
-
-    @precondition(lambda self: self.limit is None)
-    @rule(limit=st.integers(1, 4), on_done=st.booleans())
-    def enter(self, limit: int, on_done: bool) -> None:
-        self.continuity.begin(limit, on_done=on_done)
-        self.limit, self.on_done = limit, on_done
-
-    @precondition(lambda self: self.limit is not None)
-    @rule()
-    def leave(self) -> None:
-        self.continuity.end()
-        self.limit = None
-
-    @rule(data=st.data(), fails=st.sampled_from((False, False, True)))
-    def step(self, data: st.DataObject, fails: bool) -> None:
-        """Return one batch. If memory runs out, it is judged again."""
-        slots = data.draw(
-            st.lists(st.sampled_from(range(len(self.model))), min_size=1, unique=True)
-        )
-        due = np.broadcast_to(self.continuity.begin_steps(np.array(slots)), len(slots))
-        resets, overs, cuts = [], [], []
-        for slot, is_due in zip(slots, due.tolist(), strict=True):
-            env = self.model[slot]
-            expected = env.cut or (self.on_done and env.ended)
-            assert is_due == (self.limit is not None and expected)
-            if self.limit is None:
-                env.cut = False
-            if is_due:
-                self.model[slot] = env = ModelEnv()
-            else:
-                env.num_steps += 1
-                env.ended = env.ended or data.draw(st.booleans())
-            resets.append(is_due)
-            overs.append(env.ended)
-            cuts.append(self.limit is not None and not is_due and env.num_steps >= self.limit)
-            env.cut = env.cut or cuts[-1]
-        self.hand_out(slots, resets, overs, cuts, fails)
-
-    @rule(data=st.data())
-    def reset(self, data: st.DataObject) -> None:
-        slots = data.draw(
-            st.lists(st.sampled_from(range(len(self.model))), min_size=1, unique=True)
-        )
-        self.continuity.note_resets(slots)
-        for slot in slots:
-            self.model[slot] = ModelEnv()
-        nothing = [False] * len(slots)
-        self.hand_out(slots, [True] * len(slots), nothing, nothing, fails=False)
-
-    def hand_out(
-        self, slots: list[int], resets: list[bool], overs: list[bool], cuts: list[bool], fails: bool
-    ) -> None:
-        flagged = [part_of(slots, resets, overs)] if any(resets + overs) else []
-        for _ in range(1 + fails):
-            verdict = self.continuity.judge(np.array(slots), flagged)
-        is_cut = [False] * len(slots) if verdict.is_cut is None else verdict.is_cut.tolist()
-        assert is_cut == cuts
-        self.continuity.returned(np.array(slots), flagged, verdict)
-
-    @invariant()
-    def positions_agree(self) -> None:
-        if hasattr(self, "model"):
-            positions = self.continuity.positions(np.arange(len(self.model)))
-            assert positions == [Position(env.num_steps, env.cut) for env in self.model]
-
-
-TestContext = ContextMachine.TestCase
