@@ -18,11 +18,13 @@ __all__ = [
     "BadAction",
     "ClientRefused",
     "ConfigError",
+    "EnvAborted",
     "EnvAway",
     "EnvBusy",
     "EnvFault",
     "EnvHung",
     "EnvRaised",
+    "EpisodeLost",
     "GroupClosed",
     "NotInitialised",
     "NothingPending",
@@ -252,6 +254,20 @@ class EnvHung(WorkerDied):
 
 class EnvAway(EnvFault):
     """The client of a remote env is not connected; it may come back."""
+
+
+class EnvAborted(EnvFault):
+    """`abort` or `drain` of the group has ended the request of an env that another call waits for.
+
+    The env is free; its episode is over.
+    """
+
+
+class EpisodeLost(EnvFault):
+    """The step of an `EnvEpisode` has no result: its env was replaced, and the episode is over.
+
+    The cause is in the message, and in `EnvEpisode.lost`.
+    """
 
 
 class StartFailed(EnvFault):

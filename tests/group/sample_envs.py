@@ -185,6 +185,15 @@ class Gated(Probe):
         return super().step(policy_resp)
 
 
+@ENVS.register("gated_where_there_is_one")
+class SometimesGated(Gated):
+    """Each step waits at the gate, if the test has made one."""
+
+    def wait_at_gate(self) -> None:
+        if Path(self.config.env_kwargs["gates"], self.env_id).exists():
+            super().wait_at_gate()
+
+
 class Gate:
     """Lets one step of one env through; opening the FIFO for reading announces the step."""
 

@@ -26,7 +26,7 @@ from rlightning_aio.protocol.entries import SLOT_MASK, Operation
 from rlightning_aio.protocol.entries import entry as entry_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from rlightning_aio.group.requests import Ticket
 
@@ -73,7 +73,8 @@ class Driven:
             Event.GIVEN_UP: self._give_up,
             Event.METHOD_GIVEN_UP: self._give_up,
             Event.CLAIMED: self._claim,
-            Event.DROPPED: lambda: self.table.take_joined(self.table.alone(SLOT), None),
+            Event.DROPPED: lambda: self.table.claim(self.table.alone(SLOT), None),
+            Event.ABORTED: self._abort,
         }
 
     def situation(self) -> Situation:
@@ -96,7 +97,7 @@ class Driven:
 
     def _claim(self) -> None:
         self.ticket = self.table.tickets.open(np.array([SLOT, COMPANION]))
-        self.table.take_joined(self.table.alone(SLOT), self.ticket)
+        self.table.claim(self.table.alone(SLOT), self.ticket)
         self._ask([COMPANION], Operation.RESET, self.ticket.owner)
 
     def _step_at_once(self) -> None:
@@ -115,6 +116,11 @@ class Driven:
         slots = self.table.alone(self._end())
         ((owner, mine),) = self.table.owners(slots).items()
         self.table.fail(mine, owner, fault())
+
+    def _abort(self) -> None:
+        self.table.aborted.add(SLOT, fault())
+        assert self.table.end(1, self.entry()) is None
+        assert not self.table.aborted.faults
 
     def _restart(self) -> None:
         owed = self.table.owed(np.arange(3))
@@ -233,7 +239,7 @@ def test_any_other_event_is_refused_or_has_no_effect(
         # A reply without a request, like a late one.
         assert table.end(1, driven.entry()) is None
         assert table.complete_one(1, driven.entry()) is None
-    elif event is Event.RESTARTED:
+    elif event in (Event.RESTARTED, Event.ABORTED):
         assert table.owed(slots).size == 0
     elif event in (Event.CLAIMED, Event.DROPPED):
         assert not table.joined(slots).any()
@@ -281,7 +287,7 @@ def test_a_first_result_is_handed_out_once() -> None:
     ticket = table.tickets.open(np.array([SLOT, COMPANION]))
     table.join(SLOT, 1.0)
     assert table.joined(table.alone(SLOT)).all()
-    table.take_joined(table.alone(SLOT), ticket)
+    table.claim(table.alone(SLOT), ticket)
     assert not table.joined(table.alone(SLOT)).any()
 
 
@@ -428,7 +434,7 @@ class RequestsMachine(RuleBasedStateMachine):
         claim = Claim(self.table.tickets.open(everyone, method=method), slots + taken)
         self.claims.append(claim)
         if taken:
-            self.table.take_joined(np.array(taken), claim.ticket)
+            self.table.claim(np.array(taken), claim.ticket)
             for slot in taken:
                 self.slots[slot].owner = claim
         self.ask(slots, op, claim)
@@ -459,7 +465,7 @@ class RequestsMachine(RuleBasedStateMachine):
     @rule(data=st.data())
     def drop_first_results(self, data: st.DataObject) -> None:
         slots = self.some(data, self.joined())
-        self.table.take_joined(np.array(slots), None)
+        self.table.claim(np.array(slots), None)
         for slot in slots:
             self.slots[slot] = Asked(entry=self.slots[slot].entry)
 
@@ -547,6 +553,29 @@ class RequestsMachine(RuleBasedStateMachine):
         else:
             self.fail([slot])
 
+    @precondition(lambda self: self.those(State.BUSY))
+    @rule(data=st.data(), how=st.sampled_from(("reported", "ended", "lost")))
+    def abort(self, data: st.DataObject, how: str) -> None:
+        """Whatever a host says of requests that were aborted, they end without a reply."""
+        host = int(self.host_of[self.one_busy(data)[0]])
+        slots = self.some(data, self.those(State.BUSY, host=host))
+        for slot in slots:
+            self.table.aborted.add(slot, fault())
+        entries = [self.slots[slot].entry for slot in slots]
+        if how == "reported":
+            assert not len(self.table.complete([(host, np.array(entries))]))
+        elif how == "ended":
+            assert [self.table.end(host, entry) for entry in entries] == [None] * len(slots)
+        else:
+            self.die_with(host, aborted=slots)
+        assert not self.table.aborted.faults
+        for slot in slots:
+            claim = self.slots[slot].owner
+            if claim is not None:
+                claim.slots.remove(slot)
+                claim.num_faults += 1
+            self.slots[slot] = Asked(entry=self.slots[slot].entry)
+
     @precondition(lambda self: self.late)
     @rule(data=st.data())
     def answer_late(self, data: st.DataObject) -> None:
@@ -563,10 +592,16 @@ class RequestsMachine(RuleBasedStateMachine):
         """Let a host die: steps and resets are sent again to a replacement; all else ends in
         errors.
         """
-        host = data.draw(st.sampled_from(range(len(self.table.in_flight))))
+        self.die_with(data.draw(st.sampled_from(range(len(self.table.in_flight)))), replaced)
+
+    def die_with(self, host: int, replaced: bool = True, aborted: Sequence[int] = ()) -> None:
+        """Let a host die, for whose death there may be requests that were aborted."""
         owed = self.those(State.BUSY, host=host)
-        again = [s for s in owed if replaced and self.slots[s].op is not Operation.CALL]
         self.table.lose_host(host)
+        others = self.table.end_aborted(np.array(owed, np.intp)).tolist()
+        assert others == [slot for slot in owed if slot not in aborted]
+        owed = others
+        again = [s for s in owed if replaced and self.slots[s].op is not Operation.CALL]
         if failed := [slot for slot in owed if slot not in again]:
             self.fail(failed)
         if not again:

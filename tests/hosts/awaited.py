@@ -99,9 +99,10 @@ class Scripted(BaseEnv):
         return self._result(last_reward=float(action), last_terminated=action == END, info=info)
 
     async def _ignore_cancellation(self) -> None:
+        let_go = getattr(self, "let_go", None) or asyncio.Event()  # None in a worker.
         while True:
             try:
-                await self.let_go.wait()
+                await let_go.wait()
             except asyncio.CancelledError:
                 continue
             return

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import gc
 import logging
 import math
@@ -35,7 +36,17 @@ from patience import HANG as LONG
 
 import rlightning_aio as rl
 import rlightning_aio.sync
-from rlightning_aio.errors import ConfigError, EnvBusy, EnvHung, EnvRaised, StartFailed, WorkerDied
+from rlightning_aio.errors import (
+    ConfigError,
+    EnvAborted,
+    EnvBusy,
+    EnvHung,
+    EnvRaised,
+    EpisodeLost,
+    NothingPending,
+    StartFailed,
+    WorkerDied,
+)
 from rlightning_aio.evaluation import EpisodeSpec, evaluate
 
 if TYPE_CHECKING:
@@ -170,24 +181,123 @@ async def test_an_agent_may_be_one_coroutine_for_each_env() -> None:
         assert await asyncio.gather(*agents) == [(5 + k, k) for k in range(8)]
 
 
-async def test_an_episode_that_is_cancelled_leaves_its_env_idle() -> None:
-    """The result of the step that was in flight is in nobody's way."""
+@pytest.mark.parametrize("action", [HANG, IGNORE], ids=["hangs", "ignores it"])
+@pytest.mark.parametrize("leave", ["cancelled", "timeout", "exception", "caught"])
+async def test_an_episode_that_is_left_during_a_step_leaves_its_env_idle(
+    place: dict[str, Any], leave: str, action: int
+) -> None:
+    """At once, though the step would never end. Its env is replaced; no other notices anything."""
+    sent = asyncio.Event()
 
     async def agent() -> None:
-        async with group.episode("e-0") as env:
-            await env.step(GATE)
+        async with group.episode("e-0", seed=3) as env:
+            await env.step(STEP)
+            asyncio.get_running_loop().call_soon(sent.set)
+            if leave == "timeout":
+                async with asyncio.timeout(0.01):
+                    await env.step(action)
+            if leave == "caught":
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(0.01):
+                        await env.step(action)
+                return
+            async with asyncio.TaskGroup() as tasks:
+                step = tasks.create_task(env.step(action))
+                if leave == "exception":
+                    await asyncio.sleep(0.01)
+                    raise ZeroDivisionError
+                await step
 
-    async with rl.build_env_group(entry(num_workers=2)) as group:
-        gate = Scripted.gates["e-0"] = asyncio.Event()
+    async with rl.build_env_group(entry(num_workers=2, **place)) as group:
+        batch, _ = await group.reset(env_ids=["e-1"])
         running = asyncio.ensure_future(agent())
-        await until_at_gate("e-0")
-        running.cancel()
-        await asyncio.sleep(0)
-        gate.set()
-        with pytest.raises(asyncio.CancelledError):
-            await running
+        await sent.wait()
+        group.step_async(batch.respond(action=[STEP]))
+        if leave == "cancelled":
+            running.cancel()
+        (outcome,) = await asyncio.gather(running, return_exceptions=True)
+        assert {
+            "cancelled": asyncio.CancelledError,
+            "timeout": TimeoutError,
+            "exception": ExceptionGroup,
+            "caught": type(None),
+        }[leave] is type(outcome)
+        assert group.pending == ["e-1"]
+        batch, _ = await group.collect_async()
+        assert batch.observation.tolist() == [[1, 1, 1, -1]]
+        batch, _ = await group.step(steps(e_0=STEP, e_1=STEP))
+        assert batch.restarted.tolist() == [True, False]
+        assert batch.observation.tolist() == [[2, 1, 0, 3], [1, 1, 2, -1]]
+        assert group.get_workers()[0]["restarts"] == 0
+
+
+async def test_an_episode_tells_that_it_was_lost(place: dict[str, Any]) -> None:
+    """Its last result stays that of the step before; further steps of it are refused."""
+    async with rl.build_env_group(entry(step_timeout=SOON, **place)) as group:
+        async with group.episode("e-0", seed=3) as episode:
+            await episode.step(STEP)
+            assert (episode.lost, episode.is_over) == (None, False)
+            for _ in range(2):
+                with pytest.raises(EpisodeLost, match="'e-0' is lost: its env hung in a step"):
+                    await episode.step(HANG)
+                assert (episode.lost, episode.is_over) == ("hung in a step and was cancelled", True)
+                last: Any = episode.last
+                assert last.observation.tolist() == [1, 1, 1, 3]
+        batch, _ = await group.step(steps(e_0=STEP))
+        assert batch.observation.tolist() == [[2, 1, 1, 3]]
+
+
+async def test_steps_that_have_not_begun_are_aborted_as_well() -> None:
+    """Of envs that queue, or that are just being rebuilt."""
+    config = entry(num_workers=3, max_concurrency=1)
+    async with rl.build_env_group(config) as group:
+        await group.reset()
+        group.step_async(steps(e_0=HANG, e_1=STEP, e_2=STEP))
+        await group.abort(["e-1"])
+        assert group.pending == ["e-0", "e-2"]
+        await group.abort(["e-0"])
+        batch, _ = await group.collect_async()
+        assert batch.ids() == ["e-2"]
+        for _ in range(3):
+            group.step_async(steps(e_0=HANG))
+            await group.abort()
+        batch, _ = await group.step(steps(e_0=STEP, e_1=STEP, e_2=STEP))
+        assert batch.restarted.tolist() == [True, True, False]
+
+
+async def test_a_call_that_waits_for_an_env_learns_that_it_was_aborted(
+    place: dict[str, Any],
+) -> None:
+    """With the results of the others; a collector waits for the rest, or has nothing pending."""
+    async with rl.build_env_group(entry(num_workers=3, **place)) as group:
         batch, _ = await group.reset()
-        assert batch.observation[:, 1].tolist() == [2, 1]
+        stepping = asyncio.ensure_future(group.step(steps(e_0=STEP, e_1=HANG)))
+        await asyncio.sleep(0)
+        group.step_async(batch.take([2]).respond(action=[HANG]))
+        collecting = asyncio.ensure_future(group.collect_async())
+        await asyncio.sleep(0)
+        await group.abort(["e-1", "e-2"])
+        with pytest.raises(EnvAborted, match=r"the step of env 'e-1'.* was aborted") as aborted:
+            await stepping
+        assert aborted.value.results.ids() == ["e-0"]
+        with pytest.raises(NothingPending):
+            await collecting
+        batch, _ = await group.reset()
+        assert batch.observation[:, 0].tolist() == [1, 2, 2]
+
+
+async def test_an_abort_that_is_cancelled_ends_the_step_all_the_same(place: dict[str, Any]) -> None:
+    async with rl.build_env_group(entry(num_workers=2, **place)) as group:
+        await group.reset()
+        group.step_async(steps(e_0=HANG))
+        aborting = asyncio.ensure_future(group.abort())
+        await asyncio.sleep(0)
+        aborting.cancel()
+        await asyncio.wait({aborting})
+        while group.pending:
+            await group.step(steps(e_1=STEP))
+        batch, _ = await group.reset()
+        assert batch.observation[0].tolist() == [2, 1, 0, -1]
 
 
 async def test_a_step_that_is_cancelled_and_tried_again_leaves_its_env_idle() -> None:

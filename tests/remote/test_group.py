@@ -676,3 +676,29 @@ def test_a_client_process_that_dies_or_stops_is_found_by_its_silence(
     assert lost[0].env_id == "robots-0/c0"
     assert lost[0].last_truncated
     assert steps > 10
+
+
+def test_an_aborted_request_costs_its_client_the_session() -> None:
+    """The env of the client comes to a safe stop, and joins again when its step has ended."""
+    go_on = threading.Event()
+    slow, quick = CountingEnv(0, on_step=lambda: go_on.wait(HANG)), CountingEnv(1)
+    slow.stays = True
+    with sync.build_env_group(entry(min_clients=2)) as group, clients(group, slow, quick):
+        batch, _ = group.reset(seed=10)
+        group.step_async(batch.respond(action=actions(batch)))
+        (aborted,) = [ret.env_id for ret in batch.values() if ret.observation[0] == 0]
+        group.abort([aborted])
+        batch, _ = group.collect_async(wait_all=True, deadline=HANG)
+        assert batch.observation.tolist() == [[1, 11, 1]]
+        assert group.pending == []
+        assert (slow.disconnects, slow.steps) == (0, 0)
+        go_on.set()
+        batch, _ = group.collect_async(deadline=HANG)
+        assert batch.env_ids() == [aborted]
+        assert (batch.is_reset.tolist(), batch.restarted.tolist()) == ([True], [False])
+        assert (slow.disconnects, slow.steps) == (1, 0)
+        group.step_async(batch.respond(action=actions(batch)))
+        batch, _ = group.drain(deadline=HANG)
+        assert batch.observation.tolist() == [[0, -1, 1]]
+        slow.stays = False
+        group.close()

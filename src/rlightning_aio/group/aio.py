@@ -334,6 +334,12 @@ class EnvGroup(GroupInterface):
         )
         return await self._driver.run(procedure)
 
+    async def abort(self, env_ids: Sequence[str] | None = None) -> None:
+        await self._driver.run(self._core.abort(time.monotonic(), env_ids))
+
+    async def drain(self, deadline: float | None = None) -> tuple[BatchedData, list[bool]]:
+        return await self._driver.run(self._drain(deadline))
+
     async def collect_calls(self, deadline: float | None = None) -> list[Any]:
         return await self._driver.run(self._collect_calls(deadline))
 
@@ -366,8 +372,9 @@ class EnvGroup(GroupInterface):
                 while not episode.is_over:
                     await episode.step(await choose(episode.last.observation))
 
-        On entry the env is reset. On exit it is idle: the result of a step during which the agent
-        was cancelled is dropped. Other envs can be collected in batches meanwhile.
+        On entry the env is reset. On exit it is idle: a step that is in flight, because the agent
+        was cancelled or raised, is aborted (see `abort`). Other envs can be collected in batches
+        meanwhile.
 
         Args:
             env_id: which env, idle.

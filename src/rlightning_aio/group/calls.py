@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from rlightning_aio.errors import NothingPending, RLightningError
+from rlightning_aio.errors import EnvAborted, NothingPending, RLightningError
 from rlightning_aio.protocol.entries import Operation
 
 if TYPE_CHECKING:
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from rlightning_aio.errors import EnvFault
     from rlightning_aio.group.dispatch import Dispatch
     from rlightning_aio.group.intake import Intake
     from rlightning_aio.group.requests import Ticket
@@ -103,6 +104,16 @@ class Calls:
         entries = self._requests.submit(slots, op, ticket.owner, now)
         self._requests.numbering.num_values[slots] += 1
         self._dispatch.hand_over(slots, entries, packed)
+
+    def drop(self) -> list[EnvFault]:
+        """Drop the calls of `call_async`, all of which have ended; return errors of their envs."""
+        if self._collecting:
+            return []  # Whoever collects them gets what they led to.
+        tickets, self._sent = self._sent, []
+        for ticket in tickets:
+            self._requests.settle(ticket)
+        faults = [fault for ticket in tickets for fault in ticket.faults]
+        return [fault for fault in faults if not isinstance(fault, EnvAborted)]
 
     def collect_calls(self, now: float, deadline: float | None) -> Procedure[list[Any]]:
         """Wait for all calls of `call_async`, and return their values in order of sending."""

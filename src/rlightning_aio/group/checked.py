@@ -147,9 +147,13 @@ class CheckedRequests(Requests):
         with self.changes((Event.HANDED_OUT, slots)):
             super().hand_out(slots)
 
-    def take_joined(self, slots: NDArray[np.intp], ticket: Ticket | None) -> None:
+    def end_aborted(self, slots: NDArray[np.intp]) -> NDArray[np.intp]:
+        with self.changes((Event.ABORTED, slots[self.aborted.among(slots)])):
+            return super().end_aborted(slots)
+
+    def claim(self, slots: NDArray[np.intp], ticket: Ticket | None) -> None:
         with self.changes((Event.DROPPED if ticket is None else Event.CLAIMED, slots)):
-            super().take_joined(slots, ticket)
+            super().claim(slots, ticket)
 
     def settle(self, ticket: Ticket) -> None:
         with self.changes((Event.SETTLED, ticket.slots)):

@@ -38,6 +38,8 @@ FAULT: Final = 1 << 6
 """An error waits for the collector."""
 FIRST_RESULTS: Final = 1 << 7
 """Observations are still being compared with the bounds of their spaces."""
+ABORTING: Final = 1 << 9
+"""A request is to end without its reply."""
 RECORDING: Final = 1 << 8
 """A timeline is being recorded."""
 

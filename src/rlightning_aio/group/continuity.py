@@ -20,7 +20,7 @@ import numpy as np
 
 from rlightning_aio.group.conditions import CUT_BEFORE, LOST_EPISODE, Conditions
 from rlightning_aio.protocol.entries import Operation, op_of
-from rlightning_aio.protocol.slab import AS_RESTORED, IS_RESET, NO_SEED, OVER
+from rlightning_aio.protocol.slab import AS_BEFORE, AS_RESTORED, IS_RESET, NO_SEED, OVER
 
 if TYPE_CHECKING:
     from collections.abc import Container, Iterable, Sequence
@@ -139,6 +139,7 @@ class _Loss:
     Attributes:
         from_checkpoint: it was built anew from its last checkpoint, which it can show.
         resumes: the request that was lost with the worker was to show a state.
+        seed: of the reset that reports it; `AS_BEFORE` where its env may know that.
         position: of the state that the reply in flight will show; of this phase only, as
         steps_lost: see `Report`.
     """
@@ -148,6 +149,7 @@ class _Loss:
     at_fault: str | None = None
     from_checkpoint: bool = False
     resumes: bool = False
+    seed: int = NO_SEED
     position: Position | None = None
     steps_lost: int | None = None
 
@@ -300,6 +302,7 @@ class Continuity:
             reports[k] = True
             checkpoint = self._checkpoint(slot) if loss.from_checkpoint else None
             if checkpoint is None or not (is_step[k] or loss.resumes):
+                seeds[k] = loss.seed
                 self._move(slot, LossEvent.REPORT_SENT)
                 continue
             seeds[k] = AS_RESTORED
@@ -341,7 +344,18 @@ class Continuity:
         for slot in slots:
             loss = self._move(slot, LossEvent.EPISODE_LOST)
             loss.cause, loss.at_fault = cause, at_fault
-            loss.from_checkpoint = from_checkpoint
+            loss.from_checkpoint, loss.seed = from_checkpoint, NO_SEED
+
+    def abandon(self, slots: Iterable[int], cause: str) -> None:
+        """Record that the caller has ended the episodes of `slots`, whose requests end without a
+        reply, or whose results were dropped. No checkpoint of them is used.
+        """
+        slots = list(slots)
+        self.lose(slots, cause)
+        for slot in slots:
+            self._losses[slot].seed = AS_BEFORE
+            for kept in (self._pending, self._checkpoints, self._restored):
+                kept.pop(slot, None)
 
     def answered(self, slots: NDArray[np.intp]) -> list[Report]:
         """Record that results of `slots` arrived, and return the losses that they report."""

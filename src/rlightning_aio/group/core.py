@@ -17,6 +17,7 @@ import numpy as np
 from rlightning_aio.batch.contents import slots_of
 from rlightning_aio.batch.data import BatchedData, batch_of_results
 from rlightning_aio.errors import BadAction, NothingPending, RLightningError
+from rlightning_aio.group.aborts import Aborts
 from rlightning_aio.group.actions import response_columns, write_actions
 from rlightning_aio.group.arrivals import Arrivals
 from rlightning_aio.group.calls import Calls
@@ -122,6 +123,9 @@ class Core:
         self._resets = Resets(
             tables, supervisor, self._dispatch, self.results, self.intake, self.waiting
         )
+        self._aborts = Aborts(
+            tables, supervisor, self.results, self._arrivals, self.intake, self.waiting
+        )
         self.newest = Newest(tables, supervisor.members)
         self.collecting = False
 
@@ -210,10 +214,7 @@ class Core:
     def _collect(self, now: float, rules: CollectRules) -> Procedure[tuple[BatchedData, Flags]]:
         timeout, deadline = rules.timeout, rules.deadline
         self.lifetime.check_open()
-        if self.collecting:
-            raise RLightningError(
-                "another collect_async is already waiting on this group; one collector at a time"
-            )
+        self._check_collecting()
         among = None if rules.entries is None else self.envs.of_entries(rules.entries)
         self.collecting = True
         try:
@@ -241,6 +242,12 @@ class Core:
             self.waiting.end()
         slots = self.requests.collector.take(most, among)
         return self.hand_out(np.sort(slots) if rules.ordered else slots, synchronous=False)
+
+    def _check_collecting(self) -> None:
+        if self.collecting:
+            raise RLightningError(
+                "another collect_async is already waiting on this group; one collector at a time"
+            )
 
     def _counts(self, rules: CollectRules, among: NDArray[np.bool_] | None) -> tuple[int, int, int]:
         """Read replies; return the numbers of results that are ready, possible, and needed.
@@ -341,7 +348,7 @@ class Core:
         """Return the results of a call in its order, or raise its faults with the results."""
         if not ticket.faults:
             return self.hand_out(slots, synchronous=True)
-        done = self.requests.ready(slots)
+        done = self.requests.ready(ticket.slots)  # Others may have requests of other calls.
         fault = ticket.faults[0]
         fault.others = tuple(ticket.faults[1:])
         if len(done):
@@ -388,6 +395,58 @@ class Core:
         with self.observed.call("reset_async", now):
             self._resets.reset_async(now, seed, options, env_ids)
         self.waiting.wake()
+
+    # -- ends without results ---------------------------------------------------------
+
+    def abort(self, now: float, env_ids: Sequence[str] | None) -> Procedure[None]:
+        """End the requests of envs, and drop their results."""
+        with self.observed.call("abort", now):
+            self.lifetime.check_open()
+            slots = self._all_slots if env_ids is None else self.envs.find(env_ids)
+            self.intake.now = now
+            self.waiting.poll()
+            self._aborts.drop(slots)
+            yield from self._aborts.end(slots, now)
+
+    @property
+    def _all_slots(self) -> NDArray[np.intp]:
+        """The slots of local envs, and of members that are present or not."""
+        return np.arange(len(self.envs))
+
+    def drain_requests(
+        self, now: float, deadline: float | None
+    ) -> Procedure[tuple[BatchedData, Flags]]:
+        """Return the results that are ready by then, and end all other requests."""
+        with self.observed.call("drain", now):
+            return (yield from self._drain(now, deadline))
+
+    def _drain(self, now: float, deadline: float | None) -> Procedure[tuple[BatchedData, Flags]]:
+        self.lifetime.check_open()
+        self._check_collecting()
+        collector, end = self.requests.collector, now + (deadline or 0.0)
+        self.collecting = True
+        try:
+            self.intake.now = now
+            self.waiting.poll()
+            while now < end and collector.num_awaited:
+                now = yield from self.waiting.turn(collector.num_awaited, end)
+                self.waiting.poll()
+            yield from self._aborts.end(self._all_slots, now)
+        finally:
+            self.collecting = False
+            self.waiting.end()
+        collector.note_faults(self.calls.drop())
+        results: tuple[BatchedData, Flags] = BatchedData([], []), []
+        if collector.num_ready:
+            slots = np.sort(collector.take(collector.num_ready))
+            results = self.hand_out(slots, synchronous=False)
+        if collector.faults:
+            faults = [*collector.faults]
+            for fault in faults:
+                collector.take_fault(fault)
+            faults[0].results, faults[0].others = results[0], tuple(faults[1:])
+            raise faults[0]
+        return results
 
     # -- states of envs ---------------------------------------------------------------
 

@@ -10,6 +10,7 @@ import asyncio
 from typing import TYPE_CHECKING, Any, Self
 
 from rlightning_aio.batch.contents import all_agents
+from rlightning_aio.errors import EpisodeLost
 from rlightning_aio.group.facade import only_result, steps_of
 
 if TYPE_CHECKING:
@@ -29,9 +30,11 @@ class EnvEpisode:
 
     Attributes:
         env: the handle of the env.
-        last: its newest result; after entry that of the reset.
+        last: its newest result; after entry that of the reset, and that of the step before where a
+            step was lost.
         is_over: the newest result has ended the episode, of all agents and sub-environments; a
-            step limit of `auto_reset` ends it, too.
+            step limit of `auto_reset` ends it, too, and so does a loss.
+        lost: why the env was replaced or its client is gone, if it was: the episode has no end.
     """
 
     last: EnvRet | MultiAgentEnvRet
@@ -46,13 +49,15 @@ class EnvEpisode:
     ) -> None:
         self._group, self.env = group, env
         self._seed, self._options = seed, options
+        self.lost: str | None = None
         # The newest call, and earlier ones that were cancelled or raised.
         self._tasks: list[asyncio.Task[tuple[BatchedData, Any]]] = []
 
     async def __aenter__(self) -> Self:
         try:
             seeds = None if self._seed is None else [self._seed]
-            await self._wait_for(self._group.reset(seeds, self._options, [self.env.env_id]))
+            found = await self._answer(self._group.reset(seeds, self._options, [self.env.env_id]))
+            self._take(found)
         except BaseException:
             await self.__aexit__()  # Nobody else calls it for a context that was not entered.
             raise
@@ -60,24 +65,44 @@ class EnvEpisode:
 
     async def __aexit__(self, *exc: object) -> None:
         tasks, self._tasks = self._tasks, []
+        if any(not task.done() for task in tasks):
+            tasks.append(asyncio.ensure_future(self._group.abort([self.env.env_id])))
+            # However often this is cancelled, they go on, and the env is idle in the end.
+            await asyncio.wait(tasks)
         for task in tasks:
-            await asyncio.wait({task})
             # Read, so that asyncio doesn't log an error that nobody asks for.
             _ = task.cancelled() or task.exception()
 
     async def step(self, response: PolicyResponse | Any) -> EnvRet | MultiAgentEnvRet:
         """Step with a `PolicyResponse`, or with a bare action, and wait for the result.
 
-        Cancelled, it leaves the result to the end of the episode; until the env has replied,
-        further steps raise `EnvBusy`. Other errors are those of `EnvHandle.step`.
-        """
-        await self._wait_for(self._group.step(steps_of(self.env.env_id, response)))
-        return self.last
+        Cancelled, it leaves the result to the end of the episode, which aborts the step; until
+        then, further steps raise `EnvBusy`. Other errors are those of `EnvHandle.step`, and:
 
-    async def _wait_for(self, answer: Answer) -> None:
+        Raises:
+            EpisodeLost: the env was replaced during this step or an earlier one, so there is no
+                result; the env has begun another episode.
+        """
+        if self.lost is None:
+            found = await self._answer(self._group.step(steps_of(self.env.env_id, response)))
+            if not found[0].restarted.any():
+                self._take(found)
+                return self.last
+            info = found[0].values()[0].info
+            self.lost = str(info.get("worker_restarted") or info.get("client_lost"))
+            self.is_over = True
+        raise EpisodeLost(
+            f"the episode of env {self.env.env_id!r} is lost: its env {self.lost}",
+            env_id=self.env.env_id,
+        )
+
+    async def _answer(self, answer: Answer) -> tuple[BatchedData, Any]:
         task = asyncio.ensure_future(answer)
         self._tasks.append(task)
         found = await asyncio.shield(task)
         self._tasks.remove(task)
+        return found
+
+    def _take(self, found: tuple[BatchedData, Any]) -> None:
         self.last = only_result(found)
         self.is_over = bool(all_agents(found[0].done).all())

@@ -272,6 +272,10 @@ class Facade:
         call = (name, args, kwargs)
         self._driver.call(self._core.calls.call_async, time.monotonic(), env_ids, call)
 
+    def _drain(self, deadline: float | None) -> Procedure[tuple[BatchedData, list[bool]]]:
+        _check_seconds("deadline", deadline)
+        return self._core.drain_requests(time.monotonic(), deadline)
+
     def _collect_calls(self, deadline: float | None) -> Procedure[list[Any]]:
         _check_seconds("deadline", deadline)
         return self._core.calls.collect_calls(time.monotonic(), deadline)

@@ -89,6 +89,8 @@ def culprit_of(
     """
     if record.hung_slot is not None:
         return record.hung_slot
+    if record.aborted_slot is not None:
+        return record.aborted_slot
     slot_of_entry = {requests.numbering.entry.item(slot): slot for slot in unanswered.tolist()}
     for entry in death.requests:
         if entry in slot_of_entry:
@@ -100,6 +102,8 @@ def cause_of(record: HostRecord, death: Death, requests: Requests) -> str:
     """The cause of a worker's end: the supervisor's reason for killing it, else its exit."""
     if record.hung_slot is not None:
         return f"hung in {_doing(requests, record.hung_slot)} and was killed"
+    if record.aborted_slot is not None:
+        return f"was killed because {_doing(requests, record.aborted_slot)} was aborted"
     if record.rebuild_error is not None:
         error = record.rebuild_error
         return f"could not be rebuilt: {error.summary}"
@@ -110,7 +114,7 @@ def cause_of(record: HostRecord, death: Death, requests: Requests) -> str:
 
 
 def _doing(requests: Requests, slot: int) -> str:
-    op, method = requests.numbering.op(slot), requests.method(slot)
+    op, method = requests.numbering.op(slot), requests.tickets.method(requests.owner.item(slot))
     if op in (Operation.STEP, Operation.RESET, Operation.SNAPSHOT, Operation.RESTORE):
         return f"a {Operation(op).name.lower()}"
     return f"a call of {method}()" if method else "a call"

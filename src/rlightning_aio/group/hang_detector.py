@@ -3,7 +3,7 @@
 Rule: read pending output before killing a host. The worker measures how long its env takes, and
 stops its clock while it waits for the trainer to read. A worker that executes nothing gets its
 limit again whenever data passes between the two. Before a kill, the host is asked for completions
-that the trainer, late itself, has not read yet.
+that the trainer, late itself, has not read yet. An aborted request has a short limit.
 """
 
 from __future__ import annotations
@@ -18,12 +18,16 @@ from rlightning_aio.protocol.entries import Operation, slot_of
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from numpy.typing import NDArray
+
     from rlightning_aio.group.host_record import HostRecord
     from rlightning_aio.group.observed import Observed
     from rlightning_aio.group.requests import Requests
 
 __all__ = ["HangDetector", "has_news"]
 
+_ABORT_SECONDS: Final = 0.2
+"""Limit for aborted requests to end by themselves. Most do, and no worker has to be killed."""
 _OBEY_SECONDS: Final = 5.0
 """Limit for the exit of a killed worker to be reported. After that, the process that should have
 killed it hangs, too. Only an overloaded machine needs a tenth of it.
@@ -38,8 +42,8 @@ class HangDetector:
 
     Attributes:
         timed: some requests have a time limit.
-        any_dying: a killed host has not reported its exit. If neither holds, nothing needs to be
-            checked.
+        any_ending: a killed host has not reported its exit, or requests to a host that can be
+            killed were aborted. If neither holds, nothing needs to be checked.
     """
 
     def __init__(
@@ -48,17 +52,39 @@ class HangDetector:
         self._records = records
         self._requests = requests
         self._observed = observed
-        self.any_dying = False
+        self.any_ending = False
         self._now = 0.0
         self.timed = False
+
+    def abort(self, slots: NDArray[np.intp], now: float) -> list[tuple[int, int]]:
+        """Have hosts end the outstanding requests of `slots`, which are aborted.
+
+        A host that can't, and that can be killed, is killed if they don't end soon. Returns host
+        and entry of those that were held for a replacement, and are no longer.
+        """
+        entries, hosts = self._requests.numbering.entry[slots], self._requests.hosts[slots]
+        no_longer_held: list[tuple[int, int]] = []
+        found: list[int] = sorted({*hosts.tolist()})
+        for host_id in found:
+            record, own = self._records[host_id], entries[hosts == host_id]
+            if record.held is not None:
+                no_longer_held += [(host_id, entry) for entry in record.withdraw(own)]
+                continue
+            if record.aborting is not None:
+                record.aborting.abort(own)
+            if record.killable is not None and record.abort_by is None:
+                record.abort_by = now + _ABORT_SECONDS
+                self.any_ending = True
+        return no_longer_held
 
     def expiries(self) -> list[float | None]:
         """Return the times when `check` must be called."""
         times: list[float | None] = []
         if self.timed:
             times += [self._expiry(r) for r in self._records if r.timed and self._in_flight(r)]
-        if self.any_dying:
+        if self.any_ending:
             times += [r.die_by or self._now for r in self._records if r.dying]
+            times += [r.abort_by for r in self._records]
         return times
 
     def check(self, now: float) -> None:
@@ -68,13 +94,27 @@ class HangDetector:
             for record in self._records:
                 if record.timed and self._in_flight(record):
                     self._check_hung(record)
-        self._check_dying()
+        if self.any_ending:
+            for record in self._records:
+                if record.abort_by is not None:
+                    self._check_aborted(record, record.abort_by)
+            self._check_dying()
+            self.any_ending = any(r.dying or r.abort_by is not None for r in self._records)
+
+    def _check_aborted(self, record: HostRecord, by: float) -> None:
+        """Kill a worker whose aborted requests go on."""
+        aborted = [slot for slot in self._requests.aborted.faults if slot in record.slots]
+        if not aborted or record.dying:
+            record.abort_by = None
+        elif self._now >= by and not has_news(record):
+            record.abort_by, record.aborted_slot = None, aborted[0]
+            self.kill(record, dump=False)
 
     def kill(self, record: HostRecord, *, dump: bool) -> None:
         """Kill a host; with `dump`, its worker writes its stacks first."""
         record.kill(dump=dump)
         if record.killable is not None:
-            record.dying = self.any_dying = True
+            record.dying = self.any_ending = True
 
     def _in_flight(self, record: HostRecord) -> int:
         return self._requests.in_flight[record.host.host_id]
@@ -128,8 +168,6 @@ class HangDetector:
 
     def _check_dying(self) -> None:
         """Destroy hosts that a kill has not ended, together with their fork server."""
-        if not self.any_dying:
-            return
         for record in self._records:
             if not record.dying:
                 continue
@@ -140,7 +178,6 @@ class HangDetector:
                 assert record.killable is not None
                 record.die_by = None
                 record.killable.destroy()
-        self.any_dying = any(record.dying for record in self._records)
 
 
 def has_news(record: HostRecord) -> bool:

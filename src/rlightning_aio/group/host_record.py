@@ -6,13 +6,14 @@ from dataclasses import dataclass, field
 from enum import Enum, auto
 from typing import TYPE_CHECKING, Any
 
-from rlightning_aio.hosts.base import Killable
+import numpy as np
+
+from rlightning_aio.hosts.base import Aborting, Killable
 from rlightning_aio.registry import ENVS, placement_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    import numpy as np
     from numpy.typing import NDArray
 
     from rlightning_aio.config import EnvConfig
@@ -54,12 +55,14 @@ class HostRecord:
             step; key None for deaths of unknown cause. culprit: the slot of the last death.
         dying: it was killed, and its exit was not reported yet; die_by: the deadline of that.
         hung_slot: the env that hung, while its worker is being killed.
+        abort_by: when its worker is killed, unless its aborted requests have ended before;
+            aborted_slot: of the env for whose request that is being done.
         idle: its progress when it was last seen idle, and idle_since the time (`HangDetector`).
         rebuild_error: the error of its replacement while rebuilding the envs.
         lost_slots: of envs that are not rebuilt though their host goes on.
         last_death: makes the error for slots whose states were lost in it.
         refusal: makes the error for new requests to slots of a host that was given up.
-        killable: the host, if it can be killed.
+        killable: the host, if it can be killed; aborting: if it can end single requests.
         is_local: its envs use this machine's cores; is_hardware: they move in the real world.
         slots: of its envs.
         timed: some of its requests have a time limit, which the supervisor watches.
@@ -82,6 +85,8 @@ class HostRecord:
     dying: bool = False
     die_by: float | None = None
     hung_slot: int | None = None
+    abort_by: float | None = None
+    aborted_slot: int | None = None
     idle: tuple[int, ...] = ()
     idle_since: float = 0.0
     rebuild_error: ErrorText | None = None
@@ -89,6 +94,7 @@ class HostRecord:
     last_death: Callable[[NDArray[np.intp]], WorkerDied] | None = None
     refusal: Callable[[NDArray[np.intp]], WorkerDied] | None = None
     killable: Killable | None = field(init=False)
+    aborting: Aborting | None = field(init=False)
     timed: bool = field(init=False)
     is_local: bool = field(init=False)
     is_hardware: bool = field(init=False)
@@ -97,10 +103,23 @@ class HostRecord:
     def __post_init__(self) -> None:
         limits = (self.config.step_timeout, self.config.reset_timeout)
         self.killable = self.host if isinstance(self.host, Killable) else None
+        self.aborting = self.host if isinstance(self.host, Aborting) else None
         self.timed = self.killable is not None and limits != (None, None)
         self.is_local = placement_of(self.config.backend, self.config.placement).local
         self.is_hardware = ENVS.is_hardware(self.config.backend)
         self.slots = range(self.host.first_slot, self.host.first_slot + self.host.num_envs)
+
+    def withdraw(self, entries: NDArray[np.int64]) -> list[int]:
+        """Hold some requests no longer; return those that it has held."""
+        withdrawn: list[int] = []
+        kept: list[tuple[NDArray[np.int64], Sequence[Any] | None]] = []
+        for held, arguments in self.held or ():
+            stays = ~np.isin(held, entries)
+            own: list[int] = stays.nonzero()[0].tolist()
+            kept.append((held[stays], arguments and [arguments[k] for k in own]))
+            withdrawn += held[~stays].tolist()
+        self.held = kept
+        return withdrawn
 
     def kill(self, *, dump: bool) -> None:
         """Kill its worker, if it has one; `dump` first writes the worker's stacks to stderr."""

@@ -134,7 +134,9 @@ class Intake:
         doing = Operation(op).name.lower()
         go_on = "reset the env to go on"
         if answers_with_value(op):
-            doing = f"the call of {self._requests.method(slot)}()"
+            doing = (
+                f"the call of {self._requests.tickets.method(self._requests.owner.item(slot))}()"
+            )
             go_on = "the env is still usable"
         return EnvRaised.of(
             f"{self._envs.describe(slot)} raised in {doing}: {error.summary}{after}; its "
@@ -179,6 +181,8 @@ class Intake:
 
     def _on_saved(self, completion: Saved) -> None:
         slot = self._supervisor.hosts[completion.host_id].first_slot + completion.env_index
+        if slot in self._requests.aborted.faults:
+            return  # Of an episode that the caller has ended.
         numbering = self._requests.numbering
         entry, is_step = numbering.entry.item(slot), numbering.op(slot) == Operation.STEP
         self._continuity.save(
@@ -196,14 +200,16 @@ class Intake:
         outcome = self._supervisor.handle_exit(completion)
         if isinstance(outcome, GivenUp):
             self._continuity.give_up(_slots_of_host(outcome.host))
-            self._fail(outcome.owed, outcome.error_for)
+            self._fail(self._requests.end_aborted(outcome.owed), outcome.error_for)
         elif outcome is not None:
             self._replace_host(outcome)
 
     def _replace_host(self, outcome: Replaced) -> None:
         """Send the outstanding requests of a dead worker to its replacement."""
-        host, owed = outcome.host, outcome.owed
-        slots = _slots_of_host(host)
+        host, slots = outcome.host, _slots_of_host(outcome.host)
+        # Their episodes were over before.
+        others = [slot for slot in slots if slot not in self._requests.aborted.faults]
+        owed = self._requests.end_aborted(outcome.owed)
         for slot in self._requests.ready(np.array(slots, np.intp)).tolist():
             # Decoded now, because the replacement announces other schemas.
             self._results.detach_info(slot)
@@ -211,7 +217,7 @@ class Intake:
         if not outcome.resets:
             self._fail(owed, outcome.error_for)
             return
-        self._continuity.lose(slots, outcome.cause, outcome.at_fault, from_checkpoint=True)
+        self._continuity.lose(others, outcome.cause, outcome.at_fault, from_checkpoint=True)
         # A replacement answers steps and resets, but not calls.
         calls = self._requests.numbering.awaits_value(owed)
         self._fail(owed[calls], outcome.error_for)

@@ -137,6 +137,52 @@ class GroupInterface(Facade):
         """
         raise NotImplementedError
 
+    def abort(self, env_ids: Sequence[str] | None = None) -> Any:
+        """End what envs are doing, and drop its results; the envs are free when this returns.
+
+        Args:
+            env_ids: the envs; None: all. Idle ones are left as they are.
+
+        Within a second, whatever an env does: an awaitable env's step is cancelled, and the env is
+        closed and rebuilt. An env of a worker or a Ray actor may end its step within 0.2 seconds;
+        then its worker is killed and replaced, which costs other envs in it their episodes, as
+        any death does (`on_worker_death` and `max_restarts` don't count this one). An env_server
+        ends the client's session, and the client may come back with a new one. Only in this process
+        nothing can end a step that has begun; those that haven't are withdrawn.
+
+        The episodes are over: reset the envs, or step them, which resets them first and marks the
+        result as after a restart. Robots move only when they are reset. Another call that waits
+        for one of the envs raises `EnvAborted`; `collect_async` waits for the rest. Errors that
+        were not collected stay. Cancelled, it ends the requests all the same.
+
+        Raises:
+            UnknownEnv: no env of this group has that id.
+            GroupClosed: the group was not initialised, or is closed.
+        """
+        raise NotImplementedError
+
+    def drain(self, deadline: float | None = None) -> Any:
+        """Return results that are ready, and end everything else; all envs are idle then.
+
+        Args:
+            deadline: seconds to wait for the results of `step_async` and `reset_async`; None
+                takes those that are ready now.
+
+        Requests that have not ended by then are aborted, as by `abort`, also those of other calls;
+        values of `call_async` are dropped.
+
+        Returns results and a flag for each, as `collect_async` does, in the order of the group;
+        an empty batch if there are none. Cancelled, it loses no result that was ready.
+
+        Raises:
+            ValueError: `deadline` isn't above 0.
+            EnvRaised, WorkerDied, EnvHung: an error that waited to be collected, once all envs are
+                idle; the results are in its ``results``, further errors in ``others``.
+            GroupClosed: the group was not initialised, or is closed.
+            RLightningError: another call is collecting.
+        """
+        raise NotImplementedError
+
     def collect_calls(self, deadline: float | None = None) -> Any:
         """Wait for the values of all calls that `call_async` has sent.
 

@@ -40,11 +40,13 @@ class Event(Enum):
     CLAIMED = auto()
     """A call takes a first result that waited for the collector."""
     DROPPED = auto()
-    """A call asks for more than that first result."""
+    """A call asks for more than that first result, or its caller wants no result."""
     RESULT = auto()
     VALUE = auto()
     FAULT = auto()
     WITHDRAWN = auto()
+    ABORTED = auto()
+    """It has ended, and nobody gets what it led to."""
     RESTARTED = auto()
     HANDED_OUT = auto()
     SETTLED = auto()
@@ -67,6 +69,7 @@ LEGAL: Final[dict[tuple[State, Owner, Event], tuple[State, Owner]]] = {
     (_BUSY, _C, Event.RESULT): (_READY, _C),
     (_BUSY, _C, Event.FAULT): (_IDLE, _C),
     (_BUSY, _C, Event.WITHDRAWN): (_IDLE, _C),
+    (_BUSY, _C, Event.ABORTED): (_IDLE, _C),
     (_BUSY, _C, Event.RESTARTED): (_BUSY, _C),
     (_READY, _C, Event.HANDED_OUT): (_IDLE, _C),
     (_READY, _C, Event.CLAIMED): (_READY, _T),
@@ -74,6 +77,7 @@ LEGAL: Final[dict[tuple[State, Owner, Event], tuple[State, Owner]]] = {
     (_BUSY, _T, Event.RESULT): (_READY, _T),
     (_BUSY, _T, Event.VALUE): (_SPENT, _T),
     (_BUSY, _T, Event.FAULT): (_SPENT, _T),
+    (_BUSY, _T, Event.ABORTED): (_IDLE, _C),
     (_BUSY, _T, Event.RESTARTED): (_BUSY, _T),
     (_BUSY, _T, Event.GIVEN_UP): (_BUSY, _C),
     (_BUSY, _T, Event.METHOD_GIVEN_UP): (_BUSY, _N),
@@ -83,6 +87,7 @@ LEGAL: Final[dict[tuple[State, Owner, Event], tuple[State, Owner]]] = {
     (_SPENT, _T, Event.SETTLED): (_IDLE, _C),
     (_BUSY, _N, Event.VALUE): (_IDLE, _C),
     (_BUSY, _N, Event.FAULT): (_IDLE, _C),
+    (_BUSY, _N, Event.ABORTED): (_IDLE, _C),
 }
 """State and owner after each possible event. A combination that is missing can't happen."""
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from rlightning_aio.group.conditions import FAULT, Conditions
+from rlightning_aio.group.conditions import ABORTING, FAULT, Conditions
 from rlightning_aio.group.request_states import COLLECTOR, NOBODY, State
 from rlightning_aio.protocol.entries import (
     ANSWERS_WITH_VALUE,
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from rlightning_aio.errors import EnvFault
 
-__all__ = ["CollectorQueue", "Numbering", "Requests", "Ticket", "Tickets"]
+__all__ = ["Aborted", "CollectorQueue", "Numbering", "Requests", "Ticket", "Tickets"]
 
 
 # Plain ints: NumPy takes several times as long over members of an enum.
@@ -98,6 +98,11 @@ class Tickets:
         self._next_owner += 1
         self.waiting[ticket.owner] = ticket
         return ticket
+
+    def method(self, owner: int) -> str:
+        """Return the method that the call `owner` calls, or an empty string."""
+        ticket = self.waiting.get(owner)
+        return "" if ticket is None else ticket.method
 
 
 class Numbering:
@@ -224,6 +229,33 @@ class CollectorQueue:
         self._conditions.note(FAULT, bool(self.faults))
 
 
+class Aborted:
+    """The slots whose outstanding requests end without a reply, whatever their hosts report.
+
+    Attributes:
+        faults: by slot, the error for a call that waits for the request.
+    """
+
+    def __init__(self, conditions: Conditions) -> None:
+        self._conditions = conditions
+        self.faults: dict[int, EnvFault] = {}
+
+    def add(self, slot: int, fault: EnvFault) -> None:
+        """Add a slot whose request is outstanding."""
+        self.faults[slot] = fault
+        self._conditions.note(ABORTING, True)
+
+    def among(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Return which of `slots` are aborted."""
+        return np.array([slot in self.faults for slot in slots.tolist()], np.bool_)
+
+    def take(self, slots: NDArray[np.intp]) -> list[EnvFault]:
+        """Remove slots whose requests have ended; return their errors."""
+        taken = [self.faults.pop(slot) for slot in slots.tolist()]
+        self._conditions.note(ABORTING, bool(self.faults))
+        return taken
+
+
 class Requests:
     """See the module.
 
@@ -238,6 +270,7 @@ class Requests:
         state: `State`; owner: of the current request.
         sent_ns: when it was sent.
         in_flight: requests of each host that are not answered; the only count of them.
+        aborted: requests that end without a reply.
         answered: something has ended since this was set to False.
     """
 
@@ -249,7 +282,9 @@ class Requests:
         self.hosts = host_of
         self.numbering = Numbering(size)
         self.tickets = Tickets()
-        self.collector = CollectorQueue(conditions or Conditions())
+        conditions = conditions or Conditions()
+        self.collector = CollectorQueue(conditions)
+        self.aborted = Aborted(conditions)
         self.state = np.zeros(size, np.int8)
         self.owner = np.zeros(size, np.int64)
         self.sent_ns = np.zeros(size, np.int64)
@@ -372,6 +407,8 @@ class Requests:
         else:
             for host_id, own in reports:
                 self.in_flight[host_id] -= len(own)
+        if self.aborted.faults:
+            slots = self.end_aborted(slots)
         self.deliver(slots)
         return slots
 
@@ -383,12 +420,34 @@ class Requests:
         return slot
 
     def end(self, host_id: int, entry: int) -> int | None:
-        """End the request `entry`, and return its slot; None if the reply is late."""
+        """End the request `entry`, and return its slot; None if nobody wants the reply any more."""
         slot = slot_of(entry)
         if self.state[slot] != _BUSY_CODE or self.numbering.entry.item(slot) != entry:
             return None
         self.in_flight[host_id] -= 1
+        if slot in self.aborted.faults:
+            self.end_aborted(self.alone(slot))
+            return None
         return slot
+
+    def end_aborted(self, slots: NDArray[np.intp]) -> NDArray[np.intp]:
+        """End those of `slots` that are aborted, none of them in flight; return the others.
+
+        A call that waits for one gets its error, the collector nothing; the slot is free.
+        """
+        aborted = self.aborted.among(slots)
+        for owner, mine in self.owners(slots[aborted]).items():
+            faults = self.aborted.take(mine)
+            if owner > 0:
+                ticket = self.tickets.waiting[owner]
+                ticket.slots = ticket.slots[~np.isin(ticket.slots, mine)]
+                ticket.remaining -= len(mine)
+                ticket.faults += faults
+            elif owner == COLLECTOR:
+                self.collector.num_awaited -= len(mine)
+            self._forget(mine)
+            self.answered = True
+        return slots[~aborted]
 
     def join(self, slot: int, now: float) -> None:
         """Record a first result without a request; the slot is idle."""
@@ -478,8 +537,8 @@ class Requests:
         ready = (self.state[slots] == _READY_CODE) & (self.owner[slots] == COLLECTOR)
         return ready & (self.numbering.ops(slots) == _JOIN)
 
-    def take_joined(self, slots: NDArray[np.intp], ticket: Ticket | None) -> None:
-        """Give first results of the collector to a call; None drops them."""
+    def claim(self, slots: NDArray[np.intp], ticket: Ticket | None) -> None:
+        """Give results of the collector to a call; None drops them."""
         self.collector.remove(slots)
         if ticket is None:
             self.state[slots] = _IDLE_CODE
@@ -488,11 +547,6 @@ class Requests:
             ticket.remaining -= len(slots)
 
     # -- calls that wait for their own replies ------------------------------------
-
-    def method(self, slot: int) -> str:
-        """Return the method of the current request of `slot`, or an empty string."""
-        ticket = self.tickets.waiting.get(self.owner.item(slot))
-        return "" if ticket is None else ticket.method
 
     def settle(self, ticket: Ticket) -> None:
         """Close a ticket that has all replies: results may be returned, the rest is idle."""

@@ -199,7 +199,7 @@ class Resets:
         An env that joins has been reset. That is `enough` unless the reset has a seed or options,
         so a robot that takes minutes to reset isn't reset twice.
         """
-        self._requests.take_joined(slots, ticket if enough else None)
+        self._requests.claim(slots, ticket if enough else None)
         if not enough:
             for slot in slots.tolist():
                 self._results.drop(slot)

@@ -296,6 +296,9 @@ class Supervisor:
         record.stage = Stage.UP
         record.start_by = None
         record.idle = ()
+        if 0 in record.deaths.values():
+            record.deaths = {slot: count for slot, count in record.deaths.items() if count}
+            self._update_any_deaths()
         if self._lifetime.open:
             self._note_fate("up", record.host.host_id)
         held, record.held = record.held, None
@@ -354,7 +357,7 @@ class Supervisor:
     def next_check(self, until: float | None = None) -> float | None:
         """Return the time by which `check` must be called, or `until` if that is earlier."""
         times = [until]
-        if self.detector.timed or self.detector.any_dying:
+        if self.detector.timed or self.detector.any_ending:
             times += self.detector.expiries()
         if self.any_deaths:
             times += [due for r in self._records for due in (r.start_by, r.restart_at)]
@@ -375,7 +378,7 @@ class Supervisor:
                     self._restart(record, now)
         if self.members.possible:
             self.members.tick(now)
-        if self.detector.timed or self.detector.any_dying:
+        if self.detector.timed or self.detector.any_ending:
             self.detector.check(now)
         if now >= self.crash_log.due:
             self.crash_log.flush(now)
@@ -389,7 +392,7 @@ class Supervisor:
         and if the worker was a replacement that never came up: requests wait for the next one.
         """
         record, death = self._records[exited.host_id], exited.death
-        record.dying, record.die_by = False, None
+        record.dying, record.die_by, record.abort_by = False, None, None
         is_first_start = record.stage.value < Stage.UP.value and record.order is None
         if is_first_start or not self._lifetime.open:
             record.stage = Stage.CLOSED
@@ -405,6 +408,7 @@ class Supervisor:
         unanswered = self._requests.numbering.entry[owed].tolist()
         self._continuity.drop_unfinished(record.slots, set(unanswered))
         was_up = record.stage is Stage.UP
+        is_fault = record.aborted_slot is None
         report, cause, is_last = self._judge(record, death, owed)
         record.last_death = partial(report.loss, owed)
         self._note_fate("given up" if is_last else "died", exited.host_id, cause)
@@ -413,9 +417,11 @@ class Supervisor:
             self._give_up(record, partial(report.refusal, owed))
             return GivenUp(record.host, owed, report.error)
         at_fault = None if record.culprit is None else self._envs.env_ids[record.culprit]
-        self.crash_log.note(
-            record.config.name, report.message(owed), cause, at_fault, self._clock()
-        )
+        message = report.message(owed)
+        if is_fault:
+            self.crash_log.note(record.config.name, message, cause, at_fault, self._clock())
+        else:
+            _log.info("%s", message)
         self._schedule_restart(record)
         if not was_up:
             return None
@@ -478,11 +484,15 @@ class Supervisor:
         if record.stage is Stage.UP:
             # A replacement that fails to start counts against the env that made it necessary.
             record.culprit = culprit_of(record, death, requests, owed)
-        deaths = record.deaths[record.culprit] = record.deaths.get(record.culprit, 0) + 1
+        is_fault = record.aborted_slot is None  # Else the caller's wish, which counts for nothing.
+        deaths = record.deaths[record.culprit] = record.deaths.get(record.culprit, 0) + is_fault
         self._note_deaths(True)
         cause = cause_of(record, death, requests)
-        is_last = config.on_worker_death == "raise" or deaths > config.max_restarts
-        if config.on_worker_death == "raise":
+        raises = config.on_worker_death == "raise"
+        is_last = is_fault and (raises or deaths > config.max_restarts)
+        if not is_fault:
+            outcome = "it is replaced"
+        elif raises:
             outcome = "on_worker_death is 'raise', so it is not replaced"
         elif is_last:
             outcome = f"it is not replaced after {deaths - 1} restarts in a row (max_restarts)"
@@ -493,7 +503,7 @@ class Supervisor:
             if record.is_hardware:
                 outcome += "; it moves nothing until you reset it"
         report = death_report(self._envs, record, replace(death, cause=cause), requests, outcome)
-        record.hung_slot = record.rebuild_error = None
+        record.hung_slot = record.aborted_slot = record.rebuild_error = None
         return report, cause, is_last
 
     def _give_up(self, record: HostRecord, refusal: ErrorFor) -> None:

@@ -329,6 +329,12 @@ class EnvGroup(GroupInterface):
         )
         return self._driver.run(procedure)
 
+    def abort(self, env_ids: Sequence[str] | None = None) -> None:
+        self._driver.run(self._core.abort(time.monotonic(), env_ids))
+
+    def drain(self, deadline: float | None = None) -> tuple[BatchedData, list[bool]]:
+        return self._driver.run(self._drain(deadline))
+
     def collect_calls(self, deadline: float | None = None) -> list[Any]:
         return self._driver.run(self._collect_calls(deadline))
 

@@ -194,12 +194,6 @@ class AwaitedEnv:
         """Return the tasks that execute and close it."""
         return [self.task] if self._closing is None else [self.task, self._closing]
 
-    def forget(self) -> None:
-        """Let its task go without a word, if no event loop goes on with it."""
-        if not self._loop.is_running():
-            # As `asyncio.gather` does; the warning about the group says enough.
-            setattr(self.task, "_log_destroy_pending", False)  # noqa: B010  # Not in its type.
-
     def _on_end(self, task: asyncio.Task[None]) -> None:
         del task
         for future in (self.made, self.stopped):

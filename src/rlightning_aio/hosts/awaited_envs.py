@@ -23,6 +23,7 @@ from rlightning_aio.hosts.event_loop import (
     TimeLimit,
     cancel,
     cancel_leftovers,
+    leave_behind,
     log,
     new_task,
     place_of,
@@ -211,6 +212,8 @@ class AwaitedEnvs:
         errors = [(env.index, error) for env in envs if (error := env.close_error) is not None]
         closed = {**self._closed, **{env: env.name for env in envs}}
         await cancel(self._leftovers(closed), CANCEL_SECONDS / 4)
+        for task in tasks_of({*closed, *self._envs}, self._loop):
+            leave_behind(task)
         return errors
 
     def disconnect(self) -> None:
@@ -223,8 +226,8 @@ class AwaitedEnvs:
         if self._envs and not self._loop.is_closed():
             for task in self._tasks | tasks_of(self._envs, self._loop).keys():
                 task.cancel()
-        for env in self._envs:
-            env.forget()
+        for env in self._envs if self._envs and not self._loop.is_running() else ():
+            leave_behind(env.task)  # The warning about the group says enough.
         self._places.clear()
 
     def _end(self) -> None:
@@ -318,6 +321,24 @@ class AwaitedEnvs:
             1e3 * seconds,
             Operation(op_of(entry)).name.lower(),
         )
+
+    def abort(self, entry: int) -> None:
+        """End a request at once, if it has not ended; the env that executes it is replaced."""
+        if self._ending:
+            return
+        place = self._places[slot_of(entry) - self._first_slot]
+        aborted = Raised(self._host_id, entry, ErrorText.of(asyncio.CancelledError("aborted")))
+        if place.entry == entry:
+            if place.restoring is not None:
+                place.restoring.cancel()
+            if place.env is not None:
+                self._put_away(place, place.env, "was aborted")
+            self._finish(place, aborted)
+            return
+        queued = [one for one in self._queue if one[1] != entry]
+        if len(queued) < len(self._queue):
+            self._queue = deque(queued)
+            self._post(aborted)
 
     # -- envs that are lost -------------------------------------------------------
 

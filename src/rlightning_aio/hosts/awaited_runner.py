@@ -74,7 +74,8 @@ class AwaitedRunner(EnvRunner):
         if arguments is None:
             if self._checkpoints.must_show():
                 return self._show()
-            arguments = self._slab.take_seed(self._row), None
+            as_before = self._slab.take_as_before(self._row)
+            arguments = self.reset_with if as_before else (self._slab.take_seed(self._row), None)
         self._checkpoints.forget_result()
         seed, options = arguments
         if arguments is not self.reset_with:  # Not after a hang, whose numbers would come again.

@@ -68,6 +68,10 @@ class Awaiting:
     def submit(self, entry: int, arguments: Any) -> None:
         self._envs.submit(entry, arguments)
 
+    def abort(self, entry: int) -> None:
+        """End a request without its result, if it has not ended."""
+        self._envs.abort(entry)
+
     def serve(
         self, channel: socket.socket, take_requests: Callable[[], bool]
     ) -> list[tuple[int, ErrorText]]:

@@ -3,8 +3,9 @@
 A `Host` starts, accepts requests, and ends. It reports everything by completions, which it appends
 to the queue of its group (see `messages`). The other protocols are optional: a host with a
 descriptor is a `Source`, a host whose results don't wake the driver is `Polled`, a host that
-executes in the thread of the caller is `Executing`, and a host whose envs join and leave has
-`Membership`. The core checks for these protocols, never for a class of hosts.
+executes in the thread of the caller is `Executing`, one that can end single requests is `Aborting`,
+and a host whose envs join and leave has `Membership`. The core checks for these protocols, never
+for a class of hosts.
 Left out on purpose: waiting. Neither side ever waits.
 """
 
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from rlightning_aio.types import EnvMeta
 
 __all__ = [
+    "Aborting",
     "Executing",
     "Host",
     "HostFactory",
@@ -194,6 +196,22 @@ class Killable(Protocol):
         """Kill it and the process that it depends on, if `kill` had no effect.
 
         `Died` follows, also for other hosts that depend on that process.
+        """
+        ...
+
+
+@runtime_checkable
+class Aborting(Protocol):
+    """A host that can end a request without harm to its other envs."""
+
+    def abort(self, entries: NDArray[np.int64]) -> None:
+        """End requests soon, without blocking, as far as that is possible.
+
+        Args:
+            entries: of requests, which may have ended already.
+
+        One completion follows for each, as for any request, when nothing of it goes on in its env;
+        nobody uses what it holds.
         """
         ...
 

@@ -257,6 +257,15 @@ class EnvServerHost:
         seed, options = given or (cast("Slab", self._slab).take_seed(index), None)
         return requests.reset(row.name, number, seed, options, now)
 
+    def abort(self, entries: NDArray[np.int64]) -> None:
+        """See `base.Aborting`. The client is lost, and may come back with a new session."""
+        for entry in cast("list[int]", entries.tolist()):
+            row = self._rows[slot_of(entry) - self.first_slot]
+            self._sessions.dismiss(row.name, "the trainer aborted its request")
+        now = time.monotonic()
+        self._listener.flush(now)
+        self.tick(now)
+
     # -- replies ------------------------------------------------------------------
 
     def fileno(self) -> int:

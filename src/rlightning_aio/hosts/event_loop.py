@@ -26,6 +26,7 @@ __all__ = [
     "TimeLimit",
     "cancel",
     "cancel_leftovers",
+    "leave_behind",
     "log",
     "new_task",
     "place_of",
@@ -241,6 +242,15 @@ def cancel_leftovers(
     for task in found:
         task.cancel()
     return found
+
+
+def leave_behind(task: asyncio.Task[Any]) -> None:
+    """Have nobody wait for a task that ignores that it is cancelled, or whose loop has ended.
+
+    `asyncio.run` would never return, and a task that is dropped would be reported.
+    """
+    asyncio._unregister_task(task)  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
+    setattr(task, "_log_destroy_pending", False)  # noqa: B010  # As `asyncio.gather` does.
 
 
 def tasks_of(

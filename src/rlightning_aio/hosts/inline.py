@@ -25,6 +25,7 @@ from rlightning_aio.hosts.messages import (
     Reported,
     Result,
     Value,
+    Withdrawn,
 )
 from rlightning_aio.hosts.runner import attach_here, close_all
 from rlightning_aio.protocol.entries import Operation, answers_with_value, op_of, slot_of
@@ -46,7 +47,7 @@ _STEP: Final = int(Operation.STEP)
 
 
 class InlineHost:
-    """Runs envs in this process; see `base.Host`, `Executing` and `Polled`."""
+    """Runs envs in this process; see `base.Host`, `Aborting`, `Executing` and `Polled`."""
 
     def __init__(self, host_id: int, first_slot: int, order: StartOrder, wiring: Wiring) -> None:
         self.host_id = host_id
@@ -110,6 +111,16 @@ class InlineHost:
                         self._threads.unfinished[index] = entry, execute
                         continue
             self._queue.append((entry, execute))
+
+    def abort(self, entries: NDArray[np.int64]) -> None:
+        """See `base.Aborting`. Steps that simulators have begun by themselves are executed."""
+        aborted = set(cast("list[int]", entries.tolist()))
+        for waiting in list(self._queue):
+            entry = waiting[0]
+            runner = self._runners[slot_of(entry) - self.first_slot]
+            if entry in aborted and runner.begin_step is None:
+                self._queue.remove(waiting)
+                self._post(Withdrawn(self.host_id, entry))
 
     def execute_next(self) -> bool:
         if not self._queue:

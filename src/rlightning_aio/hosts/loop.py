@@ -32,7 +32,7 @@ __all__ = ["LoopHost"]
 
 
 class LoopHost:
-    """See `base.Host`, `base.Polled` and `base.SharesThread`. It has no descriptor."""
+    """See `base.Host`, and `Aborting`, `Polled` and `SharesThread` there. It has no descriptor."""
 
     shares_thread = True
 
@@ -95,6 +95,11 @@ class LoopHost:
     def submit(self, entries: NDArray[np.int64], arguments: Sequence[Any] | None = None) -> None:
         for position, entry in enumerate(entries.tolist()):
             self._envs.submit(entry, None if arguments is None else arguments[position])
+
+    def abort(self, entries: NDArray[np.int64]) -> None:
+        """See `base.Aborting`."""
+        for entry in entries.tolist():
+            self._envs.abort(entry)
 
     # -- completions --------------------------------------------------------------
 

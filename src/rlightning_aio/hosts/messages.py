@@ -286,7 +286,7 @@ class Failed(NamedTuple):
 
 
 class Withdrawn(NamedTuple):
-    """A request will not be answered: its env is away, and the caller knows."""
+    """A request will not be answered: its env is away, or it was aborted, and the caller knows."""
 
     host_id: int
     entry: int

@@ -375,6 +375,12 @@ class ProcessHost:
         if self._link is not None:
             self._link.submit(entries, arguments)
 
+    def abort(self, entries: NDArray[np.int64]) -> None:
+        """See `base.Aborting`. A worker only reads this between requests, if its envs block."""
+        if self._link is not None:
+            for entry in entries.tolist():
+                self._link.send(FrameKind.ABORT, entry)
+
     def poll(self) -> None:
         if self._link is not None:
             self._link.poll()

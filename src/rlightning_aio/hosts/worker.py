@@ -85,6 +85,7 @@ class Worker:
         self._closing = False
         self._awaits = False
         self._submit: Callable[[int, Any], None]
+        self._abort_awaited: Callable[[int], None]
         self._order: StartOrder
         self._shared = list(shared)
         self._is_child = False
@@ -122,7 +123,7 @@ class Worker:
             send,
             (lambda entry: rings.begin(entry, time.monotonic_ns())) if self._timed else None,
         )
-        self._submit = awaiting.submit
+        self._submit, self._abort_awaited = awaiting.submit, awaiting.abort
         try:
             errors = awaiting.serve(self._channel, self._take_requests)
         finally:
@@ -322,6 +323,13 @@ class Worker:
         except BaseException as error:
             self._send_error(request, error)
 
+    def _abort(self, frame: Frame) -> None:
+        """Cancel a request to an awaitable env; any other ends by itself, or with this worker."""
+        if self._awaits:
+            for request in self._rings.requests():  # It may be the newest.
+                self._submit(request, None)
+            self._abort_awaited(frame.number)
+
     def _close(self, frame: Frame) -> None:
         del frame
         self._closing = True
@@ -335,6 +343,7 @@ class Worker:
         FrameKind.START: _start,
         FrameKind.ATTACH: _attach,
         FrameKind.REQUEST: _request,
+        FrameKind.ABORT: _abort,
         FrameKind.CLOSE: _close,
     }
 

@@ -1,0 +1,203 @@
+"""Requests that nobody wants any more end soon, whatever their envs do."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from faults.driven import Driven, Tokens, entry, kill, marked, pid_of, two_workers
+from faults.drivers import kinds_on_both_drivers, on_one_driver
+from faults.test_resume import ENTRY as RESUMING
+from faults.test_resume import Walk
+from patience import HANG
+
+import rlightning_aio as rl
+from rlightning_aio.errors import EnvAborted
+from rlightning_aio.group import hang_detector
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    Start: TypeAlias = Callable[..., Driven]
+
+HANGS = ["sleep", "loop in C", "deadlock with the GIL", "stop"]
+
+
+@kinds_on_both_drivers("hangs", HANGS)
+def test_an_env_that_hangs_is_free_after_an_abort(start: Start, hangs: list[str]) -> None:
+    """Its worker is replaced, though nothing has a time limit; others have noticed nothing."""
+    group, tokens = start(entry(1 + len(hangs), envs_per_process=1)), Tokens()
+    everyone = list(group.group.env_ids)
+    alive = {env_id: pid_of(group, env_id) for env_id in everyone}
+    for env_id, kind in zip(everyone[1:], hangs, strict=True):
+        group.step_async(tokens.steps([env_id], {env_id: kind}))
+    group.step_async(tokens.steps(everyone[:1]))
+    group.abort(everyone[1:])
+    tokens.check(group.collect_async()[0])
+    assert group.group.pending == []
+    batch, _ = group.step(tokens.steps(everyone))
+    assert [marked(ret) for ret in batch.values()] == [False] + [True] * len(hangs)
+    replaced = [pid_of(group, env_id) != alive[env_id] for env_id in everyone]
+    assert replaced == [False] + [True] * len(hangs)
+    tokens.check(group.step(tokens.steps(everyone))[0])
+
+
+def test_envs_that_share_the_worker_lose_their_episodes_as_with_any_death(
+    start: Start, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Their results are marked, and name the env; a result that was ready stays what it was."""
+    group, tokens = start(entry(4, envs_per_process=4)), Tokens()
+    ids = group.group.env_ids
+    group.step_async(tokens.steps(ids[:1]))
+    assert group.collect_async(max_results=1)[0].ids() == ids[:1]
+    group.step_async(tokens.steps(ids[:3], {ids[1]: "sleep"}))
+    with caplog.at_level(logging.WARNING):
+        group.abort(ids[1:2])
+    assert "abort" not in caplog.text  # It is no fault.
+    results = {}
+    while len(results) < 2:
+        batch, _ = group.collect_async(wait_all=True)
+        results.update(batch.items())
+    tokens.check(rl.BatchedData.from_dict({ids[0]: results[ids[0]]}))
+    assert marked(results[ids[2]])
+    cause = "was killed because a step was aborted"
+    assert results[ids[2]].info["worker_restarted"] == cause
+    assert results[ids[2]].info["env_at_fault"] == ids[1]
+    batch, _ = group.step(tokens.steps([ids[0], ids[1], ids[3]]))
+    assert all(marked(ret) for ret in batch.values())
+    tokens.check(group.step(tokens.steps(ids))[0])
+
+
+@on_one_driver
+@pytest.mark.parametrize("fields", [{"on_worker_death": "raise"}, {"max_restarts": 0}], ids=str)
+def test_an_abort_counts_for_no_limit(start: Start, fields: dict[str, Any]) -> None:
+    """The worker is replaced as often as its caller wishes; its own deaths count."""
+    group, tokens = start(entry(2, **fields)), Tokens()
+    ids = group.group.env_ids
+    for _ in range(3):
+        group.step_async(tokens.steps(ids[:1], {ids[0]: "sleep"}))
+        group.abort()
+        batch, _ = group.step(tokens.steps(ids))
+        assert all(marked(ret) for ret in batch.values())
+        tokens.check(group.step(tokens.steps(ids))[0])
+    with pytest.raises(rl.WorkerDied, match="SIGSEGV"):
+        group.step(tokens.steps(ids[:1], {ids[0]: "segfault"}))
+
+
+@on_one_driver
+def test_a_step_that_ends_soon_costs_no_worker(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its result is dropped, and its episode is over."""
+    monkeypatch.setattr(hang_detector, "_ABORT_SECONDS", HANG)
+    group, tokens = start(two_workers()), Tokens()
+    ids = group.group.env_ids
+    before = [pid_of(group, env_id) for env_id in ids]
+    group.call(ids[0], "step_takes", 0.3)
+    group.step_async(tokens.steps(ids))
+    group.abort(ids[:2])
+    batch, _ = group.collect_async(wait_all=True)
+    tokens.check(batch)
+    assert sorted(batch.ids()) == ids[2:]
+    batch, _ = group.step(tokens.steps(ids))
+    assert batch.restarted.tolist() == [True, True, False, False]
+    assert [pid_of(group, env_id) for env_id in ids] == before
+    tokens.check(group.step(tokens.steps(ids))[0])
+
+
+def test_a_request_that_waits_for_a_replacement_is_withdrawn(start: Start, tmp_path: Path) -> None:
+    """At once, however long the replacement takes to start; the others are answered by it."""
+    switch = tmp_path / "switch"
+    kwargs = {"faults": {"building": "sleep"}, "while_exists": str(switch), "only": 0}
+    group, tokens = start(entry(3, env_kwargs=kwargs, max_restarts=5)), Tokens()
+    ids = group.group.env_ids
+    switch.touch()
+    group.step_async(tokens.steps(ids))
+    kill(pid := group.group._core.supervisor.hosts[0].pid)
+    while group.group._core.supervisor.hosts[0].pid in (None, pid):
+        with pytest.raises(TimeoutError):
+            group.collect_async(deadline=0.01)
+    group.abort(ids[:1])
+    assert group.group.pending == ids[1:]
+    switch.unlink()
+    kill(group.group._core.supervisor.hosts[0].pid)
+    batch, _ = group.collect_async(wait_all=True)
+    assert sorted(batch.ids()) == ids[1:]
+    assert all(marked(ret) for ret in batch.values())
+    batch, _ = group.step(tokens.steps(ids))
+    assert batch.restarted.tolist() == [True, False, False]
+
+
+class Hanging(Walk):
+    """A random walk in which a step with the action 2 never ends."""
+
+    action_space = gym.spaces.Discrete(3)
+
+    def step(self, action: Any) -> Any:
+        if action == 2:
+            time.sleep(3600)
+        return super().step(action)
+
+
+@on_one_driver
+def test_an_aborted_episode_is_not_resumed(start: Start) -> None:
+    """Those of other envs in its worker continue from their checkpoints."""
+    group = start({**RESUMING, "make_env": Hanging, "snapshot_every": 1})
+    batch, _ = group.reset(seed=1)
+    for _ in range(3):
+        batch, _ = group.step(batch.respond(action=[0] * 4))
+    group.step_async(batch.respond(action=[2, 0, 0, 0]))
+    group.abort(["e-0"])
+    found: dict[str, Any] = {}
+    while len(found) < 3:
+        found.update(group.collect_async(wait_all=True)[0].items())
+    assert found["e-1"].info["worker_resumed"] == 0
+    assert found["e-1"].observation.tolist() == batch.observation[1].tolist()
+    batch, _ = group.step(rl.BatchedData(["e-0"], [rl.PolicyResponse("e-0", 0)]))
+    (result,) = batch.values()
+    assert result.observation[0] == 0
+    assert result.info["worker_restarted"] == "was aborted"
+    assert "worker_resumed" not in result.info
+
+
+async def test_an_agent_that_is_cancelled_gives_its_env_back() -> None:
+    """A plain env in a worker of its own, whose step would never end."""
+    config = entry(2, envs_per_process=1)
+    async with rl.build_env_group(config) as group:
+
+        async def agent() -> None:
+            async with asyncio.timeout(0.05), group.episode("faulty-0") as episode:
+                await episode.step(Tokens().steps(["faulty-0"], {"faulty-0": "sleep"})["faulty-0"])
+
+        for _ in range(2):
+            with pytest.raises(TimeoutError):
+                await agent()
+        tokens = Tokens()
+        batch, _ = await group.reset()
+        assert not batch.restarted.any()
+        tokens.check((await group.step(tokens.steps(group.env_ids)))[0])
+
+
+async def test_a_wait_for_an_aborted_step_ends_though_nothing_else_happens() -> None:
+    """A call that waits without a look at the clock is woken, even if the abort is cancelled."""
+    tokens = Tokens()
+    async with rl.build_env_group(two_workers()) as group:
+        await group.reset()
+        ids = group.env_ids
+        stepping = asyncio.ensure_future(group.step(tokens.steps(ids, {ids[0]: "sleep"})))
+        while group.get_workers()[1]["owed"] or not group.get_workers()[0]["owed"]:  # noqa: ASYNC110
+            await asyncio.sleep(0)
+        aborting = asyncio.ensure_future(group.abort([ids[0]]))
+        await asyncio.sleep(0)
+        aborting.cancel()
+        with pytest.raises(EnvAborted) as aborted:
+            await stepping
+        assert aborted.value.results.ids() == ids[1:]
+        assert np.asarray(aborted.value.results.restarted).tolist() == [True, False, False]
+        await asyncio.wait({aborting})

@@ -1,0 +1,215 @@
+"""Requests that end without a result, in every placement and with every driver."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from group.sample_envs import Gate
+
+from rlightning_aio import BatchedData, NothingPending, PolicyResponse, UnknownEnv
+from rlightning_aio.errors import EnvAborted, EnvRaised, GroupClosed
+from rlightning_aio.group.conditions import ABORTING, DEATH, LOST_EPISODE
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+IDS = [f"gated-{k}" for k in range(4)]
+DO_NOTHING, END, TRUNCATE, RAISE = range(4)
+
+
+def steps(*env_ids: str, what: int = DO_NOTHING) -> BatchedData:
+    return BatchedData(
+        list(env_ids), [PolicyResponse(env_id, np.array([what, 5.0])) for env_id in env_ids]
+    )
+
+
+@pytest.fixture
+def entry(tmp_path: Path) -> dict[str, Any]:
+    """Four envs; those without a gate wait for ever in a step."""
+    return {
+        "name": "gated",
+        "backend": "gated_where_there_is_one",
+        "task": "-",
+        "num_workers": 4,
+        "env_kwargs": {"gates": str(tmp_path)},
+    }
+
+
+async def test_an_aborted_env_is_free_and_begins_an_episode(
+    start: Any, entry: dict[str, Any], tmp_path: Path
+) -> None:
+    """Its step hangs; a step is then a reset in disguise, as after a restart."""
+    group = await start(entry)
+    await group.reset(seed=3)
+    Gate(str(tmp_path), IDS[1]).make()
+    group.step_async(steps(IDS[1]))
+    await group.abort([IDS[1]])
+    assert group.pending == []
+    with pytest.raises(NothingPending):
+        await group.collect_async()
+    (tmp_path / IDS[1]).unlink()
+    batch, _ = await group.step(steps(IDS[1]))
+    assert batch.is_reset.tolist() == batch.restarted.tolist() == [True]
+    assert batch.info("worker_restarted")[0]
+    batch, _ = await group.step(steps(*IDS))
+    assert batch.observation[1, 2] == 1
+
+
+async def test_an_aborted_env_can_be_reset(
+    start: Any, entry: dict[str, Any], tmp_path: Path
+) -> None:
+    """Plainly: the loss is moot."""
+    group = await start(entry)
+    await group.reset(seed=3)
+    Gate(str(tmp_path), IDS[1]).make()
+    group.step_async(steps(IDS[1]))
+    await group.abort([IDS[1]])
+    (tmp_path / IDS[1]).unlink()
+    batch, _ = await group.reset(seed={IDS[1]: 11}, env_ids=[IDS[1]])
+    assert batch.restarted.tolist() == [False]
+    assert batch.observation[0, 2:].tolist() == [0, 11]
+    batch, _ = await group.step(steps(IDS[1]))
+    assert batch.observation[0, 2:].tolist() == [1, 11]
+
+
+async def test_results_that_were_not_collected_are_dropped(start: Any, entry: Any) -> None:
+    """Of the envs that are named; those of others stay."""
+    group = await start(entry)
+    await group.reset(seed=3)
+    group.step_async(steps(*IDS))
+    batch, _ = await group.collect_async(max_results=1)
+    (first,) = batch.ids()
+    dropped, *others = (env_id for env_id in IDS if env_id != first)
+    await group.abort([dropped])
+    assert sorted(group.pending) == others
+    batch, _ = await group.collect_async(wait_all=True)
+    assert sorted(batch.ids()) == others
+    assert not batch.restarted.any()
+    batch, _ = await group.step(steps(*IDS))
+    assert batch.restarted.tolist() == [env_id == dropped for env_id in IDS]
+
+
+@pytest.mark.one_driver_for_each_place
+async def test_idle_envs_are_left_as_they_are(start: Any, entry: Any) -> None:
+    group = await start(entry)
+    await group.reset(seed=3)
+    await group.step(steps(*IDS))
+    await group.abort()
+    await group.abort([])
+    batch, _ = await group.step(steps(*IDS))
+    assert not batch.restarted.any()
+    assert batch.observation[:, 2].tolist() == [2] * 4
+
+
+async def test_a_reset_can_be_aborted(start: Any, entry: Any) -> None:
+    """Whoever steps the env has it reset."""
+    group = await start(entry)
+    await group.reset(seed=3)
+    group.reset_async(env_ids=IDS[:2])
+    await group.abort(IDS[1:2])
+    batch, _ = await group.collect_async(wait_all=True)
+    assert batch.ids() == IDS[:1]
+    batch, _ = await group.step(steps(*IDS))
+    assert batch.restarted.tolist() == [False, True, False, False]
+
+
+@pytest.mark.one_driver_for_each_place
+async def test_a_call_can_be_aborted(start: Any, entry: Any) -> None:
+    """Its env is free, and `collect_calls` says so."""
+    group = await start(entry)
+    await group.reset(seed=3)
+    group.call_async("get_attr", "label", "outer", env_ids=IDS[:2])
+    await group.abort(IDS[:1])
+    batch, _ = await group.step(steps(IDS[0]))
+    (outcome,) = await asyncio.gather(group.collect_calls(), return_exceptions=True)
+    if isinstance(outcome, EnvAborted):
+        assert outcome.env_id == IDS[0]
+    else:
+        assert outcome == ["the env's own"] * 2  # It had ended before.
+    assert batch.restarted.tolist() == [isinstance(outcome, EnvAborted)]
+    await group.step(steps(*IDS))
+
+
+@pytest.mark.one_driver_for_each_place
+async def test_a_drain_returns_what_is_ready_and_ends_the_rest(
+    start: Any, entry: Any, tmp_path: Path
+) -> None:
+    """In the order of the group; all envs are idle then."""
+    group = await start(entry)
+    await group.reset(seed=3)
+    assert len((await group.drain())[0]) == 0
+    group.step_async(steps(*reversed(IDS)))
+    batch, flags = await group.drain(deadline=200.0)
+    assert (batch.ids(), flags) == (IDS, [False] * 4)
+    Gate(str(tmp_path), IDS[3]).make()
+    group.step_async(steps(IDS[3]))
+    batch, flags = await group.drain()
+    assert (batch.ids(), flags, group.pending) == ([], [], [])
+    (tmp_path / IDS[3]).unlink()
+    batch, _ = await group.step(steps(*IDS))
+    assert batch.restarted[3]
+
+
+@pytest.mark.one_driver_for_each_place
+async def test_a_drain_raises_errors_once_all_envs_are_idle(start: Any, entry: Any) -> None:
+    """The results are in the error, as those of a step are."""
+    group = await start(entry)
+    await group.reset(seed=3)
+    group.step_async(steps(IDS[2], IDS[0], what=RAISE))
+    group.step_async(steps(IDS[1], IDS[3]))
+    with pytest.raises(EnvRaised) as raised:
+        await group.drain(deadline=200.0)
+    assert raised.value.results.ids() == [IDS[1], IDS[3]]
+    assert {raised.value.env_id, *(other.env_id for other in raised.value.others)} == {
+        IDS[0],
+        IDS[2],
+    }
+    assert group.pending == []
+    assert len((await group.drain())[0]) == 0
+
+
+@pytest.mark.one_driver_for_each_place
+async def test_a_drain_drops_the_values_of_calls(start: Any, entry: Any) -> None:
+    group = await start(entry)
+    await group.reset(seed=3)
+    group.call_async("get_attr", "label", "outer")
+    await group.drain()
+    assert group.pending == []
+    with pytest.raises(NothingPending):
+        await group.collect_calls()
+    await group.step(steps(*IDS))
+
+
+@pytest.mark.one_driver_for_each_place
+async def test_wrong_arguments_end_nothing(start: Any, entry: Any) -> None:
+    group = await start(entry)
+    await group.reset(seed=3)
+    group.step_async(steps(*IDS))
+    with pytest.raises(UnknownEnv, match="'nobody'"):
+        await group.abort([IDS[0], "nobody"])
+    with pytest.raises(ValueError, match="deadline must be a positive number"):
+        await group.drain(deadline=0)
+    assert len((await group.collect_async(wait_all=True))[0]) == 4
+    await group.close()
+    for ending in (group.abort, group.drain):
+        with pytest.raises(GroupClosed):
+            await ending()
+
+
+@pytest.mark.one_driver_for_each_place
+async def test_ordinary_steps_go_on_after_an_abort(start: Any, entry: Any) -> None:
+    """Once the aborted env has begun an episode, nothing is left of it."""
+    group = await start(entry)
+    await group.reset(seed=3)
+    group.step_async(steps(*IDS))
+    await group.abort()
+    before, _ = await group.reset(seed=3)
+    for _ in range(3):
+        batch, _ = await group.step(before.respond(action=np.full((4, 2), [DO_NOTHING, 1.0])))
+        assert batch.reward.tolist() == [1] * 4
+        before = batch
+    conditions = getattr(group, "wrapped", group)._core.parts.tables.conditions
+    assert not conditions.active & (ABORTING | DEATH | LOST_EPISODE)
