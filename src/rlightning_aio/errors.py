@@ -267,6 +267,10 @@ class EpisodeLost(EnvFault):
     """The step of an `EnvEpisode` has no result: its env was replaced, and the episode is over.
 
     The cause is in the message, and in `EnvEpisode.lost`.
+
+    Attributes:
+        results: the first result of the episode that the env has begun in its place; None for
+            further steps.
     """
 
 

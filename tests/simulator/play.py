@@ -8,6 +8,7 @@ import math
 import pickle
 import tempfile
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from random import Random
 from typing import TYPE_CHECKING, Any
@@ -35,6 +36,7 @@ from rlightning_aio.errors import (
     BadAction,
     EnvBusy,
     EnvFault,
+    EpisodeLost,
     NothingPending,
     RLightningError,
     SnapshotError,
@@ -703,17 +705,28 @@ class Play(Session):
         request = Request("reset", seed=rng.randrange(1000))
         episode = self.group.episode(env.env_id, seed=request.seed)
 
-        def take(_: Any) -> None:
-            self.take_ret(env, episode.last, request)
+        def take(ret: Any) -> None:
+            self.take_ret(env, ret, request)
 
-        if not await self.answer({env.env_id: request}, episode.__aenter__, take):
+        async def begin() -> Any:
+            return (await episode.__aenter__()).last
+
+        async def step(action: Any) -> Any:
+            before = episode.last
+            try:
+                return await episode.step(action)
+            except EpisodeLost as lost:
+                require(episode.last is before, "what the lost step left is not the last result")
+                return lost.results.values()[0]
+
+        if not await self.answer({env.env_id: request}, begin, take):
             return
         for _ in range(rng.randint(0, 3)):
-            if episode.is_over and self.model.context is None:
+            if episode.lost or (episode.is_over and self.model.context is None):
                 break
             acts = self.acts(rng, env)
             action, request = action_of(env, acts), Request("step", acts=acts)
-            if not await self.answer({env.env_id: request}, lambda a=action: episode.step(a), take):
+            if not await self.answer({env.env_id: request}, partial(step, action), take):
                 break
         await episode.__aexit__(None, None, None)
 

@@ -83,18 +83,22 @@ class EnvEpisode:
             EpisodeLost: the env was replaced during this step or an earlier one, so there is no
                 result; the env has begun another episode.
         """
+        found: BatchedData | None = None
         if self.lost is None:
-            found = await self._answer(self._group.step(steps_of(self.env.env_id, response)))
-            if not found[0].restarted.any():
-                self._take(found)
+            answer = await self._answer(self._group.step(steps_of(self.env.env_id, response)))
+            found = answer[0]
+            if not found.restarted.any():
+                self._take(answer)
                 return self.last
-            info = found[0].values()[0].info
+            info = found.values()[0].info
             self.lost = str(info.get("worker_restarted") or info.get("client_lost"))
             self.is_over = True
-        raise EpisodeLost(
+        lost = EpisodeLost(
             f"the episode of env {self.env.env_id!r} is lost: its env {self.lost}",
             env_id=self.env.env_id,
         )
+        lost.results = found
+        raise lost
 
     async def _answer(self, answer: Answer) -> tuple[BatchedData, Any]:
         task = asyncio.ensure_future(answer)
