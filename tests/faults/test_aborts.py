@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
+import signal
 import time
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -118,8 +120,10 @@ def test_a_request_that_waits_for_a_replacement_is_withdrawn(start: Start, tmp_p
     group, tokens = start(entry(3, env_kwargs=kwargs, max_restarts=5)), Tokens()
     ids = group.group.env_ids
     switch.touch()
+    pid = group.group._core.supervisor.hosts[0].pid
+    os.kill(pid, signal.SIGSTOP)  # It answers nothing before it is killed.
     group.step_async(tokens.steps(ids))
-    kill(pid := group.group._core.supervisor.hosts[0].pid)
+    kill(pid)
     while group.group._core.supervisor.hosts[0].pid in (None, pid):
         with pytest.raises(TimeoutError):
             group.collect_async(deadline=0.01)

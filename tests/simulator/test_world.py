@@ -181,7 +181,8 @@ def test_same_seed_gives_the_same_trace() -> None:
 def test_actors_of_ray_and_their_deaths_are_simulated() -> None:
     def world(seed: int, **faults: float) -> World:
         world = World(seed, Faults(**faults))
-        with world, suppress(StartFailed), sync.build_env_group(config(placement="ray")) as group:
+        given_up = suppress(StartFailed, WorkerDied)
+        with world, given_up, sync.build_env_group(config(placement="ray")) as group:
             batch, _ = group.reset(seed=5)
             for _ in range(10):
                 batch, _ = group.step(batch.respond(action=np.zeros(4, np.int64)))
