@@ -135,6 +135,8 @@ class AwaitedEnv:
         try:
             outcome = await self._watch(answering, entry)
         except BaseException as raised:  # A CancelledError, too, is the env's own.
+            if asyncio.current_task(self._loop) is not self.task:
+                raise  # Nobody runs it any more: it is thrown away with its event loop.
             error = raised
         self._request = self.answering = None
         if not self.is_leaving:
