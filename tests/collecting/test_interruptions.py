@@ -389,14 +389,22 @@ async def until_it_raises(collector: Any) -> None:
         await collector.collect()
 
 
-async def test_envs_that_are_given_up_are_left_out() -> None:
-    """Their error is raised once; and again where none is left."""
+async def until_it_is_noticed(group: rl.EnvGroup, number: int) -> None:
+    while not group.get_workers()[number]["given_up"]:  # noqa: ASYNC110
+        await asyncio.sleep(0)
+
+
+@pytest.mark.parametrize("is_noticed", [False, True])
+async def test_envs_that_are_given_up_are_left_out(is_noticed: bool) -> None:
+    """Their error is raised once, whether they owe results or not; and again where none is left."""
     async with numbered(SEVERAL, on_worker_death="raise") as group:
         with group.auto_reset(math.inf):
             collector: Any = Collector(group, failing(), num_transitions=4)
             await collector.collect()
-            for worker, left in zip(group.get_workers(), ({2, 3}, set()), strict=True):
-                kill(worker["pid"])
+            for number, left in enumerate(({2, 3}, set())):
+                kill(group.get_workers()[number]["pid"])
+                if is_noticed:
+                    await until_it_is_noticed(group, number)
                 with pytest.raises(WorkerDied, match="SIGKILL"):
                     await until_it_raises(collector)
                 if left:

@@ -13,12 +13,14 @@ from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast, overload
 
+import numpy as np
+
 from rlightning_aio.collecting.clock import Clock
 from rlightning_aio.collecting.kind import OWN_NAMES, EnvKind, Part
 from rlightning_aio.collecting.procedure import BREAK, Interruptible, Procedure, run_as_one_call
 from rlightning_aio.collecting.record import RecordedGroup, ReplayedGroup
 from rlightning_aio.collecting.rollout import Rollout
-from rlightning_aio.errors import EnvBusy, EnvFault, NothingPending
+from rlightning_aio.errors import EnvBusy, EnvFault, NothingPending, WorkerDied
 from rlightning_aio.group.aio import EnvGroup as AsyncEnvGroup
 from rlightning_aio.group.newest import newest_of
 from rlightning_aio.group.sync import EnvGroup as SyncEnvGroup
@@ -444,8 +446,20 @@ class Collector(Generic[G, R]):
             if part.batch.env_ids()[0] in self._group.pending:
                 part.kind.staging.note_sent()
             raise
+        except WorkerDied as error:
+            self._leave_out(part, error.env_ids)
+            raise
         part.kind.staging.note_sent()
         self._clock.note_answered(part.batch)
+
+    def _leave_out(self, part: Part, given_up: Sequence[str]) -> None:
+        """Go on without envs whose error is about to be raised, unless a block needs them."""
+        if self._block:
+            return
+        is_left_out = np.isin(part.batch.env_ids(), given_up)
+        part.cut(is_left_out)
+        left = part.only(~is_left_out)
+        self._unanswered[:1] = [] if left is None else [left]
 
     def _warn_of_unknown_infos(self) -> None:
         """Warn once of names in `infos` that no env has reported up to the end of an episode."""
