@@ -65,8 +65,6 @@ _TICK_NS: Final = 200
 """How long it takes to read the clock. So a loop that only looks at the clock ends."""
 _START_NS: Final = 10**12
 _EPOCH_NS: Final = 1_700_000_000 * 10**9
-_NUMBERS: Final = itertools.count(1)
-"""Of the worlds of this process."""
 _MAX_EVENTS: Final = 2_000_000
 
 
@@ -146,12 +144,7 @@ class World:
     # -- life ---------------------------------------------------------------------
 
     def __enter__(self) -> Self:
-        # No garbage of another world may run any code in this one. What is there in the first
-        # worlds, such as modules, stays.
-        gc.collect()
-        number = next(_NUMBERS)
-        if not number & number - 1:
-            gc.freeze()
+        gc.collect()  # No garbage of another world may run any code in this one.
         if gc.isenabled():
             gc.disable()
             self._patches.callback(gc.enable)
