@@ -429,6 +429,20 @@ def test_a_host_that_survives_a_kill_is_destroyed_with_its_fork_server(
     assert ours.log.count("destroy 0") == 2
 
 
+def test_a_killed_host_has_its_time_if_the_trainer_was_stopped(fleet: Callable[..., Fleet]) -> None:
+    """It was stopped while it ordered the kill."""
+    ours = fleet((1,), step_timeout=5.0)
+    (host,) = ours.hosts
+    (entry,) = ours.ask(0)
+    host.current, host.dies = (entry, int(ours.now * 1e9)), False
+    host.kill = stopped_in(host.kill, ours)  # type: ignore[method-assign]
+    ours.now += 5
+    ours.check()
+    ours.check()
+    assert ours.log == ["dump and kill 0"]
+    assert ours.supervisor.next_check() == ours.now + hang_detector._OBEY_SECONDS
+
+
 def test_an_env_that_executes_too_long_is_killed(fleet: Callable[..., Fleet]) -> None:
     """After its limit, once, with a dump; the error has the env and the time."""
     ours = fleet((1, 2), step_timeout=5.0)
@@ -785,6 +799,58 @@ def test_a_replacement_is_not_late_if_the_trainer_is(
     ours.check()
     assert ours.log == ["start 0", "attach 0"]
     assert len(host.asked) == 2
+
+
+def test_a_replacement_has_its_time_anew_if_the_trainer_was_late(
+    fleet: Callable[..., Fleet],
+) -> None:
+    """It was stopped while it ordered the start, or it wrote the rest of the order only now."""
+    ours = fleet(max_restarts=1)
+    host = ours.hosts[0]
+    host.builds, host.attach = False, stopped_in(host.attach, ours)  # type: ignore[method-assign]
+    ours.ask(0)
+    ours.die(0)
+    ours.check()
+    assert ours.supervisor.next_check() == ours.now + 10
+    for write in (lambda: setattr(host, "traffic", 7), lambda: host.unread.append(lambda: None)):
+        ours.now += 60
+        write()
+        ours.check()
+        assert ours.supervisor.next_check() == ours.now + 10
+    assert ours.log == ["start 0", "attach 0"]
+    ours.now += 10
+    ours.check()
+    assert ours.log == ["start 0", "attach 0", "dump and kill 0"]
+
+
+def test_a_first_start_has_its_time_from_when_it_was_ordered(
+    fleet: Callable[..., Fleet],
+) -> None:
+    """Also if the trainer was stopped meanwhile."""
+    ours = fleet((1,), up=False)
+    (host,) = ours.hosts
+    host.builds = False
+    host.start, host.attach = stopped_in(host.start, ours), stopped_in(host.attach, ours)  # type: ignore[method-assign]
+    starting = ours.start()
+    ours.pass_time(9)
+    host.build()
+    host.built = False
+    ours.pass_time(0)
+    ours.pass_time(9)
+    ours.completions.append(Attached(0))
+    ours.turn()
+    starting.result()
+    assert ours.log == ["start 0", "attach 0"]
+
+
+def stopped_in(order: Callable[..., None], ours: Fleet) -> Callable[..., None]:
+    """The trainer is stopped for a minute when it has given an order."""
+
+    def given(*arguments: Any, **more: Any) -> None:
+        order(*arguments, **more)
+        ours.now += 60
+
+    return given
 
 
 # -- close

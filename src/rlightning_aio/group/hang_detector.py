@@ -16,7 +16,7 @@ from rlightning_aio.group.host_record import Stage
 from rlightning_aio.protocol.entries import Operation, slot_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
@@ -39,6 +39,7 @@ class HangDetector:
 
     Args:
         records: of the group's hosts; the list grows until the group starts.
+        clock: monotonic seconds; asked when a host was killed.
 
     Attributes:
         timed: some requests have a time limit.
@@ -47,11 +48,16 @@ class HangDetector:
     """
 
     def __init__(
-        self, records: Sequence[HostRecord], requests: Requests, observed: Observed
+        self,
+        records: Sequence[HostRecord],
+        requests: Requests,
+        observed: Observed,
+        clock: Callable[[], float],
     ) -> None:
         self._records = records
         self._requests = requests
         self._observed = observed
+        self._clock = clock
         self.any_ending = False
         self._now = 0.0
         self.timed = False
@@ -172,8 +178,8 @@ class HangDetector:
             if not record.dying:
                 continue
             if record.die_by is None:
-                # Counted from now, because the time of the kill may have been an old one.
-                record.die_by = self._now + _OBEY_SECONDS
+                # The trainer may have been stopped until it was killed.
+                record.die_by = self._clock() + _OBEY_SECONDS
             elif self._now >= record.die_by and not has_news(record):
                 assert record.killable is not None
                 record.die_by = None

@@ -46,6 +46,7 @@ class HostRecord:
         started: its envs, once built.
         order: the rows of its envs, once assigned.
         start_by: the deadline of its start; late: it missed that, and is being killed.
+        traffic: see `Killable`, at the last `has_moved`.
         restart_at: the time of its next restart; restarts: the number so far.
         refusals: consecutive attempts to start a replacement that the system refused;
             refused_since: the time of the first.
@@ -75,6 +76,7 @@ class HostRecord:
     order: AttachOrder | None = None
     start_by: float | None = None
     late: bool = False
+    traffic: int = 0
     restart_at: float | None = None
     restarts: int = 0
     refusals: int = 0
@@ -120,6 +122,17 @@ class HostRecord:
             withdrawn += held[~stays].tolist()
         self.held = kept
         return withdrawn
+
+    def give_time(self, now: float) -> None:
+        """Count the time of its start from now on."""
+        self.start_by = now + self.config.start_timeout
+        self.has_moved()
+
+    def has_moved(self) -> bool:
+        """Return True if data has passed between it and the trainer since this was last asked."""
+        before = self.traffic
+        self.traffic = before if self.killable is None else self.killable.traffic
+        return self.traffic != before
 
     def kill(self, *, dump: bool) -> None:
         """Kill its worker, if it has one; `dump` first writes the worker's stacks to stderr."""

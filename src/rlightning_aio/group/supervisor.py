@@ -3,7 +3,8 @@
 It starts hosts, places their envs in slabs, and replaces dead hosts; `Shutdown` closes them. It
 returns the consequences of a death for requests (`GivenUp`, `Replaced`), and `Intake` carries them
 out. Rule: it waits only by yielding a `Wait`. Callers pass the time in, except for a death, which
-may be found at any moment. `HangDetector` decides which workers are killed.
+may be found at any moment, and for what a host was ordered to do: the trainer may have been stopped
+until then. `HangDetector` decides which workers are killed.
 """
 
 from __future__ import annotations
@@ -115,7 +116,7 @@ class Supervisor:
         arena: of the group.
         post: appends the death of a replacement that could not be started to the queue.
         mixed_actions: the actions of envs may differ in shape.
-        clock: monotonic seconds; asked only when a host has died.
+        clock: monotonic seconds; asked when a host has died, or was ordered to start or to die.
 
     Attributes:
         hosts: in the order of their slots.
@@ -158,7 +159,7 @@ class Supervisor:
         self._mixed_actions = mixed_actions
         self._records: list[HostRecord] = []
         self.members = Members(self._envs, mixed_actions=mixed_actions)
-        self.detector = HangDetector(self._records, self._requests, self._observed)
+        self.detector = HangDetector(self._records, self._requests, self._observed, clock)
         self.shutdown = Shutdown(self._lifetime, self._records, self.resources, self._layout, arena)
         self.workers = Workers(self._records, self._envs, self._requests)
         self.hints = Hints(self._records)
@@ -185,14 +186,14 @@ class Supervisor:
         try:
             self._now = now
             for record in self._records:
-                self._launch_first(record, now)
+                self._launch_first(record)
             yield from self._until(Stage.BUILT)
             self._place()
             for record in self._records:
                 assert record.order is not None
                 record.stage = Stage.ATTACHING
-                record.start_by = self._now + record.config.start_timeout
                 record.host.attach(record.order)
+                record.give_time(self._clock())
             yield from self._until(Stage.UP)
         except BaseException:
             yield from self.shutdown.close(self._now)
@@ -206,19 +207,19 @@ class Supervisor:
         ]
         return self.metas
 
-    def _launch_first(self, record: HostRecord, now: float) -> None:
+    def _launch_first(self, record: HostRecord) -> None:
         try:
-            self._launch(record, now)
+            self._launch(record)
         except OSError as error:
             raise StartFailed(
                 _refusal(record, error), env_id=self._envs.env_ids[record.host.first_slot]
             ) from error
 
-    def _launch(self, record: HostRecord, now: float) -> None:
+    def _launch(self, record: HostRecord) -> None:
         record.stage = Stage.BUILDING
-        record.start_by = now + record.config.start_timeout
         record.late = False
         record.host.start()
+        record.give_time(self._clock())
 
     def _until(self, stage: Stage) -> Procedure[None]:
         # Hosts in this process have posted completions already.
@@ -235,15 +236,19 @@ class Supervisor:
 
     def _check_start_times(self) -> None:
         for record in self._records:
-            if record.start_by is None or self._now < record.start_by or has_news(record):
+            if record.start_by is None or self._now < record.start_by:
                 continue
-            # The death brings its stacks. A host that can't be killed gets no second limit.
-            record.start_by = None if record.late else self._now + _DUMP_SECONDS
-            if not record.late:
+            if has_news(record) or record.has_moved():
+                if not record.late:
+                    record.give_time(self._clock())
+            elif not record.late:
                 record.late = True
                 self.detector.kill(record, dump=True)
-            elif not self._lifetime.open:
-                self._fail_start(late_fault(self._envs, record, Death("")))
+                record.start_by = self._clock() + _DUMP_SECONDS  # The death brings its stacks.
+            else:
+                record.start_by = None  # A host that can't be killed gets no second limit.
+                if not self._lifetime.open:
+                    self._fail_start(late_fault(self._envs, record, Death("")))
 
     def _fail_start(self, fault: Exception) -> None:
         self._start_fault = self._start_fault or fault
@@ -443,7 +448,7 @@ class Supervisor:
     def _restart(self, record: HostRecord, now: float) -> None:
         record.restart_at = None
         try:
-            self._launch(record, now)
+            self._launch(record)
         except OSError as error:
             self._on_refused(record, error, now)
             return
@@ -460,6 +465,7 @@ class Supervisor:
             seed=seed if seed >= 0 else None,
         )
         record.host.attach(order)
+        record.give_time(self._clock())
 
     def _on_refused(self, record: HostRecord, why: OSError | str, now: float) -> None:
         """Schedule another attempt, because the system refused to start a replacement."""
