@@ -39,6 +39,8 @@ __all__ = ["ForkServer"]
 
 _GRACE_SECONDS = 1.2
 _DUMP_SECONDS = 0.3
+_LEAST_START_SECONDS = 5.0
+"""Less time to start has no entry of a program."""
 _DUMP = 'Current thread 0x0000 (most recent call first):\n  File "simulated", line 1 in step\n'
 
 
@@ -63,7 +65,7 @@ class ForkServer(Living):
         end.end.holders.append(self)
         end.end.name = self.name
         self._trainer = MessageSocket(end)  # pyright: ignore[reportArgumentType]
-        self._children: dict[int, tuple[Process, int]] = {}
+        self._children: dict[int, tuple[_WorkerProcess, int]] = {}
         self._is_ready = self._is_looking = False
         self.later(0.01 + world.start_delay(), self._begin)
 
@@ -136,6 +138,8 @@ class ForkServer(Living):
             worker, _ = self._children[message.host_id]
             if message.dump:
                 worker.stderr += _DUMP
+                if not (worker.has_started() or worker.is_late()):
+                    self.world.wrongs.append(f"{worker.name} is killed as late although it wasn't")
             self.later(_DUMP_SECONDS if message.dump else 0.0, partial(worker.end, -signal.SIGKILL))
 
     def _fork(self, place: WorkerPlace, channel: int, arena: int) -> None:
@@ -146,7 +150,7 @@ class ForkServer(Living):
             self._trainer.send(NotForked(host_id, "no more processes"))
             return
         kept = sockets.duplicate(channel)
-        worker = new_worker(self.world, place, channel, arena, partial(self._reap, host_id))
+        worker = _WorkerProcess(self.world, place, channel, arena, partial(self._reap, host_id))
         self._children[host_id] = worker, kept
         self._trainer.send(Forked(host_id, worker.pid))
 
@@ -174,28 +178,47 @@ class ForkServer(Living):
             self.end(0)
 
 
-def new_worker(world: World, place: WorkerPlace, channel: int, arena: int, on_exit: Any) -> Process:
-    """Fork the worker of `place`."""
-    sockets = world.sockets
+class _WorkerProcess(Process):
+    """The worker of `place`, as it is forked.
 
-    def main() -> int:
+    Args:
+        channel, arena: its descriptors.
+        world, on_exit: see `Process`.
+    """
+
+    def __init__(
+        self, world: World, place: WorkerPlace, channel: int, arena: int, on_exit: Any
+    ) -> None:
+        self._place, self._channel, self._arena = place, channel, arena
+        self._worker: Worker | None = None
+        super().__init__(world, f"worker {place.host_id}", self._serve, on_exit)
+        world.note("{} is forked", self.name)
+        self._end = world.sockets.by_number[channel].end
+        self._end.name = self.name
+        self.descriptors = {channel, arena}
+        self._end.holders.append(self)
+
+    def is_late(self) -> bool:
+        """It has had the time to start since it got its last order, and has not started."""
+        since_order = self.world.now_ns - self._end.received_ns
+        return since_order > _LEAST_START_SECONDS * 1e9 and not self.has_started()
+
+    def has_started(self) -> bool:
+        return self._worker is not None and self._worker._attached
+
+    def _serve(self) -> int:
+        place, sockets = self._place, self.world.sockets
         try:
-            memory = map_shared(arena, place.bell_offset, bell_size(place.num_hosts))
+            memory = map_shared(self._arena, place.bell_offset, bell_size(place.num_hosts))
             bell = WorkerBell(memory, place.num_hosts, place.host_id)
-            memory = map_shared(arena, place.rings_offset, rings_size(place.num_envs))
+            memory = map_shared(self._arena, place.rings_offset, rings_size(place.num_envs))
             rings = WorkerRings(memory, place.num_envs, bell)
-            Worker(sockets.by_number[channel], arena, rings, place.first_slot).serve()  # pyright: ignore[reportArgumentType]
+            channel = sockets.by_number[self._channel]
+            self._worker = Worker(channel, self._arena, rings, place.first_slot)  # pyright: ignore[reportArgumentType]
+            self._worker.serve()
         except Killed:
             raise
         except BaseException:  # noqa: BLE001  # As in a real one, it goes to stderr.
-            process.stderr += traceback.format_exc()
+            self.stderr += traceback.format_exc()
             return 1
         return 0
-
-    name = f"worker {place.host_id}"
-    process = Process(world, name, main, on_exit)
-    world.note("{} is forked", name)
-    sockets.by_number[channel].end.name = name
-    process.descriptors = {channel, arena}
-    sockets.by_number[channel].end.holders.append(process)
-    return process

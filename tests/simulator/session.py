@@ -138,6 +138,8 @@ class Session:
         self.say(f"{number}: {op.name}")
         await self.interruptible(getattr(self, f"op_{op.name}")(Random(op.seed)), op.name)
         self.counts[f"op {op.name}"] += 1
+        if self.world is not None:
+            require(not self.world.wrongs, "wrong", *self.world.wrongs)
 
     async def interruptible(self, doing: Coroutine[Any, Any, Any], name: str = "") -> Any:
         """Do something that Ctrl-C may interrupt; None if it did."""

@@ -43,6 +43,7 @@ class _End:
         self.name = "the trainer"
         self.packets = packets
         self.received: Any = deque() if packets else bytearray()
+        self.received_ns = 0
         self.descriptors = 0
         self.is_shut = self.is_reset = False
         self.holders: list[Any] = []
@@ -272,6 +273,7 @@ class SimulatedSocket:
         else:
             end.peer.received += data
             self._world.note("{} sends {} {} bytes", end.name, end.peer.name, len(data))
+        end.peer.received_ns = self._world.now_ns
         end.peer.wake()
 
     def recv(self, size: int, flags: int = 0) -> bytes:

@@ -4,8 +4,8 @@ It simulates what lies below the package, and nothing of the package: the clock,
 and event loops, processes, their deaths and signals. So the trainer's side is the real one, with
 its drivers, hosts and links, and so is the code of workers. A simulated process is a greenlet. It
 runs until it asks the operating system for something that takes time, or until the world takes the
-core away from it at a *point*: a system call, a look at the clock, or a fence between two writes to
-shared memory.
+core away from it at a *point*: a system call, a look at the clock, a fence between two writes to
+shared memory, or the beginning or end of a function of the hot path.
 
 One seed decides every duration, order and fault, so the same seed gives the same trace.
 
@@ -110,6 +110,7 @@ class World:
     Attributes:
         rng: the source of all chances; see `reseed`.
         counts: how often things happened.
+        wrongs: what the package did to processes that it should not have done.
         network: between env_servers and their clients, which `Network.client` starts.
         deaths: of each process that ended with an error, by its name.
         ended: it is no more.
@@ -123,6 +124,7 @@ class World:
         self.faults = self._storm = faults
         self.counts: Counter[str] = Counter()
         self.deaths: Counter[str] = Counter()
+        self.wrongs: list[str] = []
         self.running: Process | Nobody | None = None
         self.now_ns = _START_NS
         self.sockets = Sockets(self)
@@ -154,6 +156,8 @@ class World:
         self._patches.enter_context(rays.importable())
         self._patches.callback(kernel.select, kernel.selected)
         kernel.select(self._implementation)
+        for name in kernel._FUNCTIONS:
+            setattr(kernel, name, self._with_points(getattr(kernel, name)))
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -204,6 +208,15 @@ class World:
             (awaiting, "run_loop", lambda main: run_in_process(self, main)),
             *([(scripted, "machine", SimulatedMachine(self))] if scripted else []),
         ]
+
+    def _with_points(self, function: Callable[..., T]) -> Callable[..., T]:
+        def called(*arguments: Any) -> T:
+            self.point()
+            found = function(*arguments)
+            self.point()
+            return found
+
+        return called
 
     def run(self, main: Coroutine[Any, Any, T]) -> T:
         """Run a program on an event loop of the world."""
