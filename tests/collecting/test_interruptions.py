@@ -10,6 +10,8 @@ import contextlib
 import inspect
 import itertools
 import math
+import os
+import signal
 import types
 from typing import TYPE_CHECKING, Any
 
@@ -413,6 +415,26 @@ async def test_envs_that_are_given_up_are_left_out(is_noticed: bool) -> None:
             for _ in range(2):
                 with pytest.raises(WorkerDied, match=r"SIGKILL.*nothing was sent to a-0"):
                     await collector.collect()
+
+
+async def test_envs_at_work_are_waited_for_after_others_were_given_up() -> None:
+    """The error came before the actions of the envs that were given up could be sent."""
+    async with numbered(SEVERAL, on_worker_death="raise") as group:
+        with group.auto_reset(math.inf):
+            collector: Any = Collector(group, failing(), num_transitions=2, min_results=2)
+            await collector.collect()
+            killed, stopped = [worker["pid"] for worker in group.get_workers()]
+            os.kill(stopped, signal.SIGSTOP)
+            while set(group.pending) != {"b-0", "b-1"}:
+                await collector.collect()
+            kill(killed)
+            await until_it_is_noticed(group, 0)
+            with pytest.raises(WorkerDied, match="SIGKILL"):
+                await collector.collect()
+            os.kill(stopped, signal.SIGCONT)
+            for _ in range(3):
+                rollout = await collector.collect()
+            assert {*rollout.index.tolist()} <= {2, 3}
 
 
 async def test_an_env_that_may_move_something_real_is_reset_by_nobody_else(

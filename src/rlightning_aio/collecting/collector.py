@@ -460,6 +460,7 @@ class Collector(Generic[G, R]):
         part.cut(is_left_out)
         left = part.only(~is_left_out)
         self._unanswered[:1] = [] if left is None else [left]
+        self._expecting = bool(self._group.pending)
 
     def _warn_of_unknown_infos(self) -> None:
         """Warn once of names in `infos` that no env has reported up to the end of an episode."""
