@@ -219,6 +219,11 @@ def _changing(token: int) -> dict[str, Any]:
     return kinds[token % len(kinds)]
 
 
+def _with_floats(info: dict[str, Any]) -> dict[str, Any]:
+    """Gymnasium joins infos in a column of the first one's type, which may cut others off."""
+    return {key: float(value) if key == "extra" else value for key, value in info.items()}
+
+
 Act = tuple[str, int]
 """An effect and a token."""
 
@@ -584,7 +589,7 @@ class Stacked(_Body, gym.vector.VectorEnv[Any, Any, Any]):
         found = self.scripts.step(acts)
         infos = [
             info if final is None else {"final_obs": self.observed(final), "final_info": info}
-            for info, final in zip(found.infos, found.finals, strict=True)
+            for info, final in zip(map(_with_floats, found.infos), found.finals, strict=True)
         ]
         head = map(np.array, (found.rewards, found.terminated, found.truncated))
         return (self._stacked(found.words, faults), *head, self._joined(infos))

@@ -84,6 +84,10 @@ class Trail:
     def is_over(self) -> bool:
         return self.last is None or self.last.terminated or self.last.truncated
 
+    def has_shown(self, words: Words) -> bool:
+        """Return True if the episode was in this state."""
+        return words in self._sums
+
     def add(self, made: Transition, *, goes_on: bool = False) -> None:
         """Check one more; one that `goes_on` after an end belongs to no episode."""
         before, last = made.before, self.last

@@ -252,7 +252,8 @@ class Vectors(Session):
             # Several that are stepped together are reset together, once more.
             again = died and env.entry.form == "stacked" and ends[1]
             require((reward, ends) == (0.0, (False, again)), "a reset", k, reward, ends)
-            require(is_begun(now) or died, "no reset", k, now)
+            begun = is_begun(now) or (trail.resumes and trail.has_shown(now))
+            require(begun or died, "no reset", k, now)
             return
         after = now
         if self.mode == "same_step" and any(ends):
@@ -274,7 +275,8 @@ class Vectors(Session):
         for _ in range(6):
             if any(env.gone for env in self.envs):
                 return
-            await self.op_reset(Random(1))
+            # A step that Ctrl-C has cut off may still press it again in other envs.
+            await self.interruptible(self.op_reset(Random(1)))
             if self.is_whole:
                 await self.op_step(Random(1))
             if self.is_whole:
