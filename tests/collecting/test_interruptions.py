@@ -301,6 +301,37 @@ async def test_an_env_that_raised_is_taken_back(
         assert len(steps) > 4
 
 
+class Reluctant(Numbered):
+    """Raises in its first reset, if its number is 1 or 2."""
+
+    is_willing = False
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        if not self.is_willing and self.number in (1, 2):
+            self.is_willing = True
+            raise LookupError("not yet")
+        return super().reset(seed=seed, options=options)
+
+
+@pytest.mark.parametrize("go_on", GO_ON)
+@pytest.mark.parametrize("style", STYLES[::2])
+async def test_a_collector_begins_after_envs_have_raised_in_their_first_reset(
+    style: str, go_on: Any
+) -> None:
+    """The program may have reset them, and have sent that only."""
+    numbers = [lambda k=k: Reluctant(k) for k in range(4)]
+    entry = {"name": "a", "make_env": numbers, "num_workers": 4}
+    async with INLINE_SYNC.build([entry]) as group:
+        with group.auto_reset(math.inf):
+            collector = collector_of(group, style, failing())
+            with pytest.raises(EnvRaised) as raised:
+                await done(collector.collect())
+            for fault in (raised.value, *raised.value.others):
+                await go_on(group, fault)
+            found = parts_of(await done(collector.collect()))
+    assert all(steps_of(found).values())
+
+
 async def reset_two(group: Any) -> None:
     await group.reset(options={"episode": 500}, env_ids=["a-1", "b-0"])
 

@@ -160,7 +160,7 @@ class Collector(Generic[G, R]):
         self._seed = seed
         self._clock = Clock()
         self._kinds: dict[str, EnvKind] = {}
-        self._started = self._start_cut_off = False
+        self._started = self._start_cut_off = self._start_raised = False
         self._start_fault: EnvFault | None = None
         self._newest: Newest
         self._collecting = False
@@ -245,14 +245,25 @@ class Collector(Generic[G, R]):
         try:
             self._received, _ = yield partial(self._group.reset, seed=self._seed)
         except EnvBusy:
-            if not self._start_cut_off:
+            if self._start_cut_off:
+                yield from self._await_start()
+            elif self._start_raised:
+                yield from self._start_again()
+                return
+            else:
                 raise
-            yield from self._await_start()
         except BaseException as error:
             self._start_cut_off = not isinstance(error, Exception)
+            self._start_raised = isinstance(error, EnvFault)
             raise
         self._newest = newest_of(self._group)
         self._started = self._newest.keeps = True
+
+    def _start_again(self) -> Procedure[None]:
+        """Begin again where envs have raised, and the program has reset some of them meanwhile."""
+        yield partial(self._group.collect_async, wait_all=True)
+        self._start_raised = False
+        yield from self._start()
 
     def _await_start(self) -> Procedure[None]:
         """Wait for the results of a reset that was sent and then cancelled.
@@ -273,7 +284,7 @@ class Collector(Generic[G, R]):
                 break
         fault, self._start_fault = self._start_fault, None
         if fault is not None:
-            self._received, self._start_cut_off = None, False
+            self._received, self._start_cut_off, self._start_raised = None, False, True
             raise fault
 
     def _receive(self) -> Any:
