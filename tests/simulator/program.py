@@ -222,15 +222,14 @@ def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 40)
 
 def _as_rows(rng: Random, features: frozenset[str], kind: str) -> tuple[frozenset[str], list[Plan]]:
     """What a vector interface is made of: envs of one kind, in a synchronous group."""
-    features -= {"async", "base", "awaitable", "several entries", "rubbish"}
+    features -= {"async", "base", "awaitable", "several entries"}
     if kind == "sb3":
         features -= {"out of band"}
     plan = replace(_plan(rng, features, "env"), min_results=None)
     if plan.form == "stacked" and plan.mode == "next_step" and plan.on_death == "resume":
         plan = replace(plan, on_death="restart", every=None)
-    if plan.form == "stacked" and kind == "sb3":  # It takes no Dict actions of several together.
-        controls = "digits" if plan.controls == "tree" else plan.controls
-        plan = replace(plan, mode="same_step", controls=controls)
+    if plan.form == "stacked" and kind == "sb3":
+        plan = replace(plan, mode="same_step")
     return features, [plan]
 
 
