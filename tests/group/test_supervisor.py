@@ -114,7 +114,7 @@ class StandIn:
             self.post(Attached(self.host_id))
 
     def submit(self, entries: np.ndarray, arguments: Any = None) -> None:
-        assert len(arguments or entries) == len(entries)
+        assert len(arguments or entries) == len(entries) > 0
         self.asked += entries.tolist()
 
     def executing(self) -> tuple[int, int]:
@@ -728,6 +728,22 @@ def test_requests_to_a_host_that_is_down_wait_for_its_replacement(
     ours.check()
     assert ours.log[-2:] == ["start 0", "attach 0"]
     assert ours.supervisor.next_check() == ours.now + 1
+
+
+def test_a_replacement_gets_no_requests_that_were_aborted(fleet: Callable[..., Fleet]) -> None:
+    """Nor an empty batch in their place, which a Ray actor would execute."""
+    ours = fleet((2, 1), max_restarts=1)
+    host = ours.hosts[0]
+    host.builds = False
+    asked = ours.ask(0)
+    ours.die(0)
+    asked += ours.ask(1)
+    aborted = ours.supervisor.detector.abort(np.array([0]), ours.now)
+    assert [host_id for host_id, _ in aborted] == [0]
+    host.build()
+    ours.completions.append(Attached(0))
+    ours.drain()
+    assert host.asked == asked
 
 
 def test_the_time_of_a_start_counts_from_the_death(fleet: Callable[..., Fleet]) -> None:

@@ -118,7 +118,8 @@ class HostRecord:
         for held, arguments in self.held or ():
             stays = ~np.isin(held, entries)
             own: list[int] = stays.nonzero()[0].tolist()
-            kept.append((held[stays], arguments and [arguments[k] for k in own]))
+            if own:
+                kept.append((held[stays], arguments and [arguments[k] for k in own]))
             withdrawn += held[~stays].tolist()
         self.held = kept
         return withdrawn
