@@ -51,7 +51,7 @@ def after_reset(envs: Any) -> Any:
         return first(envs)
 
 
-@pytest.mark.parametrize("call", ["step", "reset"])
+@pytest.mark.parametrize("call", ["step", "reset", "get_attr"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_reset_goes_on_wherever_a_call_was_interrupted(kind: str, call: str) -> None:
     """The observations after it, and the steps after that, are those without an interrupt."""
@@ -60,7 +60,11 @@ def test_a_reset_goes_on_wherever_a_call_was_interrupted(kind: str, call: str) -
         actions = np.zeros(3, np.int64)
         expected = first(envs)
         following = envs.step(actions)[0]
-        uses = {"step": lambda: envs.step(actions), "reset": lambda: first(envs)}
+        uses = {
+            "step": lambda: envs.step(actions),
+            "reset": lambda: first(envs),
+            "get_attr": lambda: envs.get_attr("metadata"),
+        }
         for line in range(1, NUM_LINES, STRIDE):
             reached, _, _ = struck(line, uses[call])
             np.testing.assert_array_equal(after_reset(envs), expected)

@@ -389,13 +389,14 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
 
     def call(self, name: str, /, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call method `name` of each env, found through its wrappers, or get an attribute."""
-        self.call_async(name, *args, **kwargs)
-        return self.call_wait()
+        send = partial(self.call_async, name, *args, **kwargs)
+        return _in_one_call(self.group, send, self.call_wait)
 
     def call_async(self, name: str, /, *args: Any, **kwargs: Any) -> None:
         """Send calls without waiting; `call_wait` returns their values."""
         self._begin("call_async")
         _check_name(name)
+        self._has_leftovers = True  # Until all are sent.
         self._rows.call(name, args, kwargs)
         self._pending = "call"
 
@@ -422,17 +423,24 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
 
     def _call_one(self, place: int, name: str, /, *args: Any, **kwargs: Any) -> Any:
         _check_name(name)
-        return self._of_one(place, partial(self._rows.call, name, args, kwargs, [place]))
+        send = partial(self._rows.call, name, args, kwargs, [place])
+        return self._rows.values(self._answered("call_async", send), [place])[0]
 
     def _look_up(self, place: int, name: str) -> tuple[bool, Any]:
-        return self._of_one(place, partial(self._rows.look_up, name, place))
+        send = partial(self._rows.look_up, name, place)
+        return self._rows.values(self._answered("call_async", send), [place])[0]
 
-    def _of_one(self, place: int, send: Callable[[], None]) -> Any:
-        self._begin("call_async")
-        send()
-        self._pending = "call"
-        (value,) = self._rows.values(self._finish("call", None, self.group.collect_calls), [place])
-        return value
+    def _answered(self, what: str, send: Callable[[], None]) -> Any:
+        """Return what comes of calls that `send` sends."""
+
+        def begin() -> None:
+            self._begin(what)
+            self._has_leftovers = True  # A value that can't be sent leaves the calls before it.
+            send()
+            self._pending = "call"
+
+        finish = partial(self._finish, "call", None, self.group.collect_calls)
+        return _in_one_call(self.group, begin, finish)
 
     def set_attr(self, name: str, values: Any) -> None:
         """Set attribute `name` of each env: a list or tuple has one value for each env."""
@@ -444,12 +452,7 @@ class VectorEnv(gym.vector.VectorEnv[Any, Any, Any]):
                 f"{len(each)} values for num_envs={self.num_envs}; give one for each, or a single "
                 "one that is not a list or tuple"
             )
-        self._begin("set_attr")
-        # A value that can't be sent leaves the calls before it outstanding.
-        self._has_leftovers = True
-        self._rows.set_attr(name, each)
-        self._pending = "call"
-        self._finish("call", None, self.group.collect_calls)
+        self._answered("set_attr", partial(self._rows.set_attr, name, each))
 
     def render(self) -> tuple[Any, ...]:
         """Return one rendered frame of each env."""
