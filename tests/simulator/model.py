@@ -252,7 +252,8 @@ class Env:
         hangs: how often it was to hang and be replaced alone, as awaitable envs are.
         seen: `deaths` that its results have shown.
         saves: states to which it may be put back after a death.
-        loose: states of which it may have one, because a restore was given up.
+        loose: states of which it may have one, because a call was given up; torn: the same of a
+            restore, after which only a marked result, or one of a reset, may come from them.
         episodes: return and length of each that has ended.
     """
 
@@ -271,6 +272,7 @@ class Env:
     since_save: int = 0
     saves: list[State] = field(default_factory=list)
     loose: list[State] = field(default_factory=list)
+    torn: list[State] = field(default_factory=list)
     episodes: list[tuple[float, int]] = field(default_factory=list)
 
     @property
@@ -279,7 +281,7 @@ class Env:
 
     @property
     def may_be_lost(self) -> bool:
-        return self.deaths > self.seen or bool(self.loose)
+        return self.deaths > self.seen or bool(self.torn)
 
     @property
     def deaths(self) -> int:
@@ -295,7 +297,7 @@ class Env:
 
     def after_loss(self) -> list[State]:
         """The states in which a replacement may be: as saved, or newly built."""
-        states = [state.copy() for state in self.loose]
+        states = [state.copy() for state in (*self.loose, *self.torn)]
         states += [save.copy() for save in self.saves] or [self.fresh()]
         marked = [state.copy() for state in states]  # Its mark may have been set since then.
         for state in marked:
@@ -303,11 +305,20 @@ class Env:
                 sub.mark = own.mark
         return states + marked
 
-    def put_back(self, state: State) -> None:
-        """Note a state that was restored."""
-        self.state = state.copy()
-        self.saves = [state.copy()] if self.entry.every is not None else []
-        self.since_save, self.dirty = 0, False
+    def put_back(self, states: Sequence[State]) -> None:
+        """Note a state that was restored: one of these."""
+        self.adopt(states[0].copy())
+        self.loose = [state.copy() for state in states[1:]]
+        self.saves = [state.copy() for state in states] if self.entry.every is not None else []
+        self.since_save = 0
+
+    def adopt(self, state: State) -> None:
+        """Note the state that it has shown."""
+        self.state, self.dirty, self.loose, self.torn = state, False, [], []
+
+    def possible(self) -> list[State]:
+        """The states that it may have."""
+        return [self.state, *(self.after_loss() if self.may_be_lost else self.loose)]
 
 
 class Row(NamedTuple):
@@ -380,6 +391,8 @@ class Model:
                 env.state.cut = False
             else:
                 request.due = env.state.cut or (context.on_done and env.state.ended)
+        if request.resets and env.saves and env.since_save:  # That is saved before a reset.
+            env.saves.append(env.state.copy())
         effects = [effect for effect, _ in env.state.copy().faults(request)]
         request.kills = any(effect in (*DYING, "hang") for effect in effects)
         if request.kills and env.entry.form == "awaitable" and "hang" in effects:
@@ -433,9 +446,8 @@ class Model:
         if restarted[0]:
             self._judge_marked(env, request, row)
             return
-        states = [env.state, *(state.copy() for state in env.loose)]
-        if env.may_be_lost and request.kind == "reset":
-            states += env.after_loss()
+        is_reset = request.kind == "reset"
+        states = env.possible() if is_reset else [env.state, *env.loose]
         limit, marks = self._limit_of(env)
         for state in states:
             now = state.copy()
@@ -450,7 +462,7 @@ class Model:
         _compare(env, expected, row)
         if state is not env.state:
             env.seen = request.deaths
-        env.state, env.dirty, env.loose = now, False, []
+        env.adopt(now)
         env.episodes += [episode for episode in expected.episodes if episode is not None]
         self._save(env, request)
 
@@ -474,7 +486,7 @@ class Model:
             env.saves, env.since_save = [env.state.copy()], 0
 
     def _judge_marked(self, env: Env, request: Request, row: Row) -> None:
-        if not env.loose:
+        if not env.torn:
             require(env.host.mortal and env.may_be_lost, "marked, and nothing has died")
             require(env.entry.on_death != "raise", "marked, where a death is to be raised")
         require(isinstance(row.info.get("worker_restarted"), str), "marked without a cause")
@@ -495,22 +507,27 @@ class Model:
         if env.entry.form == "awaitable":  # One that hung begins the same episode again.
             seed, options = (request.seed, request.options) if request.resets else env.state.begun
             again.append(Request("reset", seed=seed, options=options))
-        for one, state in ((one, state) for one in again for state in env.after_loss()):
-            lost = max(env.state.count - state.count, 0)
-            expected = state.play(one, math.inf, marks=False)
-            if expected.outcome.words == row.words:
-                break
-        else:
-            raise Violation("marked, in no state that it may have")
+        found = [
+            state
+            for one in again
+            for state in env.after_loss()
+            if state.play(one, math.inf, marks=False).outcome.words == row.words
+        ]
+        require(found, "marked, in no state that it may have")
+        state, *others = found  # They may differ in what nobody sees.
+        lost = max(env.state.count - state.count, 0)
         if shows:
             require(row.info["worker_resumed"] == lost, "a wrong number of lost steps", lost)
             state.cut = False
         elif request.kind == "step" and not request.due:
-            require(not env.saves, "a new episode, and the old one was saved")
+            require(env.torn or not env.saves, "a new episode, and the old one was saved")
         require("episode" not in row.info, "an episode that was lost")
         was_idle = request.deaths > env.seen
-        env.seen = max(env.seen + 1, request.deaths)
-        env.state, env.dirty, env.loose = state, False, []
+        env.seen = max(env.seen + (not env.torn), request.deaths)
+        env.adopt(state)
+        env.loose = [
+            other for other in others if other.scripts.subs[0].mark != state.scripts.subs[0].mark
+        ]
         self.counts["died"] += 1
         self.counts["died while idle"] += was_idle
         self.counts["hung"] += row.info["worker_restarted"].startswith("hung")
@@ -552,7 +569,13 @@ class Model:
             after.play(request, math.inf, marks=False)
             env.loose, env.dirty = [after], True
             return
+        if request.resets and env.since_save:
+            env.saves, env.since_save = env.saves[-1:], 0
+        if request.resets and env.may_be_lost:  # What was saved can't be shown any more.
+            env.torn = env.after_loss()
         acts = env.state.faults(request)
+        for state in env.torn:  # A new episode in place of the step.
+            acts += state.faults(Request("reset"))
         raising = [act for act in acts if act[0] in RAISING]
         if raising:
             check_raised(fault, *raising[0])

@@ -27,7 +27,8 @@ from simulator.model import (
     rows_of,
     same,
 )
-from simulator.scripted import DYING, TOKENS, UNCLOSABLE
+from simulator.program import OPS
+from simulator.scripted import DEADLY, DYING, SLOW, TOKENS, UNCLOSABLE, UNLOADABLE
 from simulator.session import Session, action_of, stacked
 from simulator.world import Faults
 
@@ -36,6 +37,7 @@ from rlightning_aio.errors import (
     BadAction,
     EnvBusy,
     EnvFault,
+    EnvRaised,
     EpisodeLost,
     NothingPending,
     RLightningError,
@@ -47,6 +49,7 @@ from rlightning_aio.errors import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence
 
+    from simulator.model import State
     from simulator.program import Op
 
 
@@ -323,9 +326,17 @@ class Play(Session):
     # -- operations: steps and resets
 
     async def op_step(self, rng: Random) -> None:
-        envs = self.some(rng, self.ready())
-        if envs:
+        if envs := await self.steppable(rng):
             await self.step_on(envs, rng)
+
+    async def steppable(self, rng: Random) -> list[Env]:
+        """Envs to step; if there are none, do what may lead to some."""
+        if not (envs := self.some(rng, self.ready())):
+            if self.model.idle():
+                await self.op_reset(rng)
+            elif self.model.pending(COLLECTOR):
+                await self.op_collect(rng)
+        return envs
 
     async def step_on(self, envs: list[Env], rng: Random | None = None) -> bool:
         """Step envs and wait for them; plainly without a generator."""
@@ -343,8 +354,7 @@ class Play(Session):
         return next(iter(requests.values())).owner
 
     async def op_step_async(self, rng: Random) -> None:
-        envs = self.some(rng, self.ready())
-        if not envs:
+        if not (envs := await self.steppable(rng)):
             return
         batch, requests = self.response(rng, envs)
         self.send_async(requests, lambda: self.group.step_async(batch))
@@ -374,6 +384,8 @@ class Play(Session):
                 column.clear()
 
     async def op_collect(self, rng: Random) -> None:
+        if not self.model.pending(COLLECTOR) and rng.random() < 0.9:
+            await self.op_step_async(rng)
         rules: dict[str, Any] = {}
         if rng.random() < 0.5:
             rules["min_results"] = rng.randint(1, 4)
@@ -576,9 +588,7 @@ class Play(Session):
         words, echo = value
         env.request = None
         shown = [tuple(one) for one in words]
-        possible = [[tuple(one) for one in env.state.scripts.words]]
-        if env.may_be_lost:
-            possible += [[tuple(w) for w in s.scripts.words] for s in env.after_loss()]
+        possible = [[tuple(w) for w in state.scripts.words] for state in env.possible()]
         require(shown in possible, "another state", shown, possible)
         require(tuple(echo) == (token,), "another call's arguments", echo)
 
@@ -638,7 +648,17 @@ class Play(Session):
         envs = self.model.idle()
         if not envs:
             return
-        env, mark = rng.choice(envs), rng.choice([rng.randrange(98), UNCLOSABLE])
+        env = rng.choice(envs)
+        await self.mark(env, rng.choice([rng.randrange(SLOW), UNCLOSABLE, *self.marks(env)]))
+
+    def marks(self, env: Env) -> list[int]:
+        """Those that matter when its state is loaded."""
+        if env.entry.every is not None:  # Its replacements do that, too.
+            return [SLOW]
+        return [SLOW, UNLOADABLE] + [DEADLY] * ("die" in self.features and self.is_killable(env))
+
+    async def mark(self, env: Env, mark: int) -> None:
+        """Set the `mark` of an env, and get it."""
         if mark == UNCLOSABLE:  # Its state may be put into any other.
             self.unclosable |= {one.env_id for one in self.model.envs.values()}
         handle = self.group[env.env_id]
@@ -650,14 +670,13 @@ class Play(Session):
 
         def take_mark(value: Any) -> None:
             env.request = None
-            lost = [state.scripts.subs[0].mark for state in env.after_loss()]
-            possible = [mark, *lost] if env.may_be_lost else [mark]
+            possible = [state.scripts.subs[0].mark for state in env.possible()]
             require(value in possible, "another attribute", value, mark)
 
         request = {env.env_id: Request("call")}
         try:
             answered = await self.answer(request, lambda: handle.set_attr("mark", mark), take)
-        except KeyboardInterrupt:
+        except (asyncio.CancelledError, KeyboardInterrupt):
             env.loose = [env.state.copy()]
             for sub in env.loose[0].scripts.subs:
                 sub.mark = mark
@@ -733,10 +752,11 @@ class Play(Session):
     # -- operations: states
 
     async def op_snapshot(self, rng: Random) -> None:
+        await self.prepare(rng)
         envs = self.some(rng, self.ready())
         if not envs:
             return
-        states = [(env, env.state.copy()) for env in envs]
+        states = [(env, [state.copy() for state in env.possible()]) for env in envs]
         requests = {env.env_id: Request("call") for env in envs}
 
         def take(data: bytes) -> None:
@@ -755,43 +775,95 @@ class Play(Session):
         for env in envs:
             env.state.refuses = False
 
+    async def prepare(self, rng: Random) -> None:
+        """Do to an env what matters to its state."""
+        if (envs := self.ready()) and rng.random() < 0.5:
+            env = rng.choice(envs)
+            await self.mark(env, rng.choice(self.marks(env)))
+        if "die" in self.features and rng.random() < 0.3:
+            self.kill_soon(rng, self.ready())
+            await (self.op_step(rng) if rng.random() < 0.5 else self.rest())
+
     async def op_restore(self, rng: Random) -> None:
         if not self.snapshots:
+            await self.op_snapshot(rng)
             return
         data, states = rng.choice(self.snapshots)
         envs = self.targets(rng, [env for env, _ in states])
         if not all(env.idle for env in envs):
+            await self.op_collect(rng)
             return
         if len(states) < len(self.envs) and rng.random() < 0.1:
             with self.expected(SnapshotError, "a snapshot of fewer envs"):
                 await self.done(self.group.restore(data))
             return
-        # Until it returns, it is a call: it answers with the states or changes nothing.
-        requests = {env.env_id: Request("call") for env in envs}
-        before = [env.state for env in envs]
+        if "die" in self.features and rng.random() < 0.3:
+            self.kill_soon(rng, envs)
+        pairs = [(env, env.possible(), saved) for env, (_, saved) in zip(envs, states, strict=True)]
+        for env, _, saved in pairs:
+            if saved[0].scripts.subs[0].mark == DEADLY:
+                env.host.ask()
+        await self.restore(data, pairs)
+
+    async def restore(
+        self, data: bytes, pairs: Sequence[tuple[Env, list[State], list[State]]]
+    ) -> None:
+        """Put envs, which are in one of some states, into that of a snapshot: one of others.
+
+        Until it returns, it is a call: it answers with the states or changes nothing.
+        """
+        requests = {env.env_id: Request("call") for env, _, _ in pairs}
+
+        async def restore() -> Any:
+            try:
+                return await self.done(self.group.restore(data, [*requests]))
+            except EnvFault as fault:
+                self.undone(fault, pairs)
+                raise
 
         def take(found: Any) -> None:
             batch, flags = found
-            require(flags == [False] * len(envs), "flags", flags)
+            require(flags == [False] * len(pairs), "flags", flags)
             require(batch.env_ids() == [*requests], "another order", batch.env_ids())
-            for env, (_, state) in zip(envs, states, strict=True):
+            for env, _, saved in pairs:
                 assert env.request is not None
                 env.request.kind = "show"
-                env.put_back(state)
+                env.put_back(saved)
             self.take(batch, flags, self.owner_of(requests))
 
         try:
-            await self.answer(requests, lambda: self.group.restore(data, [*requests]), take)
+            await self.answer(requests, restore, take)
         except (asyncio.CancelledError, KeyboardInterrupt):
-            for env, state, (_, saved) in zip(envs, before, states, strict=True):
+            for env, before, saved in pairs:
                 if env.env_id in self.group.pending:  # It shows the state to a collect.
                     env.put_back(saved)
                     env.request, env.limbo = Request("show"), False
                 else:
-                    env.loose = [state.copy(), saved.copy()]
+                    env.torn = [state.copy() for state in (*before, *saved)]
             raise
-        for env in envs:
+        for env, _, _ in pairs:
             env.state.refuses = False
+
+    def undone(
+        self, fault: EnvFault, pairs: Sequence[tuple[Env, list[State], list[State]]]
+    ) -> None:
+        """Check an error of a restore, after which all are where they were before.
+
+        Those that can't be put back, or whose worker has died, begin a new episode.
+        """
+        faults = [fault, *fault.others]
+        note = "; ".join(getattr(fault, "__notes__", ()))
+        if not note:  # Nothing was changed yet.
+            return
+        require("nothing was restored" in note, "a restore that failed, and does not say so", note)
+        for env, before, saved in pairs:
+            own, others = [[s.scripts.subs[0].mark for s in states] for states in (saved, before)]
+            raised = any(one.env_id == env.env_id for one in faults if isinstance(one, EnvRaised))
+            require(not raised or UNLOADABLE in own, "an error of nobody", repr(fault))
+            if env.env_id in note:
+                require(UNLOADABLE in others, "a state that can't be put back", note)
+            if env.may_be_lost or env.env_id in note:
+                env.torn = [state.copy() for state in (*before, *saved)]
 
     def targets(self, rng: Random, envs: list[Env]) -> list[Env]:
         """Where the states of these envs may go: there, or to others of the same entries."""
@@ -814,19 +886,19 @@ class Play(Session):
     def waiting(self, rng: Random, *more: str) -> Coroutine[Any, Any, None]:
         """An operation that waits."""
         names = [name for name in (*self.WAITING, *more) if name in self.allowed()]
-        return getattr(self, f"op_{rng.choice(names)}")(rng)
+        weights = [OPS[name][0] for name in names]
+        return getattr(self, f"op_{rng.choices(names, weights)[0]}")(rng)
 
     def allowed(self) -> list[str]:
-        from simulator.program import OPS
-
         return [n for n, (_, needs) in OPS.items() if needs is None or needs in self.features]
 
     async def op_cancel(self, rng: Random) -> None:
         if not self.is_async:
             return
         task = asyncio.create_task(self.waiting(rng))
+        seconds = rng.choice([0, 0, 1e-6, 1e-5, 1e-4, 1e-2])
         for _ in range(rng.randint(1, 6)):
-            await asyncio.sleep(0)
+            await asyncio.sleep(seconds)
         task.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await task
@@ -834,7 +906,7 @@ class Play(Session):
     async def op_expire(self, rng: Random) -> None:
         if not self.is_async:
             return
-        seconds = rng.choice([0.001, 0.01, 0.3])
+        seconds = 10 ** rng.uniform(-6, -0.5)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):
                 await self.waiting(rng)
@@ -895,7 +967,8 @@ class Play(Session):
             with self.expected(BadAction, "columns of another length"):
                 batch.respond(action=[0] * (len(batch) + 1))
             return
-        with self.expected((wrong, WorkerDied), kind):
+        limbo = any(self.model.envs[env_id].limbo for env_id in batch.env_ids())
+        with self.expected((wrong, WorkerDied, *[EnvBusy] * limbo), kind):
             self.group.step_async(BatchedData(ids, values))
 
     async def op_look(self, rng: Random) -> None:

@@ -164,8 +164,8 @@ OPS: dict[str, tuple[int, str | None]] = {
     "mark": (2, "calls"),
     "handle": (4, "handles"),
     "episode": (2, "handles"),
-    "snapshot": (4, "snapshots"),
-    "restore": (5, "snapshots"),
+    "snapshot": (5, "snapshots"),
+    "restore": (9, "snapshots"),
     "cancel": (6, "cancel"),
     "expire": (4, "timeouts"),
     "task": (8, "tasks"),
@@ -189,10 +189,11 @@ KINDS: dict[str, tuple[int, dict[str, tuple[int, str | None]]]] = {
 """Kinds of programs: the weight of each, and its operations."""
 
 
-def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 40) -> Program:
-    """The program of a seed, without some features."""
+def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 60) -> Program:
+    """The program of a seed, without some features; a third of them have few."""
     rng = Random(seed)
-    features = frozenset(f for f in FEATURES if rng.random() < 0.5) - without
+    share = rng.choice((0.25, 0.5, 0.5))
+    features = frozenset(f for f in FEATURES if rng.random() < share) - without
     plans = [_plan(rng, features, "a")]
     if "several entries" in features:
         plans += [_plan(rng, features, name) for name in "bc"[: rng.randint(1, 2)]]
@@ -207,7 +208,8 @@ def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 40)
         features, plans = _as_rows(rng, features, kind)
     ops_of_kind = KINDS[kind][1]
     names = [name for name, (_, needs) in ops_of_kind.items() if needs is None or needs in features]
-    weights = [ops_of_kind[name][0] for name in names]
+    # A few of them make up most of a program.
+    weights = [ops_of_kind[name][0] * rng.choice((0.2, 1.0, 5.0)) for name in names]
     most = num_ops if kind in ("group", "vectors", "sb3") else num_ops // 5
     count = rng.randint(most // 4, most)
     ops = [Op(name, rng.getrandbits(32)) for name in rng.choices(names, weights, k=count)]

@@ -39,8 +39,8 @@ class Machine:
         time.sleep(seconds / 100)
 
     def die(self, how: str) -> None:
-        """End the process: ``killed`` or ``exit``."""
-        if how == "killed":
+        """End the process: ``killed`` or ``exit``; ``soon`` in a world a moment later."""
+        if how != "exit":
             os.kill(os.getpid(), signal.SIGKILL)
         os._exit(3)
 
@@ -115,8 +115,10 @@ def _raise(effect: str, token: int) -> None:
         signal.raise_signal(signal.SIGINT)
 
 
-UNCLOSABLE = 98
-"""The `mark` of an env that raises when it is closed."""
+UNCLOSABLE, UNLOADABLE, DEADLY, SLOW = 98, 97, 96, 95
+"""The `mark` of an env that raises when it is closed; or when its state is loaded, that then ends
+its process, that then takes long.
+"""
 
 
 class Words(NamedTuple):
@@ -170,6 +172,15 @@ class Script:
             self.refuses = False
             raise RuntimeError("it keeps its state")
         return vars(self).copy()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        if state["mark"] == UNLOADABLE:
+            raise RuntimeError("it does not load")
+        if state["mark"] == DEADLY:
+            machine.die("soon")
+        elif state["mark"] == SLOW:
+            machine.spend(0.1)
+        vars(self).update(state)
 
     @property
     def words(self) -> Words:
@@ -635,7 +646,7 @@ class ScriptedBase(BaseEnv):
 
     def load_state(self, state: Any) -> None:
         for sub, own in zip(self.env.scripts.subs, state, strict=True):
-            vars(sub).update(own)
+            sub.__setstate__(own)
 
 
 def broken(effect: str, make: Callable[..., Any], *args: Any) -> Any:

@@ -53,6 +53,7 @@ class Session:
         self.hang = 200.0 if world is None else 1e6
         self.is_async = "async" in program.features
         self.counts: Counter[str] = Counter()
+        self.is_calm = False
         self.unclosable: set[str] = set()
 
     # -- a run
@@ -132,6 +133,7 @@ class Session:
 
     async def play(self, number: int, op: Op) -> None:
         """Do an operation."""
+        self.is_calm = False
         if self.world is not None:
             self.world.reseed(op.seed)
             self.world.storm()
@@ -167,6 +169,7 @@ class Session:
 
     def calm(self) -> None:
         """Let nothing go wrong by itself."""
+        self.is_calm = True
         if self.world is not None:
             self.world.calm()
 
@@ -179,17 +182,24 @@ class Session:
 
     async def op_kill(self, rng: Random) -> None:
         """End a worker from outside."""
-        envs = [env for env in self.envs if self.is_killable(env) and not env.gone]
+        self.kill_soon(rng, self.envs)
+
+    def kill_soon(self, rng: Random, envs: Sequence[Env]) -> None:
+        """End the worker of one of these envs, in a world also a little later."""
+        envs = [env for env in envs if self.is_killable(env) and not env.gone]
         if not envs:
             return
-        env = rng.choice(envs)
-        env.host.ask()
+        env, delay = rng.choice(envs), rng.choice([0.0, 1e-5, 1e-4, 1e-3, 1e-2, 0.1])
         pids = [w["pid"] for w in self.group.get_workers() if env.env_id in w["env_ids"]]
-        if self.world is not None:
+        if self.world is None:
+            env.host.ask()
+            if pids[0] is not None:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pids[0], signal.SIGKILL)
+        elif delay:
+            self.world.after(delay, lambda: self.is_calm or self.world.kill(pids))
+        else:
             self.world.kill(pids)
-        elif pids[0] is not None:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pids[0], signal.SIGKILL)
 
     # -- errors
 

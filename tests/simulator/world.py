@@ -48,6 +48,7 @@ from simulator.processes import NOBODY, Killed, Process
 from simulator.sockets import Epoll, Loop, Sockets, run_in_process
 
 from rlightning_aio import sharing
+from rlightning_aio.group import first_observations
 from rlightning_aio.hosts import awaiting
 from rlightning_aio.hosts import process as process_hosts
 from rlightning_aio.protocol import exchange, kernel, rings
@@ -202,6 +203,8 @@ class World:
             (rings, "IN_ORDER", False),
             (exchange, "new_fence", lambda: self.point),
             (rings, "new_fence", lambda: self.point),
+            # So that steps are ordinary sooner.
+            (first_observations, "_NUM_CHECKED", 1),
             (rays.MODULES["rlightning_aio.hosts.ray"], "ray", rays.SimulatedRay(self)),
             (secrets, "randbits", self.rng.getrandbits),
             *self.network.replacements(),
@@ -407,7 +410,12 @@ class SimulatedMachine:
         self._world.sleep(seconds)
 
     def die(self, how: str) -> None:
-        self._process().end(-signal.SIGKILL if how == "killed" else 3)
+        process, world = self._process(), self._world
+        end = partial(process.end, 3 if how == "exit" else -signal.SIGKILL)
+        if how == "soon":
+            world.after(world.rng.randrange(4) * world.delay(), end)
+        else:
+            end()
 
     def hang(self) -> None:
         self._process().wait_for(lambda: False, None)
