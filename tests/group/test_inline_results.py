@@ -65,6 +65,29 @@ def test_an_interrupt_of_the_first_half_comes_with_the_result(
         halved.collect_async()
 
 
+class Interrupting(gym.Env[Any, Any]):
+    """Its `reset` is interrupted."""
+
+    observation_space = action_space = spaces.Discrete(2)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        raise KeyboardInterrupt
+
+
+@pytest.mark.timeout(20)
+def test_a_drain_has_what_another_entry_did_before_an_interrupt() -> None:
+    """Its result is reported although another env was interrupted."""
+    quiet = {"name": "quiet", "backend": "gymnasium", "task": "CartPole-v1", "placement": "inline"}
+    loud = {"name": "loud", "make_env": Interrupting, "placement": "inline"}
+    with rlightning_aio.sync.build_env_group([quiet, loud]) as group:
+        with pytest.raises(KeyboardInterrupt):
+            group.reset()
+        with pytest.raises(EnvRaised) as raised:
+            group.drain()
+        assert raised.value.env_id == "loud-0"
+        assert raised.value.results.env_ids() == ["quiet-0"]
+
+
 def test_time_between_the_halves_is_not_part_of_the_step() -> None:
     """The time of a step is the sum of its two halves."""
     clock = SimpleNamespace(now=0, monotonic_ns=lambda: clock.now)

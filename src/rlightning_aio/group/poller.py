@@ -91,12 +91,14 @@ class Poller:
         if sum(self._requests.in_flight) > waiting:
             wanted = 1
         count = 0
-        while count < wanted and self._execute_next():
-            count += 1
-            if until is not None and self._clock() >= until:
-                break
-        for _, host in self._executing:
-            host.poll()
+        try:
+            while count < wanted and self._execute_next():
+                count += 1
+                if until is not None and self._clock() >= until:
+                    break
+        finally:  # Ctrl-C may be raised in an env.
+            for _, host in self._executing:
+                host.poll()
         return count > 0
 
     def _execute_next(self) -> bool:
