@@ -417,6 +417,20 @@ def run(group: FakeGroup, procedure: Any) -> Any:
     return running.result()
 
 
+def test_requests_have_a_worker_replaced_in_which_only_a_cancelled_call_still_runs(
+    new_group: NewGroup,
+) -> None:
+    """Nobody waits, so there is nobody else who sees that its next attempt to start is due."""
+    group = new_group(1)
+    group.hosts[0].refusals = 1
+    die(group, 0)
+    group.cancel(group.begin(group.core.calls.call(group.now, 0, ("who", (), {}))))
+    group.now += 60.0
+    with pytest.raises(EnvBusy, match="a call that was cancelled still runs"):
+        group.steps.step_async(steps(0), group.now)
+    assert group.hosts[0].alive
+
+
 def die(group: FakeGroup, slot: int) -> None:
     group.host_of(slot).die()
     group.core.drain()

@@ -96,7 +96,7 @@ class Calls:
         """
         self._intake.drain()
         self._dispatch.check_local(slots, f"call {ticket.method} of")
-        self._dispatch.check_sendable(slots, f"call {ticket.method} of")
+        self._dispatch.check_sendable(now, slots, f"call {ticket.method} of")
         packed = [
             self._dispatch.packed(slot, own, what)
             for slot, own in zip(slots.tolist(), arguments, strict=True)

@@ -182,7 +182,7 @@ class Core:
             batch, slots = self._arrivals.without_gone(batch, slots)
             if not len(slots):
                 return
-        self._dispatch.check_sendable(slots, "step")
+        self._dispatch.check_sendable(now, slots, "step")
         out_of_band = write_actions(batch, slots, self.envs, self._layout)
         packed = [] if out_of_band is None else self._dispatch.packed_steps(slots, out_of_band)
         self.results.note_sent(slots, response_columns(batch, slots, self._layout))

@@ -56,12 +56,12 @@ class Dispatch:
             raise EnvBusy(f"{double!r} appears twice in one call; nothing was sent")
         return slots
 
-    def check_sendable(self, slots: NDArray[np.intp], what: str) -> None:
+    def check_sendable(self, now: float, slots: NDArray[np.intp], what: str) -> None:
         """Raise an error if the group is closed, or an env of `slots` is busy or gone."""
         self._lifetime.check_open()
         self._supervisor.check_usable(slots)
         while (slot := self._requests.first_not_idle(slots)) is not None:
-            if self._requests.owner[slot] != NOBODY or not self._end_call(slot):
+            if self._requests.owner[slot] != NOBODY or not self._end_call(now, slot):
                 break
         if slot is not None:
             why = "its last request was not collected; collect it first, with collect_async"
@@ -71,7 +71,7 @@ class Dispatch:
                 why = "its last request has not replied yet; collect it first, with collect_async"
             raise EnvBusy(f"can't {what} {self._envs.describe(slot)}: {why}; nothing was sent")
 
-    def _end_call(self, slot: int) -> bool:
+    def _end_call(self, now: float, slot: int) -> bool:
         """Note the end of a cancelled call that has ended since the group last waited.
 
         In this process, it is executed now, after the requests that were sent before it. Returns
@@ -80,6 +80,11 @@ class Dispatch:
         self._watcher.read()
         self._intake.drain()
         while not self._requests.is_idle(slot) and self._poller.execute(1, None):
+            self._intake.drain()
+        if not self._requests.is_idle(slot):  # Perhaps nobody waits who would replace its worker.
+            self._poller.poll()  # An env that has replied is not hung.
+            self._intake.drain()
+            self._supervisor.check(now)
             self._intake.drain()
         return self._requests.is_idle(slot)
 

@@ -97,7 +97,7 @@ class Resets:
         """Send resets, whose results the collector gets."""
         slots = self._members.everyone() if env_ids is None else self._dispatch.distinct(env_ids)
         seeds = self._seeds_for(slots, seed, now)
-        self._dispatch.check_sendable(slots, "reset")
+        self._dispatch.check_sendable(now, slots, "reset")
         packed = self._packed_resets(slots, seeds, options)
         self._send(slots, seeds, options, packed, COLLECTOR, now)
 
@@ -126,7 +126,7 @@ class Resets:
     ) -> Procedure[tuple[Ticket, NDArray[np.intp]]]:
         seeds = self._seeds_for(slots, seed, now)
         joined = self._requests.joined(slots)
-        self._dispatch.check_sendable(slots[~joined], "reset")
+        self._dispatch.check_sendable(now, slots[~joined], "reset")
         packed = self._packed_resets(slots, seeds, options)
 
         def send(ticket: Ticket) -> None:
