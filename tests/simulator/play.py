@@ -21,6 +21,7 @@ from simulator.model import (
     Model,
     Request,
     Row,
+    State,
     Violation,
     require,
     row_of_ret,
@@ -49,7 +50,6 @@ from rlightning_aio.errors import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence
 
-    from simulator.model import State
     from simulator.program import Op
 
 
@@ -108,11 +108,16 @@ class Play(Session):
 
     def check_pending(self) -> None:
         owed = self.model.pending()
-        # An episode steps in a task of its own, so its results are handed out a little earlier.
-        nested = {env.env_id for env in owed if env.env_id in self.nested}
+        # An episode steps in a task of its own, so its results are handed out a little earlier. An
+        # env whose worker has died takes no further part in a restore.
+        nested = {env.env_id for env in owed if env.env_id in self.nested or self.is_lost(env)}
         pending = {env.env_id for env in owed} - nested
         found = set(self.group.pending) - nested
         require(found == pending, "pending", sorted(found), "must be", sorted(pending))
+
+    def is_lost(self, env: Env) -> bool:
+        """A call waits for it that its worker may have been lost in."""
+        return env.request is not None and env.request.kind == "call" and env.may_be_lost
 
     async def finish(self) -> None:
         await self.look_at_tasks(wait=True)
@@ -123,10 +128,10 @@ class Play(Session):
         if self.context is not None:
             self.leave()
         for env in self.model.envs.values():
-            for _ in range(6):  # Errors of the env, or of a call that was given up, may come first.
+            for k in range(6):  # Errors of the env, or of a call that was given up, may come first.
                 if env.gone or await self.interruptible(self.use(env)):
                     break
-                await self.rest()
+                await self.rest(1 if self.world is None else 10**k)  # It may still be starting.
             else:
                 raise Violation(f"env {env.env_id} can't be used any more")
         self.check_stats()
@@ -196,7 +201,11 @@ class Play(Session):
 
     def refuse_busy(self, requests: dict[str, Request]) -> None:
         """A call that was given up may still run in an env."""
-        limbo = any(request.before[0] for request in requests.values())
+        limbo = any(
+            request.before[0]
+            and self.model.envs[env_id].host.mortal  # Others end it by themselves.
+            for env_id, request in requests.items()
+        )
         require(limbo, "busy, and nothing was asked", *requests)
         self.withdraw(requests)
 
@@ -677,9 +686,7 @@ class Play(Session):
         try:
             answered = await self.answer(request, lambda: handle.set_attr("mark", mark), take)
         except (asyncio.CancelledError, KeyboardInterrupt):
-            env.loose = [env.state.copy()]
-            for sub in env.loose[0].scripts.subs:
-                sub.mark = mark
+            env.loose = [env.state.marked(mark)]
             raise
         if answered and env.idle:
             request = {env.env_id: Request("call")}
@@ -862,6 +869,9 @@ class Play(Session):
             require(not raised or UNLOADABLE in own, "an error of nobody", repr(fault))
             if env.env_id in note:
                 require(UNLOADABLE in others, "a state that can't be put back", note)
+            if env.saves:  # The worker has saved again what it was put back to.
+                env.saves = [*(env.saves if env.may_be_lost else ()), *map(State.copy, before)]
+                env.since_save = 0
             if env.may_be_lost or env.env_id in note:
                 env.torn = [state.copy() for state in (*before, *saved)]
 
@@ -931,8 +941,11 @@ class Play(Session):
             return
         batch, _ = self.response(rng, envs)
         ids, values = list(batch.env_ids()), list(batch.values())
-        kind = rng.choice(["unknown", "double", "shape", "count", "busy", "foreign"])
-        busy = [env.env_id for env in self.model.pending()]
+        busy = self.model.pending()
+        sized = ("vector", "single", "digits", "number")
+        fits = [k for k, i in enumerate(ids) if self.model.envs[i].entry.controls in sized]
+        kinds = ["unknown", "double", "count"] + ["shape"] * bool(fits)
+        kind = rng.choice(kinds + ["busy"] * bool(busy) + ["foreign"] * (len(ids) > 1))
         wrong: Any = EnvBusy
         if kind == "unknown":
             ids.append("nobody-7")
@@ -941,33 +954,20 @@ class Play(Session):
         elif kind == "double":
             ids.append(ids[0])
             values.append(values[0])
-        elif kind == "foreign" and len(ids) > 1:
+        elif kind == "foreign":
             ids[0], ids[1] = ids[1], ids[0]
             wrong = BadAction
-        elif kind == "busy" and busy:
-            ids.append(busy[0])
-            values.append(
-                PolicyResponse(
-                    busy[0],
-                    action_of(self.model.envs[busy[0]], self.acts(rng, self.model.envs[busy[0]])),
-                )
-            )
+        elif kind == "busy":
+            ids.append(busy[0].env_id)
+            values.append(PolicyResponse(ids[-1], action_of(busy[0], self.acts(rng, busy[0]))))
         elif kind == "shape":
-            fits = [
-                k
-                for k, env_id in enumerate(ids)
-                if self.model.envs[env_id].entry.controls
-                in ("vector", "single", "digits", "number")
-            ]
-            if not fits:
-                return
             values[fits[0]] = PolicyResponse(ids[fits[0]], np.zeros((3, 3, 7)))
             wrong = BadAction
         else:
             with self.expected(BadAction, "columns of another length"):
                 batch.respond(action=[0] * (len(batch) + 1))
             return
-        limbo = any(self.model.envs[env_id].limbo for env_id in batch.env_ids())
+        limbo = any(env.limbo and env.host.mortal for env in envs)
         with self.expected((wrong, WorkerDied, *[EnvBusy] * limbo), kind):
             self.group.step_async(BatchedData(ids, values))
 

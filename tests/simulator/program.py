@@ -26,6 +26,16 @@ FEATURES = (
     "raise deaths", "resume", "misuse", "zero_copy", "timeline", "faults",
     "interrupts",
 )  # fmt: skip
+THEMES: tuple[tuple[str, ...], ...] = (
+    ("snapshots", "resume", "die", "processes", "auto_reset"),
+    ("snapshots", "die", "processes", "several envs"),
+    ("async", "snapshots", "cancel", "timeouts"),
+    ("snapshots", "calls", "several envs", "faults", "interrupts"),
+    ("resume", "die", "processes", "ends", "stacked"),
+    ("auto_reset", "stacked", "ends"),
+    ("several envs", "extras", "infos", "partial steps"),
+)
+"""Features that matter to each other: half of the programs have those of a theme."""
 
 
 @dataclass(frozen=True)
@@ -193,7 +203,8 @@ def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 60)
     """The program of a seed, without some features; a third of them have few."""
     rng = Random(seed)
     share = rng.choice((0.25, 0.5, 0.5))
-    features = frozenset(f for f in FEATURES if rng.random() < share) - without
+    theme = rng.choice(THEMES) if rng.random() < 0.5 else ()
+    features = frozenset(f for f in FEATURES if f in theme or rng.random() < share) - without
     plans = [_plan(rng, features, "a")]
     if "several entries" in features:
         plans += [_plan(rng, features, name) for name in "bc"[: rng.randint(1, 2)]]

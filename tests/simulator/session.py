@@ -173,12 +173,12 @@ class Session:
         if self.world is not None:
             self.world.calm()
 
-    async def rest(self) -> None:
+    async def rest(self, tenths: int = 1) -> None:
         """Let others do what they still have to do."""
         if self.is_async:
-            await asyncio.sleep(0.1)
+            await asyncio.sleep(tenths / 10)
         else:
-            time.sleep(0.1)  # noqa: ASYNC251  # Nothing else waits.
+            time.sleep(tenths / 10)  # noqa: ASYNC251  # Nothing else waits.
 
     async def op_kill(self, rng: Random) -> None:
         """End a worker from outside."""
