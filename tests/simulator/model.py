@@ -9,6 +9,7 @@ a state that it saved), and the model then adopts what it shows.
 from __future__ import annotations
 
 import copy
+import itertools
 import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -422,6 +423,18 @@ class Model:
             else:
                 env.request.owner = COLLECTOR
 
+    def abort(self, env: Env) -> None:
+        """Note that nobody gets what a request leads to: it may have been done, or its env lost."""
+        before = [env.state.copy(), env.fresh(), *env.after_loss()]
+        # Without a request it was a call that was given up before.
+        done = [] if env.request is None else [env.request, Request("reset")]
+        env.loose = list(before)
+        for request, state in itertools.product(done, before):
+            env.loose.append(state.copy())
+            env.loose[-1].play(request, math.inf, marks=False)
+        env.request, env.limbo, env.dirty = None, False, True
+        self.counts["aborted"] += 1
+
     # -- results
 
     def take(self, rows: Iterable[Row], owner: Any) -> None:
@@ -529,7 +542,7 @@ class Model:
             require(env.torn or not env.saves, "a new episode, and the old one was saved")
         require("episode" not in row.info, "an episode that was lost")
         was_idle = request.deaths > env.seen
-        env.seen = max(env.seen + (not env.torn), request.deaths)
+        env.seen = min(max(env.seen + (not env.torn), request.deaths), env.deaths)
         env.adopt(*found)
         self.counts["died"] += 1
         self.counts["died while idle"] += was_idle
@@ -568,22 +581,23 @@ class Model:
             return
         if request.interrupted and fault.exception_type == "KeyboardInterrupt":
             self.counts["Ctrl-C in an env"] += 1
-            after = env.state.copy()  # It may have been done with it.
-            after.play(request, math.inf, marks=False)
-            env.loose, env.dirty = [after], True
+            after = [state.copy() for state in (env.state, *env.loose)]
+            for state in after:  # It may have been done with it.
+                state.play(request, math.inf, marks=False)
+            env.loose += after
+            env.dirty = True
             return
         if request.resets and env.since_save:
             env.saves, env.since_save = env.saves[-1:], 0
         if request.resets and env.may_be_lost:  # What was saved can't be shown any more.
             env.torn = env.after_loss()
-        acts = env.state.faults(request)
+        acts = [act for state in (env.state, *env.loose) for act in state.faults(request)]
         for state in env.torn:  # A new episode in place of the step.
             acts += state.faults(Request("reset"))
-        for state in env.loose:
-            state.faults(request)
         raising = [act for act in acts if act[0] in RAISING]
         if raising:
-            check_raised(fault, *raising[0])
+            likely = [act for act in raising if str(act[1]) in fault.exception_text]
+            check_raised(fault, *(likely or raising)[0])
             self.counts["Ctrl-C in an env"] += raising[0][0] == "ctrl-c"
         else:
             rubbish = any(effect == "rubbish" for effect, _ in acts)

@@ -48,7 +48,7 @@ from rlightning_aio.errors import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Sequence
+    from collections.abc import Callable, Coroutine, Iterable, Sequence
 
     from simulator.program import Op
 
@@ -80,7 +80,10 @@ class Play(Session):
         await self.look_at_tasks()
         self.check_pending()
 
+    was_interrupted = False
+
     def note_interrupt(self) -> None:
+        self.was_interrupted = True
         for env in self.model.pending():
             assert env.request is not None
             env.request.interrupted = not env.host.mortal
@@ -262,6 +265,8 @@ class Play(Session):
     def check_stats(self) -> None:
         """Compare the figures of the group with the episodes that were seen."""
         for env_id, found in self.group.get_env_stats().items():
+            if env_id in self.nested:
+                continue
             episodes = self.model.envs[env_id].episodes
             require(found["episodes"] == len(episodes), "episodes", env_id, found, episodes)
             if episodes:
@@ -639,7 +644,11 @@ class Play(Session):
             values = await self.done(self.group.collect_calls(self.hang))
         except EnvFault as fault:
             self.note_faults(fault)
-            require(isinstance(fault, WorkerDied), "an error of a call that has none", repr(fault))
+            cut_off = any(env.request.interrupted for env in self.model.pending("calls"))
+            require(
+                isinstance(fault, WorkerDied) or (cut_off and "KeyboardInterrupt" in str(fault)),
+                "an error of a call that has none", repr(fault),
+            )  # fmt: skip
             self.fail_values(
                 fault, {env.env_id: env.request for env in self.model.pending("calls")}
             )
@@ -674,8 +683,9 @@ class Play(Session):
 
         def take(_: Any) -> None:
             env.request = None
-            for sub in env.state.scripts.subs:
-                sub.mark = mark
+            for state in (env.state, *env.loose):
+                for sub in state.scripts.subs:
+                    sub.mark = mark
 
         def take_mark(value: Any) -> None:
             env.request = None
@@ -686,7 +696,7 @@ class Play(Session):
         try:
             answered = await self.answer(request, lambda: handle.set_attr("mark", mark), take)
         except (asyncio.CancelledError, KeyboardInterrupt):
-            env.loose = [env.state.marked(mark)]
+            env.loose += [state.marked(mark) for state in (env.state, *env.loose)]
             raise
         if answered and env.idle:
             request = {env.env_id: Request("call")}
@@ -920,6 +930,64 @@ class Play(Session):
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):
                 await self.waiting(rng)
+
+    async def op_abort(self, rng: Random) -> None:
+        """End what some envs are doing, unless that may stay with them."""
+        envs = [env for env in self.model.pending(COLLECTOR) if self.is_abortable(env)]
+        if not envs or not self.may_abort():
+            return
+        envs = self.some(rng, envs)
+        ids = [env.env_id for env in envs]
+        try:
+            await self.done(self.group.abort(ids))
+        except KeyboardInterrupt:
+            await self.done(self.group.abort(ids))
+            raise
+        finally:
+            self.note_aborted(envs)
+
+    async def op_drain(self, rng: Random) -> None:
+        """Take what is ready, and end the rest."""
+        pending = self.model.pending()
+        if self.calls or not self.may_abort() or not all(map(self.is_abortable, pending)):
+            return
+        deadline = rng.choice([None, 1e-4, 0.2])
+        try:
+            found, flags = await self.done(self.group.drain(deadline))
+        except EnvFault as fault:
+            self.note_faults(fault)
+            self.model.failed(fault, COLLECTOR)
+            if fault.results is not None and len(fault.results):
+                self.take(fault.results, None, COLLECTOR)
+        except KeyboardInterrupt:
+            await self.done(self.group.abort())
+            raise
+        else:
+            if len(found):
+                self.take(found, flags, COLLECTOR)
+        finally:
+            envs = self.model.envs.values()
+            self.note_aborted([env for env in envs if env.limbo or env.request is not None])
+
+    def may_abort(self) -> bool:
+        """No other call waits, and an abort leaves nothing behind that the model must guess."""
+        guessed = self.features & {"raise", "hang", "snapshots"} or self.was_interrupted
+        return not (self.tasks or self.collecting or guessed)
+
+    def is_abortable(self, env: Env) -> bool:
+        """No request to it leaves anything behind that its results don't show."""
+        assert env.request is not None
+        effects = [effect for effect, _ in env.request.acts]
+        grudges = [sub.grudge for sub in env.state.scripts.subs]
+        later = [e for e in effects if e.endswith(" next") or e == "keep state"]
+        return not (later or any(grudges))
+
+    def note_aborted(self, envs: Iterable[Env]) -> None:
+        """Errors stay for a collect."""
+        pending = self.group.pending
+        for env in envs:
+            if env.env_id not in pending:
+                self.model.abort(env)
 
     async def op_task(self, rng: Random) -> None:
         if not self.is_async or len(self.tasks) > 3:

@@ -178,6 +178,8 @@ OPS: dict[str, tuple[int, str | None]] = {
     "restore": (9, "snapshots"),
     "cancel": (6, "cancel"),
     "expire": (4, "timeouts"),
+    "abort": (3, "cancel"),
+    "drain": (2, "cancel"),
     "task": (8, "tasks"),
     "join": (3, "tasks"),
     "misuse": (4, "misuse"),
