@@ -683,7 +683,7 @@ class Play(Session):
 
         def take(_: Any) -> None:
             env.request = None
-            for state in (env.state, *env.loose):
+            for state in (env.state, *env.loose, *env.torn):
                 for sub in state.scripts.subs:
                     sub.mark = mark
 
