@@ -68,6 +68,7 @@ class Play(Session):
         self.trace: Any = None
         self.collecting = self.collecting_calls = False
         self.kept: list[tuple[Any, Any]] = []
+        self.unread: list[tuple[BatchedData, dict[str, Any]]] = []
         self.owners = 0
         self.nested: set[str] = set()
         self.written: dict[str, Any] = {}
@@ -98,6 +99,9 @@ class Play(Session):
     def end(self) -> None:
         for columns, copies in self.kept:
             require(same(columns, copies), "a result was overwritten", columns, copies)
+        for part, sent in self.unread:
+            own = {name: part.sent[name] for name in part.sent}
+            require(same(own, sent), "what was sent reads differently later", own, sent)
 
     async def look_at_tasks(self, *, wait: bool = False) -> None:
         """Raise what tasks have raised, and forget those that have ended."""
@@ -259,7 +263,10 @@ class Play(Session):
             columns = [part.reward, part.terminated, part.infos]
             if "zero_copy" not in self.features:
                 columns.append(part.observation)
-            columns.append({name: part.sent[name] for name in part.sent})
+            unread = part.take(list(range(len(part))))
+            sent = {name: part.sent[name] for name in part.sent}
+            columns.append(sent)
+            self.unread.append((unread, pickle.loads(pickle.dumps(sent))))
             self.kept.append((columns, pickle.loads(pickle.dumps(columns))))
 
     def check_stats(self) -> None:

@@ -228,7 +228,9 @@ class Session:
         return env.host.mortal and self.plan(env).placement != "loop"
 
     def acts(self, rng: Random, env: Env, *, plain: bool = False) -> list[Act]:
-        """What the sub-environments of an env are to do."""
+        """What the sub-environments of an env are to do, now and then all the same."""
+        if rng.random() < 0.3:
+            return [self.act(rng, env, plain=plain)] * len(env.codes)
         return [self.act(rng, env, plain=plain) for _ in env.codes]
 
     def act(self, rng: Random, env: Env, *, plain: bool) -> Act:
