@@ -7,7 +7,7 @@ import sys
 import time
 from collections import Counter
 
-from simulator.coverage import report
+from simulator.coverage import FAULTS, report
 from simulator.program import draw
 from simulator.runs import WORLDLY, prepare, run, run_many, run_twice, shown, shrunk
 
@@ -42,9 +42,12 @@ def main() -> int:
             if arguments.stop:
                 return 1
     seconds = time.perf_counter() - began
+    ops = sum(count for name, count in counts.items() if name.startswith("op "))
+    faults = sum(counts[name] for name in FAULTS)
     print(
         f"{len(seeds)} programs, {len(failed)} failed: {seconds:.0f} s, {hours:.1f} simulated hours"
     )
+    print(f"{ops} operations, {faults} faults, {faults / seconds:.0f} a second")
     for name, count in sorted(counts.items()):
         if not name.startswith(("request ", "loss ", "op ")):
             print(f"{count:9d} {name}")

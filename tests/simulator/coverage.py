@@ -21,6 +21,12 @@ if TYPE_CHECKING:
 
 FAULTS_PAGE: Final = Path(__file__).parents[2] / "docs" / "faults.md"
 
+FAULTS: Final = (
+    "deaths", "stops", "fork servers killed", "lags", "interrupts", "refusals", "slow starts",
+    "EnvRaised",
+)  # fmt: skip
+"""What is counted where something went wrong."""
+
 ELSEWHERE: Final = "elsewhere: "
 ROWS: Final[dict[str, str]] = {
     "the environment raises in `reset`": "EnvRaised",
@@ -46,6 +52,20 @@ ROWS: Final[dict[str, str]] = {
     "the trainer dies": ELSEWHERE + "tests/faults/test_shutdown.py, which kills trainers",
 }
 """For each row of the table of faults, by its beginning: what is counted where it is reached."""
+
+_REMOTE: Final = ELSEWHERE + "tests/remote, as no program has env_servers"
+_OTHERS: Final = ELSEWHERE + "tests/group/test_aborting.py; programs abort no call of another task"
+OTHERS: Final[dict[str, str]] = {
+    "IDLE COLLECTOR JOINED": _REMOTE,
+    "READY COLLECTOR CLAIMED": _REMOTE,
+    "BUSY COLLECTOR WITHDRAWN": _REMOTE,
+    "BUSY TICKET ABORTED": _OTHERS,
+    "EnvAborted": _OTHERS,
+    "GroupClosed": ELSEWHERE + "tests/group/test_core.py; programs use no closed group",
+    "NotInitialised": ELSEWHERE + "tests/faults/test_misuse.py; programs begin with init",
+    "INTACT GIVEN_UP": ELSEWHERE + "nowhere: what is intact is not in the table of losses",
+}
+"""The same for transitions and errors that no program reaches."""
 
 NOT_OF_GROUPS: Final = {
     "ClientRefused", "EnvAway", "PolicyServerError", "RemoteTraceback", "ReplayDiverged",
@@ -97,9 +117,9 @@ def possible() -> dict[str, list[tuple[str, str]]]:
     kinds = [name for name in errors.__all__ if name not in NOT_OF_GROUPS]
     faults = [(re.sub(r"`", "", key), ROWS[key]) for key in map(row_key, rows())]
     return {
-        "transitions of requests": [(name, f"request {name}") for name in requests],
-        "transitions of losses": [(name, f"loss {name}") for name in losses],
-        "errors": [(name, name) for name in kinds],
+        "transitions of requests": [(n, OTHERS.get(n, f"request {n}")) for n in requests],
+        "transitions of losses": [(n, OTHERS.get(n, f"loss {n}")) for n in losses],
+        "errors": [(name, OTHERS.get(name, name)) for name in kinds],
         "rows of docs/faults.md": faults,
         "operations": [(name, f"op {name}") for name in OPS],
     }

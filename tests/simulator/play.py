@@ -759,6 +759,7 @@ class Play(Session):
             try:
                 return await episode.step(action)
             except EpisodeLost as lost:
+                self.count(lost)
                 require(episode.last is before, "what the lost step left is not the last result")
                 return lost.results.values()[0]
 
