@@ -94,6 +94,8 @@ class Play(Session):
             task.cancel()
         if getattr(self, "tasks", ()):
             await asyncio.wait(self.tasks)
+        if hasattr(self, "trace"):  # A program that failed has not stopped it.
+            self.stop_trace()
         await super().close()
 
     def end(self) -> None:
@@ -142,7 +144,6 @@ class Play(Session):
             else:
                 raise Violation(f"env {env.env_id} can't be used any more")
         self.check_stats()
-        self.stop_trace()
 
     async def use(self, env: Env) -> bool:
         """Reset and step an env."""
