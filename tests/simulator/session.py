@@ -243,7 +243,10 @@ class Session:
         if plain or rng.random() > 0.15:
             return effect, token
         faults = self.faults_of(env)
-        return (rng.choice(faults) if faults else effect), token
+        effect = rng.choice(faults) if faults else effect
+        if effect.removesuffix(" next") in (*DYING, "die", "hang"):
+            env.host.ask()  # Only a world counts deaths by itself.
+        return effect, token
 
     def faults_of(self, env: Env) -> list[str]:
         """The faults that an env may have."""
