@@ -286,12 +286,53 @@ def test_an_env_whose_error_was_not_raised_yet_is_busy(new_group: NewGroup) -> N
     group = new_group(2)
     running = group.begin(group.steps.step(steps(0, 1, action=RAISES), group.now))
     group.finish(0)
-    with pytest.raises(EnvBusy, match="was not collected"):
+    with pytest.raises(EnvBusy, match="the call that asked it has not returned yet"):
         group.steps.step_async(steps(0), group.now)
     group.finish(1)
     with pytest.raises(EnvRaised):
         running.result()
     group.steps.step_async(steps(0, 1), group.now)
+
+
+def test_an_error_of_a_cancelled_call_keeps_its_env_busy(new_group: NewGroup) -> None:
+    """It came before the call was cancelled, or after that; a collect raises it."""
+    group = new_group(2)
+    stepping = group.begin(group.steps.step(steps(0, 1, action=RAISES), group.now))
+    group.finish(0)
+    group.cancel(stepping)
+    group.finish(1)
+    left = {"fake-0", "fake-1"}
+    while left:
+        assert {*group.core.pending()} == left
+        for env_id in left:
+            with pytest.raises(EnvBusy, match="collect it first"):
+                group.steps.step_async(steps(int(env_id[-1])), group.now)
+        with pytest.raises(EnvRaised) as caught:
+            collect(group).result()
+        left.remove(caught.value.env_id)
+    assert group.core.pending() == []
+    group.steps.step_async(steps(0, 1), group.now)
+
+
+def test_an_error_that_could_not_be_raised_keeps_its_env_busy(new_group: NewGroup) -> None:
+    """Something else was raised in its place; the next collect raises it."""
+    group = new_group(2)
+    actions = [PolicyResponse("fake-0", RAISES), PolicyResponse("fake-1", PLAIN)]
+    batch = BatchedData(["fake-0", "fake-1"], actions)
+    stepping = group.begin(group.steps.step(batch, group.now))
+    group.finish(0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(group.core.results, "gather", Mock(side_effect=MemoryError))
+        group.finish(1)
+        with pytest.raises(MemoryError):
+            stepping.result()
+    assert group.core.pending() == ["fake-0", "fake-1"]
+    with pytest.raises(EnvBusy, match="fake-0"):
+        group.steps.step_async(steps(0), group.now)
+    with pytest.raises(EnvRaised):
+        collect(group).result()
+    assert ids_of(collect(group)) == ["fake-1"]
+    assert group.core.pending() == []
 
 
 @pytest.mark.parametrize("on_worker_death", ["restart", "raise"])

@@ -10,7 +10,7 @@ import itertools
 import os
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
@@ -74,6 +74,8 @@ class Driven:
             Event.METHOD_GIVEN_UP: self._give_up,
             Event.CLAIMED: self._claim,
             Event.DROPPED: lambda: self.table.claim(self.table.alone(SLOT), None),
+            Event.KEPT: lambda: self.table.collector.keep(self.table.alone(SLOT), fault()),
+            Event.FREED: self._free,
             Event.ABORTED: self._abort,
         }
 
@@ -99,6 +101,10 @@ class Driven:
         self.ticket = self.table.tickets.open(np.array([SLOT, COMPANION]))
         self.table.claim(self.table.alone(SLOT), self.ticket)
         self._ask([COMPANION], Operation.RESET, self.ticket.owner)
+
+    def _free(self) -> None:
+        fault = self.table.collector.failed[SLOT]
+        assert self.table.collector.take_fault(fault).tolist() == [SLOT]
 
     def _step_at_once(self) -> None:
         self.table.answer_at_once(SLOT)
@@ -154,6 +160,8 @@ class Driven:
         assert sum(table.in_flight) == busy.sum()
         assert table.collector.num_ready == (ready & collected).sum()
         assert table.collector.num_awaited == (busy & collected).sum()
+        failed = (table.state == State.SPENT) & collected
+        assert sorted(table.collector.failed) == np.flatnonzero(failed).tolist()
         table.hand_out(np.array(self.settled, np.intp))
         for among in (None, np.array([True, True, False]), np.arange(3) == SLOT):
             chosen = collected if among is None else collected & among
@@ -168,6 +176,7 @@ STEPS: dict[Situation, list[Event]] = {
     (State.IDLE, Owner.COLLECTOR): [],
     (State.BUSY, Owner.COLLECTOR): [Event.SENT],
     (State.READY, Owner.COLLECTOR): [Event.SENT, Event.RESULT],
+    (State.SPENT, Owner.COLLECTOR): [Event.SENT, Event.FAULT],
     (State.BUSY, Owner.TICKET): [Event.SENT_FOR_CALL],
     (State.READY, Owner.TICKET): [Event.SENT_FOR_CALL, Event.RESULT],
     (State.SPENT, Owner.TICKET): [Event.SENT_FOR_CALL, Event.FAULT],
@@ -186,7 +195,6 @@ NOT_EXPRESSIBLE: dict[Combination, str] = {
     (State.BUSY, Owner.NOBODY, Event.WITHDRAWN): "no method of a client's env can be called",
     (State.BUSY, Owner.NOBODY, Event.RESTARTED): "a method fails with its worker",
     (State.READY, Owner.TICKET, Event.METHOD_GIVEN_UP): "methods have values, not results",
-    (State.SPENT, Owner.TICKET, Event.METHOD_GIVEN_UP): "one that has ended is given up like any",
 }
 REACHABLE = {*STEPS, *METHODS}
 REFUSED = [
@@ -232,7 +240,10 @@ def test_any_other_event_is_refused_or_has_no_effect(
     driven = brought_to(state, owner, event)
     table = driven.table
     slots = table.alone(SLOT)
-    if event in (Event.SENT, Event.SENT_FOR_CALL, Event.JOINED, Event.STEPPED_AT_ONCE):
+    needs_idle = (
+        Event.SENT, Event.SENT_FOR_CALL, Event.JOINED, Event.STEPPED_AT_ONCE, Event.KEPT,
+    )  # fmt: skip
+    if event in needs_idle:
         assert table.first_not_idle(slots) == SLOT
         assert not table.is_idle(SLOT)
     elif event in (Event.RESULT, Event.VALUE, Event.FAULT, Event.WITHDRAWN):
@@ -243,6 +254,8 @@ def test_any_other_event_is_refused_or_has_no_effect(
         assert table.owed(slots).size == 0
     elif event in (Event.CLAIMED, Event.DROPPED):
         assert not table.joined(slots).any()
+    elif event is Event.FREED:
+        assert SLOT not in table.collector.failed
     elif event is Event.HANDED_OUT:
         assert table.collector.num_ready == 0
     elif event is Event.SETTLED and owner is Owner.TICKET:
@@ -352,7 +365,12 @@ def test_the_debug_mode_is_on_where_the_variable_says_so(value: str, checked: bo
 
 @dataclass
 class Asked:
-    """The model's view of a slot; `came` counts the moments at which results came."""
+    """The model's view of a slot.
+
+    Attributes:
+        came: counts the moments at which results came.
+        error: that it ended in.
+    """
 
     op: Operation | None = None
     state: State = State.IDLE
@@ -360,6 +378,7 @@ class Asked:
     nobodys: bool = False
     entry: int = 0
     came: int = 0
+    error: EnvFault | None = None
 
 
 @dataclass(eq=False)
@@ -368,7 +387,7 @@ class Claim:
 
     ticket: Ticket
     slots: list[int]
-    num_faults: int = 0
+    faults: list[EnvFault] = field(default_factory=list[EnvFault])
 
 
 class RequestsMachine(RuleBasedStateMachine):
@@ -381,7 +400,7 @@ class RequestsMachine(RuleBasedStateMachine):
         self.slots = [Asked() for _ in self.host_of]
         self.claims: list[Claim] = []
         self.late: list[int] = []
-        self.num_faults = 0
+        self.faults: list[EnvFault] = []
         self.moment = 0
 
     # -- drawing
@@ -525,14 +544,18 @@ class RequestsMachine(RuleBasedStateMachine):
         owners = self.table.owners(np.array(slots, np.intp)).items()
         assert sorted(slot for _, mine in owners for slot in mine.tolist()) == sorted(slots)
         for owner, mine in owners:
-            self.table.fail(mine, owner, fault())
+            error = fault()
+            self.table.fail(mine, owner, error)
             first = self.slots[mine.item(0)]
             if first.owner is not None:
-                first.owner.num_faults += 1
+                first.owner.faults.append(error)
             elif not first.nobodys:
-                self.num_faults += 1
+                self.faults.append(error)
             for slot in mine.tolist():
-                self.finish(slot)
+                if self.slots[slot].nobodys:
+                    self.finish(slot)
+                else:
+                    self.slots[slot].state, self.slots[slot].error = State.SPENT, error
 
     @precondition(lambda self: self.those(State.BUSY))
     @rule(data=st.data())
@@ -559,8 +582,9 @@ class RequestsMachine(RuleBasedStateMachine):
         """Whatever a host says of requests that were aborted, they end without a reply."""
         host = int(self.host_of[self.one_busy(data)[0]])
         slots = self.some(data, self.those(State.BUSY, host=host))
+        errors = {slot: fault() for slot in slots}
         for slot in slots:
-            self.table.aborted.add(slot, fault())
+            self.table.aborted.add(slot, errors[slot])
         entries = [self.slots[slot].entry for slot in slots]
         if how == "reported":
             assert not len(self.table.complete([(host, np.array(entries))]))
@@ -573,7 +597,7 @@ class RequestsMachine(RuleBasedStateMachine):
             claim = self.slots[slot].owner
             if claim is not None:
                 claim.slots.remove(slot)
-                claim.num_faults += 1
+                claim.faults.append(errors[slot])
             self.slots[slot] = Asked(entry=self.slots[slot].entry)
 
     @precondition(lambda self: self.late)
@@ -642,10 +666,12 @@ class RequestsMachine(RuleBasedStateMachine):
         self.table.give_up(claim.ticket)
         self.moment += 1
         if not claim.ticket.calls:
-            self.num_faults += claim.num_faults
+            self.faults += claim.faults
         for slot in claim.slots:
             asked = self.slots[slot]
             asked.owner = None
+            if asked.state is State.SPENT and not claim.ticket.calls:
+                continue  # It is busy until the collector raises its error.
             if asked.state is State.SPENT:
                 self.slots[slot] = Asked(entry=asked.entry)
             elif claim.ticket.calls:
@@ -677,11 +703,28 @@ class RequestsMachine(RuleBasedStateMachine):
         for slot in taken:
             self.slots[slot] = Asked(entry=self.slots[slot].entry)
 
-    @precondition(lambda self: self.num_faults)
-    @rule()
-    def take_fault(self) -> None:
-        self.table.collector.faults.popleft()
-        self.num_faults -= 1
+    def failed(self) -> list[int]:
+        return [slot for slot in self.those(State.SPENT) if self.slots[slot].owner is None]
+
+    @precondition(lambda self: self.faults)
+    @rule(data=st.data())
+    def raise_for_the_collector(self, data: st.DataObject) -> None:
+        """Raise an error; all envs whose requests it answers are free."""
+        error = self.faults.pop(data.draw(st.integers(0, len(self.faults) - 1)))
+        slots = [slot for slot in self.failed() if self.slots[slot].error is error]
+        assert sorted(self.table.collector.take_fault(error).tolist()) == slots
+        for slot in slots:
+            self.slots[slot] = Asked(entry=self.slots[slot].entry)
+
+    @precondition(lambda self: self.failed())
+    @rule(data=st.data())
+    def free_failed(self, data: st.DataObject) -> None:
+        """Free envs whose errors wait; the errors stay."""
+        slots = self.some(data, list(range(len(self.slots))))
+        free = [slot for slot in slots if slot in self.failed()]
+        assert self.table.collector.free(slots).tolist() == free
+        for slot in free:
+            self.slots[slot] = Asked(entry=self.slots[slot].entry)
 
     # -- invariants
 
@@ -704,7 +747,8 @@ class RequestsMachine(RuleBasedStateMachine):
         num_hosts = len(table.in_flight)
         busy = self.those(State.BUSY)
         assert table.in_flight == [len(self.those(State.BUSY, host=h)) for h in range(num_hosts)]
-        assert len(table.collector.faults) == self.num_faults
+        assert set(table.collector.faults) == set(self.faults)
+        assert len(table.collector.faults) == len(self.faults)
         mine = [s for s in busy if slots[s].owner is None and not slots[s].nobodys]
         ready = self.collectable(list(range(len(slots))))
         assert (table.collector.num_ready, table.collector.num_awaited) == (len(ready), len(mine))
@@ -721,7 +765,7 @@ class RequestsMachine(RuleBasedStateMachine):
         for claim in self.claims:
             busy = [slot for slot in claim.slots if self.slots[slot].state is State.BUSY]
             assert claim.ticket.remaining == len(busy)
-            assert len(claim.ticket.faults) == claim.num_faults
+            assert set(claim.ticket.faults) == set(claim.faults)
 
 
 TestRequests = RequestsMachine.TestCase

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import rlightning_aio
 import rlightning_aio.sync
 from rlightning_aio import BatchedData, PolicyResponse
-from rlightning_aio.errors import EnvRaised
+from rlightning_aio.errors import EnvBusy, EnvRaised
 from rlightning_aio.group.conditions import FIRST_RESULTS, UNLIKE_ENVS
 from rlightning_aio.group.core import Core
 
@@ -164,10 +164,15 @@ def test_it_is_used_for_one_inline_env_alone() -> None:
 
 
 def test_an_interrupt_ends_the_step_that_it_strikes(halved: rlightning_aio.sync.EnvGroup) -> None:
-    """The program gets it, and the group continues."""
+    """The program gets it, and the group continues, once the error of the step is collected."""
     batch, _ = halved.reset()
     with pytest.raises(KeyboardInterrupt):
         halved.step(batch.respond(action=np.array([sample_envs.Halved.INTERRUPT])))
+    assert halved.pending == halved.env_ids
+    with pytest.raises(EnvBusy, match="collect it first"):
+        halved.step(batch.respond(action=np.array([3])))
+    with pytest.raises(EnvRaised, match="KeyboardInterrupt"):
+        halved.collect_async()
     batch, _ = halved.step(batch.respond(action=np.array([3])))
     assert batch.reward.tolist() == [3]
 

@@ -241,6 +241,66 @@ async def test_pending_are_envs_with_a_reply_that_was_not_returned(start: Any) -
         _ = group.pending
 
 
+async def until_replied(group: Any, env_id: str, other: str) -> None:
+    """Have the group read the reply of an env, by steps of another one, without collecting it."""
+    while any(env_id in worker["owed"] for worker in group.get_workers()):
+        await group.step(responses([other], 1))
+
+
+@pytest.mark.parametrize("is_read", [False, True])
+@one_driver
+async def test_an_env_whose_error_was_not_collected_is_busy(start: Any, is_read: bool) -> None:
+    """Whether or not the group has read it; the collect that raises it frees the env."""
+    group = await start(ENTRY)
+    await group.reset()
+    group.step_async(responses(["probe-1"], 1, what=RAISE))
+    if is_read:
+        await until_replied(group, "probe-1", "probe-2")
+    for _ in range(2):
+        assert group.pending == ["probe-1"]
+        for send in (
+            lambda: group.step_async(responses(["probe-0", "probe-1"], 1, 2)),
+            lambda: group.reset_async(env_ids=["probe-1"]),
+            lambda: group.call_async("double", 1, env_ids=["probe-1"]),
+        ):
+            with pytest.raises(EnvBusy, match=r"'probe-1'.*collect it first, with collect_async"):
+                send()
+        for request in (
+            group.step(responses(IDS, 1, 2, 3, 4)),
+            group.reset(),
+            group.snapshot(["probe-1"]),
+            group["probe-1"].call("double", 1),
+        ):
+            with pytest.raises(EnvBusy, match=r"'probe-1'.*nothing was sent"):
+                await request
+        await group.step(responses(["probe-0", "probe-2"], 3, 4))
+    with pytest.raises(EnvRaised, match="'probe-1'"):
+        await group.collect_async()
+    assert group.pending == []
+    await group.reset(env_ids=["probe-1"])
+    await group.step(responses(IDS, 1, 2, 3, 4))
+
+
+@one_driver
+async def test_an_abort_frees_an_env_whose_error_was_not_collected(start: Any) -> None:
+    """The error is still raised by the next collect."""
+    group = await start(ENTRY)
+    await group.reset()
+    group.step_async(responses(["probe-1"], 1, what=RAISE))
+    await until_replied(group, "probe-1", "probe-2")
+    await group.abort(["probe-1"])
+    assert group.pending == []
+    group.step_async(responses(["probe-1"], 1))
+    assert group.pending == ["probe-1"]
+    with pytest.raises(EnvRaised, match="'probe-1'"):
+        await group.collect_async()
+    batch, _ = await group.collect_async()
+    assert batch.ids() == ["probe-1"]
+    assert batch.restarted.tolist() == [True]
+    with pytest.raises(NothingPending):
+        await group.collect_async()
+
+
 @one_driver
 async def test_an_error_of_an_env_arrives_with_its_traceback(start: Any) -> None:
     """With the env's name and the others' results; the type of the exception is not rebuilt."""

@@ -1018,7 +1018,9 @@ class Play(Session):
             return
         batch, _ = self.response(rng, envs)
         ids, values = list(batch.env_ids()), list(batch.values())
-        busy = self.model.pending()
+        # Of some, the results are handed out a little earlier; see `check_pending`.
+        known = [one for one in self.model.pending() if one.env_id not in self.nested]
+        busy = [one for one in known if not self.is_lost(one)]
         sized = ("vector", "single", "digits", "number")
         fits = [k for k, i in enumerate(ids) if self.model.envs[i].entry.controls in sized]
         kinds = ["unknown", "double", "count"] + ["shape"] * bool(fits)
@@ -1035,8 +1037,17 @@ class Play(Session):
             ids[0], ids[1] = ids[1], ids[0]
             wrong = BadAction
         elif kind == "busy":
-            ids.append(busy[0].env_id)
-            values.append(PolicyResponse(ids[-1], action_of(busy[0], self.acts(rng, busy[0]))))
+            env = rng.choice(busy)  # Its error may have been read, but it was not collected.
+            ids.append(env.env_id)
+            values.append(PolicyResponse(env.env_id, action_of(env, self.acts(rng, env))))
+            for call in (
+                lambda: self.group.step_async(BatchedData(ids, values)),
+                lambda: self.group.reset_async(env_ids=ids),
+                lambda: self.group.call_async("peek", 0, env_ids=ids),
+            ):
+                with self.expected(EnvBusy, kind):
+                    call()
+            return
         elif kind == "shape":
             values[fits[0]] = PolicyResponse(ids[fits[0]], np.zeros((3, 3, 7)))
             wrong = BadAction

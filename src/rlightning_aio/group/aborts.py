@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 from rlightning_aio.errors import EnvAborted
 from rlightning_aio.group.request_states import COLLECTOR
 from rlightning_aio.protocol.entries import Operation
 from rlightning_aio.registry import ENVS
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
     from rlightning_aio.group.arrivals import Arrivals
@@ -54,15 +55,16 @@ class Aborts:
         self._waiting = waiting
 
     def drop(self, slots: NDArray[np.intp]) -> None:
-        """Drop those results of `slots` that wait for the collector."""
+        """Drop those results of `slots` that wait for the collector; errors that do so stay."""
         ready = self._requests.ready(slots)
         ready = ready[self._requests.owner[ready] == COLLECTOR]
-        if not len(ready):
-            return
-        self._requests.claim(ready, None)
-        self._results.let_go(ready)
-        self._abandon(ready)
-        self._arrivals.admit(ready, self._intake.now)
+        if len(ready):
+            self._requests.claim(ready, None)
+            self._results.let_go(ready)
+        failed = self._requests.collector.free(slots.tolist())
+        dropped = np.concatenate((ready, failed))
+        self._abandon(dropped)
+        self._arrivals.admit(dropped, self._intake.now)
 
     def end(self, slots: NDArray[np.intp], now: float) -> Procedure[float]:
         """End the requests of `slots` that are outstanding; return the time after that.

@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
+from rlightning_aio.group.conditions import Conditions
 from rlightning_aio.group.request_states import COLLECTOR, LEGAL, Event, Owner, State
-from rlightning_aio.group.requests import Requests
+from rlightning_aio.group.requests import CollectorQueue, Requests
 from rlightning_aio.group.steps import Steps
 
 if TYPE_CHECKING:
-    from collections.abc import Generator
+    from collections.abc import Generator, Sequence
 
     from numpy.typing import NDArray
 
@@ -55,11 +56,32 @@ def _codes_after(event: Event) -> NDArray[np.int64]:
 _AFTER: Final = {event: _codes_after(event) for event in Event}
 
 
+class _CheckedQueue(CollectorQueue):
+    """The collector's queue in a checked table."""
+
+    def __init__(self, requests: CheckedRequests, conditions: Conditions) -> None:
+        super().__init__(conditions, requests.state)
+        self._changes = requests.changes
+
+    def keep(self, slots: NDArray[np.intp], fault: EnvFault) -> None:
+        with self._changes((Event.KEPT, slots)):
+            super().keep(slots, fault)
+
+    def free(self, slots: Sequence[int]) -> NDArray[np.intp]:
+        failed = np.array([slot for slot in slots if slot in self.failed], np.intp)
+        with self._changes((Event.FREED, failed)):
+            return super().free(slots)
+
+
 class CheckedRequests(Requests):
     """`Requests` that raises `RuntimeError` at a change that `LEGAL` doesn't allow."""
 
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
+    def __init__(
+        self, host_of: NDArray[np.int64], num_hosts: int, conditions: Conditions | None = None
+    ) -> None:
+        conditions = conditions or Conditions()
+        super().__init__(host_of, num_hosts, conditions)
+        self.collector = _CheckedQueue(self, conditions)
         self._known = self._situations()
         self._is_changing = False
 
@@ -162,7 +184,7 @@ class CheckedRequests(Requests):
     def give_up(self, ticket: Ticket) -> None:
         slots = ticket.submitted(self.owner)
         slots = slots[self.state[slots] != State.IDLE]  # An interrupt came before it was sent.
-        values = self.owed(slots) if ticket.calls else slots[:0]
+        values = slots if ticket.calls else slots[:0]
         others = np.setdiff1d(slots, values)
         with self.changes((Event.METHOD_GIVEN_UP, values), (Event.GIVEN_UP, others)):
             super().give_up(ticket)

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio.batch.columns import ResultColumns
+    from rlightning_aio.errors import EnvFault
     from rlightning_aio.group.poller import Poller
     from rlightning_aio.group.requests import Ticket
     from rlightning_aio.group.seeds import Seeds
@@ -272,8 +273,12 @@ class Core:
         """Raise the collector's oldest error of these slots, if there is one."""
         for fault in self.requests.collector.faults:
             if among is None or among[self.envs.one_of_entry(fault.env_id)]:
-                self.requests.collector.take_fault(fault)
+                self._note_raised(fault)
                 raise fault
+
+    def _note_raised(self, fault: EnvFault) -> None:
+        """Note that an error of the collector is raised, so that its envs are free."""
+        self._arrivals.admit(self.requests.collector.take_fault(fault), self.intake.now)
 
     def hand_out(self, slots: NDArray[np.intp], *, synchronous: bool) -> tuple[BatchedData, Flags]:
         """Return the results of `slots`, all ready.
@@ -355,7 +360,8 @@ class Core:
             try:
                 fault.results = self.hand_out(done, synchronous=True)[0]
             except BaseException:
-                self.requests.collector.note_faults(ticket.faults)
+                for unraised, own in ticket.failures():
+                    self.requests.collector.keep(own, unraised)
                 raise
             others = "1 other env" if len(done) == 1 else f"{len(done)} other envs"
             fault.add_note(f"the results of {others} of the same call are in the error's `results`")
@@ -443,7 +449,7 @@ class Core:
         if collector.faults:
             faults = [*collector.faults]
             for fault in faults:
-                collector.take_fault(fault)
+                self._note_raised(fault)
             faults[0].results, faults[0].others = results[0], tuple(faults[1:])
             raise faults[0]
         return results
@@ -467,12 +473,8 @@ class Core:
     def pending(self) -> list[str]:
         """Return the ids of envs whose result, value or error was not returned yet."""
         self.intake.drain()
-        requests, faults = self.requests, self.requests.collector.faults
-        slots = np.flatnonzero((requests.state != State.IDLE) & (requests.owner != NOBODY))
-        failed = [
-            id_ for fault in faults for id_ in getattr(fault, "env_ids", ()) or (fault.env_id,)
-        ]
-        return list(dict.fromkeys([*self.envs.names.ids(slots), *failed]))
+        state, owner = self.requests.state, self.requests.owner
+        return self.envs.names.ids(np.flatnonzero((state != State.IDLE) & (owner != NOBODY)))
 
 
 def _answered(batch: BatchedData) -> list[str]:

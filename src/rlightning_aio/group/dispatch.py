@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from rlightning_aio.errors import BadAction, EnvBusy
-from rlightning_aio.group.request_states import NOBODY, State
+from rlightning_aio.group.request_states import COLLECTOR, NOBODY, State
 from rlightning_aio.protocol.slab import NO_SEED
 
 if TYPE_CHECKING:
@@ -59,17 +59,31 @@ class Dispatch:
     def check_sendable(self, now: float, slots: NDArray[np.intp], what: str) -> None:
         """Raise an error if the group is closed, or an env of `slots` is busy or gone."""
         self._lifetime.check_open()
-        self._supervisor.check_usable(slots)
         while (slot := self._requests.first_not_idle(slots)) is not None:
             if self._requests.owner[slot] != NOBODY or not self._end_call(now, slot):
                 break
         if slot is not None:
-            why = "its last request was not collected; collect it first, with collect_async"
-            if self._requests.owner[slot] == NOBODY:
-                why = "a call that was cancelled still runs in it; try again when that has ended"
-            elif self._requests.state[slot] == State.BUSY:
-                why = "its last request has not replied yet; collect it first, with collect_async"
-            raise EnvBusy(f"can't {what} {self._envs.describe(slot)}: {why}; nothing was sent")
+            raise EnvBusy(
+                f"can't {what} {self._envs.describe(slot)}: {self._why_busy(slot)}; nothing was "
+                "sent"
+            )
+        # Last: the error of a worker that is gone may still have to be collected.
+        self._supervisor.check_usable(slots)
+
+    def _why_busy(self, slot: int) -> str:
+        state, owner = self._requests.state.item(slot), self._requests.owner.item(slot)
+        if owner == NOBODY:
+            return "a call that was cancelled still runs in it; try again when that has ended"
+        why = {
+            State.BUSY: "its last request has not replied yet",
+            State.READY: "the result of its last request was not collected",
+            State.SPENT: "its last request ended in an error that was not collected",
+        }[State(state)]
+        if owner == COLLECTOR:
+            return f"{why}; collect it first, with collect_async(), or end it with abort()"
+        if state != State.BUSY:
+            why = "the call that asked it has not returned yet"
+        return f"{why}; wait for that call first, with collect_calls() if it was call_async()"
 
     def _end_call(self, now: float, slot: int) -> bool:
         """Note the end of a cancelled call that has ended since the group last waited.

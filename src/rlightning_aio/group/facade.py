@@ -195,7 +195,7 @@ class Facade:
     def pending(self) -> list[str]:
         """Ids of the envs with a request whose result, value or error was not returned yet.
 
-        `collect_async` returns results and errors, `collect_calls` values.
+        These envs are busy. `collect_async` returns results and errors, `collect_calls` values.
 
         Raises:
             GroupClosed: the group was not initialised, or is closed.

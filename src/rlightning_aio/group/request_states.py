@@ -18,7 +18,8 @@ class State(IntEnum):
     READY = 2
     """The row holds a result that has not been returned."""
     SPENT = 3
-    """Ended without a result, in a call that still waits for other envs."""
+    """Ended without a result, which its owner has not been told yet: in an error that waits for the
+    collector, or in a call that still waits for other envs."""
 
 
 class Owner(Enum):
@@ -48,6 +49,10 @@ class Event(Enum):
     ABORTED = auto()
     """It has ended, and nobody gets what it led to."""
     RESTARTED = auto()
+    KEPT = auto()
+    """Its error could not be raised at once: it waits for the collector."""
+    FREED = auto()
+    """The error that it ended in is raised, or its caller doesn't wait for that."""
     HANDED_OUT = auto()
     SETTLED = auto()
     """Its call has all replies that it waited for."""
@@ -66,14 +71,16 @@ LEGAL: Final[dict[tuple[State, Owner, Event], tuple[State, Owner]]] = {
     (_IDLE, _C, Event.SENT_FOR_CALL): (_BUSY, _T),
     (_IDLE, _C, Event.JOINED): (_READY, _C),
     (_IDLE, _C, Event.STEPPED_AT_ONCE): (_READY, _C),
+    (_IDLE, _C, Event.KEPT): (_SPENT, _C),
     (_BUSY, _C, Event.RESULT): (_READY, _C),
-    (_BUSY, _C, Event.FAULT): (_IDLE, _C),
+    (_BUSY, _C, Event.FAULT): (_SPENT, _C),
     (_BUSY, _C, Event.WITHDRAWN): (_IDLE, _C),
     (_BUSY, _C, Event.ABORTED): (_IDLE, _C),
     (_BUSY, _C, Event.RESTARTED): (_BUSY, _C),
     (_READY, _C, Event.HANDED_OUT): (_IDLE, _C),
     (_READY, _C, Event.CLAIMED): (_READY, _T),
     (_READY, _C, Event.DROPPED): (_IDLE, _C),
+    (_SPENT, _C, Event.FREED): (_IDLE, _C),
     (_BUSY, _T, Event.RESULT): (_READY, _T),
     (_BUSY, _T, Event.VALUE): (_SPENT, _T),
     (_BUSY, _T, Event.FAULT): (_SPENT, _T),
@@ -82,7 +89,8 @@ LEGAL: Final[dict[tuple[State, Owner, Event], tuple[State, Owner]]] = {
     (_BUSY, _T, Event.GIVEN_UP): (_BUSY, _C),
     (_BUSY, _T, Event.METHOD_GIVEN_UP): (_BUSY, _N),
     (_READY, _T, Event.GIVEN_UP): (_READY, _C),
-    (_SPENT, _T, Event.GIVEN_UP): (_IDLE, _C),
+    (_SPENT, _T, Event.GIVEN_UP): (_SPENT, _C),
+    (_SPENT, _T, Event.METHOD_GIVEN_UP): (_IDLE, _C),
     (_READY, _T, Event.SETTLED): (_READY, _C),
     (_SPENT, _T, Event.SETTLED): (_IDLE, _C),
     (_BUSY, _N, Event.VALUE): (_IDLE, _C),

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from rlightning_aio.group.conditions import ABORTING, FAULT, Conditions
+from rlightning_aio.group.conditions import ABORTING, Conditions
 from rlightning_aio.group.request_states import COLLECTOR, NOBODY, State
+from rlightning_aio.group.uncollected import UncollectedErrors
 from rlightning_aio.protocol.entries import (
     ANSWERS_WITH_VALUE,
     NUMBER_SHIFT,
@@ -56,6 +57,7 @@ class Ticket:
     Attributes:
         remaining: number of its requests that have not ended.
         method: name of the method that it calls; empty for steps and resets.
+        failed: the error that a request ended in, by slot.
         values: returned by method calls, by slot.
     """
 
@@ -63,7 +65,7 @@ class Ticket:
     slots: NDArray[np.intp]
     remaining: int
     method: str
-    faults: list[EnvFault] = field(default_factory=list["EnvFault"])
+    failed: dict[int, EnvFault] = field(default_factory=dict[int, "EnvFault"])
     values: dict[int, Any] = field(default_factory=dict[int, Any])
 
     def submitted(self, owner: NDArray[np.int64]) -> NDArray[np.intp]:
@@ -74,6 +76,20 @@ class Ticket:
     def calls(self) -> bool:
         """True if the requests are calls of a method."""
         return bool(self.method)
+
+    @property
+    def faults(self) -> list[EnvFault]:
+        """The errors, each once."""
+        return list(dict.fromkeys(self.failed.values()))
+
+    def failures(self) -> list[tuple[EnvFault, NDArray[np.intp]]]:
+        """Return each error, with its own slots; those of aborted requests are not its own."""
+        own = set(self.slots.tolist())
+        slots_of = {
+            fault: [slot for slot in self.failed if slot in own and self.failed[slot] is fault]
+            for fault in self.faults
+        }
+        return [(fault, np.array(slots, np.intp)) for fault, slots in slots_of.items()]
 
 
 class Tickets:
@@ -161,21 +177,19 @@ class Numbering:
         self.entry[slots] = entries
 
 
-class CollectorQueue:
+class CollectorQueue(UncollectedErrors):
     """The results and errors that wait for the collector, in the order of their arrival.
 
     Attributes:
         num_ready: results; num_awaited: requests whose results it will get.
         ready: slots of those results.
-        faults: errors; see `note_faults`.
     """
 
-    def __init__(self, conditions: Conditions) -> None:
-        self._conditions = conditions
+    def __init__(self, conditions: Conditions, state: NDArray[np.int8]) -> None:
+        super().__init__(conditions, state)
         self.num_ready = 0
         self.num_awaited = 0
         self.ready: deque[NDArray[np.intp]] = deque()
-        self.faults: deque[EnvFault] = deque()
 
     def append(self, slots: NDArray[np.intp]) -> None:
         """Add awaited results that are ready."""
@@ -217,16 +231,6 @@ class CollectorQueue:
         """Remove results that the collector does not get."""
         self.ready = deque(kept for q in self.ready if len(kept := q[~np.isin(q, slots)]))
         self.num_ready -= len(slots)
-
-    def note_faults(self, faults: Sequence[EnvFault]) -> None:
-        """Keep errors for the collector."""
-        self.faults.extend(faults)
-        self._conditions.note(FAULT, bool(self.faults))
-
-    def take_fault(self, fault: EnvFault) -> None:
-        """Remove an error that the collector raises."""
-        self.faults.remove(fault)
-        self._conditions.note(FAULT, bool(self.faults))
 
 
 class Aborted:
@@ -283,9 +287,9 @@ class Requests:
         self.numbering = Numbering(size)
         self.tickets = Tickets()
         conditions = conditions or Conditions()
-        self.collector = CollectorQueue(conditions)
-        self.aborted = Aborted(conditions)
         self.state = np.zeros(size, np.int8)
+        self.collector = CollectorQueue(conditions, self.state)
+        self.aborted = Aborted(conditions)
         self.owner = np.zeros(size, np.int64)
         self.sent_ns = np.zeros(size, np.int64)
         self.in_flight = [0] * num_hosts
@@ -294,7 +298,7 @@ class Requests:
     # -- what is known ------------------------------------------------------------
 
     def is_idle(self, slot: int) -> bool:
-        """Return True if a slot has no request and no result that waits to be collected."""
+        """Return True if a slot has no request, and no result or error waits to be collected."""
         return bool(self.state[slot] == _IDLE_CODE)
 
     def first_not_idle(self, slots: NDArray[np.intp]) -> int | None:
@@ -321,7 +325,8 @@ class Requests:
             num_ready = self.collector.num_ready
             return num_ready, num_ready + self.collector.num_awaited
         states = self.state[among & (self.owner == COLLECTOR)]
-        return int(np.count_nonzero(states == _READY_CODE)), int(np.count_nonzero(states))
+        num_ready = int(np.count_nonzero(states == _READY_CODE))
+        return num_ready, num_ready + int(np.count_nonzero(states == _BUSY_CODE))
 
     # -- asking -------------------------------------------------------------------
 
@@ -442,7 +447,7 @@ class Requests:
                 ticket = self.tickets.waiting[owner]
                 ticket.slots = ticket.slots[~np.isin(ticket.slots, mine)]
                 ticket.remaining -= len(mine)
-                ticket.faults += faults
+                ticket.failed.update(zip(mine.tolist(), faults, strict=True))
             elif owner == COLLECTOR:
                 self.collector.num_awaited -= len(mine)
             self._forget(mine)
@@ -503,13 +508,13 @@ class Requests:
         if owner > 0:
             ticket = self.tickets.waiting[owner]
             ticket.remaining -= len(slots)
-            ticket.faults.append(fault)
+            ticket.failed |= dict.fromkeys(slots.tolist(), fault)
             self.state[slots] = _SPENT_CODE
-            return
-        self._forget(slots)
-        if owner == COLLECTOR:
+        elif owner == COLLECTOR:
             self.collector.num_awaited -= len(slots)
-            self.collector.note_faults([fault])
+            self.collector.keep(slots, fault)
+        else:
+            self._forget(slots)
 
     def withdraw(self, slot: int) -> None:
         """End a request of the collector without a result."""
@@ -552,7 +557,7 @@ class Requests:
         """Close a ticket that has all replies: results may be returned, the rest is idle."""
         del self.tickets.waiting[ticket.owner]
         self.owner[ticket.slots] = COLLECTOR
-        if ticket.method or ticket.faults:
+        if ticket.method or ticket.failed:
             self._forget(ticket.slots[self.state[ticket.slots] == _SPENT_CODE])
 
     def give_up(self, ticket: Ticket) -> None:
@@ -564,6 +569,7 @@ class Requests:
             return
         ready = self.ready(slots)
         self.collector.num_awaited += len(self.owed(slots)) + len(ready)
-        self.collector.note_faults(ticket.faults)
+        for fault, its in ticket.failures():
+            self.collector.keep(its, fault)
         if len(ready):
             self.collector.append(ready)

@@ -164,7 +164,7 @@ class Steps:
             if not self._waiting.wanted:
                 self._bell.disarm()
         requests.settle(ticket)
-        if ticket.faults:
+        if ticket.failed:
             results, flags = self._core.settled(ticket, slots)
         else:
             results, flags = self._hand_out(slots, synchronous=True)
@@ -276,7 +276,7 @@ class Steps:
         except BaseException as error:
             fault = self._intake.raised(0, ErrorText.of(error))
             if isinstance(error, KeyboardInterrupt):  # The step has ended, too: see `InlineHost`.
-                self._requests.collector.note_faults([fault])
+                self._requests.collector.keep(self._requests.alone(0), fault)
                 raise
             raise fault from None
         if out_of_band:
