@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import time
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -221,6 +223,68 @@ def test_only_the_env_at_fault_is_charged_an_attempt(breaks: str) -> None:
     assert found.lost == 1
     played = sorted((one.task, one.seed) for one in found.records if one.cause is None)
     assert played == [("1", 8), ("1", 9), ("3", 8), ("3", 9)]
+
+
+class AwaitableTasks:
+    """In the first life of its worker, steps wait for ever; one of task 2 then ends the worker.
+
+    It ends in the code of that step, or, if `nobodys`, while no env's code runs.
+    """
+
+    switches_task = True
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+    action_space = gym.spaces.Discrete(2)
+    waiting: ClassVar[int] = 0
+    both_wait: ClassVar = asyncio.Event()
+
+    def __init__(self, first_life: Path, *, nobodys: bool) -> None:
+        self._first_life, self._nobodys, self._task = first_life, nobodys, "1"
+
+    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        self._task = (options or {}).get("task", self._task)
+        return np.zeros(1), {}
+
+    async def step(self, action: Any) -> Any:
+        if self._task == "2":
+            await AwaitableTasks.both_wait.wait()
+            self._first_life.unlink(missing_ok=True)
+            if not self._nobodys:
+                os._exit(3)
+            asyncio.get_running_loop().call_soon(os._exit, 3)
+            await asyncio.Event().wait()
+        elif self._first_life.exists():
+            AwaitableTasks.waiting += 1
+            if AwaitableTasks.waiting == 2:
+                self.both_wait.set()
+            await asyncio.Event().wait()
+        return np.zeros(1), 1.0, True, False, {}
+
+
+@pytest.mark.parametrize("on_worker_death", ["restart", "raise"])
+@pytest.mark.parametrize("nobodys", [False, True])
+def test_each_suspect_is_charged_an_attempt_where_no_env_is_at_fault(
+    tmp_path: Path, nobodys: bool, on_worker_death: str
+) -> None:
+    """Of awaitable envs that share a worker, only the one whose code ran, or all that waited."""
+    (first_life := tmp_path / "first life").touch()
+    group = group_of(
+        3,
+        make_env=partial(AwaitableTasks, first_life, nobodys=nobodys),
+        placement="process",
+        envs_per_process=3,
+        on_worker_death=on_worker_death,
+    )
+    queue = [EpisodeSpec(task, 0) for task in "123"]
+    charged = ["1", "2", "3"] if nobodys else ["2"]
+    if on_worker_death == "raise" and not nobodys:  # No env is left for the others.
+        with pytest.raises(rl.WorkerDied, match="exited with code 3"):
+            evaluated(group, queue, max_attempts=1)
+        return
+    found = evaluated(group, queue, max_attempts=1)
+    assert sorted(one.task for one in found.failed) == charged
+    assert found.lost == len(charged)
+    played = sorted(one.task for one in found.records if one.cause is None)
+    assert played == [task for task in "123" if task not in charged]
 
 
 @pytest.mark.parametrize("together", [1, 2])

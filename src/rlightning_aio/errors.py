@@ -83,7 +83,10 @@ class UnknownEnv(RLightningError, KeyError):
 
 
 class EnvBusy(RLightningError, RuntimeError):
-    """An env got a new request before its outstanding reply was collected; nothing was sent."""
+    """An env got a request before the result or error of its last one was collected.
+
+    Nothing was sent. The message says what to call first.
+    """
 
 
 class NothingPending(RLightningError, RuntimeError):
@@ -229,11 +232,17 @@ def _unpickled_of(message: str, exception_type: str) -> EnvRaised:
 class WorkerDied(EnvFault):
     """The process of an env ended unexpectedly.
 
+    One such error answers the requests of all its ``env_ids``. Its ``env_id`` is the env that the
+    process was executing. Of awaitable envs that share a process, all may have been waiting: then
+    there are `suspects`, and the first of them is ``env_id``.
+
     Attributes:
         exit_code: of the process; negative for a signal; None if unknown.
         stderr_tail: the last lines it wrote to stderr.
         env_ids: the envs whose requests this error answers: outstanding ones, or new ones that it
             refuses.
+        suspects: the envs that owed a reply to a process in which no env's code was running; empty
+            if one was.
     """
 
     def __init__(
@@ -243,6 +252,7 @@ class WorkerDied(EnvFault):
         self.exit_code = exit_code
         self.stderr_tail = stderr_tail
         self.env_ids: tuple[str, ...] = ()
+        self.suspects: tuple[str, ...] = ()
 
 
 class EnvHung(WorkerDied):

@@ -54,6 +54,7 @@ class StandIn:
         post: takes its completions; log: its orders.
         builds, closes: at once; otherwise not before it is killed.
         dies: a kill ends it.
+        awaits: its envs are awaitable.
         refusal: the error of a start; refused_later: by the fork server, not by this process.
         asked: its entries.
         close_errors: of its envs.
@@ -70,6 +71,7 @@ class StandIn:
     builds: bool = True
     closes: bool = True
     dies: bool = True
+    awaits: bool = False
     refusal: OSError | None = None
     refused_later: bool = False
     close_errors: list[tuple[int, ErrorText]] = field(default_factory=list)
@@ -103,7 +105,14 @@ class StandIn:
             for k in range(self.num_envs)
         ]
         started = [
-            EnvStarted(meta, LAYOUT, reads_extras=False, transforms_actions=False) for meta in metas
+            EnvStarted(
+                meta,
+                LAYOUT,
+                reads_extras=False,
+                transforms_actions=False,
+                is_awaitable=self.awaits,
+            )
+            for meta in metas
         ]
         self.post(Built(self.host_id, started))
 
@@ -154,12 +163,15 @@ class Fleet:
 
     Args:
         counts: envs of each host.
+        awaits: the envs are awaitable.
 
     Attributes:
         verdicts: the outcome of each death.
     """
 
-    def __init__(self, counts: tuple[int, ...] = (1, 1), **fields: Any) -> None:
+    def __init__(
+        self, counts: tuple[int, ...] = (1, 1), *, awaits: bool = False, **fields: Any
+    ) -> None:
         self.now = 1000.0
         self.completions: deque[Any] = deque()
         self.log: list[str] = []
@@ -192,6 +204,7 @@ class Fleet:
         self.hosts: list[StandIn] = []
         for host_id, count in enumerate(counts):
             host = StandIn(host_id, sum(counts[:host_id]), count, self.completions.append, self.log)
+            host.awaits = awaits
             self.hosts.append(host)
             self.supervisor.add(host, config)
 
@@ -227,7 +240,8 @@ class Fleet:
             if isinstance(verdict, Replaced):
                 host_id = verdict.host.host_id
                 entries = self.requests.restart(host_id, verdict.owed)
-                self.supervisor.submit(host_id, entries, None)
+                if len(entries):
+                    self.supervisor.submit(host_id, entries, None)
             elif verdict is not None:
                 self.requests.fail(verdict.owed, COLLECTOR, verdict.error_for(verdict.owed))
 
@@ -524,6 +538,40 @@ def test_an_answered_request_is_not_blamed_for_a_hang(fleet: Callable[..., Fleet
     assert verdict.error_for(verdict.owed).env_id == "e-1"
 
 
+def test_an_event_loop_that_goes_on_is_not_killed(fleet: Callable[..., Fleet]) -> None:
+    """It says so while all envs wait. Once it stops, it is killed, and any of them is suspected."""
+    ours = fleet((3,), awaits=True, step_timeout=5.0)
+    ours.ask(0, 2)
+    for _ in range(3):
+        ours.hosts[0].current = (0, int(ours.now * 1e9))
+        ours.check()
+        ours.now += 4.9
+        ours.check()
+    assert ours.log == []
+    verdict = ended_as_hung(ours)
+    assert (verdict.at_fault, verdict.suspects) == (None, ("e-0", "e-2"))
+    assert verdict.cause == "hung and was killed"
+    error = verdict.error_for(verdict.owed)
+    assert isinstance(error, EnvHung)
+    assert (error.env_id, error.suspects) == ("e-0", ("e-0", "e-2"))
+    assert "no env's code was running; envs that owed a reply: e-0, e-2" in str(error)
+
+
+def test_an_env_that_blocks_the_event_loop_is_at_fault(fleet: Callable[..., Fleet]) -> None:
+    """Even if nobody waits for its request any more: only one env's code runs."""
+    ours = fleet((3,), awaits=True, step_timeout=5.0)
+    (over,) = ours.ask(2)
+    ours.reply(2)
+    ours.ask(0, 1)
+    ours.hosts[0].current = (over, int(ours.now * 1e9))
+    ours.now += 4.9
+    ours.check()
+    assert ours.log == []
+    verdict = ended_as_hung(ours)
+    assert (verdict.at_fault, verdict.suspects) == ("e-2", ())
+    assert verdict.cause == "hung in a step and was killed"
+
+
 def test_a_late_trainer_reads_pending_replies_before_it_kills(
     fleet: Callable[..., Fleet],
 ) -> None:
@@ -636,6 +684,54 @@ def test_restarts_are_counted_for_each_culprit(fleet: Callable[..., Fleet]) -> N
     ours.reply(0)
     (entry,) = ours.ask(1)
     assert isinstance(ours.die(0, entry), GivenUp)
+
+
+@pytest.mark.parametrize("executing", [0, 1])
+def test_of_awaitable_envs_the_one_whose_code_ran_is_at_fault(
+    fleet: Callable[..., Fleet], executing: int
+) -> None:
+    """Not the one that was asked first; if all waited, those that owed a reply are suspected."""
+    ours = fleet((3, 1), awaits=True)
+    asked = ours.ask(0, 1)
+    verdict = ours.die(0, (0, asked[1])[executing], *asked)
+    assert isinstance(verdict, Replaced)
+    error = verdict.error_for(np.array([1]))
+    suspects = () if executing else ("e-0", "e-1")
+    at_fault = "e-1" if executing else None
+    assert (verdict.at_fault, verdict.suspects) == (at_fault, suspects)
+    assert (error.env_id, error.suspects) == (at_fault or "e-0", suspects)
+    assert error.env_ids == ("e-1",)
+
+
+def test_a_worker_of_one_env_has_no_suspects(fleet: Callable[..., Fleet]) -> None:
+    """Nor has one that owed nothing."""
+    ours = fleet((1, 2), awaits=True)
+    verdicts = [ours.die(0, 0, *ours.ask(0)), ours.die(1, 0)]
+    found = [(v.at_fault, v.suspects) for v in verdicts if isinstance(v, Replaced)]
+    assert found == [("e-0", ()), (None, ())]
+
+
+def test_each_suspect_uses_its_own_restarts(fleet: Callable[..., Fleet]) -> None:
+    """A completed step of a suspect clears it."""
+    ours = fleet((2,), awaits=True, max_restarts=2)
+    for _ in range(2):
+        ours.ask(0, 1)
+        assert isinstance(ours.die(0, 0), Replaced)
+        if ours.supervisor.next_check() is not None:
+            ours.wait()
+        for slot in (0, 1):  # Resets, which prove nothing.
+            entry = ours.requests.numbering.entry.item(slot)
+            assert ours.requests.complete_one(0, entry) == slot
+            ours.requests.hand_out(ours.requests.collector.take(1))
+    ours.ask(0)
+    ours.reply(0)
+    ours.ask(0)
+    assert isinstance(ours.die(0, 0), Replaced)
+    ours.reply(0)
+    ours.ask(1)
+    verdict = ours.die(0, 0)
+    assert isinstance(verdict, GivenUp)
+    assert "after 2 restarts in a row" in str(verdict.error_for(verdict.owed))
 
 
 @pytest.mark.parametrize("later", [False, True])

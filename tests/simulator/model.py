@@ -73,12 +73,20 @@ class Host:
     Args:
         mortal: it is another process, or its envs are replaced alone.
         count: counts its deaths; None if only those that were asked for are known.
+        knows: which env's code it executes; an actor knows no more than the batch.
+
+    Attributes:
+        struck: it was killed from outside.
     """
 
-    def __init__(self, *, mortal: bool, count: Callable[[], int] | None = None) -> None:
+    def __init__(
+        self, *, mortal: bool, count: Callable[[], int] | None = None, knows: bool = True
+    ) -> None:
         self.mortal = mortal
+        self.knows = knows
         self._count = count
         self._asked = 0
+        self.struck = False
 
     @property
     def deaths(self) -> int:
@@ -255,6 +263,8 @@ class Env:
         codes: of its sub-environments.
         first: its first place in `batch.index`.
         limbo: the call that it executes may have been given up.
+        deadly: its code was to end its worker, or to hang until that is ended; or it was aborted.
+        kept: aborted requests that may have ended in an error before; a collect still raises that.
         gone: its worker ended and is not replaced.
         dirty: its last result could not be read, so its episode must end.
         hangs: how often it was to hang and be replaced alone, as awaitable envs are.
@@ -273,6 +283,8 @@ class Env:
     state: State
     request: Request | None = None
     limbo: bool = False
+    deadly: bool = False
+    kept: list[Request] = field(default_factory=list)
     gone: bool = False
     dirty: bool = False
     hangs: int = 0
@@ -368,11 +380,15 @@ class Model:
         envs: of the group, in its order.
         counts: what comes of requests.
         starts_fail: replacements may fail, which counts as deaths that nobody sees.
+        calm: workers end only as they are told to.
     """
 
-    def __init__(self, envs: Iterable[Env], counts: Counter[str], *, starts_fail: bool) -> None:
+    def __init__(
+        self, envs: Iterable[Env], counts: Counter[str], *, starts_fail: bool, calm: bool
+    ) -> None:
         self.counts = counts
         self.starts_fail = starts_fail
+        self.calm = calm
         self.envs = {env.env_id: env for env in envs}
         self.context: Context | None = None
 
@@ -403,6 +419,7 @@ class Model:
             env.saves.append(env.state.copy())
         effects = [effect for effect, _ in env.state.copy().faults(request)]
         request.kills = any(effect in (*DYING, "hang") for effect in effects)
+        env.deadly |= request.kills
         if request.kills and env.entry.form == "awaitable" and "hang" in effects:
             env.hangs += 1
         elif request.kills:
@@ -432,7 +449,9 @@ class Model:
         for request, state in itertools.product(done, before):
             env.loose.append(state.copy())
             env.loose[-1].play(request, math.inf, marks=False)
-        env.request, env.limbo, env.dirty = None, False, True
+        if env.request is not None:
+            env.kept.append(env.request)
+        env.request, env.limbo, env.dirty, env.deadly = None, False, True, True
         self.counts["aborted"] += 1
 
     # -- results
@@ -514,12 +533,7 @@ class Model:
         require(heads == ([0.0] * many, [False] * many, [True] * many), "not marked in all ways")
         for column, value in ((row.resets, True), (row.limit, False)):
             require(column in (None, [value] * many), "not marked in all ways")
-        at_fault = row.info.get("env_at_fault")
-        if at_fault is not None:
-            require(
-                at_fault in self.envs and self.envs[at_fault].host is env.host,
-                "a stranger at fault", at_fault,
-            )  # fmt: skip
+        self._judge_blame(env, row.info.get("env_at_fault"), row.info.get("suspects", ()))
         shows = "worker_resumed" in row.info
         require(not (shows and env.entry.every is None), "resumed, and nothing was saved")
         again = [Request("show") if shows else Request("reset")]
@@ -549,17 +563,44 @@ class Model:
         self.counts["hung"] += row.info["worker_restarted"].startswith("hung")
         self._save(env, again[0])
 
+    def _judge_blame(self, env: Env, at_fault: str | None, suspects: Sequence[str]) -> None:
+        """Check who is said to have ended the worker of an env."""
+        host = env.host
+        named = [*suspects] if at_fault is None else [at_fault, *suspects]
+        for env_id in named:
+            own = env_id in self.envs and self.envs[env_id].host is host
+            require(own, "a stranger is blamed", env_id)
+        if suspects:
+            require(at_fault is None, "at fault, and others are suspects", at_fault, suspects)
+            together = [one for one in self.envs.values() if one.host is host]
+            waits = env.entry.form == "awaitable" and len(together) > 1
+            require(waits, "suspects, and one env's code must have been running", suspects)
+        self.counts["suspects"] += bool(suspects)
+        if self.calm and host.knows and not host.struck:
+            deadly = at_fault is not None and self.envs[at_fault].deadly
+            require(deadly, "an innocent env is blamed, or none", at_fault, suspects)
+
     # -- errors
 
-    def failed(self, fault: EnvFault, owner: Any) -> list[Env]:
-        """End the requests that an error answers; return their envs."""
+    def failed(self, fault: EnvFault, owner: Any, busy: Sequence[str] = ()) -> list[Env]:
+        """End the requests that an error answers; return their envs.
+
+        Those that are `busy` after it have got another request, because they were aborted.
+        """
         ended: list[Env] = []
         for one in (fault, *fault.others):
             for env_id in getattr(one, "env_ids", ()) or (one.env_id,):
                 env = self.envs.get(env_id)
                 require(env is not None, "an error of a stranger", repr(one))
                 assert env is not None
+                ended.append(env)
                 request = env.request
+                if env.kept and (request is None or env_id in busy):
+                    env.kept.pop(0)
+                    self.counts["error of an aborted request"] += 1
+                    if isinstance(one, WorkerDied):
+                        self.gone(env, one)
+                    continue
                 require(
                     request is not None and request.owner == owner,
                     "an error that answers nothing", owner, request, repr(one),
@@ -567,7 +608,6 @@ class Model:
                 assert request is not None
                 self._judge_fault(env, request, one)
                 env.request = None
-                ended.append(env)
         return ended
 
     def _judge_fault(self, env: Env, request: Request, fault: EnvFault) -> None:
@@ -610,6 +650,9 @@ class Model:
         """Check an error that says that an env's worker has ended for good, or during a call."""
         host, entry = env.host, env.entry
         require(host.mortal and env.may_be_lost, "dead, and nothing has died", repr(fault))
+        if fault.suspects:
+            require(fault.env_id == fault.suspects[0], "another suspect", repr(fault))
+            self._judge_blame(env, None, fault.suspects)
         hung = isinstance(fault, EnvHung)
         require(fault.exit_code != 0, "dead, and left in order", hung)
         in_call = env.request is not None and env.request.kind == "call"

@@ -73,7 +73,10 @@ class Play(Session):
         self.nested: set[str] = set()
         self.written: dict[str, Any] = {}
         faults = replace(self.program.faults, deaths=0.0, interrupts=0.0)
-        self.model = Model(self.envs, self.counts, starts_fail=faults != Faults())
+        calm = replace(self.program.faults, lags=0.0, interrupts=0.0) == Faults()
+        calm = calm and "snapshots" not in self.features  # A state that is put back may kill.
+        starts_fail = faults != Faults()
+        self.model = Model(self.envs, self.counts, starts_fail=starts_fail, calm=calm)
         require([*self.model.envs] == self.group.env_ids, "ids", self.group.env_ids)
 
     async def play(self, number: int, op: Op) -> None:
@@ -467,7 +470,7 @@ class Play(Session):
     def take_fault(self, fault: EnvFault, rules: dict[str, Any]) -> None:
         self.note_faults(fault)
         require(fault.results is None and not fault.others, "an error of one request", repr(fault))
-        ended = self.model.failed(fault, COLLECTOR)
+        ended = self.model.failed(fault, COLLECTOR, self.group.pending)
         names = rules.get("entries")
         require(names is None or any(env.entry.name in names for env in ended), "another entry's")
 
@@ -597,6 +600,7 @@ class Play(Session):
         request = Request("call")
         if effect in DYING:
             env.host.ask()
+            env.deadly = True
         call = self.group[env.env_id].call
 
         def take(value: Any) -> None:
@@ -992,7 +996,7 @@ class Play(Session):
         return not (later or any(grudges))
 
     def note_aborted(self, envs: Iterable[Env]) -> None:
-        """Errors stay for a collect."""
+        """Their errors stay for a collect, but the envs are free."""
         pending = self.group.pending
         for env in envs:
             if env.env_id not in pending:

@@ -145,7 +145,8 @@ class Program:
             here = plan.placement == "inline" or worker["pid"] is None
             process = "an actor" if plan.placement == "ray" else f"worker {number}"
             count = None if world is None else partial(world.deaths.__getitem__, process)
-            host = Host(mortal=plan.placement == "ray" or not here, count=count)
+            on_ray = plan.placement == "ray"
+            host = Host(mortal=on_ray or not here, count=count, knows=not on_ray)
             host_of |= dict.fromkeys(worker["env_ids"], host)
         envs: list[Env] = []
         first = 0

@@ -190,6 +190,7 @@ class Session:
         if not envs:
             return
         env, delay = rng.choice(envs), rng.choice([0.0, 1e-5, 1e-4, 1e-3, 1e-2, 0.1])
+        env.host.struck = True
         pids = [w["pid"] for w in self.group.get_workers() if env.env_id in w["env_ids"]]
         if self.world is None:
             env.host.ask()

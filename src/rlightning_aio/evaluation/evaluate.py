@@ -17,7 +17,12 @@ from rlightning_aio.batch.contents import all_agents
 from rlightning_aio.collecting.procedure import Procedure, run
 from rlightning_aio.errors import EnvBusy, RLightningError
 from rlightning_aio.evaluation.episodes import Episode, Evaluation, check_numbers
-from rlightning_aio.evaluation.outcomes import responses, success_of, summed_rewards
+from rlightning_aio.evaluation.outcomes import (
+    is_blamed,
+    responses,
+    success_of,
+    summed_rewards,
+)
 from rlightning_aio.evaluation.queue import QueuePlay, QueueRules
 from rlightning_aio.group.aio import EnvGroup as AsyncEnvGroup
 from rlightning_aio.group.sync import EnvGroup as SyncEnvGroup
@@ -375,7 +380,7 @@ class _Play:
             env_id = env_ids[row]
             self._found.lost += int(self._open[self._places(env_id)].sum())
             self._lost.add(env_id)
-            if info.get("env_at_fault", env_id) != env_id:
+            if not is_blamed(env_id, info):
                 continue  # Another env of its worker is at fault, and reports so.
             self._losses[env_id] += 1
             if self._losses[env_id] == _LOSSES_IN_A_ROW:

@@ -12,7 +12,7 @@ from rlightning_aio.errors import BadAction
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = ["responses", "success_of", "summed_rewards"]
+__all__ = ["is_blamed", "responses", "success_of", "summed_rewards"]
 
 _SUCCESS_KEYS: Final = ("success", "is_success")
 """In an info: Gymnasium's robotics and ManiSkill's name, and Stable-Baselines3's."""
@@ -45,6 +45,14 @@ def summed_rewards(reward: Any) -> NDArray[np.float64]:
     if isinstance(reward, dict):
         reward = np.sum(list(cast("dict[str, Any]", reward).values()), axis=0)
     return np.asarray(reward, np.float64)
+
+
+def is_blamed(env_id: str, info: dict[str, Any]) -> bool:
+    """Return True if an env may have ended its worker, by the info of its marked result.
+
+    Otherwise another env of the worker has, or may have.
+    """
+    return env_id in info.get("suspects", (info.get("env_at_fault", env_id),))
 
 
 def success_of(info: dict[str, Any], sub_env: int = 0) -> bool | None:

@@ -16,7 +16,12 @@ import numpy as np
 from rlightning_aio.batch.contents import all_agents
 from rlightning_aio.errors import EnvFault, WorkerDied
 from rlightning_aio.evaluation.episode_video import EpisodeVideo, Filming
-from rlightning_aio.evaluation.outcomes import responses, success_of, summed_rewards
+from rlightning_aio.evaluation.outcomes import (
+    is_blamed,
+    responses,
+    success_of,
+    summed_rewards,
+)
 from rlightning_aio.evaluation.records import EpisodeRecord, EpisodeSpec, QueueEvaluation
 from rlightning_aio.evaluation.waiting import Attempts, WaitingEpisodes
 
@@ -263,8 +268,8 @@ class QueuePlay:
             for row, info in zip(rows, batch.take(rows).info(), strict=True):
                 env_id = env_ids[row]
                 if restarted[row]:
-                    at_fault = info.get("env_at_fault", env_id)
-                    self._lose(env_id, info.get("worker_restarted", "its worker ended"), at_fault)
+                    cause = info.get("worker_restarted", "its worker ended")
+                    self._lose(env_id, cause, is_blamed=is_blamed(env_id, info))
                 else:
                     self._end(env_id, info)
                 if env_id not in self._gone:
@@ -286,17 +291,17 @@ class QueuePlay:
             total_reward=None, length=None, success=None, lost=tuple(attempts.lost),
         )  # fmt: skip
 
-    def _lose(self, env_id: str, cause: str, at_fault: str) -> None:
+    def _lose(self, env_id: str, cause: str, *, is_blamed: bool) -> None:
         """Queue the lost episode of an env again, or note that it failed.
 
-        It was an attempt only if the env itself is at fault, not a neighbour in its worker.
+        It was an attempt only if the env itself may be at fault, not a neighbour in its worker.
         """
         attempts = self._playing.pop(env_id, None)
         if self._filming is not None:
             self._filming.drop(env_id)
         if attempts is None:
             return
-        if env_id == at_fault:
+        if is_blamed:
             attempts.lost.append(cause)
             if self._rules.results is not None:
                 self._rules.results.add_lost(attempts.spec, cause)
@@ -314,8 +319,9 @@ class QueuePlay:
     def _note_fault(self, fault: EnvFault) -> None:
         """Queue the episodes again that an error ended; drop envs that are not replaced."""
         self._fault = fault
-        struck = {fault.env_id}
+        struck, blamed = {fault.env_id}, {fault.env_id}
         if isinstance(fault, WorkerDied):
+            blamed.update(fault.suspects)
             # The env at fault may be another one, whose own request a replacement answers.
             struck = {*fault.env_ids}
             for worker in self._group.get_workers():
@@ -323,7 +329,7 @@ class QueuePlay:
         self._pending -= struck
         # A ready result of an env that is gone can still be collected.
         for env_id in (struck | self._gone) - self._pending:
-            self._lose(env_id, _cause(fault), fault.env_id)
+            self._lose(env_id, _cause(fault), is_blamed=env_id in blamed)
             if env_id not in self._gone:
                 self._idle[env_id] = None
         for env_id in self._gone:

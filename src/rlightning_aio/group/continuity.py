@@ -108,12 +108,14 @@ class Report(NamedTuple):
         cause: what ended the worker.
         at_fault: the id of the env that the worker was executing; None if unknown.
         steps_lost: steps to repeat where the env resumes; None where it begins a new episode.
+        suspects: ids; see `WorkerDied`.
     """
 
     slot: int
     cause: str
     at_fault: str | None
     steps_lost: int | None
+    suspects: tuple[str, ...] = ()
 
 
 class Judged(NamedTuple):
@@ -147,6 +149,7 @@ class _Loss:
     phase: LossPhase
     cause: str = "could not show the state that was restored"
     at_fault: str | None = None
+    suspects: tuple[str, ...] = ()
     from_checkpoint: bool = False
     resumes: bool = False
     seed: int = NO_SEED
@@ -333,17 +336,18 @@ class Continuity:
         slots: Iterable[int],
         cause: str,
         at_fault: str | None = None,
+        suspects: tuple[str, ...] = (),
         *,
         from_checkpoint: bool = False,
     ) -> None:
         """Record that the episodes of `slots` are lost; nothing is in flight there.
 
-        `cause` and `at_fault` are those of `Report`. `from_checkpoint`: the envs are built anew,
-        from their checkpoints where they have any.
+        `cause`, `at_fault` and `suspects` are those of `Report`. `from_checkpoint`: the envs are
+        built anew, from their checkpoints where they have any.
         """
         for slot in slots:
             loss = self._move(slot, LossEvent.EPISODE_LOST)
-            loss.cause, loss.at_fault = cause, at_fault
+            loss.cause, loss.at_fault, loss.suspects = cause, at_fault, suspects
             loss.from_checkpoint, loss.seed = from_checkpoint, NO_SEED
 
     def abandon(self, slots: Iterable[int], cause: str) -> None:
@@ -365,7 +369,8 @@ class Continuity:
             if loss is None or loss.phase is LossPhase.LOST:
                 continue
             if loss.phase in (LossPhase.REPORTING, LossPhase.RESUMING):
-                reports.append(Report(slot, loss.cause, loss.at_fault, loss.steps_lost))
+                about = loss.cause, loss.at_fault, loss.steps_lost, loss.suspects
+                reports.append(Report(slot, *about))
             if loss.position is not None:
                 self._restored[slot] = loss.position
             self._move(slot, LossEvent.ANSWERED)

@@ -16,6 +16,8 @@ from rlightning_aio.hosts.base import Killable
 from rlightning_aio.protocol.entries import Operation, slot_of
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import numpy as np
     from numpy.typing import NDArray
 
@@ -29,7 +31,7 @@ __all__ = [
     "CrashLog",
     "DeathReport",
     "cause_of",
-    "culprit_of",
+    "culprits_of",
     "death_report",
     "late_fault",
     "start_fault",
@@ -76,32 +78,41 @@ def _starting(record: HostRecord, death: Death) -> int:
     return max(slot, record.host.first_slot)
 
 
-def culprit_of(
-    record: HostRecord, death: Death, requests: Requests, unanswered: NDArray[np.intp]
-) -> int | None:
-    """The slot of the env that a worker was executing when it died, or None if unknown.
+def culprits_of(
+    record: HostRecord,
+    executing: Sequence[int],
+    requests: Requests,
+    unanswered: NDArray[np.intp],
+) -> tuple[int | None, tuple[int, ...]]:
+    """The slot of the env that a worker was executing when it hung or died, and suspects.
 
     Args:
         record: of its host.
-        death: of the worker.
+        executing: entries, as in `Death.requests`.
         requests: of the group.
         unanswered: its slots with a request in flight.
+
+    Without such an env there is None, and the slots of those that may be the cause: all that owed
+    a reply.
     """
-    if record.hung_slot is not None:
-        return record.hung_slot
     if record.aborted_slot is not None:
-        return record.aborted_slot
+        return record.aborted_slot, ()
+    if record.awaits_several:
+        # The worker marks whose code runs, and that of one whose request is over may run, too.
+        slot = slot_of(executing[0]) if executing and executing[0] else None
+        return (slot, ()) if slot in record.slots else (None, tuple(unanswered.tolist()))
     slot_of_entry = {requests.numbering.entry.item(slot): slot for slot in unanswered.tolist()}
-    for entry in death.requests:
+    for entry in executing:
         if entry in slot_of_entry:
-            return slot_of_entry[entry]
-    return int(unanswered[0]) if len(unanswered) else None
+            return slot_of_entry[entry], ()
+    return (int(unanswered[0]) if len(unanswered) else None), ()
 
 
 def cause_of(record: HostRecord, death: Death, requests: Requests) -> str:
     """The cause of a worker's end: the supervisor's reason for killing it, else its exit."""
-    if record.hung_slot is not None:
-        return f"hung in {_doing(requests, record.hung_slot)} and was killed"
+    if record.is_hung:
+        where = "" if record.culprit is None else f" in {_doing(requests, record.culprit)}"
+        return f"hung{where} and was killed"
     if record.aborted_slot is not None:
         return f"was killed because {_doing(requests, record.aborted_slot)} was aborted"
     if record.rebuild_error is not None:
@@ -134,7 +145,8 @@ class DeathReport:
     Attributes:
         what: the subject and the cause; last: the last request of the env at fault.
         outcome: what happens to the worker now.
-        slot: of the env at fault.
+        slot: of the env at fault, or of the first suspect.
+        suspects: slots; see `HostRecord`.
     """
 
     envs: EnvTable
@@ -144,14 +156,12 @@ class DeathReport:
     last: str
     outcome: str
     slot: int
+    suspects: tuple[int, ...]
 
     def message(self, unanswered: NDArray[np.intp]) -> str:
         """The message about the death; `unanswered` had a request in flight."""
         names = ", ".join(self._ids(unanswered)) or "none"
-        return (
-            f"{self.what} (last request: {self.last}; envs that owed a reply: {names}); "
-            f"{self.outcome}"
-        )
+        return f"{self.what} ({self.last}; envs that owed a reply: {names}); {self.outcome}"
 
     def error(self, unanswered: NDArray[np.intp]) -> WorkerDied:
         """The error for these slots, with the last lines of the worker's stderr."""
@@ -175,6 +185,7 @@ class DeathReport:
             stderr_tail=self.death.stderr_tail,
         )
         error.env_ids = tuple(self._ids(slots))
+        error.suspects = tuple(self.envs.env_ids[slot] for slot in self.suspects)
         return error
 
     def _ids(self, slots: NDArray[np.intp]) -> list[str]:
@@ -187,19 +198,19 @@ def death_report(
     envs: EnvTable, record: HostRecord, death: Death, requests: Requests, outcome: str
 ) -> DeathReport:
     """Describe a death; `outcome` says what happens to the worker now."""
-    slot = record.host.first_slot if record.culprit is None else record.culprit
+    slot, config = record.blamed[0], record.config
+    slot = record.host.first_slot if slot is None else slot
     doing, number = _doing(requests, slot), requests.numbering.number(slot)
-    last = f"request {number}, {doing}" if number else "none"
-    if record.hung_slot is not None:
-        config = record.config
+    last = f"last request: {f'request {number}, {doing}' if number else 'none'}"
+    what = f"the worker of {envs.describe(slot)} {death.cause}"
+    if record.suspects:
+        last = "no env's code was running"
+    elif record.is_hung:
         stepped = requests.numbering.op(slot) == Operation.STEP
         limit = config.step_timeout if stepped else config.reset_timeout
         what = f"{envs.describe(slot)} took longer than {limit} s for {doing} and was killed"
-    else:
-        what = f"the worker of {envs.describe(slot)} {death.cause}"
-    kind = WorkerDied if record.hung_slot is None else EnvHung
-
-    return DeathReport(envs, death, kind, what, last, outcome, slot)
+    kind = EnvHung if record.is_hung else WorkerDied
+    return DeathReport(envs, death, kind, what, last, outcome, slot, record.suspects)
 
 
 def _said(stderr_tail: str) -> str:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from rlightning_aio.group.fault_messages import culprits_of
 from rlightning_aio.group.host_record import Stage
 from rlightning_aio.protocol.entries import Operation, slot_of
 
@@ -127,7 +128,7 @@ class HangDetector:
 
     def _expiry(self, record: HostRecord) -> float | None:
         """Return the time when the worker's current request exceeds its limit."""
-        if record.stage is not Stage.UP or record.hung_slot is not None:
+        if record.stage is not Stage.UP or record.is_hung:
             return None
         assert record.killable is not None
         entry, since_ns = record.killable.executing()
@@ -143,11 +144,13 @@ class HangDetector:
         return self._now + shortest if limit is None else since_ns / 1e9 + limit
 
     def _progress(self, record: HostRecord) -> tuple[int, ...]:
-        """Return numbers that change with every request, reply, and part of a reply."""
+        """Return numbers that change with every request, reply, part of a reply, sign of life."""
         assert record.killable is not None
         slots = slice(record.slots.start, record.slots.stop)
         entries = int(self._requests.numbering.entry[slots].sum())
-        return self._in_flight(record), entries, record.killable.traffic
+        # Where all envs wait, the worker says now and then that its event loop goes on.
+        executing = record.killable.executing()
+        return self._in_flight(record), entries, record.killable.traffic, *executing
 
     def _check_hung(self, record: HostRecord) -> None:
         assert record.killable is not None
@@ -160,17 +163,13 @@ class HangDetector:
         expiry = self._expiry(record)
         if expiry is None or self._now < expiry or has_news(record):
             return
-        record.hung_slot = self._hung_slot(record, entry)
-        if self._observed.observer is not None:
-            host_id = record.host.host_id
-            self._observed.observer.note_fate("hung", host_id, record.hung_slot, "")
-        self.kill(record, dump=True)
-
-    def _hung_slot(self, record: HostRecord, entry: int) -> int:
-        """Return the slot of `entry`, or the first busy slot if that request is over."""
+        record.is_hung = True
         busy = self._requests.owed(np.array(record.slots, np.intp))
-        slot = slot_of(entry)
-        return slot if slot in busy else int(busy[0])
+        record.culprit, record.suspects = culprits_of(record, (entry,), self._requests, busy)
+        slot = record.blamed[0]
+        if self._observed.observer is not None and slot is not None:
+            self._observed.observer.note_fate("hung", record.host.host_id, slot, "")
+        self.kill(record, dump=True)
 
     def _check_dying(self) -> None:
         """Destroy hosts that a kill has not ended, together with their fork server."""

@@ -52,10 +52,12 @@ class HostRecord:
             refused_since: the time of the first.
         held: requests (entries and arguments) since its death, kept until a replacement is up;
             None while it needs none.
-        deaths: by slot, deaths of workers that were executing that env since it last completed a
-            step; key None for deaths of unknown cause. culprit: the slot of the last death.
+        deaths: by slot, deaths of workers that this env is blamed for, since it last completed a
+            step; key None for deaths of unknown cause.
+        culprit: the slot of the env that the last worker was executing when it died.
+        suspects: without one, the slots of those that owed a reply while none was executed.
         dying: it was killed, and its exit was not reported yet; die_by: the deadline of that.
-        hung_slot: the env that hung, while its worker is being killed.
+        is_hung: its worker hung and is being killed.
         abort_by: when its worker is killed, unless its aborted requests have ended before;
             aborted_slot: of the env for whose request that is being done.
         idle: its progress when it was last seen idle, and idle_since the time (`HangDetector`).
@@ -84,9 +86,10 @@ class HostRecord:
     held: list[tuple[NDArray[np.int64], Sequence[Any] | None]] | None = None
     deaths: dict[int | None, int] = field(default_factory=dict[int | None, int])
     culprit: int | None = None
+    suspects: tuple[int, ...] = ()
     dying: bool = False
     die_by: float | None = None
-    hung_slot: int | None = None
+    is_hung: bool = False
     abort_by: float | None = None
     aborted_slot: int | None = None
     idle: tuple[int, ...] = ()
@@ -110,6 +113,16 @@ class HostRecord:
         self.is_local = placement_of(self.config.backend, self.config.placement).local
         self.is_hardware = ENVS.is_hardware(self.config.backend)
         self.slots = range(self.host.first_slot, self.host.first_slot + self.host.num_envs)
+
+    @property
+    def awaits_several(self) -> bool:
+        """Its worker executes the requests of several envs at the same time."""
+        return len(self.started) > 1 and any(env.is_awaitable for env in self.started)
+
+    @property
+    def blamed(self) -> tuple[int | None, ...]:
+        """The keys of `deaths` that the last death counts for."""
+        return self.suspects or (self.culprit,)
 
     def withdraw(self, entries: NDArray[np.int64]) -> list[int]:
         """Hold some requests no longer; return those that it has held."""

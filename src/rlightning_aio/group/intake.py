@@ -217,7 +217,9 @@ class Intake:
         if not outcome.resets:
             self._fail(owed, outcome.error_for)
             return
-        self._continuity.lose(others, outcome.cause, outcome.at_fault, from_checkpoint=True)
+        self._continuity.lose(
+            others, outcome.cause, outcome.at_fault, outcome.suspects, from_checkpoint=True
+        )
         # A replacement answers steps and resets, but not calls.
         calls = self._requests.numbering.awaits_value(owed)
         self._fail(owed[calls], outcome.error_for)

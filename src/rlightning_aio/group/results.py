@@ -129,6 +129,8 @@ class Results:
             info["worker_restarted"] = report.cause
             if report.at_fault is not None:
                 info["env_at_fault"] = report.at_fault
+            if report.suspects:
+                info["suspects"] = report.suspects
             if report.steps_lost is not None:
                 info["worker_resumed"] = report.steps_lost
         self.mark_lost(report.slot)

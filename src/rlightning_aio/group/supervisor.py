@@ -22,7 +22,7 @@ from rlightning_aio.group.conditions import DEATH
 from rlightning_aio.group.fault_messages import (
     CrashLog,
     cause_of,
-    culprit_of,
+    culprits_of,
     death_report,
     late_fault,
     start_fault,
@@ -98,6 +98,7 @@ class Replaced:
 
     Attributes:
         at_fault: the id of the env that the worker was executing; None if unknown.
+        suspects: ids; see `WorkerDied`.
     """
 
     host: Host
@@ -105,6 +106,7 @@ class Replaced:
     error_for: ErrorFor
     cause: str
     at_fault: str | None
+    suspects: tuple[str, ...]
     resets: bool
 
 
@@ -313,6 +315,7 @@ class Supervisor:
     def _on_not_built(self, record: HostRecord, slot: int, error: ErrorText) -> None:
         if self._lifetime.open:
             record.rebuild_error, record.culprit = record.rebuild_error or error, slot
+            record.suspects = ()
             self.detector.kill(record, dump=False)
             return
         # ConfigError keeps its type, because the config is wrong for every process.
@@ -432,14 +435,16 @@ class Supervisor:
             return None
         self._requests.lose_host(exited.host_id)
         resets = not record.is_hardware
-        return Replaced(record.host, owed, report.error, cause, at_fault, resets)
+        suspects = tuple(self._envs.env_ids[slot] for slot in record.suspects)
+        return Replaced(record.host, owed, report.error, cause, at_fault, suspects, resets)
 
     def _schedule_restart(self, record: HostRecord) -> None:
         """Restart immediately after the first death in a row, later after further ones."""
         now = self._clock()
         record.stage = Stage.DOWN
         record.start_by = None
-        record.restart_at = now + restart_pause(record.deaths[record.culprit])
+        in_a_row = max(record.deaths[slot] for slot in record.blamed)
+        record.restart_at = now + restart_pause(in_a_row)
         if record.held is None:
             record.held = []
         if record.restart_at <= now:
@@ -487,11 +492,14 @@ class Supervisor:
     ) -> tuple[DeathReport, str, bool]:
         """Return the report of a death, its cause, and True if it exceeds ``max_restarts``."""
         requests, config = self._requests, record.config
-        if record.stage is Stage.UP:
+        if record.stage is Stage.UP and not record.is_hung:
             # A replacement that fails to start counts against the env that made it necessary.
-            record.culprit = culprit_of(record, death, requests, owed)
+            found = culprits_of(record, death.requests, requests, owed)
+            record.culprit, record.suspects = found
         is_fault = record.aborted_slot is None  # Else the caller's wish, which counts for nothing.
-        deaths = record.deaths[record.culprit] = record.deaths.get(record.culprit, 0) + is_fault
+        for slot in record.blamed:
+            record.deaths[slot] = record.deaths.get(slot, 0) + is_fault
+        deaths = max(record.deaths[slot] for slot in record.blamed)
         self._note_deaths(True)
         cause = cause_of(record, death, requests)
         raises = config.on_worker_death == "raise"
@@ -509,7 +517,7 @@ class Supervisor:
             if record.is_hardware:
                 outcome += "; it moves nothing until you reset it"
         report = death_report(self._envs, record, replace(death, cause=cause), requests, outcome)
-        record.hung_slot = record.aborted_slot = record.rebuild_error = None
+        record.is_hung, record.aborted_slot, record.rebuild_error = False, None, None
         return report, cause, is_last
 
     def _give_up(self, record: HostRecord, refusal: ErrorFor) -> None:

@@ -35,6 +35,7 @@ from rlightning_aio.hosts.messages import ErrorText, Failed, NotBuilt, Raised, R
 from rlightning_aio.hosts.restart_pause import restart_pause
 from rlightning_aio.hosts.runner import disconnect_all
 from rlightning_aio.protocol.entries import Operation, answers_with_value, op_of, slot_of
+from rlightning_aio.protocol.entries import entry as entry_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable
@@ -96,7 +97,8 @@ class AwaitedEnvs:
         inline: see `EnvRunner`.
         post: gets every completion.
         done: gets the entries of requests whose results are all in their rows.
-        enter: gets an entry whenever the code of its env is about to run; None: nobody needs it.
+        enter: gets an entry whenever the code of its env is about to run, and 0 after that; None:
+            nobody needs it.
 
     Attributes:
         num_busy: how many envs execute a request now.
@@ -120,6 +122,7 @@ class AwaitedEnvs:
         self._inline = inline
         self._post = post
         self._done = done
+        self._enter = enter
         self._watch = partial(watched, report=self._report, enter=enter)
         self._loop: asyncio.AbstractEventLoop
         self._places: list[_Place] = []
@@ -186,6 +189,9 @@ class AwaitedEnvs:
     async def _build(self, place: _Place) -> BaseException | None:
         """Build an env for a place; return the error if that fails."""
         make: Any = partial(built_env, self._order, place.index, inline=self._inline)
+        if self._enter is not None:
+            entry = entry_of(0, self._first_slot + place.index, 0)
+            make = partial(_entered, make, self._enter, entry)
         env = self._new_env(place, make)
         try:
             error = await asyncio.shield(env.made)
@@ -489,6 +495,15 @@ class AwaitedEnvs:
         if for_good:
             place.fault = fault
         return Failed(self._host_id, place.entry, fault, for_good)
+
+
+def _entered(make: Callable[[], Any], enter: Callable[[int], object], entry: int) -> Any:
+    """Make an env, whose code runs meanwhile."""
+    enter(entry)
+    try:
+        return make()
+    finally:
+        enter(0)
 
 
 def _reraise(error: BaseException) -> NoReturn:

@@ -34,6 +34,7 @@ class AwaitedRunner(EnvRunner):
         reset_with: seed and options of the last reset, of this env or of the one before it.
     """
 
+    is_awaitable = True
     is_abandoned = False
     reset_with: tuple[Any, Any] = (None, None)
 

@@ -1,8 +1,9 @@
 """`Awaiting`: a worker's awaitable envs, all at once, on an event loop of the worker's own.
 
-The worker's channel wakes the loop. While envs have time limits, the worker says every now and
-then that its loop is alive: the trainer kills a worker whose loop an env blocks for longer than
-the limit. Requests that only wait too long are cancelled here (see `AwaitedEnvs`).
+The worker's channel wakes the loop. The worker says whose code runs, and that none does while all
+envs wait: if it dies, the trainer knows which env is at fault. While envs have time limits, it also
+says every now and then that its loop is alive: the trainer kills a worker whose loop an env blocks
+for longer than the limit. Requests that only wait too long are cancelled here (see `AwaitedEnvs`).
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ class Awaiting:
         runners: of its envs.
         report: takes the entries of requests whose results are all in their rows.
         send: sends a frame: its kind, a number, a payload.
-        enter: says that an env's code runs now, by an entry; None if nothing has a time limit.
+        enter: says that an env's code runs now, by an entry; 0: none does.
     """
 
     def __init__(
@@ -46,11 +47,10 @@ class Awaiting:
         runners: Sequence[EnvRunner],
         report: Callable[[int], None],
         send: Callable[[FrameKind, int, bytes], None],
-        enter: Callable[[int], None] | None,
+        enter: Callable[[int], None],
     ) -> None:
         self._send = send
         self._enter = enter
-        self._entered = 0
         self._envs = AwaitedEnvs(
             0,
             first_slot,
@@ -58,7 +58,7 @@ class Awaiting:
             inline=False,
             post=self._post,
             done=report,
-            enter=None if enter is None else self._note_entered,
+            enter=enter,
         )
         self._runners = cast("Sequence[AwaitedRunner]", runners)
         config = order.config
@@ -104,11 +104,10 @@ class Awaiting:
                 ended.set_result(None)
 
         def beat() -> None:
-            assert self._enter is not None
-            self._enter(self._entered)
+            self._enter(0)
             loop.call_later(self._beat_seconds, beat)
 
-        if self._enter is not None:
+        if self._beat_seconds:
             beat()
         loop.add_reader(channel, look)
         # uvloop has made it non-blocking; a reply that the socket can't hold waits for the trainer.
@@ -123,11 +122,6 @@ class Awaiting:
         finally:
             loop.remove_reader(channel)
         return await self._envs.close()
-
-    def _note_entered(self, entry: int) -> None:
-        self._entered = entry
-        assert self._enter is not None
-        self._enter(entry)
 
     def _post(self, completion: Completion) -> None:
         """Send a completion; what can't be pickled is an error of its request."""

@@ -96,7 +96,7 @@ def watched(
         entry: of the request.
         report: gets `entry` and the seconds of each turn longer than `LONG_TURN_SECONDS`; after
             `time_collector` without those of the garbage collector.
-        enter: gets `entry` before each turn.
+        enter: gets `entry` before each turn, and 0 after it.
     """
     send, throw, clock = answering.send, answering.throw, time.monotonic
     error: BaseException | None = None
@@ -109,6 +109,8 @@ def watched(
         except StopIteration as stop:
             return stop.value
         finally:
+            if enter is not None:
+                enter(0)
             held = clock() - began - (_collector.seconds - collected)
             if held > LONG_TURN_SECONDS:
                 report(entry, held)

@@ -148,12 +148,17 @@ class WorkerPlace:
 
 @dataclass(frozen=True)
 class EnvStarted:
-    """The description of an env that was built."""
+    """The description of an env that was built.
+
+    Attributes:
+        is_awaitable: its host executes its requests together with those of others.
+    """
 
     meta: EnvMeta
     layout: RowLayout
     reads_extras: bool
     transforms_actions: bool
+    is_awaitable: bool = False
 
 
 @dataclass(frozen=True)
@@ -165,7 +170,8 @@ class Death:
         exit_code: negative for a signal; None if unknown.
         stderr_tail: its last lines on stderr.
         requests: entries, beginning with those that it may have been executing; they may be
-            answered already, or be 0.
+            answered already, or be 0. Where envs are awaitable, the first is the one whose code
+            ran, or 0 if all envs waited.
         refused: the system did not let it start.
     """
 

@@ -10,7 +10,7 @@ import contextlib
 import random
 import time
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -94,9 +94,12 @@ class EnvRunner:
         step: steps with the action in the row.
         begin_step: starts a step that the simulator computes by itself, and returns a function
             that ends it. None if the env has no such step.
+        is_awaitable: its requests are awaited, together with those of other envs.
 
     Raises what `recording.Camera` raises.
     """
+
+    is_awaitable: ClassVar[bool] = False
 
     def __init__(
         self, env: BaseEnv, *, inline: bool = False, video: VideoConfig | None = None
@@ -118,7 +121,9 @@ class EnvRunner:
     def started(self) -> EnvStarted:
         """Return the description of the env that the trainer gets."""
         any_action = self.env.transforms_actions or has_preprocess_fn(self.env)
-        return EnvStarted(self.meta, self.layout, reads_extras(self.env), any_action)
+        return EnvStarted(
+            self.meta, self.layout, reads_extras(self.env), any_action, self.is_awaitable
+        )
 
     @property
     def layout(self) -> RowLayout:

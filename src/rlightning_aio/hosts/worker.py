@@ -121,7 +121,7 @@ class Worker:
             self._runners,
             lambda entry: rings.report(entry, ring),
             send,
-            (lambda entry: rings.begin(entry, time.monotonic_ns())) if self._timed else None,
+            lambda entry: rings.begin(entry, time.monotonic_ns()),
         )
         self._submit, self._abort_awaited = awaiting.submit, awaiting.abort
         try:

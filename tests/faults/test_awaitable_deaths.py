@@ -1,0 +1,146 @@
+"""A worker of several awaitable envs that dies: the one whose code ran is at fault, or any."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import time
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from faults.driven import Driven, kill
+from faults.drivers import on_one_driver
+
+import rlightning_aio as rl
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    Start: TypeAlias = Callable[..., Driven]
+
+STEP, WAIT, DIE, BLOCK, LATER = range(5)
+
+
+class Waits:
+    """Its action says what a step does.
+
+    Attributes:
+        waiting: how many steps wait for ever in this process.
+    """
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+    action_space = gym.spaces.Discrete(5)
+    waiting: ClassVar[int] = 0
+
+    async def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        del seed, options
+        return np.zeros(1), {}
+
+    async def step(self, action: Any) -> Any:
+        await asyncio.sleep(0)
+        if action == DIE:
+            os._exit(3)
+        elif action == BLOCK:
+            time.sleep(3600)  # noqa: ASYNC251  # As it should not.
+        elif action in (WAIT, LATER):
+            Waits.waiting += 1
+            if action == LATER:  # The end comes out of nobody's code, as from a thread.
+                asyncio.get_running_loop().call_soon(os._exit, 3)
+            await asyncio.Event().wait()
+        return np.ones(1), 1.0, False, False, {}
+
+    def num_waiting(self) -> int:
+        return Waits.waiting
+
+
+def waits(num_workers: int = 4, **fields: Any) -> dict[str, Any]:
+    config = {"name": "w", "make_env": Waits, "num_workers": num_workers}
+    return {**config, "envs_per_process": num_workers, **fields}
+
+
+def steps(actions: dict[str, int]) -> rl.BatchedData:
+    values = [rl.PolicyResponse(env_id, action) for env_id, action in actions.items()]
+    return rl.BatchedData([*actions], values)
+
+
+def let_wait(group: Driven, *env_ids: str) -> None:
+    """Have steps of these envs wait for ever; return when all of them do."""
+    group.step_async(steps(dict.fromkeys(env_ids, WAIT)))
+    while group.call("w-3", "num_waiting") < len(env_ids):
+        pass
+
+
+def results_of(group: Driven, count: int) -> dict[str, Any]:
+    """Collect as many results."""
+    found: dict[str, Any] = {}
+    while len(found) < count:
+        found.update(group.collect_async()[0].items())
+    return found
+
+
+def test_the_env_whose_code_ran_is_at_fault(start: Start) -> None:
+    """Not those that waited longer; all that owed a reply have lost their episodes."""
+    group = start(waits())
+    let_wait(group, "w-0", "w-1")
+    group.step_async(steps({"w-2": DIE}))
+    found = results_of(group, 3)
+    assert {ret.info["env_at_fault"] for ret in found.values()} == {"w-2"}
+    assert not any("suspects" in ret.info for ret in found.values())
+    found = group.step(steps(dict.fromkeys(group.group.env_ids, STEP)))[0].values()
+    assert ["worker_restarted" in ret.info for ret in found] == [False, False, False, True]
+
+
+def test_envs_that_only_waited_are_suspects(start: Start) -> None:
+    """No one of them is named; the one that owed nothing is no suspect, and learns who is."""
+    group = start(waits())
+    let_wait(group, "w-0", "w-2")
+    kill(group.group.get_workers()[0]["pid"])
+    found = results_of(group, 2)
+    found.update(group.step(steps({"w-1": STEP}))[0].items())
+    assert {*found} == {"w-0", "w-1", "w-2"}
+    for ret in found.values():
+        assert ret.info["worker_restarted"].startswith("was killed by SIGKILL")
+        assert "env_at_fault" not in ret.info
+        assert ret.info["suspects"] == ("w-0", "w-2")
+
+
+@on_one_driver
+@pytest.mark.parametrize("dies", [DIE, LATER])
+def test_the_error_of_a_worker_that_is_not_replaced_names_them(start: Start, dies: int) -> None:
+    """It is one error for all that owed a reply, which are busy until it is raised."""
+    group = start(waits(8, envs_per_process=4, on_worker_death="raise"))
+    let_wait(group, "w-0", "w-1")
+    group.step_async(steps({"w-2": dies}))
+    while not group.group.get_workers()[0]["given_up"]:
+        group.step(steps({"w-4": STEP}))
+    for env_id in ("w-0", "w-1", "w-2"):
+        with pytest.raises(rl.EnvBusy, match=f"'{env_id}'.*error that was not collected"):
+            group.step_async(steps({env_id: STEP}))
+    assert group.group.pending == ["w-0", "w-1", "w-2"]
+    with pytest.raises(rl.WorkerDied, match="exited with code 3") as caught:
+        group.collect_async()
+    error = caught.value
+    assert sorted(error.env_ids) == ["w-0", "w-1", "w-2"]
+    if dies == DIE:
+        assert (error.env_id, error.suspects) == ("w-2", ())
+    else:
+        assert (error.env_id, sorted(error.suspects)) == ("w-0", ["w-0", "w-1", "w-2"])
+        assert "no env's code was running" in str(error)
+    assert group.group.pending == []
+    with pytest.raises(rl.WorkerDied, match="nothing was sent to w-1") as refused:
+        group.step_async(steps({"w-1": STEP}))
+    assert refused.value.suspects == error.suspects
+    assert error.env_id == refused.value.env_id
+
+
+@on_one_driver
+def test_the_env_that_blocks_the_event_loop_has_hung(start: Start) -> None:
+    """Whoever was asked before."""
+    group = start(waits(step_timeout=0.5, on_worker_death="raise"))
+    with pytest.raises(
+        rl.EnvHung, match=r"env 'w-1'.* took longer than 0\.5 s for a step"
+    ) as caught:
+        group.step(steps({"w-0": STEP, "w-1": BLOCK, "w-2": STEP}))
+    assert (caught.value.env_id, caught.value.suspects) == ("w-1", ())
