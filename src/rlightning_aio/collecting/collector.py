@@ -188,9 +188,8 @@ class Collector(Generic[G, R]):
             RuntimeError: the group has no open `auto_reset` context, or a call is in progress.
             ValueError, TypeError: the policy's answer doesn't fit; envs differ, and need a policy
                 for each entry; or these envs can't fill a block.
-            EnvRaised, WorkerDied, EnvHung: as for `EnvGroup.collect_async`, the answer to one
-                request. An env that raised takes part again in the next call, and one whose worker
-                is not replaced doesn't.
+            EnvRaised, WorkerDied, EnvHung: as for `EnvGroup.collect_async`. An env that raised
+                takes part again in the next call, and one whose worker is not replaced doesn't.
             RLightningError: a robot's or a client's env has raised and was not reset since.
             BadAction: the policy's actions don't fit the action space; nothing was sent.
         """

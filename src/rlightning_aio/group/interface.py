@@ -130,8 +130,9 @@ class GroupInterface(Facade):
             ValueError: a time isn't above 0, a number isn't above 0, or `min_results` is above
                 `max_results`.
             TimeoutError: `deadline` has passed; the next call returns the results.
-            EnvRaised, WorkerDied, EnvHung: the answer to one request; the results of others
-                stay for the next call.
+            EnvRaised: the answer to the request of its `env_id`; results and errors of others stay
+                for the next call.
+            WorkerDied, EnvHung: the answer to the requests of all its `env_ids`; likewise.
             GroupClosed: the group was not initialised, or is closed.
             RLightningError: another call is collecting.
         """
@@ -153,7 +154,7 @@ class GroupInterface(Facade):
         The episodes are over: reset the envs, or step them, which resets them first and marks the
         result as after a restart. Robots move only when they are reset. Another call that waits
         for one of the envs raises `EnvAborted`; `collect_async` waits for the rest. Errors that
-        were not collected stay. Cancelled, it ends the requests all the same.
+        were not collected stay for the next collect. Cancelled, it ends the requests all the same.
 
         Raises:
             UnknownEnv: no env of this group has that id.
