@@ -13,13 +13,13 @@ stable = not sysconfig.get_config_var("Py_GIL_DISABLED")
 setup(
     ext_modules=[
         Extension(
-            f"rlightning_aio.{package}.{name}",
+            f"rlightning_aio.{package.replace('/', '.')}.{name}",
             [f"src/rlightning_aio/{package}/{name}.c"],
             extra_compile_args=["-std=c11"],
             py_limited_api=stable,
             optional=True,
         )
-        for package, name in [("protocol", "_kernel"), ("envs", "_mujoco_forces")]
+        for package, name in [("protocol", "_kernel"), ("envs/mujoco", "_mujoco_forces")]
     ],
     options={"bdist_wheel": {"py_limited_api": "cp311"}} if stable else {},
 )

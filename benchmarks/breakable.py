@@ -19,7 +19,7 @@ import numpy as np
 from gymnasium.spaces import Box
 
 from rlightning_aio import ENVS
-from rlightning_aio.envs.gymnasium import GymnasiumEnv
+from rlightning_aio.envs.simulators.gymnasium import GymnasiumEnv
 
 INDEX, PID, EPISODE, STEPS, TOKEN = range(5)
 NOTHING, RAISE, EXIT, HANG, KILL, RAISE_ODDLY, WAIT_FOR_GATE = range(7)

@@ -84,7 +84,7 @@ def busy(num_workers: int, envs_each: int, episodes: int, min_results: int) -> N
 
 def task_env(task: str) -> Any:
     """The env of the backend, on its own."""
-    from rlightning_aio.envs.metaworld import MetaworldTask, _Options
+    from rlightning_aio.envs.simulators.metaworld import MetaworldTask, _Options
 
     return MetaworldTask(task, _Options())
 

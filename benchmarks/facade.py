@@ -16,8 +16,8 @@ from harness import Question, Target, main
 from round_trip import SyncCalls, median_us
 
 if TYPE_CHECKING:
-    from rlightning_aio.group.wait import Procedure
-    from rlightning_aio.hosts.base import Source
+    from rlightning_aio._core.group.drivers.wait import Procedure
+    from rlightning_aio._core.hosts.base import Source
 
 WORK = Work(no_work.NO_WORK, num_envs=1, modules=("no_work",))
 
@@ -70,8 +70,8 @@ class Raw(Stepped):
     package = "rlightning_aio"
 
     def setup(self) -> None:
-        from rlightning_aio.group.build import assemble
-        from rlightning_aio.group.plan import plan_group
+        from rlightning_aio._core.group.setup.build import assemble
+        from rlightning_aio._core.group.setup.plan import plan_group
 
         self._driver = RawDriver()
         config = group_config(self.work, "auto")

@@ -26,7 +26,7 @@ from harness import Contender, Question, Target, main
 import rlightning_aio
 from rlightning_aio import sync
 from rlightning_aio.config import EnvConfig
-from rlightning_aio.envs.gymnasium import GymnasiumEnv
+from rlightning_aio.envs.simulators.gymnasium import GymnasiumEnv
 from rlightning_aio.protocol.net.wire import ClientResult, Step, Writer
 from rlightning_aio.remote import RemoteEnvClient, make_keys
 from rlightning_aio.remote.keys import read_client_keys, read_server_keys

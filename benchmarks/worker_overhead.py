@@ -18,10 +18,10 @@ from typing import Any
 import no_work
 import numpy as np
 
+from rlightning_aio._core.hosts.process.worker import Worker
+from rlightning_aio._core.hosts.running.runner import EnvRunner
 from rlightning_aio.config import EnvConfig
-from rlightning_aio.envs.gymnasium import GymnasiumEnv
-from rlightning_aio.hosts.runner import EnvRunner
-from rlightning_aio.hosts.worker import Worker
+from rlightning_aio.envs.simulators.gymnasium import GymnasiumEnv
 from rlightning_aio.protocol import kernel
 from rlightning_aio.protocol.entries import Operation, entry
 from rlightning_aio.protocol.slab import Slab

@@ -31,7 +31,7 @@ uvloop.new_event_loop().close()
 # For loops that tests make themselves; pytest-asyncio has an option for its own loops.
 os.environ["PYTHONASYNCIODEBUG"] = "1"
 
-# Every group that a test builds checks what happens to its requests (`group/checked.py`).
+# Every group that a test builds checks what happens to its requests: `group/engine/checked.py`.
 os.environ["RLIGHTNING_AIO_DEBUG"] = "1"
 
 # The tests start a thousand interpreters; they must not compile all modules again.

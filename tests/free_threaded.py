@@ -19,8 +19,8 @@ MODULES = (
     "rlightning_aio.remote",
     "rlightning_aio.sync",
     "rlightning_aio.vector",
-    "rlightning_aio.hosts.worker",
-    "rlightning_aio.envs.gymnasium",
+    "rlightning_aio._core.hosts.process.worker",
+    "rlightning_aio.envs.simulators.gymnasium",
 )
 
 

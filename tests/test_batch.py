@@ -15,6 +15,7 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rlightning_aio._core.group.state.env_table import EnvTable
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.batch.columns import ResultColumns
 from rlightning_aio.batch.contents import (
@@ -28,7 +29,6 @@ from rlightning_aio.batch.infos import vector_infos
 from rlightning_aio.batch.sent import UNASKED, columns_of_values, copied
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.errors import BadAction
-from rlightning_aio.group.env_table import EnvTable
 from rlightning_aio.protocol.columns import index
 from rlightning_aio.protocol.info import INFO_BYTES, PICKLED, InfoSchema, InfoSchemas, InfoWriter
 from rlightning_aio.protocol.slab import IS_RESET, OVER, TERMINATED, TRUNCATED

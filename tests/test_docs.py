@@ -14,8 +14,8 @@ import pytest
 from run_python import output_of
 
 from rlightning_aio import EnvGroup, build_env_group
+from rlightning_aio._core.hosts.env_server.settings import ServerSettings
 from rlightning_aio.config import VideoConfig
-from rlightning_aio.hosts.server_settings import ServerSettings
 
 DOCS = Path(__file__).parent.parent / "docs"
 PROGRAMS = Path(__file__).with_name("programs.py")

@@ -17,7 +17,7 @@ DOCS = ROOT / "docs"
 PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md"), *(ROOT / "benchmarks").glob("*.md")])
 PACKAGE = ROOT / "src" / "rlightning_aio"
 # Internal packages; other modules export what users need.
-INTERNAL = {"batch", "cli", "config", "envs", "group", "hosts", "protocol", "registry", "sharing"}
+INTERNAL = {"_core", "batch", "cli", "config", "envs", "protocol", "registry", "sharing"}
 INTERNAL |= {"files", "json_text", "piper", "sealing", "types", "video", "__init__", "__main__"}
 # "The words" of ARCHITECTURE.md.
 WORDS = {
@@ -95,7 +95,7 @@ def test_names_in_pages_on_the_code_exist(page: str) -> None:
     """Files, and methods as ``Class.method``."""
     spans = re.findall(r"`([^`\n]+)`", prose(ROOT / page))
     known = members()
-    roots = (ROOT, PACKAGE)
+    roots = (ROOT, PACKAGE, PACKAGE / "_core")
     lost = [
         span
         for span in spans
@@ -115,13 +115,17 @@ def imports_of(package: str) -> set[str]:
     count as one.
     """
     found: set[str] = set()
-    files = [*(PACKAGE / package).rglob("*.py"), *PACKAGE.glob(f"{package}.py")]
+    rooms = (PACKAGE / package, PACKAGE / "_core" / package)
+    files = [
+        *PACKAGE.glob(f"{package}.py"),
+        *(path for room in rooms for path in room.rglob("*.py")),
+    ]
     for path in files:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(
                 f"{PACKAGE.name}."
             ):
-                top = (node.module or "").split(".")[1]
+                top = (node.module or "").replace("._core.", ".").split(".")[1]
                 found.add("the words" if top in WORDS else top)
     return found - {package}
 

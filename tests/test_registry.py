@@ -12,7 +12,7 @@ import pytest
 
 from rlightning_aio import registry
 from rlightning_aio.envs.base import BaseEnv
-from rlightning_aio.envs.gymnasium import GymnasiumEnv, MujocoEnv
+from rlightning_aio.envs.simulators.gymnasium import GymnasiumEnv, MujocoEnv
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.registry import BACKENDS, ENTRY_POINT_GROUP, ROWS_GROUP, Backend, Registry
 

@@ -22,7 +22,7 @@ from websockets.asyncio.server import serve
 from websockets.frames import Frame, Opcode
 
 import rlightning_aio as rl
-from rlightning_aio.envs.openenv_session import get_json, post_json
+from rlightning_aio.envs.openenv.session import get_json, post_json
 from rlightning_aio.serving import OpenEnvServer
 from rlightning_aio.spaces import Anything
 

@@ -9,6 +9,13 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from rlightning_aio._core.group.api.aio import (
+        EnvGroup,
+        EnvHandle,
+        ServerHandle,
+        build_env_group,
+        run,
+    )
     from rlightning_aio.batch import BatchedData
     from rlightning_aio.config import EnvConfig, load_config
     from rlightning_aio.envs.base import BaseEnv
@@ -28,7 +35,6 @@ if TYPE_CHECKING:
         UnknownEnv,
         WorkerDied,
     )
-    from rlightning_aio.group.aio import EnvGroup, EnvHandle, ServerHandle, build_env_group, run
     from rlightning_aio.registry import ENVS
     from rlightning_aio.types import (
         EnvMeta,
@@ -61,7 +67,7 @@ _HOMES = {
         "UnknownEnv",
         "WorkerDied",
     ),
-    "group.aio": ("EnvGroup", "EnvHandle", "ServerHandle", "build_env_group", "run"),
+    "_core.group.api.aio": ("EnvGroup", "EnvHandle", "ServerHandle", "build_env_group", "run"),
     "registry": ("ENVS",),
     "types": (
         "EnvMeta",

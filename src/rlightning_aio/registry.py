@@ -13,7 +13,7 @@ import importlib
 import importlib.util
 from dataclasses import dataclass, field
 from functools import cache, partial
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar, cast
 
 from rlightning_aio.errors import ConfigError
 
@@ -99,42 +99,44 @@ ISAAC_LAB = (
     "pip install --ignore-requires-python --no-deps isaaclab==3.0.0"
 )
 
+_SIMULATORS: Final = "rlightning_aio.envs.simulators"
+
 # fmt: off
 BACKENDS: dict[str, Backend] = {
     backend.name: backend
     for backend in (
-        Backend("mujoco", "rlightning_aio.envs.gymnasium:MujocoEnv", "mujoco", "mujoco",
+        Backend("mujoco", f"{_SIMULATORS}.gymnasium:MujocoEnv", "mujoco", "mujoco",
                 cpu_bound=True, vectorized=True,
-                preload=("rlightning_aio.envs.gymnasium", "gymnasium.envs.mujoco")),
-        Backend("gymnasium", "rlightning_aio.envs.gymnasium:GymnasiumEnv", "gymnasium",
+                preload=(f"{_SIMULATORS}.gymnasium", "gymnasium.envs.mujoco")),
+        Backend("gymnasium", f"{_SIMULATORS}.gymnasium:GymnasiumEnv", "gymnasium",
                 "gymnasium", cpu_bound=True, vectorized=True,
-                preload=("rlightning_aio.envs.gymnasium",)),
-        Backend("callable", "rlightning_aio.envs.callable:env_of_callable", "gymnasium",
+                preload=(f"{_SIMULATORS}.gymnasium",)),
+        Backend("callable", f"{_SIMULATORS}.callable:env_of_callable", "gymnasium",
                 "gymnasium", cpu_bound=True, vectorized=True,
-                preload=("rlightning_aio.envs.callable",)),
-        Backend("env_server", "rlightning_aio.hosts.env_server:EnvServerHost", "zmq", "pyzmq",
-                vectorized=True),
-        Backend("ale", "rlightning_aio.envs.ale:ALEEnv", "ale_py", "ale-py", extra="ale",
-                cpu_bound=True, vectorized=True, preload=("rlightning_aio.envs.ale",)),
-        Backend("pettingzoo", "rlightning_aio.envs.pettingzoo:PettingZooEnv", "pettingzoo",
+                preload=(f"{_SIMULATORS}.callable",)),
+        Backend("env_server", "rlightning_aio._core.hosts.env_server.host:EnvServerHost", "zmq",
+                "pyzmq", vectorized=True),
+        Backend("ale", f"{_SIMULATORS}.ale:ALEEnv", "ale_py", "ale-py", extra="ale",
+                cpu_bound=True, vectorized=True, preload=(f"{_SIMULATORS}.ale",)),
+        Backend("pettingzoo", f"{_SIMULATORS}.pettingzoo:PettingZooEnv", "pettingzoo",
                 "pettingzoo", extra="pettingzoo", cpu_bound=True,
-                preload=("rlightning_aio.envs.pettingzoo",)),
-        Backend("envpool", "rlightning_aio.envs.envpool:EnvPoolEnv", "envpool", "envpool",
-                extra="envpool", vectorized=True, preload=("rlightning_aio.envs.envpool",)),
-        Backend("maniskill", "rlightning_aio.envs.maniskill:ManiskillEnv", "mani_skill",
+                preload=(f"{_SIMULATORS}.pettingzoo",)),
+        Backend("envpool", f"{_SIMULATORS}.envpool:EnvPoolEnv", "envpool", "envpool",
+                extra="envpool", vectorized=True, preload=(f"{_SIMULATORS}.envpool",)),
+        Backend("maniskill", f"{_SIMULATORS}.maniskill:ManiskillEnv", "mani_skill",
                 "mani-skill", extra="maniskill", vectorized=True,
-                preload=("rlightning_aio.envs.maniskill",)),
-        Backend("isaac_manager_based", "rlightning_aio.envs.isaac:IsaacManagerBasedEnv",
+                preload=(f"{_SIMULATORS}.maniskill",)),
+        Backend("isaac_manager_based", f"{_SIMULATORS}.isaac:IsaacManagerBasedEnv",
                 "isaaclab", "isaaclab", extra="isaac", vectorized=True, own_command=ISAAC_LAB),
-        Backend("isaac_marl", "rlightning_aio.envs.isaac:IsaacMarlEnv",
+        Backend("isaac_marl", f"{_SIMULATORS}.isaac:IsaacMarlEnv",
                 "isaaclab", "isaaclab", extra="isaac", vectorized=True, own_command=ISAAC_LAB),
-        Backend("metaworld", "rlightning_aio.envs.metaworld:MetaworldEnv", "metaworld", "metaworld",
-                extra="metaworld", cpu_bound=True, preload=("rlightning_aio.envs.metaworld",)),
-        Backend("pusht", "rlightning_aio.envs.lerobot_tasks:PushTEnv", "gym_pusht", "gym-pusht",
-                extra="pusht", cpu_bound=True, preload=("rlightning_aio.envs.lerobot_tasks",)),
-        Backend("aloha", "rlightning_aio.envs.lerobot_tasks:AlohaEnv", "gym_aloha", "gym-aloha",
-                extra="aloha", cpu_bound=True, preload=("rlightning_aio.envs.lerobot_tasks",)),
-        Backend("openenv", "rlightning_aio.envs.openenv:OpenEnv", "websockets", "websockets",
+        Backend("metaworld", f"{_SIMULATORS}.metaworld:MetaworldEnv", "metaworld", "metaworld",
+                extra="metaworld", cpu_bound=True, preload=(f"{_SIMULATORS}.metaworld",)),
+        Backend("pusht", f"{_SIMULATORS}.lerobot_tasks:PushTEnv", "gym_pusht", "gym-pusht",
+                extra="pusht", cpu_bound=True, preload=(f"{_SIMULATORS}.lerobot_tasks",)),
+        Backend("aloha", f"{_SIMULATORS}.lerobot_tasks:AlohaEnv", "gym_aloha", "gym-aloha",
+                extra="aloha", cpu_bound=True, preload=(f"{_SIMULATORS}.lerobot_tasks",)),
+        Backend("openenv", "rlightning_aio.envs.openenv.env:OpenEnv", "websockets", "websockets",
                 extra="openenv", awaitable=True),
     )
 }
@@ -180,13 +182,13 @@ _NOT_ON_LOOP = "it limits the envs on the trainer's event loop (placement: loop)
 
 PLACEMENTS: dict[str, Placement] = {
     "process": Placement(
-        "rlightning_aio.hosts.process:ProcessHost",
+        "rlightning_aio._core.hosts.process.host:ProcessHost",
         spreads=True,
         refuses={"ray_options": _NOT_RAYS, "max_concurrency": _NOT_ON_LOOP},
         awaits="also",
     ),
     "loop": Placement(
-        "rlightning_aio.hosts.loop:LoopHost",
+        "rlightning_aio._core.hosts.here.loop:LoopHost",
         spreads=False,
         refuses={
             "snapshot_every": "an env whose step takes too long is rebuilt and reset; "
@@ -200,7 +202,7 @@ PLACEMENTS: dict[str, Placement] = {
         awaits="only",
     ),
     "inline": Placement(
-        "rlightning_aio.hosts.inline:InlineHost",
+        "rlightning_aio._core.hosts.here.inline:InlineHost",
         spreads=False,
         refuses={
             "step_timeout": _NO_LIMIT,
@@ -219,7 +221,7 @@ PLACEMENTS: dict[str, Placement] = {
         },
     ),
     "split": Placement(
-        "rlightning_aio.hosts.process:ProcessHost",
+        "rlightning_aio._core.hosts.process.host:ProcessHost",
         spreads=True,
         refuses={
             "step_timeout": _NO_LIMIT,
@@ -234,7 +236,7 @@ PLACEMENTS: dict[str, Placement] = {
         own_share=True,
     ),
     "ray": Placement(
-        "rlightning_aio.hosts.ray_host:RayHost",
+        "rlightning_aio._core.hosts.ray.host:RayHost",
         spreads=True,
         refuses={
             "interpreter": "Ray starts the actors; ray_options.runtime_env may name another "
@@ -252,7 +254,7 @@ _PLACED_BY_BACKEND: dict[str, Placement] = {
         BACKENDS["env_server"].target,
         spreads=False,
         max_members=1024,  # Twice the limit on clients that are connected at a time.
-        check="rlightning_aio.hosts.server_settings:server_settings",
+        check="rlightning_aio._core.hosts.env_server.settings:server_settings",
         refuses={
             "num_workers": "an env_server is one env with as many clients as connect; "
             "env_kwargs.min_clients is the number for which a reset waits",

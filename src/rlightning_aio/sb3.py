@@ -18,8 +18,8 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 
 from rlightning_aio.batch import BatchedData
-from rlightning_aio.envs.gymnasium import spec_of
-from rlightning_aio.envs.sub_envs import adapted
+from rlightning_aio.envs.simulators.gymnasium import spec_of
+from rlightning_aio.envs.sub_envs.sub_envs import adapted
 from rlightning_aio.errors import BadAction, ConfigError
 from rlightning_aio.protocol.columns import index
 from rlightning_aio.sync import EnvGroup, build_env_group
@@ -56,7 +56,7 @@ def make_vec_env(
 ) -> Any:
     """Make monitored envs of one task; see `stable_baselines3.common.env_util.make_vec_env`.
 
-    Envs of a MuJoCo task that `rlightning_aio.envs.mujoco_batch` supports are stepped together, in
+    Envs of a MuJoCo task that `rlightning_aio.envs.mujoco.batch` supports are stepped together, in
     threads of this process, inside a `VecMonitor`. Envs of any other task, and envs that need a
     wrapper or a file each, are separate, each in a `Monitor`.
 

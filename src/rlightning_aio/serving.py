@@ -26,7 +26,7 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Response
 
-from rlightning_aio.envs.openenv_session import keep_alive_by_system
+from rlightning_aio.envs.openenv.session import keep_alive_by_system
 from rlightning_aio.envs.post_connection import PostConnection
 from rlightning_aio.errors import ConfigError, RLightningError
 from rlightning_aio.json_text import json_of
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from websockets.asyncio.server import Server, ServerConnection
     from websockets.http11 import Request
 
-    from rlightning_aio.group.aio import EnvGroup, EnvHandle
+    from rlightning_aio._core.group.api.aio import EnvGroup, EnvHandle
 
 __all__ = ["OpenEnvServer"]
 

@@ -11,17 +11,17 @@ from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from rlightning_aio._core.hosts.messages import RECORD_VIDEO
 from rlightning_aio.collecting.procedure import run
 from rlightning_aio.config import VideoConfig
 from rlightning_aio.errors import ConfigError, RLightningError
-from rlightning_aio.hosts.messages import RECORD_VIDEO
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from rlightning_aio._core.group.api.aio import EnvGroup as AsyncEnvGroup
+    from rlightning_aio._core.group.api.sync import EnvGroup as SyncEnvGroup
     from rlightning_aio.collecting.procedure import Procedure
-    from rlightning_aio.group.aio import EnvGroup as AsyncEnvGroup
-    from rlightning_aio.group.sync import EnvGroup as SyncEnvGroup
 
 __all__ = ["record_video"]
 

@@ -19,7 +19,7 @@ from patience import HANG
 from timelines import Seen
 
 from rlightning_aio import EnvConfig, load_config
-from rlightning_aio.cli import bench, measuring, settings, tune
+from rlightning_aio.cli.bench import bench, measuring, settings, tune
 from rlightning_aio.config import moved
 from rlightning_aio.sharing import num_cores
 

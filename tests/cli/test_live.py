@@ -9,11 +9,11 @@ from typing import Any, cast
 import pytest
 from rich.console import Console
 
-from rlightning_aio.cli import live
-from rlightning_aio.cli.contender_table import print_contenders
-from rlightning_aio.cli.live import Display
-from rlightning_aio.cli.measuring import Contender, Costs, Round, Rule
-from rlightning_aio.cli.settings import possible_settings
+from rlightning_aio.cli.bench.contender_table import print_contenders
+from rlightning_aio.cli.bench.measuring import Contender, Costs, Round, Rule
+from rlightning_aio.cli.bench.settings import possible_settings
+from rlightning_aio.cli.playing import live
+from rlightning_aio.cli.playing.live import Display
 from rlightning_aio.config import EnvConfig
 
 

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rlightning_aio import BatchedData, EnvRet, MultiAgentEnvRet
-from rlightning_aio.cli.policies import RandomPolicy
+from rlightning_aio.cli.policies.policies import RandomPolicy
 from rlightning_aio.errors import ConfigError
 
 shapes = st.lists(st.integers(1, 3), min_size=1, max_size=2).map(tuple)

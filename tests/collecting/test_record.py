@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 
 import rlightning_aio as rl
 from rlightning_aio import sync
+from rlightning_aio._core.group.api.sync import SyncDriver
 from rlightning_aio.collecting import Collector, Record, RecordedGroup, ReplayedGroup
 from rlightning_aio.errors import EnvFault, EnvRaised, ReplayDiverged
-from rlightning_aio.group.sync import SyncDriver
 
 if TYPE_CHECKING:
     from rlightning_aio.batch import BatchedData

@@ -17,7 +17,7 @@ from rlightning_aio.types import PolicyResponse
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from rlightning_aio.envs.ale import ALEEnv
+    from rlightning_aio.envs.simulators.ale import ALEEnv
 
 pytest.importorskip("ale_py")
 import gymnasium as gym
@@ -31,7 +31,7 @@ def entry(task: str = "ALE/Pong-v5", num_envs: int = 1, **fields: Any) -> EnvCon
 
 
 def make(config: EnvConfig) -> ALEEnv:
-    from rlightning_aio.envs.ale import ALEEnv
+    from rlightning_aio.envs.simulators.ale import ALEEnv
 
     return ALEEnv(config)
 

@@ -18,7 +18,7 @@ from rlightning_aio.types import PolicyResponse
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from rlightning_aio.envs.envpool import EnvPoolEnv
+    from rlightning_aio.envs.simulators.envpool import EnvPoolEnv
 
 envpool: Any = pytest.importorskip("envpool")
 
@@ -34,7 +34,7 @@ def entry(task: str = "CartPole-v1", num_envs: int = 4, **fields: Any) -> EnvCon
 
 
 def make(*args: Any, **fields: Any) -> EnvPoolEnv:
-    from rlightning_aio.envs.envpool import EnvPoolEnv
+    from rlightning_aio.envs.simulators.envpool import EnvPoolEnv
 
     return EnvPoolEnv(entry(*args, **fields))
 

@@ -11,7 +11,7 @@ from envs.bare import gymnasium_outcomes
 from envs.group_contract import GroupContract
 
 from rlightning_aio.config import EnvConfig
-from rlightning_aio.envs.gymnasium import GymnasiumEnv
+from rlightning_aio.envs.simulators.gymnasium import GymnasiumEnv
 from rlightning_aio.types import PolicyResponse
 
 if TYPE_CHECKING:

@@ -59,7 +59,7 @@ def make() -> Iterator[Any]:
     live: list[BaseEnv] = []
 
     def build(task: str = MANAGER_BASED, backend: str = "isaac_manager_based", **fields: Any):
-        from rlightning_aio.envs.isaac import IsaacManagerBasedEnv, IsaacMarlEnv
+        from rlightning_aio.envs.simulators.isaac import IsaacManagerBasedEnv, IsaacMarlEnv
 
         close()
         env_class = IsaacMarlEnv if backend == "isaac_marl" else IsaacManagerBasedEnv
@@ -244,7 +244,7 @@ def test_torch_and_numpy_actions_have_the_same_effect(make: Any) -> None:
 
 def test_a_second_live_env_is_refused(make: Any) -> None:
     """Isaac Lab has one env in a process: the error names the first, and closing it helps."""
-    from rlightning_aio.envs.isaac import IsaacManagerBasedEnv
+    from rlightning_aio.envs.simulators.isaac import IsaacManagerBasedEnv
 
     first = make(num_envs=2)
     second = EnvConfig(

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from rlightning_aio.config import EnvConfig
-from rlightning_aio.envs import isaac_task
+from rlightning_aio.envs.simulators import isaac_task
 from rlightning_aio.errors import ConfigError
 
 ROOT = Path(__file__).parents[2]

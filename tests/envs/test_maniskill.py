@@ -17,14 +17,14 @@ from envs.group_contract import GroupContract
 from rlightning_aio import sync
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.envs.contract import Outcome, same
-from rlightning_aio.envs.vulkan import render_device_is_usable
+from rlightning_aio.envs.simulators.vulkan import render_device_is_usable
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.types import PolicyResponse
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from rlightning_aio.envs.maniskill import ManiskillEnv
+    from rlightning_aio.envs.simulators.maniskill import ManiskillEnv
     from rlightning_aio.types import EnvRet
 
 if find_spec("mani_skill") is None:
@@ -51,7 +51,7 @@ def entry(task: str = "PickCube-v1", **fields: Any) -> EnvConfig:
 
 
 def make(task: str = "PickCube-v1", **fields: Any) -> ManiskillEnv:
-    from rlightning_aio.envs.maniskill import ManiskillEnv
+    from rlightning_aio.envs.simulators.maniskill import ManiskillEnv
 
     return ManiskillEnv(entry(task, **fields))
 
@@ -262,7 +262,7 @@ def test_missing_assets_raise_with_the_command_that_fetches_them(
 
 WITHOUT_VULKAN = """
 from rlightning_aio.config import EnvConfig
-from rlightning_aio.envs.maniskill import ManiskillEnv
+from rlightning_aio.envs.simulators.maniskill import ManiskillEnv
 from rlightning_aio.types import PolicyResponse
 import numpy as np
 

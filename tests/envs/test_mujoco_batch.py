@@ -18,11 +18,11 @@ from vector.toys import assert_alike
 
 from rlightning_aio import sync
 from rlightning_aio.config import EnvConfig
-from rlightning_aio.envs import mujoco_threads
-from rlightning_aio.envs.gymnasium import MujocoEnv, outdated_assets_accepted
-from rlightning_aio.envs.mujoco_batch import MujocoBatch
-from rlightning_aio.envs.mujoco_forces import compiled
-from rlightning_aio.envs.mujoco_threads import Simulations
+from rlightning_aio.envs.mujoco import threads as mujoco_threads
+from rlightning_aio.envs.mujoco.batch import MujocoBatch
+from rlightning_aio.envs.mujoco.forces import compiled
+from rlightning_aio.envs.mujoco.threads import Simulations
+from rlightning_aio.envs.simulators.gymnasium import MujocoEnv, outdated_assets_accepted
 from rlightning_aio.errors import ConfigError, EnvRaised
 from rlightning_aio.vector import make_vec
 
@@ -508,9 +508,9 @@ def test_batches_of_one_entry_share_the_cores(
             asked.append(num_threads)
             super().__init__(model, count, num_threads, **options)
 
-    monkeypatch.setattr("rlightning_aio.envs.mujoco_batch.Simulations", Counted)
-    monkeypatch.setattr("rlightning_aio.envs.gymnasium.num_cores", lambda: 4)
-    monkeypatch.setattr("rlightning_aio.envs.mujoco_batch.is_brief", lambda *_: brief)
+    monkeypatch.setattr("rlightning_aio.envs.mujoco.batch.Simulations", Counted)
+    monkeypatch.setattr("rlightning_aio.envs.simulators.gymnasium.num_cores", lambda: 4)
+    monkeypatch.setattr("rlightning_aio.envs.mujoco.batch.is_brief", lambda *_: brief)
     config = EnvConfig.model_validate(
         {
             "name": "x", "backend": "mujoco", "task": "Hopper-v5", "num_envs": 2,

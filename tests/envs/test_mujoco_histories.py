@@ -14,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from vector.toys import assert_alike
 
-from rlightning_aio.envs.gymnasium import outdated_assets_accepted
-from rlightning_aio.envs.mujoco_batch import MujocoBatch
+from rlightning_aio.envs.mujoco.batch import MujocoBatch
+from rlightning_aio.envs.simulators.gymnasium import outdated_assets_accepted
 from rlightning_aio.envs.state import load_state, save_state
 
 NUM_EXAMPLES = 6 if "RLIGHTNING_AIO_EXAMPLES" not in os.environ else settings().max_examples

@@ -7,7 +7,7 @@ import mujoco
 import pytest
 
 from rlightning_aio.config import EnvConfig
-from rlightning_aio.envs.gymnasium import MujocoEnv
+from rlightning_aio.envs.simulators.gymnasium import MujocoEnv
 
 OUTDATED = """
 <mujoco>

@@ -16,7 +16,7 @@ from gymnasium import spaces
 from patience import HANG
 
 import rlightning_aio as rl
-from rlightning_aio.envs.openenv_session import OpenEnvSession, ServerRefused
+from rlightning_aio.envs.openenv.session import OpenEnvSession, ServerRefused
 from rlightning_aio.errors import StartFailed
 from rlightning_aio.policy_servers.loop_thread import LoopThread
 

@@ -26,9 +26,9 @@ from hypothesis.stateful import (
 from patience import HANG
 
 import rlightning_aio as rl
-from rlightning_aio.envs import openenv_session
+from rlightning_aio._core.hosts.awaiting import awaited_envs
+from rlightning_aio.envs.openenv import session as openenv_session
 from rlightning_aio.errors import EnvRaised
-from rlightning_aio.hosts import awaited_envs
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

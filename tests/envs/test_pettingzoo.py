@@ -10,7 +10,7 @@ from envs.group_contract import NO_LIMIT, GroupContract
 from gymnasium.spaces import Box, Dict, Discrete, Tuple
 
 from rlightning_aio import sync
-from rlightning_aio.cli.policies import RandomPolicy
+from rlightning_aio.cli.policies.policies import RandomPolicy
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.evaluation import evaluate
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from rlightning_aio.envs.contract import Outcome
-    from rlightning_aio.envs.pettingzoo import PettingZooEnv
+    from rlightning_aio.envs.simulators.pettingzoo import PettingZooEnv
     from rlightning_aio.types import MultiAgentEnvRet
 
 pytest.importorskip("pettingzoo")
@@ -43,7 +43,7 @@ def entry(task: str, **fields: Any) -> EnvConfig:
 
 
 def make(task: str, **fields: Any) -> PettingZooEnv:
-    from rlightning_aio.envs.pettingzoo import PettingZooEnv
+    from rlightning_aio.envs.simulators.pettingzoo import PettingZooEnv
 
     return PettingZooEnv(entry(task, **fields))
 

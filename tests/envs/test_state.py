@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rlightning_aio import PolicyResponse
+from rlightning_aio._core.hosts.running.build_env import build_env
 from rlightning_aio.config import EnvConfig
-from rlightning_aio.hosts.build_env import build_env
 
 TASKS = (
     *("Ant", "HalfCheetah", "Hopper", "Humanoid", "HumanoidStandup", "InvertedDoublePendulum"),

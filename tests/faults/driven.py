@@ -17,7 +17,7 @@ from patience import HANG
 
 import rlightning_aio
 import rlightning_aio.sync
-from rlightning_aio.hosts.process import ForkServer
+from rlightning_aio._core.hosts.process.host import ForkServer
 
 if TYPE_CHECKING:
     from rlightning_aio.batch import BatchedData

@@ -17,7 +17,7 @@ import sys
 import psutil
 
 from rlightning_aio import BatchedData, PolicyResponse
-from rlightning_aio.group.hint import HINT_AFTER_BATCHES
+from rlightning_aio._core.group.supervision.hint import HINT_AFTER_BATCHES
 from rlightning_aio.sync import EnvGroup, build_env_group
 
 ENTRIES = [

@@ -49,7 +49,7 @@ class Strike:
 
     def _counts(self, path: str) -> bool:
         holds_back = signal.getsignal(signal.SIGINT) is not signal.default_int_handler
-        return holds_back or not path.endswith("/group/sync.py")
+        return holds_back or not path.endswith("/_core/group/api/sync.py")
 
 
 def struck(

@@ -19,8 +19,8 @@ from faults.test_resume import Walk
 from patience import HANG
 
 import rlightning_aio as rl
+from rlightning_aio._core.group.supervision import hang_detector
 from rlightning_aio.errors import EnvAborted
-from rlightning_aio.group import hang_detector
 
 if TYPE_CHECKING:
     from collections.abc import Callable

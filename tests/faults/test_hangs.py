@@ -27,8 +27,8 @@ from patience import HANG
 
 import rlightning_aio
 from rlightning_aio import registry
+from rlightning_aio._core.group.supervision import hang_detector
 from rlightning_aio.errors import EnvHung, NothingPending, StartFailed, WorkerDied
-from rlightning_aio.group import hang_detector
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -24,9 +24,9 @@ from faults.driven import Driven, Tokens, fork_server_of, kill, pid_of, stop, tw
 from patience import HANG
 
 import rlightning_aio
+from rlightning_aio._core.group.supervision import shutdown
+from rlightning_aio._core.hosts.process import fork_server
 from rlightning_aio.errors import GroupClosed
-from rlightning_aio.group import shutdown
-from rlightning_aio.hosts import fork_server
 from rlightning_aio.protocol.entries import Operation, op_of
 
 if TYPE_CHECKING:

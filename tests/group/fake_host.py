@@ -16,20 +16,19 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from rlightning_aio.config import EnvConfig
-from rlightning_aio.group.checked import CheckedRequests, CheckedSteps
-from rlightning_aio.group.conditions import FIRST_RESULTS, Conditions
-from rlightning_aio.group.continuity import Continuity
-from rlightning_aio.group.core import Core, Parts
-from rlightning_aio.group.env_table import EnvTable
-from rlightning_aio.group.lifetime import Lifetime
-from rlightning_aio.group.observed import Observed
-from rlightning_aio.group.poller import Poller
-from rlightning_aio.group.slab_layout import SlabLayout
-from rlightning_aio.group.supervisor import Supervisor
-from rlightning_aio.group.tables import Tables
-from rlightning_aio.hosts.arena import Arena, map_shared
-from rlightning_aio.hosts.messages import (
+from rlightning_aio._core.group.engine.checked import CheckedRequests, CheckedSteps
+from rlightning_aio._core.group.engine.core import Core, Parts
+from rlightning_aio._core.group.engine.poller import Poller
+from rlightning_aio._core.group.episodes.continuity import Continuity
+from rlightning_aio._core.group.state.conditions import FIRST_RESULTS, Conditions
+from rlightning_aio._core.group.state.env_table import EnvTable
+from rlightning_aio._core.group.state.lifetime import Lifetime
+from rlightning_aio._core.group.state.observed import Observed
+from rlightning_aio._core.group.state.slab_layout import SlabLayout
+from rlightning_aio._core.group.supervision.supervisor import Supervisor
+from rlightning_aio._core.group.tables import Tables
+from rlightning_aio._core.hosts.arena import Arena, map_shared
+from rlightning_aio._core.hosts.messages import (
     NO_ACTION,
     Attached,
     AttachOrder,
@@ -45,6 +44,7 @@ from rlightning_aio.hosts.messages import (
     Result,
     Value,
 )
+from rlightning_aio.config import EnvConfig
 from rlightning_aio.protocol.entries import Operation, op_of, slot_of
 from rlightning_aio.protocol.info import NO_INFO, PICKLED
 from rlightning_aio.protocol.rings import (
@@ -61,7 +61,7 @@ from rlightning_aio.types import EnvMeta
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from rlightning_aio.group.wait import Procedure
+    from rlightning_aio._core.group.drivers.wait import Procedure
     from rlightning_aio.protocol.exchange import Ring
 
 PLAIN, TERMINATES, TRUNCATES, RAISES, SENDS_INFO = range(5)

@@ -10,8 +10,8 @@ import pytest
 from group.sample_envs import Gate
 
 from rlightning_aio import BatchedData, NothingPending, PolicyResponse, UnknownEnv
+from rlightning_aio._core.group.state.conditions import ABORTING, DEATH, LOST_EPISODE
 from rlightning_aio.errors import EnvAborted, EnvRaised, GroupClosed
-from rlightning_aio.group.conditions import ABORTING, DEATH, LOST_EPISODE
 
 if TYPE_CHECKING:
     from pathlib import Path

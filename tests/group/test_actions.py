@@ -16,10 +16,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from rlightning_aio import BatchedData, EnvConfig, PolicyResponse, sync
+from rlightning_aio._core.group.engine.actions import write_actions
+from rlightning_aio._core.group.state.env_table import EnvTable
 from rlightning_aio.batch.data import batch_of_results
 from rlightning_aio.errors import BadAction
-from rlightning_aio.group.actions import write_actions
-from rlightning_aio.group.env_table import EnvTable
 from rlightning_aio.protocol.slab import RowLayout, Slab
 
 IDS = ["e-0", "e-1", "e-2"]

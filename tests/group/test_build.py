@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from rlightning_aio import sync
+from rlightning_aio._core.group.setup import build
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.group import build
 
 POLE = {"backend": "gymnasium", "task": "CartPole-v1"}
 OTHER = {"backend": "probe", "task": "x"}
@@ -55,8 +55,8 @@ def test_a_placement_whose_package_is_missing_says_how_to_install_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The error comes before anything starts."""
-    monkeypatch.delitem(sys.modules, "rlightning_aio.hosts.ray", raising=False)
-    monkeypatch.delitem(sys.modules, "rlightning_aio.hosts.ray_host", raising=False)
+    monkeypatch.delitem(sys.modules, "rlightning_aio._core.hosts.ray.cluster", raising=False)
+    monkeypatch.delitem(sys.modules, "rlightning_aio._core.hosts.ray.host", raising=False)
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ConfigError, match=r"entry 'e'.*pip install 'rlightning-aio\[ray\]'"):
         sync.build_env_group(POLE | {"name": "e", "placement": "ray"})

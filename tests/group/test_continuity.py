@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from rlightning_aio.config import EnvConfig
-from rlightning_aio.group.continuity import (
+from rlightning_aio._core.group.episodes.continuity import (
     LEGAL,
     Continuity,
     LossEvent,
@@ -18,7 +17,8 @@ from rlightning_aio.group.continuity import (
     Position,
     Report,
 )
-from rlightning_aio.group.env_table import EnvTable
+from rlightning_aio._core.group.state.env_table import EnvTable
+from rlightning_aio.config import EnvConfig
 from rlightning_aio.protocol.slab import AS_RESTORED, IS_RESET, NO_SEED, OVER
 
 if TYPE_CHECKING:

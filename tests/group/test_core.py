@@ -9,6 +9,8 @@ from unittest.mock import Mock
 import pytest
 from group.fake_host import PLAIN, RAISES, FakeGroup
 
+from rlightning_aio._core.group.drivers.wait import CollectRules
+from rlightning_aio._core.hosts.messages import Failed, Withdrawn
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import (
     BadAction,
@@ -20,8 +22,6 @@ from rlightning_aio.errors import (
     NothingPending,
     WorkerDied,
 )
-from rlightning_aio.group.wait import CollectRules
-from rlightning_aio.hosts.messages import Failed, Withdrawn
 from rlightning_aio.types import PolicyResponse
 
 if TYPE_CHECKING:

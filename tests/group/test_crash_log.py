@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from rlightning_aio.group.fault_messages import CrashLog
+from rlightning_aio._core.group.supervision.fault_messages import CrashLog
 
 
 class Log:

@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rlightning_aio import sync
+from rlightning_aio._core.group.setup.devices import dealt_out, visible_devices
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.errors import ConfigError
-from rlightning_aio.group.devices import dealt_out, visible_devices
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -51,7 +51,7 @@ def test_without_the_variable_devices_are_counted(
 ) -> None:
     """By the driver's program, if there are no device files."""
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
-    monkeypatch.setattr("rlightning_aio.group.devices.Path", lambda _: tmp_path)
+    monkeypatch.setattr("rlightning_aio._core.group.setup.devices.Path", lambda _: tmp_path)
     monkeypatch.setenv("PATH", str(tmp_path))
     assert visible_devices()[0] == []
     program = tmp_path / "nvidia-smi"

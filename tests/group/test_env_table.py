@@ -7,8 +7,8 @@ from itertools import permutations
 import numpy as np
 import pytest
 
+from rlightning_aio._core.group.state.env_table import EnvTable
 from rlightning_aio.config import EnvConfig
-from rlightning_aio.group.env_table import EnvTable
 from rlightning_aio.types import ClientTraits, EnvMeta
 
 CLIENTS = [("a", 0), ("a", 1), ("b", 0), ("c", 1)]

@@ -23,7 +23,7 @@ from rlightning_aio import (
     PolicyResponse,
     build_env_group,
 )
-from rlightning_aio.group.slab_layout import check_actions
+from rlightning_aio._core.group.state.slab_layout import check_actions
 from rlightning_aio.protocol.columns import stacked
 
 # Values are made and read independently of the loop.

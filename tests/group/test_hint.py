@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from rlightning_aio import EnvConfig, sync
-from rlightning_aio.group.hint import HINT_AFTER_BATCHES, Hints, hint
-from rlightning_aio.group.host_record import HostRecord
-from rlightning_aio.group.stats import Stats
+from rlightning_aio._core.group.state.host_record import HostRecord
+from rlightning_aio._core.group.state.stats import Stats
+from rlightning_aio._core.group.supervision.hint import HINT_AFTER_BATCHES, Hints, hint
 
 
 def latencies(step: float, transfer: float) -> dict[str, dict[str, float]]:

@@ -103,8 +103,8 @@ def test_time_between_the_halves_is_not_part_of_the_step() -> None:
 
     with (
         patch.dict(rlightning_aio.ENVS._classes, {"halved": Timed}),
-        patch("rlightning_aio.hosts.env_steps.time", clock),
-        patch("rlightning_aio.hosts.runner.time", clock),
+        patch("rlightning_aio._core.hosts.running.env_steps.time", clock),
+        patch("rlightning_aio._core.hosts.running.runner.time", clock),
         rlightning_aio.sync.build_env_group(HALVED) as group,
     ):
         batch, _ = group.reset()

@@ -69,7 +69,7 @@ async def test_a_call_delays_no_ordinary_step_on_one_core(
     place: Place, calls: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It is executed in its turn, though a trainer that has no core to spare never looks around."""
-    monkeypatch.setattr("rlightning_aio.group.build.num_cores", lambda: 1)
+    monkeypatch.setattr("rlightning_aio._core.group.setup.build.num_cores", lambda: 1)
     entry = {"name": "pole", "backend": "gymnasium", "task": "CartPole-v1", "num_workers": 2}
     async with place.build(entry) as group:
         for _ in range(12):  # As many batches as are compared with their spaces, and more.

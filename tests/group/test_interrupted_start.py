@@ -52,7 +52,7 @@ def test_interrupting_a_synchronous_init_raises_the_interrupt() -> None:
     """Ctrl-C while workers start raises KeyboardInterrupt, and the group is closed."""
     script = textwrap.dedent(f"""
         import rlightning_aio.sync
-        from rlightning_aio.hosts import process
+        from rlightning_aio._core.hosts.process import host as process
 
         launch = process.ForkServer._launch
         def announced(server):

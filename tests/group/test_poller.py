@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rlightning_aio.group.poller import Poller
-from rlightning_aio.group.request_states import COLLECTOR
-from rlightning_aio.group.requests import Requests
+from rlightning_aio._core.group.engine.poller import Poller
+from rlightning_aio._core.group.state.request_states import COLLECTOR
+from rlightning_aio._core.group.state.requests import Requests
 from rlightning_aio.protocol.entries import Operation
 from rlightning_aio.protocol.rings import TrainerBell, WorkerBell, bell_size
 

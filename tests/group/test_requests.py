@@ -19,16 +19,23 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
+from rlightning_aio._core.group.engine.checked import CheckedRequests
+from rlightning_aio._core.group.state.request_states import (
+    COLLECTOR,
+    LEGAL,
+    NOBODY,
+    Event,
+    Owner,
+    State,
+)
 from rlightning_aio.errors import EnvFault
-from rlightning_aio.group.checked import CheckedRequests
-from rlightning_aio.group.request_states import COLLECTOR, LEGAL, NOBODY, Event, Owner, State
 from rlightning_aio.protocol.entries import SLOT_MASK, Operation
 from rlightning_aio.protocol.entries import entry as entry_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from rlightning_aio.group.requests import Ticket
+    from rlightning_aio._core.group.state.requests import Ticket
 
 Situation: TypeAlias = tuple[State, Owner]
 Combination: TypeAlias = tuple[State, Owner, Event]

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 import rlightning_aio
 import rlightning_aio.sync
 from rlightning_aio import BatchedData, PolicyResponse
+from rlightning_aio._core.group.engine.core import Core
+from rlightning_aio._core.group.state.conditions import FIRST_RESULTS, UNLIKE_ENVS
 from rlightning_aio.errors import EnvBusy, EnvRaised
-from rlightning_aio.group.conditions import FIRST_RESULTS, UNLIKE_ENVS
-from rlightning_aio.group.core import Core
 
 PROBE = HALVED | {"backend": "probe"}
 TWO = {"num_workers": 2}

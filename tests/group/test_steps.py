@@ -30,11 +30,11 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
+from rlightning_aio._core.group.drivers.wait import CollectRules
+from rlightning_aio._core.group.state.conditions import UNLIKE_ENVS
+from rlightning_aio._core.group.timeline.trace import Trace
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.errors import RLightningError
-from rlightning_aio.group.conditions import UNLIKE_ENVS
-from rlightning_aio.group.trace import Trace
-from rlightning_aio.group.wait import CollectRules
 from rlightning_aio.protocol import kernel
 
 if TYPE_CHECKING:

@@ -10,21 +10,19 @@ import numpy as np
 import pytest
 from group.fake_host import ACTION_SPACE, LAYOUT, OBSERVATION_SPACE, Running
 
-from rlightning_aio.config import EnvConfig
-from rlightning_aio.errors import ConfigError, EnvHung, GroupClosed, StartFailed, WorkerDied
-from rlightning_aio.group import hang_detector
-from rlightning_aio.group.conditions import Conditions
-from rlightning_aio.group.continuity import Continuity
-from rlightning_aio.group.env_table import EnvTable
-from rlightning_aio.group.lifetime import Lifetime
-from rlightning_aio.group.observed import Observed
-from rlightning_aio.group.request_states import COLLECTOR
-from rlightning_aio.group.requests import Requests
-from rlightning_aio.group.slab_layout import SlabLayout
-from rlightning_aio.group.supervisor import GivenUp, Replaced, Supervisor
-from rlightning_aio.group.tables import Tables
-from rlightning_aio.hosts.arena import Arena
-from rlightning_aio.hosts.messages import (
+from rlightning_aio._core.group.episodes.continuity import Continuity
+from rlightning_aio._core.group.state.conditions import Conditions
+from rlightning_aio._core.group.state.env_table import EnvTable
+from rlightning_aio._core.group.state.lifetime import Lifetime
+from rlightning_aio._core.group.state.observed import Observed
+from rlightning_aio._core.group.state.request_states import COLLECTOR
+from rlightning_aio._core.group.state.requests import Requests
+from rlightning_aio._core.group.state.slab_layout import SlabLayout
+from rlightning_aio._core.group.supervision import hang_detector
+from rlightning_aio._core.group.supervision.supervisor import GivenUp, Replaced, Supervisor
+from rlightning_aio._core.group.tables import Tables
+from rlightning_aio._core.hosts.arena import Arena
+from rlightning_aio._core.hosts.messages import (
     Attached,
     Built,
     Closed,
@@ -34,6 +32,8 @@ from rlightning_aio.hosts.messages import (
     ErrorText,
     NotBuilt,
 )
+from rlightning_aio.config import EnvConfig
+from rlightning_aio.errors import ConfigError, EnvHung, GroupClosed, StartFailed, WorkerDied
 from rlightning_aio.protocol.entries import Operation
 from rlightning_aio.protocol.slab import RowLayout
 from rlightning_aio.types import EnvMeta
@@ -41,7 +41,7 @@ from rlightning_aio.types import EnvMeta
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from rlightning_aio.group.wait import Procedure
+    from rlightning_aio._core.group.drivers.wait import Procedure
 
 KILLED = Death("was killed by SIGKILL", -9)
 

@@ -12,8 +12,8 @@ from timelines import Seen
 
 import rlightning_aio
 from rlightning_aio import sync
-from rlightning_aio.group.conditions import RECORDING
-from rlightning_aio.group.trace_records import KEPT, Records
+from rlightning_aio._core.group.state.conditions import RECORDING
+from rlightning_aio._core.group.timeline.records import KEPT, Records
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

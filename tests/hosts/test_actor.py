@@ -10,8 +10,8 @@ import numpy as np
 from group.sample_envs import Gate, Probe
 
 from rlightning_aio import EnvConfig
-from rlightning_aio.hosts.actor import Batch, EnvActor, NotStarted
-from rlightning_aio.hosts.messages import StartOrder
+from rlightning_aio._core.hosts.messages import StartOrder
+from rlightning_aio._core.hosts.ray.actor import Batch, EnvActor, NotStarted
 from rlightning_aio.protocol.entries import Operation, entry
 from rlightning_aio.protocol.pickling import dumped_with_code
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     import pytest
 
-    from rlightning_aio.hosts.actor import Reply
+    from rlightning_aio._core.hosts.ray.actor import Reply
 
 FIRST_SLOT = 5
 

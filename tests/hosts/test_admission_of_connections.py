@@ -10,8 +10,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from zmq.utils import z85
 
-from rlightning_aio.hosts.authenticator import Authenticator, Question, QuestionQueue
-from rlightning_aio.hosts.rate_limiter import CONNECTION_COST, RateLimiter, message_cost
+from rlightning_aio._core.hosts.env_server.authenticator import (
+    Authenticator,
+    Question,
+    QuestionQueue,
+)
+from rlightning_aio._core.hosts.env_server.rate_limiter import (
+    CONNECTION_COST,
+    RateLimiter,
+    message_cost,
+)
 from rlightning_aio.protocol.net.limited_log import LimitedLog
 from rlightning_aio.protocol.net.wire import MAX_HELLO_BYTES
 from rlightning_aio.remote import make_keys

@@ -7,7 +7,7 @@ import weakref
 
 from patience import HANG
 
-from rlightning_aio.hosts.event_loop import TimeLimit
+from rlightning_aio._core.hosts.awaiting.event_loop import TimeLimit
 
 
 class Env:

@@ -14,7 +14,8 @@ import pytest
 from patience import HANG
 
 import rlightning_aio
-from rlightning_aio.hosts.fork_messages import (
+from rlightning_aio._core.hosts.messages import WorkerPlace
+from rlightning_aio._core.hosts.process.fork_messages import (
     Exited,
     Fork,
     MessageSocket,
@@ -22,13 +23,12 @@ from rlightning_aio.hosts.fork_messages import (
     Preload,
     Ready,
 )
-from rlightning_aio.hosts.fork_server import BOOTSTRAP
-from rlightning_aio.hosts.messages import WorkerPlace
+from rlightning_aio._core.hosts.process.fork_server import BOOTSTRAP
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from rlightning_aio.hosts.fork_messages import Received
+    from rlightning_aio._core.hosts.process.fork_messages import Received
 
 Pair = tuple[MessageSocket, MessageSocket]
 

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rlightning_aio.hosts import fork_server
-from rlightning_aio.hosts.arena import Arena
-from rlightning_aio.hosts.fork_messages import Exited, Fork
-from rlightning_aio.hosts.messages import WorkerPlace
-from rlightning_aio.hosts.process import ForkServer
+from rlightning_aio._core.hosts.arena import Arena
+from rlightning_aio._core.hosts.messages import WorkerPlace
+from rlightning_aio._core.hosts.process import fork_server
+from rlightning_aio._core.hosts.process.fork_messages import Exited, Fork
+from rlightning_aio._core.hosts.process.host import ForkServer
 
 if TYPE_CHECKING:
     from pathlib import Path

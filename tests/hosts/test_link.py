@@ -14,10 +14,9 @@ import numpy as np
 import pytest
 from protocol.memory_of_rings import unused
 
-from rlightning_aio.config import EnvConfig
-from rlightning_aio.hosts.arena import Arena, map_shared
-from rlightning_aio.hosts.base import Wiring
-from rlightning_aio.hosts.messages import (
+from rlightning_aio._core.hosts.arena import Arena, map_shared
+from rlightning_aio._core.hosts.base import Wiring
+from rlightning_aio._core.hosts.messages import (
     Attached,
     AttachOrder,
     Built,
@@ -32,7 +31,8 @@ from rlightning_aio.hosts.messages import (
     StartOrder,
     Value,
 )
-from rlightning_aio.hosts.process import ForkServer, ProcessHost, _surroundings
+from rlightning_aio._core.hosts.process.host import ForkServer, ProcessHost, _surroundings
+from rlightning_aio.config import EnvConfig
 from rlightning_aio.protocol.entries import Operation, entry
 from rlightning_aio.protocol.frames import BELL, FrameKind, FrameReader, encode
 from rlightning_aio.protocol.info import InfoSchema
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     import socket
     from collections.abc import Iterator
 
-    from rlightning_aio.hosts.fork_messages import Fork
+    from rlightning_aio._core.hosts.process.fork_messages import Fork
 
 pytestmark = pytest.mark.usefixtures("implementation")
 

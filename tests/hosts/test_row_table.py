@@ -11,7 +11,7 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rlightning_aio.hosts.row_table import RowTable
+from rlightning_aio._core.hosts.ray.row_table import RowTable
 from rlightning_aio.protocol.entries import Operation, entry
 from rlightning_aio.protocol.slab import RowLayout, Slab
 

@@ -12,11 +12,11 @@ from gymnasium.vector import AutoresetMode
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rlightning_aio._core.hosts.messages import NO_ACTION
+from rlightning_aio._core.hosts.running.row_writer import RowWriter, infos_out_of_band
+from rlightning_aio._core.hosts.running.runner import EnvRunner
 from rlightning_aio.config import EnvConfig
-from rlightning_aio.envs.gymnasium import GymnasiumEnv
-from rlightning_aio.hosts.messages import NO_ACTION
-from rlightning_aio.hosts.row_writer import RowWriter, infos_out_of_band
-from rlightning_aio.hosts.runner import EnvRunner
+from rlightning_aio.envs.simulators.gymnasium import GymnasiumEnv
 from rlightning_aio.protocol.entries import Operation
 from rlightning_aio.protocol.info import INFO_BYTES, NO_INFO, PICKLED, InfoSchema, InfoSchemas
 from rlightning_aio.protocol.slab import RowLayout, Slab

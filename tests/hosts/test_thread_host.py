@@ -27,8 +27,8 @@ from hosts.thread_host import EnvThread
 
 import rlightning_aio.sync
 from rlightning_aio import ENVS, PolicyResponse
+from rlightning_aio._core.group.supervision import shutdown
 from rlightning_aio.errors import StartFailed
-from rlightning_aio.group import shutdown
 from rlightning_aio.registry import PLACEMENTS, Placement
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import time
 from patience import HANG
 from protocol.memory_of_rings import both_sides
 
-from rlightning_aio.hosts.worker import Worker
+from rlightning_aio._core.hosts.process.worker import Worker
 from rlightning_aio.protocol.entries import Operation, entry
 from rlightning_aio.protocol.frames import FrameKind, FrameReader
 

@@ -18,10 +18,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rlightning_aio.hosts.arena import map_shared
-from rlightning_aio.hosts.build_env import built_envs
-from rlightning_aio.hosts.copied import copied
-from rlightning_aio.hosts.messages import (
+from rlightning_aio._core.hosts.arena import map_shared
+from rlightning_aio._core.hosts.messages import (
     Attached,
     Built,
     Closed,
@@ -36,7 +34,9 @@ from rlightning_aio.hosts.messages import (
     Saved,
     Value,
 )
-from rlightning_aio.hosts.runner import attach_all, close_all
+from rlightning_aio._core.hosts.running.build_env import built_envs
+from rlightning_aio._core.hosts.running.copied import copied
+from rlightning_aio._core.hosts.running.runner import attach_all, close_all
 from rlightning_aio.protocol.entries import Operation, answers_with_value, op_of, slot_of
 from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
 
@@ -45,9 +45,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from rlightning_aio.hosts.base import Wiring
-    from rlightning_aio.hosts.messages import AttachOrder, Completion, StartOrder
-    from rlightning_aio.hosts.runner import EnvRunner
+    from rlightning_aio._core.hosts.base import Wiring
+    from rlightning_aio._core.hosts.messages import AttachOrder, Completion, StartOrder
+    from rlightning_aio._core.hosts.running.runner import EnvRunner
 
 __all__ = ["ThreadHost"]
 

@@ -11,7 +11,7 @@ import sys
 import time
 
 from rlightning_aio.config import EnvConfig
-from rlightning_aio.envs.gymnasium import GymnasiumEnv
+from rlightning_aio.envs.simulators.gymnasium import GymnasiumEnv
 from rlightning_aio.remote import RemoteEnvClient
 
 

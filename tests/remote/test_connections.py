@@ -16,7 +16,12 @@ from patience import HANG
 from remote.counting import ClientThread, CountingEnv
 
 from rlightning_aio import sync
-from rlightning_aio.hosts import authenticator, connection_limiter, listener, rate_limiter
+from rlightning_aio._core.hosts.env_server import (
+    authenticator,
+    connection_limiter,
+    listener,
+    rate_limiter,
+)
 from rlightning_aio.protocol.net.space_description import describe
 from rlightning_aio.protocol.net.wire import MAX_PARTS, VERSION, ClientHello, Ping, Writer
 from rlightning_aio.remote import RemoteEnvClient, make_keys

@@ -20,9 +20,9 @@ from remote.random_spaces import mutation
 from zmq.utils.monitor import recv_monitor_message
 
 from rlightning_aio import ConfigError, sync
+from rlightning_aio._core.hosts.env_server.settings import server_settings
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.errors import StartFailed
-from rlightning_aio.hosts.server_settings import server_settings
 from rlightning_aio.protocol.net.wire import ClientHello, Writer
 from rlightning_aio.remote import RemoteEnvClient, client, make_keys
 from rlightning_aio.remote.keys import read_client_keys, read_server_keys

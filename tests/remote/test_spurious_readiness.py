@@ -11,7 +11,7 @@ from patience import HANG
 from remote.counting import ClientThread, CountingEnv
 
 from rlightning_aio import sync
-from rlightning_aio.hosts import authenticator, connection_limiter, listener
+from rlightning_aio._core.hosts.env_server import authenticator, connection_limiter, listener
 
 if TYPE_CHECKING:
     from collections.abc import Callable

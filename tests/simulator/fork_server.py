@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 from simulator.processes import Killed, Living, Process
 
-from rlightning_aio.hosts.arena import map_shared
-from rlightning_aio.hosts.fork_messages import (
+from rlightning_aio._core.hosts.arena import map_shared
+from rlightning_aio._core.hosts.process.fork_messages import (
     Exited,
     Fork,
     Forked,
@@ -25,7 +25,7 @@ from rlightning_aio.hosts.fork_messages import (
     NotForked,
     Ready,
 )
-from rlightning_aio.hosts.worker import Worker
+from rlightning_aio._core.hosts.process.worker import Worker
 from rlightning_aio.protocol.rings import WorkerBell, WorkerRings, bell_size, rings_size
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from simulator.world import World
 
-    from rlightning_aio.hosts.messages import WorkerPlace
+    from rlightning_aio._core.hosts.messages import WorkerPlace
 
 __all__ = ["ForkServer"]
 

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
     from simulator.world import World
 
+    from rlightning_aio._core.hosts.env_server.settings import ServerSettings
     from rlightning_aio.envs.base import BaseEnv
-    from rlightning_aio.hosts.server_settings import ServerSettings
     from rlightning_aio.protocol.net.server_session import ServerSessions
 
 __all__ = ["Network"]
@@ -47,7 +47,9 @@ class Network:
 
     def replacements(self) -> list[tuple[Any, str, Any]]:
         """What takes which place."""
-        from rlightning_aio.hosts import env_server  # Few programs need it.
+        from rlightning_aio._core.hosts.env_server import (
+            host as env_server,  # Few programs need it.
+        )
 
         return [
             (env_server, "Listener", partial(_Listener, self)),

@@ -1,8 +1,8 @@
 """A simulated Ray: actors in processes of the world, and the calls between them and the trainer.
 
-It is what `rlightning_aio.hosts.ray` uses of Ray. Calls reach an actor in order, their values
-travel as pickles, and their outcomes arrive in order, late. An actor may not find a node at first,
-and may end, alone or with its node; calls that have not returned then end in Ray's errors.
+It is what `hosts.ray.cluster` uses of Ray. Calls reach an actor in order, their values travel as
+pickles, and their outcomes arrive in order, late. An actor may not find a node at first, and may
+end, alone or with its node; calls that have not returned then end in Ray's errors.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = ["MODULES", "SimulatedRay", "importable"]
 
-_NAMES = ("rlightning_aio.hosts.ray", "rlightning_aio.hosts.ray_host")
+_NAMES = ("rlightning_aio._core.hosts.ray.cluster", "rlightning_aio._core.hosts.ray.host")
 _ENDS = {-signal.SIGKILL: "Worker unexpectedly exits with a connection error code 2. End of file."}
 
 

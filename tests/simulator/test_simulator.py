@@ -10,7 +10,7 @@ from simulator.coverage import ROWS, row_key, rows
 from simulator.program import draw
 from simulator.runs import run, run_twice, shown, shrunk
 
-from rlightning_aio.group.continuity import Continuity
+from rlightning_aio._core.group.episodes.continuity import Continuity
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -48,9 +48,9 @@ from simulator.processes import NOBODY, Killed, Process
 from simulator.sockets import Epoll, Loop, Sockets, run_in_process
 
 from rlightning_aio import sharing
-from rlightning_aio.group import first_observations
-from rlightning_aio.hosts import awaiting
-from rlightning_aio.hosts import process as process_hosts
+from rlightning_aio._core.group.engine import first_observations
+from rlightning_aio._core.hosts.awaiting import worker_loop as awaiting
+from rlightning_aio._core.hosts.process import host as process_hosts
 from rlightning_aio.protocol import exchange, kernel, rings
 
 if TYPE_CHECKING:
@@ -205,7 +205,11 @@ class World:
             (rings, "new_fence", lambda: self.point),
             # So that steps are ordinary sooner.
             (first_observations, "_NUM_CHECKED", 1),
-            (rays.MODULES["rlightning_aio.hosts.ray"], "ray", rays.SimulatedRay(self)),
+            (
+                rays.MODULES["rlightning_aio._core.hosts.ray.cluster"],
+                "ray",
+                rays.SimulatedRay(self),
+            ),
             (secrets, "randbits", self.rng.getrandbits),
             *self.network.replacements(),
             (awaiting, "run_loop", lambda main: run_in_process(self, main)),

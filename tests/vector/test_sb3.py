@@ -15,7 +15,7 @@ from gymnasium.vector import AutoresetMode
 from timelines import Seen
 from vector.toys import assert_alike, press_ctrl_c
 
-from rlightning_aio.envs.of_spec import BatchOf, OneOf
+from rlightning_aio.envs.mujoco.of_spec import BatchOf, OneOf
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -15,7 +15,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from vector.toys import Toy, assert_alike
 
 from rlightning_aio import sync
-from rlightning_aio.envs import mujoco_tasks
+from rlightning_aio.envs.mujoco import tasks as mujoco_tasks
 from rlightning_aio.errors import EnvRaised, StartFailed
 from rlightning_aio.vector import VectorEnv, make_vec
 from rlightning_aio.vector.making import steps_together

@@ -30,9 +30,9 @@ def main() -> None:
     from rlightning_aio.errors import ConfigError  # noqa: PLC0415
 
     try:
+        from rlightning_aio._core.hosts.standard_streams import stdout_set_aside  # noqa: PLC0415
         from rlightning_aio.cli.app import app  # noqa: PLC0415
         from rlightning_aio.cli.terminal import ResultStream  # noqa: PLC0415
-        from rlightning_aio.hosts.standard_streams import stdout_set_aside  # noqa: PLC0415
     except ConfigError as error:  # Of the environment variables that imports read.
         sys.stderr.write(f"error: {error}\n")
         sys.exit(2)

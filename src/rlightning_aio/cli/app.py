@@ -10,15 +10,15 @@ import typer
 
 import rlightning_aio
 from rlightning_aio.cli.backends import backends
-from rlightning_aio.cli.bench import bench
+from rlightning_aio.cli.bench.bench import bench
+from rlightning_aio.cli.bench.tune import tune
 from rlightning_aio.cli.check import check
-from rlightning_aio.cli.evaluating import evaluation
+from rlightning_aio.cli.playing.evaluating import evaluation
+from rlightning_aio.cli.playing.rollout import rollout
 from rlightning_aio.cli.remote import client, keygen
-from rlightning_aio.cli.rollout import rollout
 from rlightning_aio.cli.serving import serve
 from rlightning_aio.cli.tasks import tasks
 from rlightning_aio.cli.terminal import guarded
-from rlightning_aio.cli.tune import tune
 from rlightning_aio.protocol import kernel
 
 __all__ = ["app"]

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 
 import rlightning_aio
-from rlightning_aio.cli.collecting import Roster, resetting, respond_to_all, responder
 from rlightning_aio.cli.options import Config, Overrides
+from rlightning_aio.cli.policies.collecting import Roster, resetting, respond_to_all, responder
 from rlightning_aio.cli.terminal import counted, out, print_json, run_interruptible
 from rlightning_aio.config import check_installed, load_config
 from rlightning_aio.errors import ConfigError
@@ -98,8 +98,8 @@ async def _look(configs: Sequence[EnvConfig], findings: list[_Finding]) -> None:
 def _offers(config: EnvConfig) -> dict[str, Any]:
     """Return the description and schemas of an entry's first server."""
     # Imported here because it needs an extra.
-    from rlightning_aio.envs.openenv import OpenEnvOptions  # noqa: PLC0415
-    from rlightning_aio.envs.openenv_session import get_json  # noqa: PLC0415
+    from rlightning_aio.envs.openenv.env import OpenEnvOptions  # noqa: PLC0415
+    from rlightning_aio.envs.openenv.session import get_json  # noqa: PLC0415
     from rlightning_aio.envs.options import read_options  # noqa: PLC0415
 
     headers = read_options(OpenEnvOptions, config.name, config.env_kwargs).headers

@@ -16,6 +16,8 @@ from rich.live import Live
 from rich.spinner import Spinner
 from rich.text import Text
 
+from rlightning_aio._core.hosts.messages import ErrorText
+from rlightning_aio._core.hosts.running.build_env import build_env
 from rlightning_aio.cli.terminal import (
     connections_logged,
     count,
@@ -27,8 +29,6 @@ from rlightning_aio.cli.terminal import (
 )
 from rlightning_aio.config import check_installed, load_config
 from rlightning_aio.errors import ConfigError, EnvRaised, RLightningError
-from rlightning_aio.hosts.build_env import build_env
-from rlightning_aio.hosts.messages import ErrorText
 from rlightning_aio.remote import RemoteEnvClient, make_keys
 
 if TYPE_CHECKING:

@@ -15,22 +15,22 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast, overload
 
 import numpy as np
 
+from rlightning_aio._core.group.api.aio import EnvGroup as AsyncEnvGroup
+from rlightning_aio._core.group.api.sync import EnvGroup as SyncEnvGroup
+from rlightning_aio._core.group.engine.newest import newest_of
 from rlightning_aio.collecting.clock import Clock
 from rlightning_aio.collecting.kind import OWN_NAMES, EnvKind, Part
 from rlightning_aio.collecting.procedure import BREAK, Interruptible, Procedure, run_as_one_call
 from rlightning_aio.collecting.record import RecordedGroup, ReplayedGroup
 from rlightning_aio.collecting.rollout import Rollout
 from rlightning_aio.errors import EnvBusy, EnvFault, NothingPending, WorkerDied
-from rlightning_aio.group.aio import EnvGroup as AsyncEnvGroup
-from rlightning_aio.group.newest import newest_of
-from rlightning_aio.group.sync import EnvGroup as SyncEnvGroup
 from rlightning_aio.registry import did_you_mean
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence
 
+    from rlightning_aio._core.group.engine.newest import Newest
     from rlightning_aio.batch import BatchedData
-    from rlightning_aio.group.newest import Newest
     from rlightning_aio.types import EnvMeta
 
 __all__ = ["Collector"]

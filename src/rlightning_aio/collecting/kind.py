@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from rlightning_aio._core.group.engine.newest import Newest
     from rlightning_aio.batch import BatchedData
-    from rlightning_aio.group.newest import Newest
     from rlightning_aio.protocol.columns import Tree
     from rlightning_aio.types import EnvMeta
 

@@ -11,14 +11,14 @@ from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
 
-from rlightning_aio.group.aio import EnvGroup as AsyncEnvGroup
-from rlightning_aio.group.sync import driver_of
+from rlightning_aio._core.group.api.aio import EnvGroup as AsyncEnvGroup
+from rlightning_aio._core.group.api.sync import driver_of
 
 __all__ = ["BREAK", "Interruptible", "Procedure", "run", "run_as_one_call"]
 
 if TYPE_CHECKING:
-    from rlightning_aio.group.sync import EnvGroup as SyncEnvGroup
-    from rlightning_aio.group.sync import SyncDriver
+    from rlightning_aio._core.group.api.sync import EnvGroup as SyncEnvGroup
+    from rlightning_aio._core.group.api.sync import SyncDriver
 
 T = TypeVar("T")
 

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 import numpy as np
 
+from rlightning_aio._core.group.api.aio import EnvGroup as AsyncEnvGroup
+from rlightning_aio._core.group.api.sync import EnvGroup as SyncEnvGroup
 from rlightning_aio.batch import joined
 from rlightning_aio.batch.contents import parts_of
 from rlightning_aio.collecting.procedure import Procedure, run_as_one_call
 from rlightning_aio.errors import EnvFault, NothingPending, ReplayDiverged
 from rlightning_aio.files import write_file
-from rlightning_aio.group.aio import EnvGroup as AsyncEnvGroup
-from rlightning_aio.group.sync import EnvGroup as SyncEnvGroup
 from rlightning_aio.sealing import seal, unseal
 
 if TYPE_CHECKING:

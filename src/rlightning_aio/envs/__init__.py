@@ -1,1 +1,6 @@
-"""What runs inside a worker: `base.BaseEnv` and one module for each simulator."""
+"""Envs: the base classes, and an adapter for each simulator.
+
+`base` is what authors derive from, `contract` checks their envs, `state` saves them. The folders
+are `simulators` (one module each), `mujoco` (many simulations stepped together), `openenv`, and
+`sub_envs` (an env of several). Nothing here knows workers or groups.
+"""

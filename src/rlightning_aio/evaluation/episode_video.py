@@ -14,9 +14,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rlightning_aio._core.hosts.messages import RECORD_VIDEO
 from rlightning_aio.config import VideoConfig
 from rlightning_aio.files import check_folder, file_name, finish_file
-from rlightning_aio.hosts.messages import RECORD_VIDEO
 
 if TYPE_CHECKING:
     import os

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any, Final, SupportsIndex, TypeVar, overload
 
 import numpy as np
 
+from rlightning_aio._core.group.api.aio import EnvGroup as AsyncEnvGroup
+from rlightning_aio._core.group.api.sync import EnvGroup as SyncEnvGroup
 from rlightning_aio.batch.contents import all_agents
 from rlightning_aio.collecting.procedure import Procedure, run
 from rlightning_aio.errors import EnvBusy, RLightningError
@@ -24,8 +26,6 @@ from rlightning_aio.evaluation.outcomes import (
     summed_rewards,
 )
 from rlightning_aio.evaluation.queue import QueuePlay, QueueRules
-from rlightning_aio.group.aio import EnvGroup as AsyncEnvGroup
-from rlightning_aio.group.sync import EnvGroup as SyncEnvGroup
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable

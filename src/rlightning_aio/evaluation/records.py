@@ -13,8 +13,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from rlightning_aio._core.group.episodes.seeds import checked_seed
 from rlightning_aio.evaluation.episodes import Figures
-from rlightning_aio.group.seeds import checked_seed
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

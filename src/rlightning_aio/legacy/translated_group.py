@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 
+from rlightning_aio._core.group.api.sync import driver_of
 from rlightning_aio.batch import BatchedData
 from rlightning_aio.batch.contents import parts_of
 from rlightning_aio.batch.parts import rows_in_order
 from rlightning_aio.envs.tensors import as_numpy
 from rlightning_aio.errors import EnvFault, NothingPending, WorkerDied
-from rlightning_aio.group.sync import driver_of
 from rlightning_aio.legacy.hosted import restored
 from rlightning_aio.legacy.names import names_in_use
 from rlightning_aio.sync import build_env_group

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, Final, Generic, Self, TypeVar, cast
 import numpy as np
 from websockets.exceptions import ConnectionClosed
 
+from rlightning_aio._core.group.engine.core import Core
 from rlightning_aio.batch.contents import origin_of
 from rlightning_aio.errors import PolicyServerError
-from rlightning_aio.group.core import Core
 from rlightning_aio.policies.episodes import begins_of_envs
 from rlightning_aio.policy_servers.connection import MAX_BYTES, connected
 from rlightning_aio.policy_servers.loop_thread import LoopThread

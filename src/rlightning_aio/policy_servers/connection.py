@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidHandshake, InvalidStatus
 
-from rlightning_aio.envs.secret_headers import check_headers, secretly
+from rlightning_aio.envs.openenv.secret_headers import check_headers, secretly
 from rlightning_aio.errors import ConfigError, PolicyServerError
 
 if TYPE_CHECKING:

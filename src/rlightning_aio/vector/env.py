@@ -19,11 +19,11 @@ from gymnasium.error import (
 )
 from gymnasium.vector import AutoresetMode, utils
 
+from rlightning_aio._core.group.api.sync import driver_of
+from rlightning_aio._core.group.episodes.continuity import as_int
 from rlightning_aio.batch import BatchedData
-from rlightning_aio.envs.sub_envs import adapted
+from rlightning_aio.envs.sub_envs.sub_envs import adapted
 from rlightning_aio.errors import BadAction, ConfigError, EnvFault
-from rlightning_aio.group.continuity import as_int
-from rlightning_aio.group.sync import driver_of
 from rlightning_aio.protocol.columns import leaves
 from rlightning_aio.sync import EnvGroup, build_env_group
 from rlightning_aio.types import PolicyResponse

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 from gymnasium.vector import AutoresetMode
 
 from rlightning_aio.config import EnvConfig
-from rlightning_aio.envs.gymnasium import spec_of
-from rlightning_aio.envs.mujoco_tasks import is_batched
-from rlightning_aio.envs.of_spec import BatchOf, OneOf, VectorOf
+from rlightning_aio.envs.mujoco.of_spec import BatchOf, OneOf, VectorOf
+from rlightning_aio.envs.mujoco.tasks import is_batched
+from rlightning_aio.envs.simulators.gymnasium import spec_of
 from rlightning_aio.errors import ConfigError
 from rlightning_aio.registry import PLACEMENTS
 from rlightning_aio.sharing import check_threads, num_batches, num_cores

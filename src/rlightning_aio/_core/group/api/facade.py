@@ -1,0 +1,487 @@
+"""The methods that the asynchronous and the synchronous `EnvGroup` share: those that never wait."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+import warnings
+import weakref
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+from rlightning_aio._core.group.drivers.scope import Scope
+from rlightning_aio._core.group.drivers.wait import CollectRules
+from rlightning_aio._core.group.engine.checked import DEBUG, CheckedSteps
+from rlightning_aio._core.group.engine.steps import Steps
+from rlightning_aio._core.group.setup.build import assemble
+from rlightning_aio._core.group.state.observed import NO_SPAN
+from rlightning_aio._core.group.timeline.trace import Trace
+from rlightning_aio._core.hosts.base import Watcher
+from rlightning_aio.batch import BatchedData
+from rlightning_aio.errors import BadAction, RLightningError
+from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence, Sized
+    from contextlib import AbstractContextManager
+    from pathlib import Path
+
+    import gymnasium as gym
+
+    from rlightning_aio._core.group.drivers.wait import Procedure
+    from rlightning_aio._core.group.engine.core import Core
+    from rlightning_aio._core.group.setup.plan import Plan
+
+__all__ = [
+    "AutoResetContext",
+    "Facade",
+    "forked_from",
+    "only_result",
+    "steps_of",
+    "this_process",
+]
+
+
+_log = logging.getLogger("rlightning_aio")
+_NOT_CLOSED: Final = ("TimeoutError", "WorkerDied")
+"""What is said to be raised where a close was cut short, or by what is as good as that."""
+
+
+def only_result(results: tuple[BatchedData, Any]) -> EnvRet | MultiAgentEnvRet:
+    """The one result of a batch of one."""
+    return results[0].values()[0]
+
+
+def steps_of(env_id: str, response: PolicyResponse | Any) -> BatchedData:
+    """A batch of one step; raises `BadAction` for a response to another env."""
+    if not isinstance(response, PolicyResponse):
+        response = PolicyResponse(env_id, response)
+    elif response.env_id != env_id and not response.env_id.startswith(f"{env_id}/"):  # Its client.
+        raise BadAction(
+            f"the response is for env {response.env_id!r}, and this is the handle of {env_id!r}; "
+            "step that env, or the group; nothing was sent"
+        )
+    return BatchedData([env_id], [response])
+
+
+class AutoResetContext(Scope):
+    """The context of `EnvGroup.auto_reset`: envs are reset at their limit from entry to exit.
+
+    It can be entered again after an exit.
+    """
+
+    def __init__(
+        self, core: Core, max_episode_steps: float | None, on_done: bool, mark_truncated: bool
+    ) -> None:
+        self._core = core
+        self._limit = max_episode_steps
+        self._on_done = on_done
+        self._mark_truncated = mark_truncated
+
+    def _enter(self) -> None:
+        self._core.continuity.begin(
+            self._limit, on_done=self._on_done, mark_truncated=self._mark_truncated
+        )
+
+    def _leave(self) -> None:
+        self._core.continuity.end()
+
+
+class Driver(Watcher, Protocol):
+    """Waits for the sources of a group.
+
+    Attributes:
+        completions: queue of the outcomes that sources posted.
+        drain: applies them; the driver calls it whenever the queue isn't empty.
+    """
+
+    completions: Sized
+
+    drain: Callable[[], None]
+
+    def check_caller(self) -> None:
+        """Raise `RLightningError` if another thread uses the group, or another loop owns it."""
+        ...
+
+    def call(self, function: Callable[..., None], *args: Any) -> None:
+        """Call a function of the group that doesn't wait, after `check_caller`."""
+        ...
+
+    def forget(self) -> None:
+        """Forget all sources without unregistering them, as the parent still watches them."""
+        ...
+
+
+this_process: Final = [os.getpid()]
+"""The pid, updated in forked children; `os.getpid` would double the time of each check."""
+
+
+def forked_from(pid: int) -> RLightningError:
+    """The error for a call in a child forked by process `pid`."""
+    return RLightningError(
+        f"this group belongs to process {pid}, which has forked this one; only that process can "
+        "use and close the group; build another one here"
+    )
+
+
+class Facade:
+    """The plain methods of an `EnvGroup`."""
+
+    def __init__(self, plan: Plan) -> None:
+        self._driver = self._new_driver()
+        self._core = assemble(plan, self._driver, shares_thread=self._shares_thread)
+        self._steps = (CheckedSteps if DEBUG else Steps)(self._core)
+        self._driver.completions = self._core.parts.completions
+        self._driver.drain = self._core.drain
+        self._finalizer = weakref.finalize(self, self._core.supervisor.shutdown.abandon)
+        self._disowned = False
+        self._traces: list[Trace] = []
+        _groups.add(self)
+
+    _shares_thread = False
+    """True if other tasks may use the group while a call waits."""
+
+    def _new_driver(self) -> Driver:
+        raise NotImplementedError
+
+    # -- envs ---------------------------------------------------------------------
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self._core.supervisor.workers.summary()})"
+
+    @property
+    def env_ids(self) -> list[str]:
+        """Ids of the local envs, then of the env_servers, in order."""
+        envs = self._core.envs
+        return [*envs.local_ids, *envs.server_ids]
+
+    def __len__(self) -> int:
+        """The number of envs, each env_server counted once."""
+        return len(self.env_ids)
+
+    def size(self) -> int:
+        """The number of local envs."""
+        return len(self._core.envs.local_ids)
+
+    @property
+    def metas(self) -> list[EnvMeta]:
+        """The metadata of each env, as returned by `init`.
+
+        Raises:
+            GroupClosed: the group was not initialised, or is closed.
+        """
+        self._core.lifetime.check_open()
+        return self._core.supervisor.metas
+
+    def get_observation_spaces(self) -> list[gym.Space[Any] | None]:
+        """Observation space of each env, in the order of `env_ids`; None for an env_server.
+
+        Raises:
+            GroupClosed: the group was not initialised, or is closed.
+        """
+        return [meta.observation_space for meta in self.metas]
+
+    def get_action_spaces(self) -> list[gym.Space[Any] | None]:
+        """Action space of each env, in the order of `env_ids`; None for an env_server.
+
+        Raises:
+            GroupClosed: the group was not initialised, or is closed.
+        """
+        return [meta.action_space for meta in self.metas]
+
+    # -- requests -----------------------------------------------------------------
+
+    @property
+    def pending(self) -> list[str]:
+        """Ids of the envs with a request whose result, value or error was not returned yet.
+
+        These envs are busy. `collect_async` returns results and errors, `collect_calls` values.
+
+        Raises:
+            GroupClosed: the group was not initialised, or is closed.
+            RLightningError: another thread is using the group, or it belongs to another loop.
+        """
+        self._driver.check_caller()
+        self._core.lifetime.check_open()
+        return self._core.pending()
+
+    def step_async(self, batch: BatchedData) -> None:
+        """Send a step to each env of `batch`; `collect_async` returns the results. Never blocks.
+
+        Args:
+            batch: a batch of responses, from `BatchedData.respond` (columns, fast) or made of
+                `PolicyResponse` values.
+
+        The caller may reuse the columns on return: the values sent, and those that
+        `BatchedData.sent` returns, are copies.
+
+        Raises (before anything is sent):
+            BadAction: an action's shape, dtype or count doesn't fit; it holds NaN, a number that
+                its dtype can't hold, or infinity where its space is bounded; or this is not a
+                batch.
+            EnvBusy: an env has a reply outstanding, or appears twice.
+            UnknownEnv: no env of this group has that id.
+            WorkerDied, EnvHung: an env's worker is gone and is not replaced.
+            GroupClosed: the group was not initialised, or is closed.
+            RLightningError: another thread is using the group, or it belongs to another loop.
+        """
+        self._driver.call(self._steps.step_async, batch, time.monotonic())
+
+    def reset_async(
+        self,
+        seed: int | Sequence[int] | Mapping[str, int] | None = None,
+        options: dict[str, Any] | None = None,
+        env_ids: Sequence[str] | None = None,
+    ) -> None:
+        """Send a reset to each env; `collect_async` returns the first observations.
+
+        Never blocks, and doesn't wait for clients of an env_server.
+
+        Args:
+            seed: as for `reset`.
+            options: a dict, passed to each env.
+            env_ids: the envs to reset; None for all local ones and all connected clients.
+
+        Raises (before anything is sent):
+            EnvBusy: an env has a reply outstanding, or appears twice.
+            UnknownEnv: no env of this group has that id.
+            ValueError: a seed is not an int from 0 to 2**62 - 1, or there isn't one for each env.
+            TypeError: the options are no dict, or can't be sent to a worker or a client.
+            WorkerDied, EnvHung: an env's worker is gone and is not replaced.
+            GroupClosed: the group was not initialised, or is closed.
+            RLightningError: another thread is using the group, or it belongs to another loop.
+        """
+        self._driver.call(self._core.reset_async, time.monotonic(), seed, options, env_ids)
+
+    def call_async(
+        self, name: str, /, *args: Any, env_ids: Sequence[str] | None = None, **kwargs: Any
+    ) -> None:
+        """Call method `name` of the envs `env_ids` in parallel; None for all local envs.
+
+        `collect_calls` returns the values. Never blocks.
+
+        Raises (before anything is sent):
+            EnvBusy: an env has a reply outstanding, or appears twice.
+            UnknownEnv: no env of this group has that id.
+            TypeError: the arguments can't be sent to a worker.
+            NotImplementedError: an env belongs to a client; its methods can't be called.
+            WorkerDied, EnvHung: an env's worker is gone and is not replaced.
+            GroupClosed: the group was not initialised, or is closed.
+            RLightningError: another thread is using the group, or it belongs to another loop.
+        """
+        call = (name, args, kwargs)
+        self._driver.call(self._core.calls.call_async, time.monotonic(), env_ids, call)
+
+    def _drain(self, deadline: float | None) -> Procedure[tuple[BatchedData, list[bool]]]:
+        _check_seconds("deadline", deadline)
+        return self._core.drain_requests(time.monotonic(), deadline)
+
+    def _collect_calls(self, deadline: float | None) -> Procedure[list[Any]]:
+        _check_seconds("deadline", deadline)
+        return self._core.calls.collect_calls(time.monotonic(), deadline)
+
+    def _collect(
+        self,
+        timeout: float | None,
+        wait_all: bool,
+        min_results: int | None,
+        max_results: int | None,
+        deadline: float | None,
+        entries: Sequence[str] | None,
+        ordered: bool,
+    ) -> Procedure[tuple[BatchedData, list[bool]]]:
+        if timeout is not None or deadline is not None:
+            _check_seconds("timeout", timeout)
+            _check_seconds("deadline", deadline)
+        if min_results is None:
+            usual = 1 if wait_all else self._core.envs.usual_min_results(entries)
+            min_results = usual if max_results is None else max(1, min(usual, max_results))
+        if min_results < 1:
+            raise ValueError(f"min_results must be at least 1, not {min_results!r}")
+        if max_results is not None and max_results < 1:
+            raise ValueError(f"max_results must be at least 1, not {max_results!r}")
+        if max_results is not None and min_results > max_results:
+            raise ValueError(f"min_results ({min_results}) is above max_results ({max_results})")
+        if wait_all and timeout is not None:
+            warnings.warn("collect_async(wait_all=True) ignores timeout", stacklevel=3)
+            timeout = None
+        rules = CollectRules(
+            timeout=timeout,
+            wait_all=wait_all,
+            min_results=min_results,
+            max_results=max_results,
+            deadline=deadline,
+            entries=entries,
+            ordered=ordered,
+        )
+        return self._steps.collect(time.monotonic(), rules)
+
+    def auto_reset(
+        self,
+        max_episode_steps: float | None = None,
+        on_done: bool = True,
+        mark_truncated: bool = False,
+    ) -> AutoResetContext:
+        """Reset envs at their step limit, in place of their next step.
+
+        The step that reaches the limit sets `BatchedData.limit_reached` and the flag returned with
+        the batch. The next step of that env performs a reset instead, which returns reward 0 and
+        sets `BatchedData.is_reset`. Works with ``with`` and ``async with``.
+
+        Args:
+            max_episode_steps: the limit for all envs; None uses the limit of each entry, or else
+                of its simulator; `math.inf` sets no limit, for envs that end their own episodes.
+            on_done: also reset envs when their episode ends; an env with sub-environments or
+                agents when the episodes of all of them have ended.
+            mark_truncated: also set `BatchedData.truncated` at the limit.
+
+        Raises:
+            ValueError: the limit is neither a positive int nor `math.inf`, or it is None and an
+                env has no limit.
+            RuntimeError: another `auto_reset` context is open; contexts don't nest.
+        """
+        return AutoResetContext(self._core, max_episode_steps, on_done, mark_truncated)
+
+    @property
+    def resets_by_itself(self) -> bool:
+        """True while an `auto_reset` context is open."""
+        return self._core.continuity.active
+
+    # -- measurements -------------------------------------------------------------
+
+    def get_stats(self) -> dict[str, Any]:
+        """Throughput and latencies over the last ten seconds, at most the last thousand batches.
+
+        An env step is a step of one sub-environment: a result of an env with ``num_envs: n``
+        counts as n steps, a result of a multi-agent env as one, a reset as none.
+
+        Keys: ``steps_per_second`` (env steps); ``entries`` (by config entry, env steps per
+        second from ``step``, as ``sync``, and from ``collect_async``, as ``async``);
+        ``batch_size`` (results per batch: mean, min, max); ``latency_us`` (``p50`` and ``p99`` of
+        ``step``, the time in the env; ``wait``, from sending until the env begins; and
+        ``transfer``, from the end in the env until the result is returned). The dicts are empty
+        before anything was measured.
+        """
+        return self._core.stats.summary()
+
+    def get_env_stats(
+        self, reset: bool = False, by_entry: bool = False
+    ) -> dict[str, dict[str, Any]]:
+        """Requests sent, episodes ended, and mean and last return and length, by env id.
+
+        The means are over all ended episodes, so envs with short episodes contribute more of them.
+        To measure a policy, use `rlightning_aio.evaluation.evaluate`.
+
+        An episode ends by itself or at the step limit of `auto_reset`. ``success_rate`` and
+        ``fail_rate`` are the shares of True in ``info["success"]`` and ``info["fail"]`` of the
+        results that end episodes; None if the env sets no such key.
+
+        A former client, its slot taken by another, counts only in the figures of its entry.
+
+        Args:
+            reset: set the figures to zero after this call.
+            by_entry: return the figures of each config entry instead.
+        """
+        stats = self._core.stats
+        found = stats.by_entry() if by_entry else stats.by_env()
+        if reset:
+            stats.reset_envs()
+        return found
+
+    def get_workers(self) -> list[dict[str, Any]]:
+        """The current state of each host: each worker, this process, and each env_server.
+
+        Never waits; other tasks may be waiting for results or for `init`.
+
+        Keys: ``entry``; ``env_ids`` (for an env_server, of the connected clients); ``given_up``
+        (ids of envs that no request reaches any more: all of a failed worker, or an awaitable one
+        that is not rebuilt); ``pid`` (of a process on this machine, else None); ``state``
+        (``"new"`` before `init`, ``"starting"``, ``"up"``, ``"down"`` before a replacement,
+        ``"failed"``, ``"closed"``); ``owed`` (ids of envs with a request in flight, the oldest
+        first, which is the order of execution);
+        ``owed_seconds`` (the age of the oldest); ``restarts`` (the number of replacements).
+
+        Raises:
+            RLightningError: another thread is using the group, or it belongs to another loop.
+        """
+        self._driver.check_caller()
+        return self._core.describe_workers(time.monotonic_ns())
+
+    def print_timing_summary(self) -> None:
+        """Print the figures of `get_stats` as a table."""
+        stats = self.get_stats()
+        print(f"{stats['steps_per_second']:12.0f} env steps per second")
+        for name, rates in stats["entries"].items():
+            print(f"{rates['sync'] + rates['async']:12.0f}   {name}")
+        for kind, figures in stats["latency_us"].items():
+            print(f"{figures['p50']:12.1f} µs {kind} (median), {figures['p99']:.1f} µs (p99)")
+
+    def trace(self, path: str | Path) -> Trace:
+        """Record a timeline of this group into a file that https://ui.perfetto.dev opens.
+
+        Use ``with group.trace("run.json"):`` (or ``async with``), or `Trace.start` and
+        `Trace.stop`. The timeline shows steps and resets of each env, waits of workers and trainer,
+        the path of each request to its result, restarts, hangs and step limits: see
+        docs/timeline.md. `span` adds other work of the trainer.
+
+        Args:
+            path: of the file, in Chrome's trace event format (JSON). It is written when the
+                recording ends, also by an error, Ctrl-C or `close`, and replaces an existing file.
+
+        Raises:
+            OSError: the file can't be written.
+        """
+        return Trace(self._core, path, self._traces, by_task=self._shares_thread)
+
+    def span(self, name: str) -> AbstractContextManager[Any]:
+        """Add a slice to the timeline for other work: ``with group.span("learner"):``.
+
+        Does nothing while no timeline is recorded, so the call may stay in the program.
+        """
+        return self._traces[0].span(name) if self._traces else NO_SPAN
+
+    def _disown(self) -> None:
+        """Release this group in a forked child, and leave it intact in the parent."""
+        self._disowned = True
+        self._driver.forget()
+        self._core.supervisor.shutdown.disown()
+
+    def _closed(self) -> None:
+        if not self._core.lifetime.closed:
+            return  # `close` raised before it closed anything.
+        self._finalizer.detach()
+        for trace in list(self._traces):
+            trace.stop()
+        close_errors = self._core.supervisor.close_errors
+        errors = list(close_errors)
+        close_errors.clear()  # Warn once, however often `close` is called.
+        left = [env_id for env_id, error in errors if error.type_name in _NOT_CLOSED]
+        if left:
+            _log.warning(
+                "%d envs were not closed, and what they hold may be left behind (close_timeout of "
+                "an entry gives its envs more time): %s",
+                len(left),
+                ", ".join(left),
+            )
+        # Of envs that were lost with their worker, which have one error, the first.
+        first_of = {id(error): (env_id, error) for env_id, error in reversed(errors)}
+        for env_id, error in reversed(first_of.values()):
+            warnings.warn(f"close() of env {env_id!r} raised {error.summary}", stacklevel=3)
+
+
+_groups: weakref.WeakSet[Facade] = weakref.WeakSet()
+
+
+def _disown_all() -> None:
+    """Release all groups in a forked child."""
+    this_process[0] = os.getpid()
+    for group in list(_groups):
+        group._disown()  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]  # Same module.
+
+
+os.register_at_fork(after_in_child=_disown_all)
+
+
+def _check_seconds(name: str, seconds: float | None) -> None:
+    if seconds is not None and not seconds > 0:
+        raise ValueError(f"{name} must be a positive number of seconds, not {seconds!r}")

@@ -1,0 +1,420 @@
+"""The waiting methods of groups and handles, documented once for both kinds.
+
+`aio` defines them as coroutines and `sync` as plain methods. A method returns when the replies are
+there; "cancelled" below means a cancelled task, or Ctrl-C in a synchronous program.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from rlightning_aio._core.group.api.facade import Facade
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from rlightning_aio._core.group.engine.core import Core
+    from rlightning_aio._core.hosts.base import Membership
+    from rlightning_aio.batch import BatchedData
+    from rlightning_aio.types import EnvMeta, PolicyResponse
+
+__all__ = ["EnvHandleInterface", "GroupInterface", "ServerHandleInterface"]
+
+
+class GroupInterface(Facade):
+    """The waiting methods of a group."""
+
+    def init(self) -> Any:
+        """Start all worker processes in parallel, and build their envs.
+
+        Returns one `EnvMeta` for each local env, then one without spaces for each env_server,
+        in the order of `env_ids`. If it fails or is cancelled, nothing is left running.
+
+        Raises:
+            StartFailed: an env could not be built, or took longer than ``start_timeout``.
+            ConfigError: the envs' action spaces have different shapes (a `ValueError`).
+            GroupClosed: the group was closed before.
+            RLightningError: another event loop has initialised the group.
+        """
+        raise NotImplementedError
+
+    def reset(
+        self,
+        seed: int | Sequence[int] | Mapping[str, int] | None = None,
+        options: dict[str, Any] | None = None,
+        env_ids: Sequence[str] | None = None,
+    ) -> Any:
+        """Start a new episode in all envs, or in those of `env_ids`, and wait for all of them.
+
+        Args:
+            seed: env k of the group gets ``seed + k`` (k counts sub-environments); a sequence
+                gives one seed for each env, a mapping seeds by id.
+            options: a dict, passed to each env.
+            env_ids: the envs to reset; the results have this order. None: all local envs, then
+                the clients of env_servers, after waiting until enough have joined.
+
+        Returns the first observations, in fresh arrays (views, if the group was built with
+        ``zero_copy``), and a list of flags that are all False. Cancelled, it leaves the results
+        to `collect_async`.
+
+        Raises:
+            EnvBusy: an env has a reply outstanding, or appears twice; nothing was sent.
+            UnknownEnv: no env of this group has that id.
+            ValueError: a seed is not an int from 0 to 2**62 - 1, or there isn't one for each env.
+            TypeError: the options are no dict, or can't be sent to a worker or a client.
+            TimeoutError: too few clients of an env_server have joined in time.
+            EnvRaised, WorkerDied, EnvHung, EnvAway: an env failed, or its client is away; the
+                others' results are in the error's ``results``.
+            GroupClosed: the group was not initialised, or is closed.
+        """
+        raise NotImplementedError
+
+    def step(self, batch: BatchedData) -> Any:
+        """Step the envs of `batch` and wait for all of them.
+
+        Args:
+            batch: a batch of responses, from `BatchedData.respond` (columns, fast) or made of
+                `PolicyResponse` values; any of the local envs, in any order.
+
+        Returns results with the same ids in the same order, in fresh arrays (views, if the
+        group was built with ``zero_copy``), and None; inside `auto_reset` a flag for each
+        result instead of None. Cancelled, it leaves the results to `collect_async`.
+
+        Raises:
+            BadAction: an action's shape, dtype or count doesn't fit; it holds NaN, a number that
+                its dtype can't hold, or infinity where its space is bounded; or this is not a
+                batch. Nothing was sent.
+            EnvBusy: an env has a reply outstanding, or appears twice; nothing was sent.
+            UnknownEnv: no env of this group has that id.
+            NotImplementedError: the env is a client's, which answers when it can.
+            EnvRaised, WorkerDied, EnvHung: an env failed; the others' results are in the
+                error's ``results``.
+            GroupClosed: the group was not initialised, or is closed.
+        """
+        raise NotImplementedError
+
+    def collect_async(
+        self,
+        timeout: float | None = None,
+        wait_all: bool = False,
+        min_results: int | None = None,
+        max_results: int | None = None,
+        deadline: float | None = None,
+        entries: Sequence[str] | None = None,
+        ordered: bool = False,
+    ) -> Any:
+        """Wait for results of `step_async`; never returns an empty batch.
+
+        In a synchronous group the method has the same name and blocks.
+
+        Args:
+            timeout: seconds of a further window, opened when the first result is ready, in
+                which more results join.
+            wait_all: wait for all pending results; ignores `timeout`, with a warning.
+            min_results: return when this many are ready, or all that are pending. None is the
+                sum of the config entries' ``min_results``, or 1.
+            max_results: leave results above this number to the next call, first come, first
+                served.
+            deadline: limit in seconds, from now.
+            entries: take results of these config entries only; those of others stay.
+            ordered: return results in the group's order instead of that of arrival. With
+                ``wait_all`` that makes a run reproducible.
+
+        Returns results, in fresh arrays (views, if the group was built with ``zero_copy``), and
+        a flag for each: inside `auto_reset` True where the result reached the step limit, as in
+        `BatchedData.limit_reached`. Cancelled, it loses no result.
+
+        Raises:
+            NothingPending: no request is outstanding (of `entries`), and no client can join.
+            UnknownEnv: no config entry has such a name.
+            ValueError: a time isn't above 0, a number isn't above 0, or `min_results` is above
+                `max_results`.
+            TimeoutError: `deadline` has passed; the next call returns the results.
+            EnvRaised: the answer to the request of its `env_id`; results and errors of others stay
+                for the next call.
+            WorkerDied, EnvHung: the answer to the requests of all its `env_ids`; likewise.
+            GroupClosed: the group was not initialised, or is closed.
+            RLightningError: another call is collecting.
+        """
+        raise NotImplementedError
+
+    def abort(self, env_ids: Sequence[str] | None = None) -> Any:
+        """End what envs are doing, and drop its results; the envs are free when this returns.
+
+        Args:
+            env_ids: the envs; None: all. Idle ones are left as they are.
+
+        Within a second, whatever an env does: an awaitable env's step is cancelled, and the env is
+        closed and rebuilt. An env of a worker or a Ray actor may end its step within 0.2 seconds;
+        then its worker is killed and replaced, which costs other envs in it their episodes, as
+        any death does (`on_worker_death` and `max_restarts` don't count this one). An env_server
+        ends the client's session, and the client may come back with a new one. Only in this process
+        nothing can end a step that has begun; those that haven't are withdrawn.
+
+        The episodes are over: reset the envs, or step them, which resets them first and marks the
+        result as after a restart. Robots move only when they are reset. Another call that waits
+        for one of the envs raises `EnvAborted`; `collect_async` waits for the rest. Errors that
+        were not collected stay for the next collect. Cancelled, it ends the requests all the same.
+
+        Raises:
+            UnknownEnv: no env of this group has that id.
+            GroupClosed: the group was not initialised, or is closed.
+        """
+        raise NotImplementedError
+
+    def drain(self, deadline: float | None = None) -> Any:
+        """Return results that are ready, and end everything else; all envs are idle then.
+
+        Args:
+            deadline: seconds to wait for the results of `step_async` and `reset_async`; None
+                takes those that are ready now.
+
+        Requests that have not ended by then are aborted, as by `abort`, also those of other calls;
+        values of `call_async` are dropped.
+
+        Returns results and a flag for each, as `collect_async` does, in the order of the group;
+        an empty batch if there are none. Cancelled, it loses no result that was ready.
+
+        Raises:
+            ValueError: `deadline` isn't above 0.
+            EnvRaised, WorkerDied, EnvHung: an error that waited to be collected, once all envs are
+                idle; the results are in its ``results``, further errors in ``others``.
+            GroupClosed: the group was not initialised, or is closed.
+            RLightningError: another call is collecting.
+        """
+        raise NotImplementedError
+
+    def collect_calls(self, deadline: float | None = None) -> Any:
+        """Wait for the values of all calls that `call_async` has sent.
+
+        Args:
+            deadline: limit in seconds, from now.
+
+        Returns the values in the order in which the calls were sent: copies from a worker, the
+        objects themselves from an inline env. Cancelled, it loses none.
+
+        Raises:
+            NothingPending: no call is outstanding.
+            TimeoutError: `deadline` has passed; the next `collect_calls` gets the values.
+            EnvRaised: a method raised, or its value can't be pickled; further errors are in
+                ``others``, and the values of the others are gone.
+            WorkerDied, EnvHung: a worker ended meanwhile; a replacement does not repeat the call.
+            GroupClosed: the group was not initialised, or is closed.
+            RLightningError: another call is collecting values.
+        """
+        raise NotImplementedError
+
+    def snapshot(self, env_ids: Sequence[str] | None = None) -> Any:
+        """Return the complete state of envs as bytes that can be stored.
+
+        Args:
+            env_ids: the envs, all idle and reset before; None: all local ones.
+
+        The bytes hold the state of simulators, wrappers and generators, the sums of the current
+        episodes, the step counts of `auto_reset`, and which envs are due for a reset;
+        docs/state.md says what they leave out. `restore` takes them in this group or another, in
+        this process or another.
+
+        Raises:
+            EnvBusy: an env has a reply outstanding; nothing was sent.
+            UnknownEnv: no env of this group has that id.
+            SnapshotError: an env is a robot's, or was never reset.
+            NotImplementedError: an env is a client's.
+            EnvRaised: an env can't give its state; the message says why.
+            WorkerDied, EnvHung: a worker ended meanwhile.
+            GroupClosed: the group was not initialised, or is closed.
+        """
+        raise NotImplementedError
+
+    def restore(self, snapshot: bytes, env_ids: Sequence[str] | None = None) -> Any:
+        """Restore envs to the state of a snapshot: all of them, or none.
+
+        Args:
+            snapshot: bytes that `snapshot` returned. They hold pickles, which can make a worker
+                execute anything: use only what you have written yourself.
+            env_ids: the envs to restore, all idle, in the order of the snapshot's. Any env of an
+                equal entry will do. None: all envs, whose ids must be the snapshot's.
+
+        Returns the envs' last observations at the time of the snapshot, and flags that are all
+        False, as `reset` does: with `is_reset`, because no transition ends here, and without
+        reward. Cancelled, the envs start a new episode with their next step, marked as after a
+        restart.
+
+        Raises:
+            SnapshotError: the bytes are damaged, or of another number of envs, another task,
+                other options or another version of a library; nothing was changed.
+            EnvBusy: an env has a reply outstanding; nothing was sent.
+            UnknownEnv: no env of this group has that id.
+            NotImplementedError: an env is a client's.
+            EnvRaised, WorkerDied, EnvHung: an env failed; the others keep their states. After all
+                were restored, the results of the others are in the error's ``results``.
+            GroupClosed: the group was not initialised, or is closed.
+        """
+        raise NotImplementedError
+
+    def offload(self) -> Any:
+        """Free the device memory of every local env until `reload`.
+
+        Cancelled, it leaves the envs to free it on their own.
+
+        Raises:
+            EnvBusy: an env has a reply outstanding; nothing was sent.
+            EnvRaised: an env can't, or failed to; further errors are in ``others``.
+            WorkerDied, EnvHung: a worker ended meanwhile; a replacement does not repeat it.
+            GroupClosed: the group was not initialised, or is closed.
+        """
+        raise NotImplementedError
+
+    def reload(self) -> Any:
+        """Allocate the device memory of every local env again; errors are those of `offload`."""
+        raise NotImplementedError
+
+    def close(self) -> Any:
+        """Close all envs and end their workers, by force after a second and a half, or after the
+        ``close_timeout`` of their entry.
+
+        Idempotent. Calls that wait get `GroupClosed`, and results that were not collected are
+        gone. Cancelled, it ends the remaining workers by force. A warning names an env that
+        raises in its own `close`, and the log names those that were not closed in time. A signal
+        handler may close a synchronous group; the call that it interrupts raises `GroupClosed`.
+
+        Raises:
+            RLightningError: the loop that the group belongs to runs in another thread.
+        """
+        raise NotImplementedError
+
+
+class EnvHandleInterface:
+    """The methods of a handle on one env."""
+
+    def __init__(self, group: Any, core: Core, driver: Any, env_id: str) -> None:
+        self._group = group
+        self._core = core
+        self._driver = driver
+        self._env_id = env_id
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self._env_id!r})"
+
+    @property
+    def env_id(self) -> str:
+        """Id of the env, as in `EnvGroup.env_ids`."""
+        return self._env_id
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        """Start a new episode and wait for its first observation.
+
+        Args:
+            seed: of the env; sub-environment k gets ``seed + k``.
+            options: passed to the env.
+
+        Returns the result as a value, with arrays like those of `EnvGroup.reset`. Cancelled, it
+        leaves the result to the group's `collect_async`. Errors are those of `EnvGroup.reset`.
+        """
+        raise NotImplementedError
+
+    def step(self, response: PolicyResponse | Any) -> Any:
+        """Step with a `PolicyResponse`, or with a bare action, and wait for the result.
+
+        Returns the result as a value, inside `auto_reset` that of a reset if one is due, with
+        arrays like those of `EnvGroup.step`. Cancelled, it leaves the result to the group's
+        `collect_async`. Errors are those of `EnvGroup.step`.
+        """
+        raise NotImplementedError
+
+    def call(self, name: str, /, *args: Any, **kwargs: Any) -> Any:
+        """Call method `name` of the env, or of the first of its simulator's wrappers that has
+        it, from the outermost to the simulator.
+
+        Returns its value: a copy from a worker, the object itself from an inline env. Cancelled,
+        it lets the method end on its own and drops the value.
+
+        Raises:
+            EnvRaised: the method raised, or its value can't be pickled.
+            EnvBusy: the env has a reply outstanding; nothing was sent.
+            TypeError: the arguments can't be sent to a worker; nothing was sent.
+            WorkerDied, EnvHung: the worker ended meanwhile; a replacement does not repeat it.
+            UnknownEnv: the env was a client's that has gone, and another has its place.
+            GroupClosed: the group was not initialised, or is closed.
+        """
+        raise NotImplementedError
+
+    def get_attr(self, name: str, target: str = "unwrapped") -> Any:
+        """Return attribute `name` of the simulator, or of its outermost wrapper with target
+        ``outer``; values and errors are those of `call`.
+        """
+        return self.call("get_attr", name, target)
+
+    def set_attr(self, name: str, value: Any, target: str = "unwrapped") -> Any:
+        """Set attribute `name` of the simulator or its outermost wrapper; errors as in `call`."""
+        return self.call("set_attr", name, value, target)
+
+    def render(self) -> Any:
+        """Return one frame as the simulator renders it; errors are those of `call`."""
+        return self.call("render")
+
+    def offload(self) -> Any:
+        """Free the env's device memory until `reload`; errors are those of `call`."""
+        return self.call("offload")
+
+    def reload(self) -> Any:
+        """Allocate the env's device memory again; errors are those of `call`."""
+        return self.call("reload")
+
+
+class ServerHandleInterface(EnvHandleInterface):
+    """The methods of a handle on one env_server."""
+
+    def __init__(self, group: Any, core: Core, driver: Any, server: Membership) -> None:
+        super().__init__(group, core, driver, server.server_id)
+        self._server = server
+
+    @property
+    def address(self) -> str:
+        """Address that clients connect to, as ``tcp://host:port`` with the port in use.
+
+        Raises:
+            RuntimeError: it does not listen yet, before `init`.
+        """
+        return self._server.address()
+
+    @property
+    def clients(self) -> list[str]:
+        """Ids of the envs of connected clients, ``<server id>/<client name>``."""
+        return [f"{self.env_id}/{name}" for name in self._server.members()]
+
+    @property
+    def metas(self) -> list[EnvMeta]:
+        """Metadata of these clients' envs, in the same order."""
+        return list(self._server.members().values())
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        """Reset all clients and wait for them; each env_server must have ``min_clients`` first.
+
+        Args:
+            seed: client k, in the order of their names, gets ``seed + k`` (counting
+                sub-environments).
+            options: passed to each.
+
+        Returns a list with one result for each client, in the order of their names. Cancelled
+        while the clients reset, it leaves the results to the group's `collect_async`.
+
+        Raises:
+            TimeoutError: too few clients have joined within ``connect_timeout``.
+            EnvBusy: a client has a reply outstanding; nothing was sent.
+            TypeError: the options can't be sent to a client; nothing was sent.
+            EnvRaised, EnvAway: a client's env failed, or the client is away; the others'
+                results are in the error's ``results``.
+            GroupClosed: the group was not initialised, or is closed.
+        """
+        raise NotImplementedError
+
+    def step(self, response: PolicyResponse | Any) -> Any:
+        """Raise NotImplementedError, because remote envs answer when they can."""
+        raise NotImplementedError(
+            f"{self.env_id} is an env_server; use the group's step_async and collect_async"
+        )
+
+    def call(self, name: str, /, *args: Any, **kwargs: Any) -> Any:
+        """Raise NotImplementedError, because methods of remote envs can't be called."""
+        raise NotImplementedError(f"{self.env_id} is an env_server; it can't call {name}()")

@@ -1,0 +1,106 @@
+"""`Aborts`: ends requests without their results, because their caller wants none.
+
+The envs are free soon after that, whatever they do: their hosts cancel a request, withdraw it, or
+are replaced. The episode of an aborted request is over. Left out: what hosts do for that (see
+`HangDetector`).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from rlightning_aio._core.group.state.request_states import COLLECTOR
+from rlightning_aio.errors import EnvAborted
+from rlightning_aio.protocol.entries import Operation
+from rlightning_aio.registry import ENVS
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from rlightning_aio._core.group.drivers.wait import Procedure
+    from rlightning_aio._core.group.engine.arrivals import Arrivals
+    from rlightning_aio._core.group.engine.intake import Intake
+    from rlightning_aio._core.group.engine.results import Results
+    from rlightning_aio._core.group.engine.waiting import Waiting
+    from rlightning_aio._core.group.supervision.supervisor import Supervisor
+    from rlightning_aio._core.group.tables import Tables
+
+__all__ = ["Aborts"]
+
+_CAUSE: Final = "was aborted"
+
+
+class Aborts:
+    """See the module; the arguments are the group's parts."""
+
+    def __init__(
+        self,
+        tables: Tables,
+        supervisor: Supervisor,
+        results: Results,
+        arrivals: Arrivals,
+        intake: Intake,
+        waiting: Waiting,
+    ) -> None:
+        self._envs = tables.envs
+        self._requests = tables.requests
+        self._continuity = tables.continuity
+        self._lifetime = tables.lifetime
+        self._supervisor = supervisor
+        self._results = results
+        self._arrivals = arrivals
+        self._intake = intake
+        self._waiting = waiting
+
+    def drop(self, slots: NDArray[np.intp]) -> None:
+        """Drop those results of `slots` that wait for the collector; errors that do so stay."""
+        ready = self._requests.ready(slots)
+        ready = ready[self._requests.owner[ready] == COLLECTOR]
+        if len(ready):
+            self._requests.claim(ready, None)
+            self._results.let_go(ready)
+        failed = self._requests.collector.free(slots.tolist())
+        dropped = np.concatenate((ready, failed))
+        self._abandon(dropped)
+        self._arrivals.admit(dropped, self._intake.now)
+
+    def end(self, slots: NDArray[np.intp], now: float) -> Procedure[float]:
+        """End the requests of `slots` that are outstanding; return the time after that.
+
+        Results that are ready stay. Cancelled, they end all the same.
+        """
+        slots = self._requests.owed(slots)
+        aborted = self._requests.aborted
+        for slot in slots.tolist():
+            aborted.add(slot, self._fault(slot))
+        self._abandon(slots)
+        for host_id, entry in self._supervisor.detector.abort(slots, now):
+            self._requests.end(host_id, entry)
+        self._waiting.poll()
+        self._waiting.wake()  # Others may have waited for these, or without a look at the clock.
+        try:
+            while left := aborted.faults.keys() & slots.tolist():
+                now = yield from self._waiting.turn(len(left), None)
+                self._waiting.poll()
+        finally:
+            self._waiting.end()
+        self._arrivals.admit(slots, self._intake.now)
+        return now
+
+    def _fault(self, slot: int) -> EnvAborted:
+        doing = Operation(self._requests.numbering.op(slot)).name.lower()
+        return EnvAborted(
+            f"the {doing} of {self._envs.describe(slot)} was aborted by the group's abort() or "
+            "drain(), or by the end of its episode(); its episode is over: reset it to go on",
+            env_id=self._envs.env_ids[slot],
+        )
+
+    def _abandon(self, slots: NDArray[np.intp]) -> None:
+        """Note that episodes are over; only its user resets a robot, or the env of a client."""
+        chosen: list[int] = slots.tolist()
+        for slot in chosen:
+            backend = self._envs.configs[slot].backend
+            if slot < len(self._envs.all) and not ENVS.is_hardware(backend):
+                self._continuity.abandon([slot], _CAUSE)

@@ -1,0 +1,314 @@
+"""Check the actions of a batch and write them into slab rows.
+
+Rule: all or nothing. The whole batch is checked before the first byte is sent. Columns are checked
+and copied with vector operations, separate values one by one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from rlightning_aio._core.group.state.slab_layout import rows_in
+from rlightning_aio._core.hosts.messages import NO_ACTION
+from rlightning_aio.batch.contents import columns_of_responses
+from rlightning_aio.batch.sent import columns_of_values
+from rlightning_aio.errors import BadAction
+from rlightning_aio.protocol.columns import Leaf, Rows, Tree, as_array, index, out_of_range
+from rlightning_aio.protocol.exchange import FEW_NUMBERS, sum_of_squares
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from gymnasium import spaces
+    from numpy.typing import NDArray
+
+    from rlightning_aio._core.group.state.env_table import EnvTable
+    from rlightning_aio._core.group.state.slab_layout import SlabLayout
+    from rlightning_aio.batch import BatchedData
+    from rlightning_aio.protocol.slab import Slab
+
+__all__ = ["OutOfBandSteps", "number_limits", "write_actions", "write_column"]
+
+
+@dataclass(frozen=True, slots=True)
+class OutOfBandSteps:
+    """Steps with arguments that the channel carries: (action, extras) by position in the batch."""
+
+    positions: NDArray[np.intp]
+    contents: list[tuple[Any, dict[str, Any]]]
+
+
+def write_actions(
+    batch: BatchedData, slots: NDArray[np.intp], envs: EnvTable, layout: SlabLayout
+) -> OutOfBandSteps | None:
+    """Check the actions of `batch` and write those that fit into their rows.
+
+    Returns the steps to send out of band, or None if the rows hold all actions.
+
+    Raises:
+        BadAction: an action doesn't match its env in shape, dtype or count, or holds a number
+            outside its space. Nothing was sent; rows of idle envs may have been written.
+    """
+    out_of_band = None
+    if envs.any_out_of_band:
+        out_of_band = _chosen_out_of_band(batch, slots, envs, layout)
+        if out_of_band is not None and len(out_of_band.positions) == len(slots):
+            return out_of_band
+    columns = columns_of_responses(batch)
+    if columns is not None and len(layout.slabs) == 1 and out_of_band is None:
+        rows = rows_in(layout, slots, envs.all)
+        write_column(columns.get("action"), layout.slabs[0], slots, rows, envs)
+        return None
+    _write_one_by_one(batch, slots, envs, layout, out_of_band)
+    return out_of_band
+
+
+def write_column(
+    action: Any, slab: Slab, slots: NDArray[np.intp], rows: Rows, envs: EnvTable
+) -> None:
+    """Write the actions of a whole batch, one copy per leaf of the action space."""
+    for leaf, target in slab.action_columns:
+        source = _as_array(_column_at(action, leaf) if leaf.path else action)
+        if source.shape != (len(slots), *leaf.shape) or not _castable(source, leaf):
+            raise BadAction(_misfit(f"the batch's action{leaf.name}", source, leaf, len(slots)))
+        if (unfit := _unfit(source, leaf, slab)) is not None:
+            raise _unfit_error(unfit, source, leaf, slots, envs)
+        target[rows] = source
+
+
+def number_limits(dtype: np.dtype[Any]) -> dict[np.dtype[Any], float | None]:
+    """The dtypes that can be written to a column of `dtype` unconverted.
+
+    Each maps to the limit on the sum of the squares of an action, or None if all numbers fit.
+    """
+    if dtype.kind != "f":
+        return {dtype: None}
+    floats = (np.dtype(np.float32), np.dtype(np.float64))
+    return {own: _largest(own, dtype)[1] for own in floats}
+
+
+def _write_one_by_one(
+    batch: BatchedData,
+    slots: NDArray[np.intp],
+    envs: EnvTable,
+    layout: SlabLayout,
+    out_of_band: OutOfBandSteps | None,
+) -> None:
+    """Write actions given as separate values, or for envs with different layouts."""
+    elsewhere = set(out_of_band.positions.tolist()) if out_of_band is not None else set[int]()
+    actions = actions_of(batch)
+    by_slab: dict[int, list[int]] = {}
+    for position, slab_index in enumerate(layout.slab[slots].tolist()):
+        if position not in elsewhere:
+            by_slab.setdefault(slab_index, []).append(position)
+    for slab_index, positions in by_slab.items():
+        slab = layout.slabs[slab_index]
+        rows = layout.row[slots[positions]]
+        for leaf, target in slab.action_columns:
+            sources = [_as_array(_at(actions[k], leaf)) for k in positions]
+            for k, source in zip(positions, sources, strict=True):
+                if source.shape != leaf.shape or not _castable(source, leaf):
+                    who = envs.describe(int(slots[k]))
+                    raise BadAction(_misfit(f"action{leaf.name} for {who}", source, leaf))
+            stacked = np.array(sources)
+            if (unfit := _unfit(stacked, leaf, slab)) is not None:
+                raise _unfit_error(unfit, stacked, leaf, slots[positions], envs)
+            target[rows] = stacked
+
+
+def _unfit_error(
+    unfit: NDArray[np.bool_],
+    source: NDArray[Any],
+    leaf: Leaf,
+    slots: NDArray[np.intp],
+    envs: EnvTable,
+) -> BadAction:
+    """The error that names the first of `slots` with an `unfit` number."""
+    row = int(unfit.reshape(len(slots), -1).any(axis=1).argmax())
+    number = source[row][unfit[row]].flat[0]
+    return BadAction(
+        f"action{leaf.name} for {envs.describe(int(slots[row]))} holds {number}, which doesn't "
+        f"fit the action space, of dtype {leaf.dtype}; nothing was sent"
+    )
+
+
+def _unfit(source: NDArray[Any], leaf: Leaf, slab: Slab) -> NDArray[np.bool_] | None:
+    """A mask of the numbers that the space can't hold, or None if there are none.
+
+    These are NaN, numbers outside the range of the dtype, and infinity where the space is bounded.
+    Finite numbers outside the bounds are left to the env.
+    """
+    if leaf.dtype.kind != "f" or source.dtype.kind != "f":
+        return out_of_range(source, leaf.dtype)
+    most, most_squared = _largest(source.dtype, leaf.dtype)
+    if source.size <= FEW_NUMBERS:
+        # One multiplication detects NaN, infinity, and any number that may be too large.
+        if sum_of_squares(source) <= most_squared:
+            return None
+    elif source.max() <= most and source.min() >= -most:
+        return None
+    space = slab.layout.action_space
+    for key in leaf.path:
+        space = cast("Any", space)[key]
+    box = cast("spaces.Box", space)
+    infinite = np.isinf(source)
+    unfit = (source > most) & (box.bounded_above | ~infinite)
+    unfit |= (source < -most) & (box.bounded_below | ~infinite)
+    unfit |= np.isnan(source)
+    return unfit if unfit.any() else None
+
+
+@cache
+def _largest(one: np.dtype[Any], other: np.dtype[Any]) -> tuple[float, float]:
+    """The largest number that both dtypes hold, and its square (itself where that overflows)."""
+    most = min(float(np.finfo(one).max), float(np.finfo(other).max))
+    return most, most * most if most < 1e100 else most
+
+
+def actions_of(batch: BatchedData) -> list[Any]:
+    """One action for each value of `batch`."""
+    columns = columns_of_responses(batch)
+    if columns is not None:
+        return [index(columns["action"], k) for k in range(len(batch))]
+    actions: list[Any] = []
+    for id_, value in batch.items():
+        if not hasattr(value, "action"):
+            raise BadAction(
+                f"the value for {id_!r} is a {type(value).__name__}, not a PolicyResponse with an "
+                "action"
+            )
+        actions.append(value.action)
+    return actions
+
+
+def _chosen_out_of_band(
+    batch: BatchedData, slots: NDArray[np.intp], envs: EnvTable, layout: SlabLayout
+) -> OutOfBandSteps | None:
+    """The steps that the channel carries: actions that fit no row, and extras that envs read."""
+    columns = columns_of_responses(batch)
+    any_extras = columns is None or len(columns) > 1
+    chosen = envs.out_of_band_actions[slots]
+    if any_extras:
+        chosen = chosen | envs.reads_extras[slots]
+    positions = np.flatnonzero(chosen)
+    if not len(positions):
+        return None
+    if columns is not None and len(layout.slabs) == 1:
+        action = columns.get("action")
+        if _fits(action, layout.slabs[0], len(slots)):
+            if not any_extras:
+                return None
+            _write(action, layout.slabs[0], rows_in(layout, slots, envs.all))
+            return _extras_alone(batch, slots, envs)
+    actions = actions_of(batch)
+    contents: list[tuple[Any, dict[str, Any]]] = []
+    kept: list[int] = []
+    for k in positions.tolist():
+        slot = int(slots[k])
+        extras = _extras(batch, k) if envs.reads_extras[slot] else {}
+        slab, row = layout.of(slot)
+        if not _fits(actions[k], slab):
+            if envs.out_of_band_actions[slot]:
+                kept.append(k)
+                contents.append((_plain(actions[k]), extras))
+        elif extras:
+            _write(actions[k], slab, row)
+            kept.append(k)
+            contents.append((NO_ACTION, extras))
+    return OutOfBandSteps(np.array(kept, np.intp), contents) if kept else None
+
+
+def response_columns(
+    batch: BatchedData, slots: NDArray[np.intp], layout: SlabLayout
+) -> Mapping[str, Any]:
+    """Return the columns of a batch of responses to `slots`."""
+    columns = columns_of_responses(batch)
+    if columns is not None:
+        return columns
+    slabs: set[int] = {*layout.slab[slots].tolist()}
+    actions_as_list = any(layout.slabs[k].action is None for k in slabs)
+    return columns_of_values(batch.values(), actions_as_list=actions_as_list)
+
+
+def _extras_alone(
+    batch: BatchedData, slots: NDArray[np.intp], envs: EnvTable
+) -> OutOfBandSteps | None:
+    """The extras that envs read, of steps whose actions are in their rows."""
+    readers = np.flatnonzero(envs.reads_extras[slots])
+    contents = [(NO_ACTION, _extras(batch, k)) for k in readers.tolist()]
+    return OutOfBandSteps(readers, contents) if contents else None
+
+
+def _extras(batch: BatchedData, position: int) -> dict[str, Any]:
+    columns = columns_of_responses(batch)
+    if columns is not None:
+        return {name: index(c, position) for name, c in columns.items() if name != "action"}
+    return batch.values()[position].extras
+
+
+def _fits(action: Any, slab: Slab, *count: int) -> bool:
+    """True if a row can hold `action`, or `count` rows the actions of a whole batch."""
+    at = _column_at if count else _at
+    try:
+        return slab.action is not None and all(
+            (array := _as_array(at(action, leaf))).shape == (*count, *leaf.shape)
+            and _castable(array, leaf)
+            and _unfit(array, leaf, slab) is None
+            for leaf, _ in slab.action_columns
+        )
+    except (BadAction, ValueError):
+        return False
+
+
+def _write(action: Any, slab: Slab, rows: Any) -> None:
+    """Write one action into its row, or a whole batch into `rows`."""
+    at = _at if isinstance(rows, int) else _column_at
+    for leaf, target in slab.action_columns:
+        target[rows] = _as_array(at(action, leaf))
+
+
+def _plain(action: Any) -> Any:
+    """Convert a tensor to an array, as workers may lack torch."""
+    return _as_array(action) if hasattr(action, "detach") else action
+
+
+def _as_array(value: Any) -> NDArray[Any]:
+    try:
+        return as_array(value)
+    except (ValueError, TypeError, RuntimeError) as error:  # Tensors NumPy can't convert.
+        raise BadAction(f"an action is not an array: {error}; nothing was sent") from None
+
+
+def _at(tree: Tree, leaf: Leaf) -> Any:
+    """The array of `tree` that belongs to `leaf`."""
+    for key in leaf.path:
+        try:
+            tree = tree[key]
+        except (KeyError, IndexError, TypeError):
+            raise BadAction(
+                f"the action has no part {leaf.name}; the action space is a Dict or Tuple"
+            ) from None
+    return tree
+
+
+def _column_at(action: Any, leaf: Leaf) -> Any:
+    """The column of a batch's actions that belongs to `leaf`; lists hold one action per item."""
+    if isinstance(action, list) and leaf.path:
+        return [_at(one, leaf) for one in cast("list[Tree]", action)]
+    return _at(action, leaf)
+
+
+def _castable(array: NDArray[Any], leaf: Leaf) -> bool:
+    return array.dtype == leaf.dtype or np.can_cast(array.dtype, leaf.dtype, "same_kind")
+
+
+def _misfit(what: str, found: NDArray[Any], leaf: Leaf, rows: int | None = None) -> str:
+    shape = leaf.shape if rows is None else (rows, *leaf.shape)
+    return (
+        f"{what} doesn't fit the action space: expected shape {shape} and dtype {leaf.dtype}, "
+        f"found shape {found.shape} and dtype {found.dtype}; nothing was sent"
+    )

@@ -1,0 +1,163 @@
+"""`Calls`: method calls of envs, and other requests that return a value instead of a result."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from rlightning_aio.errors import EnvAborted, NothingPending, RLightningError
+from rlightning_aio.protocol.entries import Operation
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from rlightning_aio._core.group.drivers.wait import Procedure
+    from rlightning_aio._core.group.engine.dispatch import Dispatch
+    from rlightning_aio._core.group.engine.intake import Intake
+    from rlightning_aio._core.group.engine.waiting import Waiting
+    from rlightning_aio._core.group.state.requests import Ticket
+    from rlightning_aio._core.group.tables import Tables
+    from rlightning_aio.errors import EnvFault
+
+__all__ = ["Calls", "values_of"]
+
+Call: TypeAlias = "tuple[str, tuple[Any, ...], dict[str, Any]]"
+"""Name of a method and its arguments."""
+
+
+class Calls:
+    """Send method calls, and collect the returned values."""
+
+    def __init__(
+        self,
+        tables: Tables,
+        dispatch: Dispatch,
+        intake: Intake,
+        waiting: Waiting,
+    ) -> None:
+        self._observed = tables.observed
+        self._envs = tables.envs
+        self._requests = tables.requests
+        self._lifetime = tables.lifetime
+        self._dispatch = dispatch
+        self._intake = intake
+        self._waiting = waiting
+        # Calls that `collect_calls` returns next.
+        self._sent: list[Ticket] = []
+        self._collecting = False
+
+    def call(self, now: float, slot: int, call: Call) -> Procedure[Any]:
+        """Call a method of one env and return its value."""
+        with self._observed.call("call", now):
+            return (yield from self._call(now, self._requests.alone(slot), call))[0]
+
+    def call_all(self, now: float, name: str) -> Procedure[None]:
+        """Call a method of every local env, in parallel."""
+        with self._observed.call("call", now):
+            yield from self._call(now, self._envs.all, (name, (), {}))
+
+    def _call(self, now: float, slots: NDArray[np.intp], call: Call) -> Procedure[list[Any]]:
+        send = partial(self._send_calls, now, slots, call)
+        ticket, _ = yield from self._waiting.ask(now, slots, send, call[0])
+        return values_of([ticket])
+
+    def call_async(self, now: float, env_ids: Sequence[str] | None, call: Call) -> None:
+        """Call a method without waiting; `collect_calls` returns the values."""
+        with self._observed.call("call_async", now):
+            slots = self._envs.all if env_ids is None else self._dispatch.distinct(env_ids)
+            send = partial(self._send_calls, now, slots, call)
+            self._sent.append(self._waiting.begin(slots, send, call[0]))
+
+    def _send_calls(self, now: float, slots: NDArray[np.intp], call: Call, ticket: Ticket) -> None:
+        what = f"the arguments of {call[0]}()"
+        self.send(now, slots, Operation.CALL, [call] * len(slots), what, ticket)
+
+    def send(
+        self,
+        now: float,
+        slots: NDArray[np.intp],
+        op: Operation,
+        arguments: Sequence[Any],
+        what: str,
+        ticket: Ticket,
+    ) -> None:
+        """Send requests that return a value.
+
+        Args:
+            now: monotonic seconds.
+            slots: of local envs.
+            op: the operation.
+            arguments: of the request to each slot.
+            what: describes the arguments in messages.
+            ticket: of the call, with the name of the operation as its method.
+        """
+        self._intake.drain()
+        self._dispatch.check_local(slots, f"call {ticket.method} of")
+        self._dispatch.check_sendable(now, slots, f"call {ticket.method} of")
+        packed = [
+            self._dispatch.packed(slot, own, what)
+            for slot, own in zip(slots.tolist(), arguments, strict=True)
+        ]
+        entries = self._requests.submit(slots, op, ticket.owner, now)
+        self._requests.numbering.num_values[slots] += 1
+        self._dispatch.hand_over(slots, entries, packed)
+
+    def drop(self) -> list[EnvFault]:
+        """Drop the calls of `call_async`, all of which have ended; return errors of their envs."""
+        if self._collecting:
+            return []  # Whoever collects them gets what they led to.
+        tickets, self._sent = self._sent, []
+        for ticket in tickets:
+            self._requests.settle(ticket)
+        faults = [fault for ticket in tickets for fault in ticket.faults]
+        return [fault for fault in faults if not isinstance(fault, EnvAborted)]
+
+    def collect_calls(self, now: float, deadline: float | None) -> Procedure[list[Any]]:
+        """Wait for all calls of `call_async`, and return their values in order of sending."""
+        with self._observed.call("collect_calls", now):
+            return (yield from self._collect(now, deadline))
+
+    def _collect(self, now: float, deadline: float | None) -> Procedure[list[Any]]:
+        self._lifetime.check_open()
+        if self._collecting:
+            raise RLightningError(
+                "another collect_calls is already waiting on this group; one at a time"
+            )
+        if not self._sent:
+            raise NothingPending("no call is outstanding; send one with call_async")
+        end = None if deadline is None else now + deadline
+        self._collecting = True
+        try:
+            while True:
+                self._waiting.poll()
+                remaining = sum(ticket.remaining for ticket in self._sent)
+                if not remaining:
+                    break
+                if end is not None and now >= end:
+                    raise TimeoutError(
+                        f"{remaining} calls have not returned within {deadline} s; nothing is "
+                        "lost, the next collect_calls gets their values"
+                    )
+                now = yield from self._waiting.turn(remaining, end)
+        finally:
+            self._collecting = False
+            self._waiting.end()
+        tickets, self._sent = self._sent, []
+        for ticket in tickets:
+            self._requests.settle(ticket)
+        return values_of(tickets)
+
+
+def values_of(tickets: Sequence[Ticket]) -> list[Any]:
+    """The values that calls returned, in order of sending.
+
+    If calls failed, the first error is raised, with the rest as its `others`.
+    """
+    faults = [fault for ticket in tickets for fault in ticket.faults]
+    if faults:
+        faults[0].others = tuple(faults[1:])
+        raise faults[0]
+    return [ticket.values[slot] for ticket in tickets for slot in ticket.slots.tolist()]

@@ -1,0 +1,211 @@
+"""The debug mode: each change of a request's state is checked against the table `LEGAL`.
+
+`CheckedRequests` and `CheckedSteps` replace their base classes if the environment variable
+`RLIGHTNING_AIO_DEBUG` is 1 when this module is imported. They apply each event to a copy of the
+table by `LEGAL`, and compare the two. So they refuse an event that can't happen, a change that the
+event doesn't make, and a change without an event. Without the variable, nothing here is called.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from typing import TYPE_CHECKING, Any, Final, cast
+
+import numpy as np
+
+from rlightning_aio._core.group.engine.steps import Steps
+from rlightning_aio._core.group.state.conditions import Conditions
+from rlightning_aio._core.group.state.request_states import COLLECTOR, LEGAL, Event, Owner, State
+from rlightning_aio._core.group.state.requests import CollectorQueue, Requests
+
+if TYPE_CHECKING:
+    from collections.abc import Generator, Sequence
+
+    from numpy.typing import NDArray
+
+    from rlightning_aio._core.group.state.requests import Ticket
+    from rlightning_aio.errors import EnvFault
+
+__all__ = ["DEBUG", "CheckedRequests", "CheckedSteps"]
+
+DEBUG: Final = os.environ.get("RLIGHTNING_AIO_DEBUG") == "1"
+"""Groups check their requests."""
+
+_OWNERS: Final = list(Owner)
+_TICKET: Final = _OWNERS.index(Owner.TICKET)
+_NOBODY: Final = _OWNERS.index(Owner.NOBODY)
+_IDLE: Final = int(State.IDLE)
+_ILLEGAL: Final = -1
+
+
+def _code(state: State, owner: Owner) -> int:
+    """Number a situation: a state, and the kind of its owner."""
+    return state * len(_OWNERS) + _OWNERS.index(owner)
+
+
+def _codes_after(event: Event) -> NDArray[np.int64]:
+    """Return the situation after `event`, by the situation before it."""
+    after = np.full(len(State) * len(Owner), _ILLEGAL)
+    for (state, owner, possible), situation in LEGAL.items():
+        if possible is event:
+            after[_code(state, owner)] = _code(*situation)
+    return after
+
+
+_AFTER: Final = {event: _codes_after(event) for event in Event}
+
+
+class _CheckedQueue(CollectorQueue):
+    """The collector's queue in a checked table."""
+
+    def __init__(self, requests: CheckedRequests, conditions: Conditions) -> None:
+        super().__init__(conditions, requests.state)
+        self._changes = requests.changes
+
+    def keep(self, slots: NDArray[np.intp], fault: EnvFault) -> None:
+        with self._changes((Event.KEPT, slots)):
+            super().keep(slots, fault)
+
+    def free(self, slots: Sequence[int]) -> NDArray[np.intp]:
+        failed = np.array([slot for slot in slots if slot in self.failed], np.intp)
+        with self._changes((Event.FREED, failed)):
+            return super().free(slots)
+
+
+class CheckedRequests(Requests):
+    """`Requests` that raises `RuntimeError` at a change that `LEGAL` doesn't allow."""
+
+    def __init__(
+        self, host_of: NDArray[np.int64], num_hosts: int, conditions: Conditions | None = None
+    ) -> None:
+        conditions = conditions or Conditions()
+        super().__init__(host_of, num_hosts, conditions)
+        self.collector = _CheckedQueue(self, conditions)
+        self._known = self._situations()
+        self._is_changing = False
+
+    def _situations(self) -> NDArray[np.int64]:
+        """Return the situation of each slot; an idle slot has no owner."""
+        kinds = np.where(self.owner > 0, _TICKET, 0)
+        kinds[self.owner < 0] = _NOBODY
+        kinds[self.state == _IDLE] = 0
+        return self.state.astype(np.int64) * len(_OWNERS) + kinds
+
+    @contextlib.contextmanager
+    def changes(self, *events: tuple[Event, NDArray[np.intp]]) -> Generator[None]:
+        """Check that the context does to slots what these events mean, and nothing else."""
+        if self._is_changing:  # The event is a part of another.
+            yield
+            return
+        self._compare(self._known, "without an event")
+        expected = self._known.copy()
+        for event, slots in events:
+            before = self._known[slots]
+            after = _AFTER[event][before]
+            illegal = np.flatnonzero(after == _ILLEGAL)
+            if len(illegal):
+                k = illegal.item(0)
+                raise RuntimeError(
+                    f"{event.name} can't happen to slot {slots[k]}, which is "
+                    f"{_named(before.item(k))}"
+                )
+            expected[slots] = after
+        try:
+            self._is_changing = True
+            yield
+            self._compare(expected, f"by {', '.join(event.name for event, _ in events)}")
+            self._known = expected
+        except BaseException:
+            self._known = self._situations()
+            raise
+        finally:
+            self._is_changing = False
+
+    def _compare(self, expected: NDArray[np.int64], how: str) -> None:
+        found = self._situations()
+        wrong = np.flatnonzero(found != expected)
+        if len(wrong):
+            slot = wrong.item(0)
+            raise RuntimeError(
+                f"slot {slot} became {_named(found.item(slot))} {how}; it would be "
+                f"{_named(expected.item(slot))}"
+            )
+
+    def submit(self, slots: NDArray[np.intp], op: int, owner: int, now: float) -> NDArray[np.int64]:
+        event = Event.SENT if owner == COLLECTOR else Event.SENT_FOR_CALL
+        with self.changes((event, slots)):
+            return super().submit(slots, op, owner, now)
+
+    def answer_at_once(self, slot: int) -> None:
+        with self.changes((Event.STEPPED_AT_ONCE, self.alone(slot))):
+            super().answer_at_once(slot)
+
+    def restart(self, host_id: int, slots: NDArray[np.intp]) -> NDArray[np.int64]:
+        with self.changes((Event.RESTARTED, slots)):
+            return super().restart(host_id, slots)
+
+    def join(self, slot: int, now: float) -> None:
+        with self.changes((Event.JOINED, self.alone(slot))):
+            super().join(slot, now)
+
+    def deliver(self, slots: NDArray[np.intp]) -> None:
+        with self.changes((Event.RESULT, slots)):
+            super().deliver(slots)
+
+    def set_value(self, slot: int, value: Any) -> None:
+        with self.changes((Event.VALUE, self.alone(slot))):
+            super().set_value(slot, value)
+
+    def fail(self, slots: NDArray[np.intp], owner: int, fault: EnvFault) -> None:
+        with self.changes((Event.FAULT, slots)):
+            super().fail(slots, owner, fault)
+
+    def withdraw(self, slot: int) -> None:
+        with self.changes((Event.WITHDRAWN, self.alone(slot))):
+            super().withdraw(slot)
+
+    def hand_out(self, slots: NDArray[np.intp]) -> None:
+        with self.changes((Event.HANDED_OUT, slots)):
+            super().hand_out(slots)
+
+    def end_aborted(self, slots: NDArray[np.intp]) -> NDArray[np.intp]:
+        with self.changes((Event.ABORTED, slots[self.aborted.among(slots)])):
+            return super().end_aborted(slots)
+
+    def claim(self, slots: NDArray[np.intp], ticket: Ticket | None) -> None:
+        with self.changes((Event.DROPPED if ticket is None else Event.CLAIMED, slots)):
+            super().claim(slots, ticket)
+
+    def settle(self, ticket: Ticket) -> None:
+        with self.changes((Event.SETTLED, ticket.slots)):
+            super().settle(ticket)
+
+    def give_up(self, ticket: Ticket) -> None:
+        slots = ticket.submitted(self.owner)
+        slots = slots[self.state[slots] != State.IDLE]  # An interrupt came before it was sent.
+        values = slots if ticket.calls else slots[:0]
+        others = np.setdiff1d(slots, values)
+        with self.changes((Event.METHOD_GIVEN_UP, values), (Event.GIVEN_UP, others)):
+            super().give_up(ticket)
+
+
+class CheckedSteps(Steps):
+    """`Steps` over `CheckedRequests`: it announces what it writes itself."""
+
+    def _publish(self, slots: NDArray[np.intp], now: float) -> None:
+        requests = cast("CheckedRequests", self._requests)
+        event = Event.SENT_FOR_CALL if requests.owner[slots[0]] else Event.SENT
+        with requests.changes((event, slots)):
+            super()._publish(slots, now)
+
+    def _hand_out(self, slots: NDArray[np.intp], *, synchronous: bool) -> Any:
+        if self._conditions.active:
+            return super()._hand_out(slots, synchronous=synchronous)
+        with cast("CheckedRequests", self._requests).changes((Event.HANDED_OUT, slots)):
+            return super()._hand_out(slots, synchronous=synchronous)
+
+
+def _named(code: int) -> str:
+    state, owner = divmod(code, len(_OWNERS))
+    return f"{State(state).name} for {_OWNERS[owner].name}"

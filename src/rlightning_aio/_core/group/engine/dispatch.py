@@ -1,0 +1,197 @@
+"""`Dispatch`: checks requests, packs their arguments, and gives them to hosts.
+
+Rule: all or nothing. All checks are done and all arguments packed before the first request is sent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from rlightning_aio._core.group.state.request_states import COLLECTOR, NOBODY, State
+from rlightning_aio.errors import BadAction, EnvBusy
+from rlightning_aio.protocol.slab import NO_SEED
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from rlightning_aio._core.group.engine.actions import OutOfBandSteps
+    from rlightning_aio._core.group.engine.intake import Intake
+    from rlightning_aio._core.group.engine.poller import Poller
+    from rlightning_aio._core.group.supervision.supervisor import Supervisor
+    from rlightning_aio._core.group.tables import Tables
+    from rlightning_aio._core.hosts.base import Host, Membership, Watcher
+
+__all__ = ["Dispatch"]
+
+
+class Dispatch:
+    """The outgoing side of a group."""
+
+    def __init__(
+        self,
+        tables: Tables,
+        supervisor: Supervisor,
+        poller: Poller,
+        intake: Intake,
+        watcher: Watcher,
+    ) -> None:
+        self._envs = tables.envs
+        self._requests = tables.requests
+        self._lifetime = tables.lifetime
+        self._supervisor = supervisor
+        self._poller = poller
+        self._intake = intake
+        self._watcher = watcher
+
+    def distinct(self, env_ids: Sequence[str]) -> NDArray[np.intp]:
+        """The slots of `env_ids`; `EnvBusy` if an id appears twice."""
+        slots = self._envs.find(env_ids)
+        if slots is not self._envs.all and len(set(env_ids)) < len(slots):
+            double = next(id_ for k, id_ in enumerate(env_ids) if id_ in env_ids[:k])
+            raise EnvBusy(f"{double!r} appears twice in one call; nothing was sent")
+        return slots
+
+    def check_sendable(self, now: float, slots: NDArray[np.intp], what: str) -> None:
+        """Raise an error if the group is closed, or an env of `slots` is busy or gone."""
+        self._lifetime.check_open()
+        while (slot := self._requests.first_not_idle(slots)) is not None:
+            if self._requests.owner[slot] != NOBODY or not self._end_call(now, slot):
+                break
+        if slot is not None:
+            raise EnvBusy(
+                f"can't {what} {self._envs.describe(slot)}: {self._why_busy(slot)}; nothing was "
+                "sent"
+            )
+        # Last: the error of a worker that is gone may still have to be collected.
+        self._supervisor.check_usable(slots)
+
+    def _why_busy(self, slot: int) -> str:
+        state, owner = self._requests.state.item(slot), self._requests.owner.item(slot)
+        if owner == NOBODY:
+            return "a call that was cancelled still runs in it; try again when that has ended"
+        why = {
+            State.BUSY: "its last request has not replied yet",
+            State.READY: "the result of its last request was not collected",
+            State.SPENT: "its last request ended in an error that was not collected",
+        }[State(state)]
+        if owner == COLLECTOR:
+            return f"{why}; collect it first, with collect_async(), or end it with abort()"
+        if state != State.BUSY:
+            why = "the call that asked it has not returned yet"
+        return f"{why}; wait for that call first, with collect_calls() if it was call_async()"
+
+    def _end_call(self, now: float, slot: int) -> bool:
+        """Note the end of a cancelled call that has ended since the group last waited.
+
+        In this process, it is executed now, after the requests that were sent before it. Returns
+        False if it has not ended.
+        """
+        self._watcher.read()
+        self._intake.drain()
+        while not self._requests.is_idle(slot) and self._poller.execute(1, None):
+            self._intake.drain()
+        if not self._requests.is_idle(slot):  # Perhaps nobody waits who would replace its worker.
+            self._poller.poll()  # An env that has replied is not hung.
+            self._intake.drain()
+            self._supervisor.check(now)
+            self._intake.drain()
+        return self._requests.is_idle(slot)
+
+    def check_local(self, slots: NDArray[np.intp], what: str) -> None:
+        """Raise `NotImplementedError` if any of `slots` belongs to a member."""
+        if (
+            self._supervisor.members.possible
+            and (remote := slots[slots >= len(self._envs.all)]).size
+        ):
+            raise NotImplementedError(
+                f"can't {what} {self._envs.describe(int(remote[0]))}: remote envs answer when they "
+                "can; use step_async and collect_async"
+            )
+
+    def packed_steps(self, slots: NDArray[np.intp], out_of_band: OutOfBandSteps) -> list[Any]:
+        """The packed arguments of steps that go out of band."""
+        chosen = slots[out_of_band.positions].tolist()
+        try:
+            for slot, (action, extras) in zip(chosen, out_of_band.contents, strict=True):
+                if slot >= len(self._envs.all):
+                    host = self._host_of(slot)
+                    cast("Membership", host).check_step(slot - host.first_slot, action, extras)
+            return [
+                self.packed(slot, content, "the response")
+                for slot, content in zip(chosen, out_of_band.contents, strict=True)
+            ]
+        except TypeError as error:
+            raise BadAction(str(error)) from error
+
+    def packed_resets(
+        self, slots: NDArray[np.intp], seeds: NDArray[np.int64], options: dict[str, Any]
+    ) -> list[Any]:
+        if not isinstance(cast("object", options), Mapping):
+            raise TypeError(
+                f"options must be a dict, which each env gets, not a {type(options).__name__}; for "
+                "options of its own, reset an env by itself: reset(options={…}, env_ids=[env_id])"
+            )
+        packed: list[Any] = []
+        for slot, seed in zip(slots.tolist(), seeds.tolist(), strict=True):
+            given = (None if seed == NO_SEED else seed, options)
+            if slot >= len(self._envs.all):
+                self._check_reset(slot, *given)
+            packed.append(self.packed(slot, given, "the options"))
+        return packed
+
+    def _check_reset(self, slot: int, seed: int | None, options: dict[str, Any]) -> None:
+        host = self._host_of(slot)
+        try:
+            cast("Membership", host).check_reset(slot - host.first_slot, seed, options)
+        except ValueError as error:
+            raise TypeError(f"{error}; nothing was sent") from error
+
+    def packed(self, slot: int, arguments: Any, what: str) -> Any:
+        try:
+            return self._host_of(slot).packed(arguments)
+        except Exception as error:
+            raise TypeError(
+                f"{what} for {self._envs.describe(slot)} can't be sent to its worker: {error}; "
+                "nothing was sent"
+            ) from error
+
+    def _host_of(self, slot: int) -> Host:
+        return self._supervisor.hosts[self._requests.hosts.item(slot)]
+
+    def hand_over(
+        self,
+        slots: NDArray[np.intp],
+        entries: NDArray[np.int64],
+        arguments: Sequence[Any] | None = None,
+    ) -> None:
+        """Give submitted requests to their hosts, one call per run of slots of the same host."""
+        for host_id, part in self._requests.by_host(slots):
+            given = None if arguments is None else arguments[part]
+            self._supervisor.submit(host_id, entries[part], given)
+
+    def hand_over_out_of_band(
+        self,
+        slots: NDArray[np.intp],
+        entries: NDArray[np.int64],
+        positions: NDArray[np.intp],
+        packed: Sequence[Any],
+        resets: NDArray[np.bool_] | None,
+    ) -> None:
+        """Give submitted requests to their hosts, with out-of-band arguments at `positions`.
+
+        Positions that became resets go without arguments.
+        """
+        out_of_band = np.zeros(len(slots), np.bool_)
+        out_of_band[positions] = True
+        if resets is not None:
+            out_of_band &= ~resets
+        self.hand_over(slots[~out_of_band], entries[~out_of_band])
+        kept = out_of_band[positions]
+        chosen = positions[kept]
+        arguments = [one for one, keep in zip(packed, kept.tolist(), strict=True) if keep]
+        self.hand_over(slots[chosen], entries[chosen], arguments)

@@ -1,0 +1,246 @@
+"""`Intake`: applies completions to requests and results, and carries out what a death means.
+
+Hosts post to one queue, and only this module applies its completions.
+Rule: it sends no requests of its own. After a death it sends outstanding ones again, to the
+replacement.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from rlightning_aio._core.group.episodes.continuity import Report
+from rlightning_aio._core.group.state.request_states import COLLECTOR
+from rlightning_aio._core.group.supervision.fault_messages import without_terminal
+from rlightning_aio._core.group.supervision.supervisor import GivenUp, Replaced
+from rlightning_aio._core.hosts.messages import (
+    Attached,
+    Built,
+    Closed,
+    Died,
+    ErrorText,
+    Failed,
+    Joined,
+    NewSchema,
+    NotBuilt,
+    Raised,
+    Reported,
+    Result,
+    Saved,
+    Value,
+    Withdrawn,
+)
+from rlightning_aio.errors import EnvAway, EnvRaised
+from rlightning_aio.protocol.entries import Operation, answers_with_value
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from rlightning_aio._core.group.engine.arrivals import Arrivals
+    from rlightning_aio._core.group.engine.results import Results
+    from rlightning_aio._core.group.supervision.supervisor import Supervisor
+    from rlightning_aio._core.group.tables import Tables
+    from rlightning_aio._core.hosts.base import Host
+    from rlightning_aio._core.hosts.messages import Completions
+    from rlightning_aio.errors import EnvFault
+
+__all__ = ["Intake"]
+
+
+class Intake:
+    """See the module; the arguments are the group's parts.
+
+    Attributes:
+        now: when the driver last looked at sources (monotonic seconds).
+    """
+
+    def __init__(
+        self,
+        completions: Completions,
+        tables: Tables,
+        supervisor: Supervisor,
+        results: Results,
+        arrivals: Arrivals,
+    ) -> None:
+        self.now = 0.0
+        self._completions = completions
+        self._envs = tables.envs
+        self._requests = tables.requests
+        self._layout = tables.layout
+        self._supervisor = supervisor
+        self._results = results
+        self._continuity = tables.continuity
+        self._arrivals = arrivals
+        self._handlers: dict[type, Callable[[Any], None]] = {
+            Reported: self._on_reported,
+            Result: self._on_result,
+            Value: self._on_value,
+            Raised: self._on_raised,
+            Failed: self._on_failed,
+            Withdrawn: self._on_withdrawn,
+            NewSchema: self._on_new_schema,
+            Joined: self._on_joined,
+            Saved: self._on_saved,
+            Died: self._on_died,
+            **dict.fromkeys((Built, NotBuilt, Attached, Closed), supervisor.handle),
+        }
+
+    def drain(self) -> None:
+        """Apply queued completions."""
+        completions, handlers = self._completions, self._handlers
+        while completions:
+            completion = completions.popleft()
+            handlers[type(completion)](completion)
+
+    def _on_reported(self, completion: Reported) -> None:
+        reports = [completion]
+        completions = self._completions
+        while completions and type(completions[0]) is Reported:
+            reports.append(cast("Reported", completions.popleft()))
+        self._note_answered(self._requests.complete(reports))
+
+    def _on_result(self, completion: Result) -> None:
+        slot = self._requests.complete_one(completion.host_id, completion.entry)
+        if slot is not None:
+            self._results.keep(slot, completion.out_of_band)
+            if completion.is_loss:
+                self._results.mark_lost(slot)
+            if completion.restarted:
+                self._supervisor.note_rebuilt(completion.host_id, slot, completion.restarted)
+                env_id = self._envs.env_ids[slot]
+                self._results.mark_restarted(Report(slot, completion.restarted, env_id, None))
+            self._note_answered(self._requests.alone(slot))
+
+    def _on_value(self, completion: Value) -> None:
+        slot = self._requests.end(completion.host_id, completion.entry)
+        if slot is not None:
+            self._requests.set_value(slot, completion.value)
+
+    def _on_raised(self, completion: Raised) -> None:
+        slot = self._requests.end(completion.host_id, completion.entry)
+        if slot is not None:
+            self._fail(self._requests.alone(slot), lambda _: self.raised(slot, completion.error))
+
+    def raised(self, slot: int, error: ErrorText) -> EnvRaised:
+        """Make the error for the current request of `slot`, which ended in `error`."""
+        cause = self._continuity.raised(slot)
+        after = f" (its worker {cause}, and was replaced)" if cause else ""
+        after += without_terminal(error, self._supervisor.hosts[self._requests.hosts.item(slot)])
+        op = self._requests.numbering.op(slot)
+        doing = Operation(op).name.lower()
+        go_on = "reset the env to go on"
+        if answers_with_value(op):
+            doing = (
+                f"the call of {self._requests.tickets.method(self._requests.owner.item(slot))}()"
+            )
+            go_on = "the env is still usable"
+        return EnvRaised.of(
+            f"{self._envs.describe(slot)} raised in {doing}: {error.summary}{after}; its "
+            f"__cause__ is the remote traceback; {go_on}",
+            env_id=self._envs.env_ids[slot],
+            exception_type=error.type_name,
+            exception_text=error.text,
+            traceback_text=error.traceback,
+        )
+
+    def _on_failed(self, completion: Failed) -> None:
+        slot = self._requests.end(completion.host_id, completion.entry)
+        if slot is None:
+            return
+        self._continuity.raised(slot)
+        if completion.for_good:
+            self._supervisor.note_lost_env(completion.host_id, slot)
+        self._fail(self._requests.alone(slot), lambda _: completion.fault)
+
+    def _on_withdrawn(self, completion: Withdrawn) -> None:
+        slot = self._requests.end(completion.host_id, completion.entry)
+        if slot is None:
+            return
+        self._continuity.raised(slot)
+        if self._requests.owner[slot] == COLLECTOR:
+            self._arrivals.withdraw(slot)
+            return
+        text = (
+            f"the client of {self._envs.describe(slot)} is not connected; its next first result "
+            "comes through collect_async when it is back"
+        )
+        away = EnvAway(text, env_id=self._envs.env_ids[slot])
+        self._fail(self._requests.alone(slot), lambda _: away)
+
+    def _on_new_schema(self, completion: NewSchema) -> None:
+        host = self._supervisor.hosts[completion.host_id]
+        self._results.note_schema(host.first_slot, completion.number, completion.schema)
+
+    def _on_joined(self, completion: Joined) -> None:
+        first_slot = self._supervisor.hosts[completion.host_id].first_slot
+        self._arrivals.join(completion, first_slot, self.now)
+
+    def _on_saved(self, completion: Saved) -> None:
+        slot = self._supervisor.hosts[completion.host_id].first_slot + completion.env_index
+        if slot in self._requests.aborted.faults:
+            return  # Of an episode that the caller has ended.
+        numbering = self._requests.numbering
+        entry, is_step = numbering.entry.item(slot), numbering.op(slot) == Operation.STEP
+        self._continuity.save(
+            slot, completion.checkpoint, entry, before=completion.before, is_step=is_step
+        )
+
+    def _fail(
+        self, slots: NDArray[np.intp], error_for: Callable[[NDArray[np.intp]], EnvFault]
+    ) -> None:
+        """End requests that are no longer in flight, with one error for each caller."""
+        for owner, mine in self._requests.owners(slots).items():
+            self._requests.fail(mine, owner, error_for(mine))
+
+    def _on_died(self, completion: Died) -> None:
+        outcome = self._supervisor.handle_exit(completion)
+        if isinstance(outcome, GivenUp):
+            self._continuity.give_up(_slots_of_host(outcome.host))
+            self._fail(self._requests.end_aborted(outcome.owed), outcome.error_for)
+        elif outcome is not None:
+            self._replace_host(outcome)
+
+    def _replace_host(self, outcome: Replaced) -> None:
+        """Send the outstanding requests of a dead worker to its replacement."""
+        host, slots = outcome.host, _slots_of_host(outcome.host)
+        # Their episodes were over before.
+        others = [slot for slot in slots if slot not in self._requests.aborted.faults]
+        owed = self._requests.end_aborted(outcome.owed)
+        for slot in self._requests.ready(np.array(slots, np.intp)).tolist():
+            # Decoded now, because the replacement announces other schemas.
+            self._results.detach_info(slot)
+        self._results.begin_schemas(slots)
+        if not outcome.resets:
+            self._fail(owed, outcome.error_for)
+            return
+        self._continuity.lose(
+            others, outcome.cause, outcome.at_fault, outcome.suspects, from_checkpoint=True
+        )
+        # A replacement answers steps and resets, but not calls.
+        calls = self._requests.numbering.awaits_value(owed)
+        self._fail(owed[calls], outcome.error_for)
+        owed = owed[~calls]
+        if len(owed):
+            is_step = self._requests.numbering.ops(owed) == int(Operation.STEP)
+            _, seeds = self._continuity.report_losses(owed, is_step)
+            entries = self._requests.restart(host.host_id, owed)
+            self._layout.write_seeds(owed, seeds)
+            self._supervisor.submit(host.host_id, entries, None)
+
+    def _note_answered(self, slots: NDArray[np.intp]) -> None:
+        """Mark results that report a loss, and let steps show that a replacement works."""
+        if self._continuity.exceptional:
+            for report in self._continuity.answered(slots):
+                self._results.mark_restarted(report)
+        if self._supervisor.any_deaths:
+            for slot in slots.tolist():
+                if self._requests.numbering.op(slot) == Operation.STEP:
+                    self._supervisor.note_step(slot)
+
+
+def _slots_of_host(host: Host) -> range:
+    return range(host.first_slot, host.first_slot + host.num_envs)

@@ -1,0 +1,331 @@
+"""`Results`: ready rows become a batch, with a few copies for each slab and none for each env."""
+
+from __future__ import annotations
+
+import pickle
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from rlightning_aio._core.group.state.conditions import BESIDE_ROWS
+from rlightning_aio.batch.columns import ResultColumns
+from rlightning_aio.batch.sent import UNASKED, copied
+from rlightning_aio.protocol import kernel
+from rlightning_aio.protocol.columns import Rows, gather, mapped, stacked
+from rlightning_aio.protocol.info import NO_INFO, PICKLED
+from rlightning_aio.protocol.slab import TRUNCATED
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from rlightning_aio._core.group.episodes.continuity import Report
+    from rlightning_aio._core.group.state.conditions import Conditions
+    from rlightning_aio._core.group.state.env_table import EnvTable
+    from rlightning_aio._core.group.state.slab_layout import SlabLayout
+    from rlightning_aio._core.hosts.messages import OutOfBand
+    from rlightning_aio.batch.sent import Sources
+    from rlightning_aio.protocol.info import InfoSchema
+    from rlightning_aio.protocol.slab import Slab
+
+__all__ = ["Results"]
+
+
+class Results:
+    """What lies in the rows of a group, and what came out of band.
+
+    Args:
+        envs: names them; layout: where their rows are; conditions: of the group.
+        zero_copy: observations are handed out as views where their rows are contiguous.
+    """
+
+    def __init__(
+        self, envs: EnvTable, layout: SlabLayout, conditions: Conditions, *, zero_copy: bool
+    ) -> None:
+        self._envs = envs
+        self._conditions = conditions
+        self._layout = layout
+        self._zero_copy = zero_copy
+        self._out_of_band: dict[int, Any] = {}
+        # Of each slot's host; a host's slots share one dict.
+        self._schemas: list[dict[int, InfoSchema]] = [{} for _ in range(len(envs))]
+        # Bytes of a row's info that any schema uses; 0 if there is none.
+        self._info_width = 0
+        self._restarted = np.zeros(len(envs), np.bool_)
+        self._any_restarted = False
+        # What was sent, by slot; that of the last batch is entered when that is needed.
+        self._sent_columns = np.full(len(envs), None, object)
+        self._sent_rows = np.zeros(len(envs), np.intp)
+        self._last_sent: tuple[NDArray[np.intp], Mapping[str, Any]] | None = None
+        # The columns sent last to each entry: examples for rows that answer no request. Batches
+        # refer to these dicts, so they are replaced and never changed.
+        self._examples: list[dict[str, Any]] = [{} for _ in envs.names.entry_names]
+        self._any_unasked = False
+        self._each = np.arange(len(envs))
+
+    # -- what comes in ----------------------------------------------------------------
+
+    def note_sent(self, slots: NDArray[np.intp], columns: Mapping[str, Any]) -> None:
+        """Keep the columns that a policy sent to `slots`, one row for each, for their results."""
+        if self._last_sent is not None and self._last_sent[0] is not slots:
+            self._enter_last_sent()  # Else all of it is replaced.
+        kept: dict[str, Any] = {}
+        for name, column in columns.items():  # Their maker may go on writing to them.
+            kept[name] = column.copy() if type(column) is np.ndarray else copied(column)
+        self._last_sent = slots, kept
+        entries = {0}
+        if len(self._examples) > 1:
+            entries = set(cast("list[int]", self._envs.names.entries[slots].tolist()))
+        for k in entries:
+            self._examples[k] = dict(kept)
+
+    def note_unasked(self, slots: NDArray[np.intp]) -> None:
+        """Note that the next results of `slots` answer no response."""
+        self._enter_last_sent()
+        self._sent_rows[slots] = UNASKED
+        self._any_unasked = True
+
+    def _enter_last_sent(self) -> None:
+        if self._last_sent is not None:
+            slots, columns = self._last_sent
+            self._last_sent = None
+            self._sent_columns[slots] = columns
+            self._sent_rows[slots] = self._each[: len(slots)]
+
+    def keep(self, slot: int, out_of_band: bytes | OutOfBand) -> None:
+        """Keep what of a result has no place in its row."""
+        if out_of_band:
+            self._out_of_band[slot] = out_of_band
+            self._conditions.note(BESIDE_ROWS, True)
+
+    def keep_at_once(self, slot: int, out_of_band: OutOfBand) -> None:
+        """Keep what of a result has no place in its row until it is handed out in the same call."""
+        self._out_of_band[slot] = out_of_band
+
+    def drop(self, slot: int) -> None:
+        """Nobody will ask for the result of `slot`."""
+        self._out_of_band.pop(slot, None)
+
+    def begin_schemas(self, slots: range) -> None:
+        """The host of `slots` announces its ways of holding infos (anew, after a restart)."""
+        shared: dict[int, InfoSchema] = {}
+        # A new list: batches that were handed out go on reading the old one.
+        self._schemas = list(self._schemas)
+        for slot in slots:
+            self._schemas[slot] = shared
+
+    def note_schema(self, first_slot: int, number: int, schema: InfoSchema) -> None:
+        """A host holds infos in one more way."""
+        self._schemas[first_slot][number] = schema
+        self._info_width = max(self._info_width, schema.size, 1)
+
+    def mark_restarted(self, report: Report) -> None:
+        """Mark a result as the first of a replaced worker, and note in its info what it reports."""
+        self.detach_info(report.slot)
+        found = self._out_of_band.get(report.slot)
+        if isinstance(found, dict):
+            info = cast("dict[str, Any]", found["info"])
+            info["worker_restarted"] = report.cause
+            if report.at_fault is not None:
+                info["env_at_fault"] = report.at_fault
+            if report.suspects:
+                info["suspects"] = report.suspects
+            if report.steps_lost is not None:
+                info["worker_resumed"] = report.steps_lost
+        self.mark_lost(report.slot)
+
+    def mark_lost(self, slot: int) -> None:
+        """Mark a result as one whose episode before was lost; it will be truncated."""
+        self._restarted[slot] = self._any_restarted = True
+        self._conditions.note(BESIDE_ROWS, True)
+
+    def detach_info(self, slot: int) -> None:
+        """Decode the info of a result that is ready, while its row and schemas are there."""
+        slab, row = self._layout.of(slot)
+        found = self._out_of_band.get(slot)
+        try:
+            kept: dict[str, Any] = pickle.loads(found) if isinstance(found, bytes) else found or {}
+        except Exception:  # noqa: BLE001  # It may hold anything; its reader learns why not.
+            return
+        info: dict[str, Any] = kept.get("info", {})
+        mark = int(slab.info_mark[row])  # Left as it is: the env's snapshot reads the row, too.
+        if "info" not in kept and mark not in (NO_INFO, PICKLED):
+            info = self._schemas[slot][mark].decode(memoryview(slab.info[row]))
+        self._out_of_band[slot] = {**kept, "info": dict(info)}
+        self._conditions.note(BESIDE_ROWS, True)
+
+    # -- what goes out ----------------------------------------------------------------
+
+    def gather(self, slots: NDArray[np.intp]) -> list[ResultColumns]:
+        """Copy the results of `slots` out of their rows: one part for each layout.
+
+        Takes nothing away: should memory run out, they can be gathered again.
+        """
+        layout = self._layout
+        if len(layout.slabs) == 1:
+            return [self.part(layout.slabs[0], slots)]
+        slabs = layout.slab[slots]
+        present: list[int] = np.flatnonzero(np.bincount(slabs)).tolist()
+        return [
+            self.part(layout.slabs[slab], slots[places], places)
+            for slab in present
+            for places in (np.flatnonzero(slabs == slab),)
+        ]
+
+    def add_episodes(self, part: ResultColumns) -> None:
+        """Copy the sums of the episodes that end in `part`; its rows are as they were."""
+        slots, layout = part.slots, self._layout
+        slab = layout.slabs[layout.slab.item(slots.item(0))]
+        rows = slice(0, len(slots)) if slots is self._envs.all else layout.row[slots]
+        part.episode_return, part.episode_length = kernel.gather(
+            (slab.episode_return, slab.episode_length), rows
+        )
+
+    def let_go(self, slots: NDArray[np.intp]) -> None:
+        """The results of `slots` are handed out: what is kept for them beside their rows goes."""
+        if self._any_restarted:
+            self._restarted[slots] = False
+            self._any_restarted = bool(self._restarted.any())
+        if self._out_of_band:
+            for slot in slots.tolist():
+                self._out_of_band.pop(slot, None)
+        self._conditions.note(BESIDE_ROWS, self._any_restarted or bool(self._out_of_band))
+
+    def sources(self, slots: NDArray[np.intp]) -> Sources:
+        """Return the columns that were sent for the results of `slots`."""
+        if self._last_sent is not None and self._last_sent[0] is slots:
+            return self._last_sent[1], None  # As `step` asks and is answered.
+        self._enter_last_sent()
+        columns, rows = self._sent_columns[slots], self._sent_rows[slots]
+        if self._any_unasked:
+            for k in np.flatnonzero(rows == UNASKED).tolist():
+                columns[k] = self._example_for(slots.item(k))
+            self._any_unasked = bool((self._sent_rows == UNASKED).any())
+        return columns, rows
+
+    def _example_for(self, slot: int) -> dict[str, Any]:
+        """Return the columns sent last to the entry of `slot`, or an action without rows."""
+        entry = self._envs.names.entries.item(slot)
+        if not self._examples[entry]:
+            action = self._layout.of(slot)[0].action
+            if action is not None:
+                self._examples[entry] = {"action": mapped(_without_rows, action)}
+        return self._examples[entry]
+
+    def part(
+        self, slab: Slab, slots: NDArray[np.intp], positions: NDArray[np.intp] | None = None
+    ) -> ResultColumns:
+        """Copy the results of `slots`, whose rows are in `slab`; see `gather`."""
+        layout, width = self._layout, self._info_width
+        if positions is None and slots is self._envs.all:
+            rows: Rows = slice(0, len(slots))
+        else:
+            rows = slots if layout.row_is_slot else layout.row[slots]
+        columns = [slab.reward, slab.flags, slab.times]
+        if width:
+            columns += (slab.info_mark, slab.info[:, :width])
+        observation: Any = slab.observation
+        in_rows = type(observation) is np.ndarray and not self._zero_copy
+        if in_rows:
+            columns.append(observation)
+        reward, flags, times, *others = kernel.gather(columns, rows)
+        out_of_band: dict[int, Any] = {}
+        restarted, whole = None, False
+        if self._any_restarted:
+            restarted = self._restarted[slots]
+            # Here and not in the row, where envs write their flags only when they change.
+            flags[restarted, ..., TRUNCATED] = True
+        if self._out_of_band:
+            out_of_band, whole = self._out_of_band_of(slots, others[0] if width else None)
+        if in_rows:
+            observation = others[-1]
+        else:
+            observation, out_of_band = self._observations(slab, rows, out_of_band)
+        return ResultColumns(
+            slots=slots,
+            names=self._envs.names,
+            positions=positions,
+            observation=observation,
+            reward=reward,
+            flags=flags,
+            info_marks=others[0] if width else None,
+            info=others[1] if width else None,
+            schemas=self._schemas,
+            out_of_band=out_of_band,
+            restarted=restarted,
+            times=times,
+            sent_ns=None if slab.sent_ns is None else gather(slab.sent_ns, rows),
+            agents=slab.layout.agents,
+            observation_space=slab.layout.observation_space,
+            whole_results=whole,
+        )
+
+    def _out_of_band_of(
+        self, slots: NDArray[np.intp], info_marks: NDArray[np.uint8] | None
+    ) -> tuple[dict[int, Any], bool]:
+        """Return out-of-band data of `slots` by batch row, and True if any is a whole result.
+
+        Mark the infos among it in `info_marks`, gathered from rows that may still mark their own.
+        """
+        found: dict[int, Any] = {}
+        whole = False
+        for row, slot in enumerate(slots.tolist()):
+            kept = self._out_of_band.get(slot)
+            if kept is None:
+                continue
+            found[row] = kept
+            if type(kept) is dict:
+                whole = whole or "ret" in kept
+                if info_marks is not None and "info" in kept:
+                    info_marks[row] = PICKLED
+        return found, whole
+
+    def _observations(
+        self, slab: Slab, rows: Rows, out_of_band: dict[int, Any]
+    ) -> tuple[Any, dict[int, Any]]:
+        """Fresh columns, and what is out of band beside them.
+
+        Read-only views where the group hands those out and the rows allow it. What envs have
+        handed over as it is becomes columns; that of one alone isn't copied.
+        """
+        if slab.observation is None:
+            handed_over = slab.layout.observations_out_of_band and len(out_of_band) > 0
+            if not handed_over or not all("observation" in kept for kept in out_of_band.values()):
+                return None, out_of_band
+            if len(out_of_band) == 1:
+                ((row, kept),) = out_of_band.items()
+                beside = dict(kept)
+                return stacked([beside.pop("observation")]), {row: beside}
+            columns = stacked([kept["observation"] for kept in out_of_band.values()])
+            beside = {
+                row: {name: value for name, value in kept.items() if name != "observation"}
+                for row, kept in out_of_band.items()
+            }
+            return columns, beside
+        contiguous = _contiguous(rows) if self._zero_copy else None
+        if contiguous is None:
+            return gather(slab.observation, rows), out_of_band
+
+        def view(array: NDArray[Any]) -> NDArray[Any]:
+            part = array[contiguous]
+            part.flags.writeable = False
+            return part
+
+        return mapped(view, slab.observation), out_of_band
+
+
+def _without_rows(column: NDArray[Any]) -> NDArray[Any]:
+    """An empty array with the dtype and the shape of a row of `column`."""
+    return np.empty((0, *column.shape[1:]), column.dtype)
+
+
+def _contiguous(rows: Rows) -> slice | None:
+    if isinstance(rows, slice):
+        return rows
+    if not len(rows):
+        return None
+    first, last = int(rows[0]), int(rows[-1])
+    if last - first + 1 == len(rows) and (np.diff(rows) == 1).all():
+        return slice(first, last + 1)
+    return None

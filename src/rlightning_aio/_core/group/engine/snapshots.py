@@ -1,0 +1,196 @@
+"""`Snapshots`: take the state of envs out of them, and put it back.
+
+A restore is all or nothing: it first takes the current state of every env, so that a failure can
+be undone. `Continuity` records what the next results then report; `snapshot_format` has the bytes.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rlightning_aio._core.group.engine.calls import values_of
+from rlightning_aio._core.group.episodes.continuity import Position
+from rlightning_aio._core.group.episodes.snapshot_format import (
+    EnvSnapshot,
+    check_same,
+    identity_of,
+    pack,
+    unpack,
+)
+from rlightning_aio.errors import EnvFault, SnapshotError, WorkerDied
+from rlightning_aio.protocol.entries import Operation
+from rlightning_aio.registry import ENVS
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from rlightning_aio._core.group.drivers.wait import Procedure
+    from rlightning_aio._core.group.engine.calls import Calls
+    from rlightning_aio._core.group.engine.dispatch import Dispatch
+    from rlightning_aio._core.group.engine.waiting import Waiting
+    from rlightning_aio._core.group.episodes.continuity import Continuity
+    from rlightning_aio._core.group.state.env_table import EnvTable
+    from rlightning_aio._core.group.state.requests import Ticket
+    from rlightning_aio._core.group.supervision.supervisor import Supervisor
+
+__all__ = ["Snapshots"]
+
+
+class Snapshots:
+    """See the module; the arguments are the group's parts."""
+
+    def __init__(
+        self,
+        envs: EnvTable,
+        supervisor: Supervisor,
+        dispatch: Dispatch,
+        calls: Calls,
+        continuity: Continuity,
+        waiting: Waiting,
+    ) -> None:
+        self._envs = envs
+        self._supervisor = supervisor
+        self._dispatch = dispatch
+        self._calls = calls
+        self._continuity = continuity
+        self._waiting = waiting
+
+    def take(self, now: float, env_ids: Sequence[str] | None) -> Procedure[bytes]:
+        """See `EnvGroup.snapshot`."""
+        slots = self._envs.all if env_ids is None else self._dispatch.distinct(env_ids)
+        self._check_restorable(slots)
+        snapshots, _ = yield from self._take(now, slots)
+        for snapshot, was_reset in snapshots:
+            if not was_reset:
+                raise SnapshotError(
+                    f"env {snapshot.env_id!r} has no state yet: reset it before its snapshot is "
+                    "taken"
+                )
+        return pack([snapshot for snapshot, _ in snapshots])
+
+    def _check_restorable(self, slots: NDArray[np.intp]) -> None:
+        self._dispatch.check_local(slots, "take a snapshot of, or restore,")
+        each: list[int] = slots.tolist()
+        for slot in each:
+            if ENVS.is_hardware(self._envs.configs[slot].backend):
+                raise SnapshotError(
+                    f"{self._envs.describe(slot)} moves something real, which a snapshot can't "
+                    "restore"
+                )
+
+    def _take(
+        self, now: float, slots: NDArray[np.intp]
+    ) -> Procedure[tuple[list[tuple[EnvSnapshot, bool]], float]]:
+        """Take one snapshot per env, and say whether it was ever reset; return the time, too."""
+        op, nothing = Operation.SNAPSHOT, [()] * len(slots)
+        send = partial(self._calls.send, now, slots, op, nothing, "nothing")
+        ticket, now = yield from self._waiting.ask(now, slots, send, "snapshot")
+        each: list[int] = slots.tolist()
+        replies = zip(each, self._continuity.positions(slots), values_of([ticket]), strict=True)
+        snapshots: list[tuple[EnvSnapshot, bool]] = []
+        for slot, (num_steps, is_cut), (versions, was_reset, state) in replies:
+            identity = identity_of(self._envs.configs[slot], self._supervisor.metas[slot], versions)
+            env_id = self._envs.env_ids[slot]
+            snapshots.append((EnvSnapshot(env_id, identity, num_steps, is_cut, state), was_reset))
+        return snapshots, now
+
+    def put_back(
+        self, now: float, data: bytes, env_ids: Sequence[str] | None
+    ) -> Procedure[tuple[NDArray[np.intp], list[Position], float]]:
+        """Put envs into the state of their snapshots, which a reset `AS_RESTORED` then shows.
+
+        Returns their slots, their positions in their episodes, and the time.
+        """
+        snapshots = unpack(data)
+        slots = self._slots_for(snapshots, env_ids)
+        self._check_restorable(slots)
+        deaths = self._supervisor.last_deaths(slots)
+        before, now = yield from self._take(now, slots)
+        for slot, snapshot, (own, _) in zip(slots.tolist(), snapshots, before, strict=True):
+            check_same(snapshot, own.identity, self._envs.describe(slot))
+        try:
+            states = [own.state for own, _ in before]
+            now = yield from self._put_back(now, slots, snapshots, states, deaths)
+        except EnvFault:
+            raise
+        except BaseException:
+            self._continuity.lose(slots.tolist(), "was being restored when that was cancelled")
+            raise
+        positions = [Position(snapshot.num_steps, snapshot.is_cut) for snapshot in snapshots]
+        return slots, positions, now
+
+    def _slots_for(
+        self, snapshots: Sequence[EnvSnapshot], env_ids: Sequence[str] | None
+    ) -> NDArray[np.intp]:
+        """Return the slots of `env_ids`, or else of all envs, if these are what was saved."""
+        taken_of = [snapshot.env_id for snapshot in snapshots]
+        where = len(self._envs.all) if env_ids is None else len(env_ids)
+        if where != len(snapshots):
+            raise SnapshotError(
+                f"the snapshot is of {len(snapshots)} envs, but should go into {where}; "
+                "name as many in env_ids, in order; nothing was changed"
+            )
+        if env_ids is None and (missing := set(taken_of) - set(self._envs.env_ids)):
+            raise SnapshotError(
+                f"the snapshot is of {min(missing)!r}, and this group has no such env; name in "
+                "env_ids where each should go, in order; nothing was changed"
+            )
+        return self._dispatch.distinct(taken_of if env_ids is None else env_ids)
+
+    def _put_back(
+        self,
+        now: float,
+        slots: NDArray[np.intp],
+        snapshots: Sequence[EnvSnapshot],
+        before: Sequence[bytes],
+        deaths: NDArray[Any],
+    ) -> Procedure[float]:
+        """Load the state of each snapshot; if one fails, load the states from `before` again.
+
+        The envs of a worker that has died since `deaths` were its last can't go back. Returns the
+        time.
+        """
+        states = [(snapshot.state, True) for snapshot in snapshots]
+        try:
+            ticket, now = yield from self._load(now, slots, states)
+            values_of([ticket])
+            last = self._supervisor.last_deaths(slots)
+            for death in last[last != deaths]:
+                raise death(slots[last == death])  # Its envs had replied, so nobody has heard.
+        except EnvFault as fault:
+            alive = self._supervisor.last_deaths(slots) == deaths
+            kept = [before[k] for k in np.flatnonzero(alive).tolist()]
+            lost = yield from self._undo(now, slots[alive], kept)
+            note = "nothing was restored: the other envs are where they were before"
+            if lost:
+                note += f", but {', '.join(lost)}: to begin a new episode with the next step"
+            fault.add_note(note)
+            raise
+        return now
+
+    def _undo(
+        self, now: float, slots: NDArray[np.intp], before: Sequence[bytes]
+    ) -> Procedure[list[str]]:
+        """Load the states from `before` again; return the ids of envs that can't go back."""
+        try:
+            ticket, _ = yield from self._load(now, slots, [(state, False) for state in before])
+            values_of([ticket])
+        except EnvFault as fault:
+            # What a death means for its envs is settled.
+            faults = [one for one in (fault, *fault.others) if not isinstance(one, WorkerDied)]
+            lost = [fault.env_id for fault in faults]
+            self._continuity.lose(self._envs.find(lost).tolist(), "could not be put back")
+            return lost
+        return []
+
+    def _load(
+        self, now: float, slots: NDArray[np.intp], states: Sequence[tuple[bytes, bool]]
+    ) -> Procedure[tuple[Ticket, float]]:
+        """Have envs load states; each comes with whether the env is to show it afterwards."""
+        send = partial(self._calls.send, now, slots, Operation.RESTORE, states, "its snapshot")
+        return self._waiting.ask(now, slots, send, "restore")

@@ -1,0 +1,574 @@
+"""`Continuity`: where each env is in its episode, and what its next result must report.
+
+For every env it counts steps and remembers whether the last returned result ended the episode;
+these are arrays, updated when a batch is returned. For the few envs that lost an episode, or show
+a state that was put back, it runs the transition table `LEGAL`. It also keeps the checkpoints from
+which a replaced worker resumes. Left out: hosts, time and I/O; callers say what was sent, answered
+and returned.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+import warnings
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+
+from rlightning_aio._core.group.state.conditions import CUT_BEFORE, LOST_EPISODE, Conditions
+from rlightning_aio.protocol.entries import Operation, op_of
+from rlightning_aio.protocol.slab import AS_BEFORE, AS_RESTORED, IS_RESET, NO_SEED, OVER
+
+if TYPE_CHECKING:
+    from collections.abc import Container, Iterable, Sequence
+
+    from numpy.typing import NDArray
+
+    from rlightning_aio._core.group.state.env_table import EnvTable
+    from rlightning_aio.batch.columns import ResultColumns
+
+__all__ = [
+    "LEGAL",
+    "Continuity",
+    "LossEvent",
+    "LossPhase",
+    "Position",
+    "Report",
+    "as_int",
+]
+
+_NO_LIMIT: Final = 1 << 62
+
+
+class LossPhase(Enum):
+    """What the next result of an env must report about the episode before it."""
+
+    INTACT = auto()
+    """Nothing: the episode continues."""
+    LOST = auto()
+    """The episode is lost, and no request that reports it is in flight."""
+    REPORTING = auto()
+    """A request is in flight whose result begins a new episode and reports the loss."""
+    RESUMING = auto()
+    """A request is in flight whose result shows the last checkpoint and reports the loss."""
+    RESETTING = auto()
+    """A reset that the caller asked for is in flight; if it succeeds, the loss is moot."""
+    SHOWING = auto()
+    """A request is in flight whose result shows the state that `restore` put back."""
+
+
+class LossEvent(Enum):
+    """What can happen to an env that lost its episode or was put back."""
+
+    EPISODE_LOST = auto()
+    REPORT_SENT = auto()
+    RESUME_SENT = auto()
+    RESET_SENT = auto()
+    SHOW_SENT = auto()
+    ANSWERED = auto()
+    RAISED = auto()
+    GIVEN_UP = auto()
+
+
+_IN_FLIGHT: Final = (
+    LossPhase.REPORTING,
+    LossPhase.RESUMING,
+    LossPhase.RESETTING,
+    LossPhase.SHOWING,
+)
+
+LEGAL: Final[dict[tuple[LossPhase, LossEvent], LossPhase]] = {
+    (LossPhase.LOST, LossEvent.REPORT_SENT): LossPhase.REPORTING,
+    (LossPhase.LOST, LossEvent.RESUME_SENT): LossPhase.RESUMING,
+    (LossPhase.LOST, LossEvent.RESET_SENT): LossPhase.RESETTING,
+    (LossPhase.LOST, LossEvent.SHOW_SENT): LossPhase.SHOWING,
+    (LossPhase.INTACT, LossEvent.SHOW_SENT): LossPhase.SHOWING,
+    **{(phase, LossEvent.EPISODE_LOST): LossPhase.LOST for phase in LossPhase},
+    **{(phase, LossEvent.ANSWERED): LossPhase.INTACT for phase in _IN_FLIGHT},
+    **{(phase, LossEvent.RAISED): LossPhase.LOST for phase in _IN_FLIGHT},
+    **{(phase, LossEvent.GIVEN_UP): LossPhase.INTACT for phase in LossPhase},
+}
+"""The phase after each event. A pair that is missing is a bug, and raises."""
+
+
+class Position(NamedTuple):
+    """An env's place in its episode: steps since the reset, and if the step limit cut it there."""
+
+    num_steps: int
+    is_cut: bool
+
+
+class Report(NamedTuple):
+    """A loss that the result of a slot reports.
+
+    Attributes:
+        cause: what ended the worker.
+        at_fault: the id of the env that the worker was executing; None if unknown.
+        steps_lost: steps to repeat where the env resumes; None where it begins a new episode.
+        suspects: ids; see `WorkerDied`.
+    """
+
+    slot: int
+    cause: str
+    at_fault: str | None
+    steps_lost: int | None
+    suspects: tuple[str, ...] = ()
+
+
+class Judged(NamedTuple):
+    """What a batch of results changes, once it is returned to the caller.
+
+    Attributes:
+        num_steps: of each slot's episode after the result.
+        is_cut: the step limit cuts the episode at this result; None if it cuts none.
+        restored: slots whose results show a state that was put back.
+        begun: of each part with flags, the slots that were reset with all their sub-environments.
+    """
+
+    num_steps: NDArray[np.int64]
+    is_cut: NDArray[np.bool_] | None
+    restored: Sequence[int]
+    begun: Sequence[NDArray[np.intp]]
+
+
+@dataclass(slots=True)
+class _Loss:
+    """The phase of one env that is not intact.
+
+    Attributes:
+        from_checkpoint: it was built anew from its last checkpoint, which it can show.
+        resumes: the request that was lost with the worker was to show a state.
+        seed: of the reset that reports it; `AS_BEFORE` where its env may know that.
+        position: of the state that the reply in flight will show; of this phase only, as
+        steps_lost: see `Report`.
+    """
+
+    phase: LossPhase
+    cause: str = "could not show the state that was restored"
+    at_fault: str | None = None
+    suspects: tuple[str, ...] = ()
+    from_checkpoint: bool = False
+    resumes: bool = False
+    seed: int = NO_SEED
+    position: Position | None = None
+    steps_lost: int | None = None
+
+
+@dataclass(slots=True)
+class _Checkpoint:
+    """A saved state, the request during which it was saved, and its place in the episode."""
+
+    content: bytes
+    entry: int
+    num_steps: int
+
+
+class Continuity:
+    """See the module.
+
+    Attributes:
+        exceptional: some env is not intact, so results must be checked for reports.
+        due: by slot, whether the env is reset in place of its next step; all False while no
+            context is open.
+        active: an `auto_reset` context is open.
+        mark_truncated: mark results at the step limit as truncated.
+    """
+
+    def __init__(self, envs: EnvTable, conditions: Conditions | None = None) -> None:
+        self._envs = envs
+        self._conditions = conditions or Conditions()
+        self.due = np.zeros(len(envs), np.bool_)
+        self._num_steps = np.zeros(len(envs), np.int64)
+        # The last returned result reached the step limit; ended the episode by itself.
+        self._cut = np.zeros(len(envs), np.bool_)
+        self._ended = np.zeros(len(envs), np.bool_)
+        self._limits: NDArray[np.int64] | None = None
+        self._uses_own_limits = False
+        self._resets_ended = True
+        # No env can reach its limit within this number of batches.
+        self._margin = 0
+        self._losses: dict[int, _Loss] = {}
+        self._restored: dict[int, Position] = {}
+        # Checkpoints by slot; pending ones count once the request that made them is answered.
+        self._checkpoints: dict[int, _Checkpoint] = {}
+        self._pending: dict[int, _Checkpoint] = {}
+        self.exceptional = False
+        self.active = False
+        self.mark_truncated = False
+
+    # -- the context ------------------------------------------------------------------
+
+    def begin(
+        self, max_episode_steps: float | None, *, on_done: bool, mark_truncated: bool = False
+    ) -> None:
+        """Open the `auto_reset` context.
+
+        Raises:
+            ValueError: the limit is neither a positive int nor `math.inf`, or is None and an env
+                has none.
+            RuntimeError: the context is open already.
+        """
+        if self.active:
+            raise RuntimeError("auto_reset contexts don't nest; leave the open one first")
+        self._limits = self._chosen_limits(max_episode_steps)
+        self._uses_own_limits = max_episode_steps is None
+        self._margin = 0
+        self._resets_ended = on_done
+        self.mark_truncated = mark_truncated
+        self.active = True
+        self._conditions.note(CUT_BEFORE, False)
+        self._update_due()
+
+    def _chosen_limits(self, given: float | None) -> NDArray[np.int64]:
+        envs = self._envs
+        if given is None:
+            present = np.array([bool(env_id) for env_id in envs.env_ids])
+            lacking = np.flatnonzero(present & (envs.step_limits == 0) & ~envs.resets_itself)
+            if len(lacking):
+                raise ValueError(
+                    f"{envs.describe(int(lacking[0]))} has no step limit, neither a configured "
+                    "max_episode_steps nor one of the simulator's own; configure one, pass "
+                    "auto_reset(max_episode_steps=…), or auto_reset(math.inf) for no limit"
+                )
+            return self._own_limits(...)
+        limit = _NO_LIMIT if given == math.inf else as_int(given)
+        if limit is None or limit < 1:
+            raise ValueError(
+                f"max_episode_steps must be a positive int, or math.inf for no limit, not {given!r}"
+            )
+        configured = {config.max_episode_steps for config in envs.configs} - {None, limit}
+        if configured:
+            warnings.warn(
+                f"auto_reset(max_episode_steps={given}) overrides the limits that are configured",
+                stacklevel=5,
+            )
+        return np.full(len(envs), limit, np.int64)
+
+    def _own_limits(self, slots: Any) -> Any:
+        """Return each env's own limit. Envs that reset themselves keep their limits themselves,
+        one sub-environment at a time.
+        """
+        limits = self._envs.step_limits[slots]
+        return np.where((limits == 0) | self._envs.resets_itself[slots], _NO_LIMIT, limits)
+
+    def end(self) -> None:
+        """Close the context: steps are plain again."""
+        self._limits = None
+        self.active = self.mark_truncated = False
+        self._update_due()
+
+    def note_joined(self, slot: int) -> None:
+        """Use the limit of the env that has just joined at `slot`."""
+        if self._limits is not None and self._uses_own_limits:
+            self._limits[slot] = self._own_limits(slot)
+            self._margin = 0
+
+    # -- requests ---------------------------------------------------------------------
+
+    def begin_steps(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Note steps that are about to be sent; return which of `slots` are reset instead."""
+        if not self.active:
+            self._cut[slots] = False  # Outside the context a step continues the episode.
+            self._update_due()
+        return self.due[slots]
+
+    def _update_due(self) -> None:
+        if not self.active:
+            self.due[:] = False
+            self._conditions.note(CUT_BEFORE, len(self._cut.nonzero()[0]) > 0)
+        elif self._resets_ended:
+            np.logical_or(self._cut, self._ended, out=self.due)
+        else:
+            self.due[:] = self._cut
+
+    def report_losses(
+        self, slots: NDArray[np.intp], is_step: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+        """Report lost episodes with the requests that are about to be sent to `slots`.
+
+        Args:
+            slots: idle, or asked again after a restart.
+            is_step: of each, whether the caller asked for a step within an episode. Such an env
+                resumes from its checkpoint, if it has one; others begin a new episode.
+
+        Returns which requests must be resets that report a loss, and the seeds for all slots.
+        """
+        reports = np.zeros(len(slots), np.bool_)
+        seeds = np.full(len(slots), NO_SEED)
+        for k, slot in enumerate(slots.tolist()):
+            loss = self._losses.get(slot)
+            if loss is None or loss.phase is not LossPhase.LOST:
+                continue
+            reports[k] = True
+            checkpoint = self._checkpoint(slot) if loss.from_checkpoint else None
+            if checkpoint is None or not (is_step[k] or loss.resumes):
+                seeds[k] = loss.seed
+                self._move(slot, LossEvent.REPORT_SENT)
+                continue
+            seeds[k] = AS_RESTORED
+            self._move(slot, LossEvent.RESUME_SENT)
+            loss.position = Position(checkpoint.num_steps, is_cut=False)
+            loss.steps_lost = max(self._num_steps.item(slot) - checkpoint.num_steps, 0)
+        return reports, seeds
+
+    def note_resets(self, slots: Iterable[int]) -> None:
+        """Record that resets which the caller asked for are about to be sent."""
+        for slot in slots if self._losses else ():
+            if slot in self._losses:
+                self._move(slot, LossEvent.RESET_SENT)
+
+    def note_shows(self, slots: Iterable[int], positions: Sequence[Position]) -> None:
+        """Record that resets which show restored states at `positions` are about to be sent."""
+        for slot, position in zip(slots, positions, strict=True):
+            self._move(slot, LossEvent.SHOW_SENT).position = position
+            checkpoint = self._pending.pop(slot, None)
+            if checkpoint is not None:  # Of the state that was put back.
+                checkpoint.num_steps = position.num_steps
+                self._checkpoints[slot] = checkpoint
+
+    # -- replies ----------------------------------------------------------------------
+
+    def lose(
+        self,
+        slots: Iterable[int],
+        cause: str,
+        at_fault: str | None = None,
+        suspects: tuple[str, ...] = (),
+        *,
+        from_checkpoint: bool = False,
+    ) -> None:
+        """Record that the episodes of `slots` are lost; nothing is in flight there.
+
+        `cause`, `at_fault` and `suspects` are those of `Report`. `from_checkpoint`: the envs are
+        built anew, from their checkpoints where they have any.
+        """
+        for slot in slots:
+            loss = self._move(slot, LossEvent.EPISODE_LOST)
+            loss.cause, loss.at_fault, loss.suspects = cause, at_fault, suspects
+            loss.from_checkpoint, loss.seed = from_checkpoint, NO_SEED
+
+    def abandon(self, slots: Iterable[int], cause: str) -> None:
+        """Record that the caller has ended the episodes of `slots`, whose requests end without a
+        reply, or whose results were dropped. No checkpoint of them is used.
+        """
+        slots = list(slots)
+        self.lose(slots, cause)
+        for slot in slots:
+            self._losses[slot].seed = AS_BEFORE
+            for kept in (self._pending, self._checkpoints, self._restored):
+                kept.pop(slot, None)
+
+    def answered(self, slots: NDArray[np.intp]) -> list[Report]:
+        """Record that results of `slots` arrived, and return the losses that they report."""
+        reports: list[Report] = []
+        for slot in slots.tolist():
+            loss = self._losses.get(slot)
+            if loss is None or loss.phase is LossPhase.LOST:
+                continue
+            if loss.phase in (LossPhase.REPORTING, LossPhase.RESUMING):
+                about = loss.cause, loss.at_fault, loss.steps_lost, loss.suspects
+                reports.append(Report(slot, *about))
+            if loss.position is not None:
+                self._restored[slot] = loss.position
+            self._move(slot, LossEvent.ANSWERED)
+        return reports
+
+    def raised(self, slot: int) -> str | None:
+        """Record that the request of `slot` ended without a result; return the cause of a loss that
+        it would have reported.
+        """
+        loss = self._losses.get(slot)
+        if loss is None or loss.phase is LossPhase.LOST:
+            return None
+        cause = loss.cause if loss.phase in (LossPhase.REPORTING, LossPhase.RESUMING) else None
+        self._move(slot, LossEvent.RAISED).from_checkpoint = False
+        return cause
+
+    def give_up(self, slots: Iterable[int]) -> None:
+        """Forget losses and checkpoints of `slots`, whose host will not be replaced."""
+        for slot in slots:
+            if slot in self._losses:
+                self._move(slot, LossEvent.GIVEN_UP)
+            self._pending.pop(slot, None)
+            self._checkpoints.pop(slot, None)
+
+    def _move(self, slot: int, event: LossEvent) -> _Loss:
+        """Apply an event of one slot by the table."""
+        loss = self._losses.get(slot)
+        phase = LossPhase.INTACT if loss is None else loss.phase
+        after = LEGAL.get((phase, event))
+        if after is None:
+            raise RuntimeError(f"slot {slot} is {phase.name}, where {event.name} can't happen")
+        if loss is None:
+            loss = _Loss(after)
+        loss.phase = after
+        loss.resumes = phase in (LossPhase.RESUMING, LossPhase.SHOWING)
+        loss.position = loss.steps_lost = None
+        if after is LossPhase.INTACT:
+            self._losses.pop(slot, None)
+        else:
+            self._losses[slot] = loss
+        self.exceptional = bool(self._losses)
+        self._conditions.note(LOST_EPISODE, self.exceptional)
+        return loss
+
+    # -- results ----------------------------------------------------------------------
+
+    def judge(self, slots: NDArray[np.intp], flagged: Sequence[ResultColumns]) -> Judged:
+        """Decide what returning the results of `slots` will mean; `returned` carries it out.
+
+        Args:
+            slots: of all results, each once.
+            flagged: the parts of the batch that have any flag set.
+        """
+        num_steps = self._num_steps[slots] + 1
+        restored: list[int] = []
+        begun: list[NDArray[np.intp]] = []
+        for part in flagged:  # A comprehension is a call more.
+            begun.append(self._judge_flags(part, slots, num_steps, restored))  # noqa: PERF401
+        if self._limits is None:
+            return Judged(num_steps, None, restored, begun)
+        self._margin -= 1
+        is_cut = None
+        if self._margin <= 0:
+            # The steps of this batch are not counted yet.
+            self._margin = int((self._limits - self._num_steps).min()) - 1
+            is_cut = num_steps >= self._limits[slots]
+            if restored:  # The limit was reported when the state was new.
+                is_cut &= ~np.isin(slots, restored)
+            is_cut = is_cut if len(is_cut.nonzero()[0]) else None
+        return Judged(num_steps, is_cut, restored, begun)
+
+    def _judge_flags(
+        self,
+        part: ResultColumns,
+        slots: NDArray[np.intp],
+        num_steps: NDArray[np.int64],
+        restored: list[int],
+    ) -> NDArray[np.intp]:
+        """Restart the counts of episodes that begin in `part`; return the slots that were reset.
+
+        An env that resets itself needs no request for that: its next episode must not be cut for
+        the steps of the one that ends here.
+        """
+        flags = part.flags
+        begins = resets = flags[:, IS_RESET] if flags.ndim == 2 else _all_reset(part)
+        if self._envs.any_resets_itself:
+            begins = resets | (part.over & self._envs.resets_itself[part.slots])
+        places = begins.nonzero()[0]
+        if part.positions is not None:
+            places = part.positions[places]
+        num_steps[places] = 0
+        if self._restored:
+            for place in places.tolist():
+                position = self._restored.get(slots.item(place))
+                if position is not None:
+                    num_steps[place] = position.num_steps
+                    restored.append(slots.item(place))
+        return part.slots[resets]
+
+    def returned(
+        self, slots: NDArray[np.intp], flagged: Sequence[ResultColumns], judged: Judged
+    ) -> None:
+        """Record that results were returned, as `judge` has decided."""
+        self._num_steps[slots] = judged.num_steps
+        for part, begun in zip(flagged, judged.begun, strict=True):
+            self._note_flags(part, begun)
+        for slot in judged.restored:
+            self._cut[slot] = self._restored.pop(slot).is_cut
+            self._margin = 0
+        if judged.is_cut is not None:
+            self._cut[slots[judged.is_cut]] = True
+        if flagged or judged.is_cut is not None:
+            self._update_due()
+        if self._pending:
+            self._accept_checkpoints(slots)
+
+    def _note_flags(self, part: ResultColumns, begun: NDArray[np.intp]) -> None:
+        self._cut[begun] = self._ended[begun] = False
+        ended = part.flags[:, OVER] if part.flags.ndim == 2 else part.over
+        if self._envs.any_resets_itself:
+            ended = ended & ~self._envs.resets_itself[part.slots]
+        self._ended[part.slots[ended]] = True
+
+    def positions(self, slots: NDArray[np.intp]) -> list[Position]:
+        """Return the positions of `slots`, all idle; after a loss, those of their checkpoints."""
+        found: list[Position] = []
+        for slot in slots.tolist():
+            loss = self._losses.get(slot)
+            from_checkpoint = loss is not None and loss.from_checkpoint
+            checkpoint = self._checkpoint(slot) if from_checkpoint else None
+            if checkpoint is not None:
+                found.append(Position(checkpoint.num_steps, is_cut=False))
+            else:
+                found.append(Position(self._num_steps.item(slot), self._cut.item(slot)))
+        return found
+
+    # -- checkpoints ------------------------------------------------------------------
+
+    def save(self, slot: int, content: bytes, entry: int, *, before: bool, is_step: bool) -> None:
+        """Keep a checkpoint that an env sent during its current request.
+
+        Args:
+            slot: of the env.
+            content: its state, opaque here.
+            entry: of the current request.
+            before: the state is from before the request, so it is valid at once. Otherwise it
+                is valid once the request is answered, and that of a restore once it is complete.
+            is_step: the request is a step.
+        """
+        answered = self._pending.pop(slot, None)
+        if before:
+            self._checkpoints[slot] = _Checkpoint(content, entry, self._num_steps.item(slot))
+            return
+        if answered is not None:
+            self._checkpoints[slot] = answered
+        num_steps = self._num_steps.item(slot) + 1 if is_step else 0
+        self._pending[slot] = _Checkpoint(content, entry, num_steps)
+
+    def _accept_checkpoints(self, slots: NDArray[np.intp]) -> None:
+        for slot in slots.tolist():
+            checkpoint = self._pending.pop(slot, None)
+            if checkpoint is not None:
+                checkpoint.num_steps = self._num_steps.item(slot)
+                self._checkpoints[slot] = checkpoint
+
+    def drop_unfinished(self, slots: Iterable[int], unanswered: Container[int]) -> None:
+        """Drop checkpoints that a replacement of the host of `slots` must not start from.
+
+        They are of requests that were not answered (entries), or of a restore that was not
+        completed: see `note_shows`.
+        """
+        for slot in slots:
+            pending = self._pending.get(slot)
+            if pending is not None and (
+                pending.entry in unanswered or op_of(pending.entry) == Operation.RESTORE
+            ):
+                del self._pending[slot]
+
+    def checkpoints(self, slots: Iterable[int]) -> tuple[bytes | None, ...]:
+        """Return the states that a replacement's envs start from; None for a new episode."""
+        found = (self._checkpoint(slot) for slot in slots)
+        return tuple(None if one is None else one.content for one in found)
+
+    def _checkpoint(self, slot: int) -> _Checkpoint | None:
+        return self._pending.get(slot) or self._checkpoints.get(slot)
+
+
+def _all_reset(part: ResultColumns) -> NDArray[np.bool_]:
+    """Return which envs were reset, with all of their sub-environments."""
+    resets = part.is_reset
+    return resets if resets.ndim == 1 else np.logical_and.reduce(resets, 1)
+
+
+def as_int(value: Any) -> int | None:
+    """Return `value` as an int, NumPy's included; None if it is no whole number, or a bool."""
+    if isinstance(value, bool):
+        return None
+    try:
+        return operator.index(value)
+    except TypeError:
+        return None

@@ -1,0 +1,132 @@
+"""Build a group from its plan: create the hosts and the parts of the core."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rlightning_aio._core.group.engine.checked import DEBUG, CheckedRequests
+from rlightning_aio._core.group.engine.core import Core, Parts
+from rlightning_aio._core.group.engine.poller import Poller
+from rlightning_aio._core.group.episodes.continuity import Continuity
+from rlightning_aio._core.group.setup.plan import host_class, place_of
+from rlightning_aio._core.group.setup.start_orders import start_orders
+from rlightning_aio._core.group.state.conditions import Conditions
+from rlightning_aio._core.group.state.env_table import EnvTable
+from rlightning_aio._core.group.state.lifetime import Lifetime
+from rlightning_aio._core.group.state.observed import Observed
+from rlightning_aio._core.group.state.requests import Requests
+from rlightning_aio._core.group.state.slab_layout import SlabLayout
+from rlightning_aio._core.group.supervision.supervisor import Supervisor
+from rlightning_aio._core.group.tables import Tables
+from rlightning_aio._core.hosts.arena import Arena, map_shared
+from rlightning_aio._core.hosts.base import Wiring
+from rlightning_aio.errors import ConfigError
+from rlightning_aio.protocol.rings import TrainerBell, bell_size
+from rlightning_aio.sharing import num_cores
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rlightning_aio._core.group.setup.plan import Plan
+    from rlightning_aio._core.hosts.base import Watcher
+    from rlightning_aio._core.hosts.messages import Completions, StartOrder
+    from rlightning_aio.protocol.exchange import Ring
+
+__all__ = ["assemble"]
+
+
+def assemble(plan: Plan, watcher: Watcher, *, shares_thread: bool) -> Core:
+    """Create the core of a group and its hosts, without starting anything.
+
+    An error of a host's factory propagates, after everything created before it is released.
+
+    Args:
+        plan: from `plan_group`.
+        watcher: the driver.
+        shares_thread: other tasks may use the group while a procedure waits.
+
+    Raises:
+        ConfigError: an entry needs the event loop that a synchronous group doesn't have.
+    """
+    for config in plan.configs:
+        if not shares_thread and place_of(config).awaits == "only":
+            raise ConfigError(
+                f"entry {config.name!r}: a synchronous group has no event loop for placement "
+                f"{config.placement!r}; use placement: process, whose workers run awaitable envs "
+                "on event loops of their own, or the asynchronous group"
+            )
+    arena = Arena()
+    try:
+        return _assembled(plan, watcher, arena, shares_thread=shares_thread)
+    except BaseException:
+        arena.close()
+        raise
+
+
+def _assembled(plan: Plan, watcher: Watcher, arena: Arena, *, shares_thread: bool) -> Core:
+    cores = num_cores()
+    orders = start_orders(plan, cores)
+    bell_offset = arena.append(bell_size(len(orders)))
+    bell_memory = map_shared(arena.descriptor, bell_offset, bell_size(len(orders)))
+    bell = TrainerBell(bell_memory, len(orders))
+    tables = _tables(plan, orders)
+    completions: Completions = deque()
+    supervisor = Supervisor(
+        tables,
+        arena,
+        completions.append,
+        mixed_actions=plan.mixed_actions,
+        clock=time.monotonic,
+    )
+    supervisor.resources["bell"] = bell
+    poller = Poller(tables.requests, bell, cores, clock=time.monotonic)
+    rings: list[Ring | None] = [None] * len(orders)
+    wiring = Wiring(
+        completions=completions,
+        watcher=watcher,
+        arena=arena,
+        bell=bell,
+        bell_offset=bell_offset,
+        rings=rings,
+        num_hosts=len(orders),
+        configs=[order.config for order in orders],
+        objection=lambda meta: supervisor.members.objection(meta, supervisor.metas),
+        is_idle=tables.requests.is_idle,
+        resources=supervisor.resources,
+        shares_thread=shares_thread,
+    )
+    first_slot = 0
+    for host_id, order in enumerate(orders):
+        host = host_class(order.config)(host_id, first_slot, order, wiring)
+        supervisor.add(host, order.config)
+        poller.add(host)
+        first_slot += host.num_envs
+    parts = Parts(tables, supervisor, poller, bell, rings, completions, watcher)
+    return Core(parts, zero_copy=plan.zero_copy, shares_thread=shares_thread)
+
+
+def _tables(plan: Plan, orders: Sequence[StartOrder]) -> Tables:
+    """Make the state of a group whose hosts get `orders`."""
+    local = [config for config in plan.configs if not place_of(config).max_members]
+    servers = [config for config in plan.configs if place_of(config).max_members]
+    envs = EnvTable(
+        [config for config in local for _ in range(config.num_workers)],
+        [f"{config.name}-{index}" for config in local for index in range(config.num_workers)],
+        [(f"{config.name}-0", config, place_of(config).max_members) for config in servers],
+    )
+    conditions = Conditions()
+    nums_envs = [len(order.worker_indices) for order in orders]
+    hosts = np.repeat(np.arange(len(orders)), nums_envs)
+    return Tables(
+        envs=envs,
+        requests=(CheckedRequests if DEBUG else Requests)(hosts, len(orders), conditions),
+        layout=SlabLayout(len(envs)),
+        continuity=Continuity(envs, conditions),
+        conditions=conditions,
+        observed=Observed(conditions),
+        lifetime=Lifetime(conditions),
+    )

@@ -1,0 +1,154 @@
+"""`start_orders`: which host runs which envs, and with which cores, devices and variables."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections import Counter
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
+
+from rlightning_aio._core.group.setup.devices import check_own_devices, dealt_out
+from rlightning_aio._core.group.setup.plan import Plan, PreprocessFn, place_of
+from rlightning_aio._core.group.setup.videos import filmed_alone
+from rlightning_aio._core.hosts.messages import StartOrder
+from rlightning_aio._core.hosts.running.known_tasks import known_tasks
+from rlightning_aio.config import EnvConfig, moved
+from rlightning_aio.registry import ENVS
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+__all__ = ["start_orders"]
+
+Share: TypeAlias = "list[tuple[int, PreprocessFn | None]]"
+"""The envs of a host: their positions in the entry, and their preprocess functions."""
+
+
+def _has_worker_here(config: EnvConfig) -> bool:
+    """True if the envs of an entry run in worker processes on this machine."""
+    place = place_of(config)
+    return place.spreads and place.local
+
+
+def start_orders(plan: Plan, num_cores: int) -> list[StartOrder]:
+    """The start order of each host: first those whose envs are built with the group."""
+    shares = _all_shares(plan, num_cores)
+    cores = sorted(os.sched_getaffinity(0))
+    num_processes = sum(_has_worker_here(config) for config, _ in shares)
+    variables = _environment_variables([config for config, _ in shares])
+    elsewhere = any(place_of(config).spreads for config, _ in shares)
+    tasks = known_tasks() if elsewhere else ()
+    orders = [
+        StartOrder(
+            config=_own_makers(config, [index for index, _ in share]).model_copy(
+                update={"env_vars": variables[host_id]}
+            ),
+            env_class=ENVS.registered(config.backend),
+            worker_indices=tuple(index for index, _ in share),
+            preprocess_fns=tuple(fn for _, fn in share),
+            spins=num_processes <= num_cores,
+            core=cores[host_id % len(cores)] if config.cpu_affinity else None,
+            tasks=tasks,
+        )
+        for host_id, (config, share) in enumerate(shares)
+    ]
+    return orders + [_order_of_members(c) for c in plan.configs if place_of(c).max_members]
+
+
+def _all_shares(plan: Plan, num_cores: int) -> list[tuple[EnvConfig, Share]]:
+    """The entry and the envs of each local host."""
+    local = [
+        (config, fns)
+        for config, fns in zip(plan.configs, plan.preprocess_fns, strict=True)
+        if not place_of(config).max_members
+    ]
+    nums_hosts = _nums_hosts([config for config, _ in local], num_cores)
+    shares = [
+        (config, share)
+        for (config, fns), num_hosts in zip(local, nums_hosts, strict=True)
+        for share in _shares(config, fns, num_hosts)
+    ]
+    # This process runs the envs of one worker, whatever the number of entries.
+    for k, (config, share) in list(enumerate(shares))[::-1]:
+        if place_of(config).own_share:
+            shares[k] = moved(config, "inline"), share
+            break
+    return shares
+
+
+def _order_of_members(config: EnvConfig) -> StartOrder:
+    """The order of a host whose envs join and leave."""
+    count = place_of(config).max_members
+    return StartOrder(config, None, tuple(range(count)), (None,) * count, spins=False, core=None)
+
+
+def _environment_variables(workers: Sequence[EnvConfig]) -> list[dict[str, str]]:
+    """The environment variables of each worker, given its entry.
+
+    The entry's own variables override those that assign devices. ``{worker_index}`` in a value is
+    replaced by the number of the worker within its entry.
+    """
+    devices = iter(dealt_out([config for config in workers if _has_worker_here(config)]))
+    count = Counter[str]()
+    found: list[dict[str, str]] = []
+    for config in workers:
+        index = str(count[config.name])
+        count[config.name] += 1
+        own = {k: v.replace("{worker_index}", index) for k, v in config.env_vars.items()}
+        if config.placement == "inline":
+            check_own_devices(config)
+        dealt = next(devices) if _has_worker_here(config) else {}
+        found.append({**dealt, **own})
+    return found
+
+
+def _own_makers(config: EnvConfig, indices: Sequence[int]) -> EnvConfig:
+    """`config` for a host of the envs at `indices`, with only their `make_env` functions."""
+    makers: Any = config.make_env
+    if not isinstance(makers, tuple):
+        return config
+    makers = cast("tuple[Any, ...]", makers)
+    return config.model_copy(update={"make_env": tuple(makers[k] for k in indices)})
+
+
+def _nums_hosts(configs: Sequence[EnvConfig], num_cores: int) -> list[int]:
+    """The number of hosts of each entry.
+
+    With ``envs_per_process: auto``, entries of CPU-bound simulators share the cores in proportion
+    to their envs. Entries on other machines don't, as the cores there are unknown here. Envs that
+    only wait are all in one worker, which keeps an event loop for them.
+    """
+    nums: list[int] = []
+    sharing: list[int] = []
+    for k, config in enumerate(configs):
+        if not place_of(config).spreads:
+            nums.append(1)
+        elif config.envs_per_process != "auto":
+            nums.append(-(-config.num_workers // config.envs_per_process))
+        elif ENVS.is_awaitable(config.backend):
+            nums.append(1)
+        elif ENVS.is_cpu_bound(config.backend) and place_of(config).local:
+            nums.append(1)
+            sharing.append(k)
+        else:
+            nums.append(config.num_workers)
+    for _ in range(num_cores - len(sharing)):
+        # Add a worker to the entry with the most envs per worker.
+        crowded = max(sharing, key=lambda k: configs[k].num_workers / nums[k], default=None)
+        if crowded is None or nums[crowded] == configs[crowded].num_workers:
+            break
+        nums[crowded] += 1
+    return nums
+
+
+def _shares(config: EnvConfig, fns: Sequence[PreprocessFn | None], num_hosts: int) -> list[Share]:
+    """The envs of each host of an entry: consecutive ones, evenly divided.
+
+    Filmed envs have hosts of their own (`filmed_alone`).
+    """
+    count = len(fns)
+    envs = list(enumerate(fns))
+    bounds = {count * k // num_hosts for k in range(num_hosts + 1)}
+    if place_of(config).spreads:
+        bounds |= {k + side for k in filmed_alone(config) for side in (0, 1)}
+    return [envs[first:end] for first, end in itertools.pairwise(sorted(bounds))]

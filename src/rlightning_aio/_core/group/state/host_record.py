@@ -1,0 +1,154 @@
+"""`HostRecord`: the supervisor's state of one host, from its first start until it is closed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum, auto
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rlightning_aio._core.hosts.base import Aborting, Killable
+from rlightning_aio.registry import ENVS, placement_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    from rlightning_aio._core.hosts.base import Host
+    from rlightning_aio._core.hosts.messages import AttachOrder, EnvStarted, ErrorText
+    from rlightning_aio.config import EnvConfig
+    from rlightning_aio.errors import WorkerDied
+
+__all__ = ["HostRecord", "Stage"]
+
+
+class Stage(Enum):
+    """The stage of a host in its life."""
+
+    NEW = auto()
+    BUILDING = auto()
+    BUILT = auto()
+    ATTACHING = auto()
+    UP = auto()
+    DOWN = auto()
+    """Dead, and to be restarted."""
+    FAILED = auto()
+    CLOSED = auto()
+
+
+@dataclass
+class HostRecord:
+    """The state of one host. Times are monotonic seconds.
+
+    Attributes:
+        started: its envs, once built.
+        order: the rows of its envs, once assigned.
+        start_by: the deadline of its start; late: it missed that, and is being killed.
+        traffic: see `Killable`, at the last `has_moved`.
+        restart_at: the time of its next restart; restarts: the number so far.
+        refusals: consecutive attempts to start a replacement that the system refused;
+            refused_since: the time of the first.
+        held: requests (entries and arguments) since its death, kept until a replacement is up;
+            None while it needs none.
+        deaths: by slot, deaths of workers that this env is blamed for, since it last completed a
+            step; key None for deaths of unknown cause.
+        culprit: the slot of the env that the last worker was executing when it died.
+        suspects: without one, the slots of those that owed a reply while none was executed.
+        dying: it was killed, and its exit was not reported yet; die_by: the deadline of that.
+        is_hung: its worker hung and is being killed.
+        abort_by: when its worker is killed, unless its aborted requests have ended before;
+            aborted_slot: of the env for whose request that is being done.
+        idle: its progress when it was last seen idle, and idle_since the time (`HangDetector`).
+        rebuild_error: the error of its replacement while rebuilding the envs.
+        lost_slots: of envs that are not rebuilt though their host goes on.
+        last_death: makes the error for slots whose states were lost in it.
+        refusal: makes the error for new requests to slots of a host that was given up.
+        killable: the host, if it can be killed; aborting: if it can end single requests.
+        is_local: its envs use this machine's cores; is_hardware: they move in the real world.
+        slots: of its envs.
+        timed: some of its requests have a time limit, which the supervisor watches.
+    """
+
+    host: Host
+    config: EnvConfig
+    stage: Stage = Stage.NEW
+    started: list[EnvStarted] = field(default_factory=list["EnvStarted"])
+    order: AttachOrder | None = None
+    start_by: float | None = None
+    late: bool = False
+    traffic: int = 0
+    restart_at: float | None = None
+    restarts: int = 0
+    refusals: int = 0
+    refused_since: float | None = None
+    held: list[tuple[NDArray[np.int64], Sequence[Any] | None]] | None = None
+    deaths: dict[int | None, int] = field(default_factory=dict[int | None, int])
+    culprit: int | None = None
+    suspects: tuple[int, ...] = ()
+    dying: bool = False
+    die_by: float | None = None
+    is_hung: bool = False
+    abort_by: float | None = None
+    aborted_slot: int | None = None
+    idle: tuple[int, ...] = ()
+    idle_since: float = 0.0
+    rebuild_error: ErrorText | None = None
+    lost_slots: set[int] = field(default_factory=set[int])
+    last_death: Callable[[NDArray[np.intp]], WorkerDied] | None = None
+    refusal: Callable[[NDArray[np.intp]], WorkerDied] | None = None
+    killable: Killable | None = field(init=False)
+    aborting: Aborting | None = field(init=False)
+    timed: bool = field(init=False)
+    is_local: bool = field(init=False)
+    is_hardware: bool = field(init=False)
+    slots: range = field(init=False)
+
+    def __post_init__(self) -> None:
+        limits = (self.config.step_timeout, self.config.reset_timeout)
+        self.killable = self.host if isinstance(self.host, Killable) else None
+        self.aborting = self.host if isinstance(self.host, Aborting) else None
+        self.timed = self.killable is not None and limits != (None, None)
+        self.is_local = placement_of(self.config.backend, self.config.placement).local
+        self.is_hardware = ENVS.is_hardware(self.config.backend)
+        self.slots = range(self.host.first_slot, self.host.first_slot + self.host.num_envs)
+
+    @property
+    def awaits_several(self) -> bool:
+        """Its worker executes the requests of several envs at the same time."""
+        return len(self.started) > 1 and any(env.is_awaitable for env in self.started)
+
+    @property
+    def blamed(self) -> tuple[int | None, ...]:
+        """The keys of `deaths` that the last death counts for."""
+        return self.suspects or (self.culprit,)
+
+    def withdraw(self, entries: NDArray[np.int64]) -> list[int]:
+        """Hold some requests no longer; return those that it has held."""
+        withdrawn: list[int] = []
+        kept: list[tuple[NDArray[np.int64], Sequence[Any] | None]] = []
+        for held, arguments in self.held or ():
+            stays = ~np.isin(held, entries)
+            own: list[int] = stays.nonzero()[0].tolist()
+            if own:
+                kept.append((held[stays], arguments and [arguments[k] for k in own]))
+            withdrawn += held[~stays].tolist()
+        self.held = kept
+        return withdrawn
+
+    def give_time(self, now: float) -> None:
+        """Count the time of its start from now on."""
+        self.start_by = now + self.config.start_timeout
+        self.has_moved()
+
+    def has_moved(self) -> bool:
+        """Return True if data has passed between it and the trainer since this was last asked."""
+        before = self.traffic
+        self.traffic = before if self.killable is None else self.killable.traffic
+        return self.traffic != before
+
+    def kill(self, *, dump: bool) -> None:
+        """Kill its worker, if it has one; `dump` first writes the worker's stacks to stderr."""
+        if self.killable is not None:
+            self.killable.kill(dump=dump)

@@ -1,0 +1,575 @@
+"""`Requests`: the current request of each env, its owner, and its state.
+
+A pure table over slots, the positions of envs in their group. It knows hosts by number only, no
+time and no I/O. An env has one request at a time. Each request ends once, in a result, a value, an
+error or a withdrawal, and goes to the call that waits for it, or else to `collect`. `LEGAL` lists
+every transition: tests are generated from it, and the debug mode (`checked`) executes it.
+
+The table consists of arrays, so that a batch of thousands costs a few vector operations.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from rlightning_aio._core.group.state.conditions import ABORTING, Conditions
+from rlightning_aio._core.group.state.request_states import COLLECTOR, NOBODY, State
+from rlightning_aio._core.group.state.uncollected import UncollectedErrors
+from rlightning_aio.protocol.entries import (
+    ANSWERS_WITH_VALUE,
+    NUMBER_SHIFT,
+    OP_BITS,
+    OP_BITS_ARRAY,
+    OP_MASK,
+    SLOT_MASK_ARRAY,
+    WITHOUT_OP,
+    Operation,
+    slot_of,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from rlightning_aio.errors import EnvFault
+
+__all__ = ["Aborted", "CollectorQueue", "Numbering", "Requests", "Ticket", "Tickets"]
+
+
+# Plain ints: NumPy takes several times as long over members of an enum.
+_IDLE_CODE, _BUSY_CODE, _READY_CODE, _SPENT_CODE = map(int, State)
+_STEP, _RESET, _JOIN = map(int, (Operation.STEP, Operation.RESET, Operation.JOIN))
+
+_OP: Final = np.array(OP_MASK)
+_NEXT: Final = {op: np.array((1 << NUMBER_SHIFT) + op) for op in map(int, Operation)}
+"""Numbers to add to an entry without an operation."""
+
+
+@dataclass(slots=True)
+class Ticket:
+    """A call that waits for its own requests, independently of `collect`.
+
+    Attributes:
+        remaining: number of its requests that have not ended.
+        method: name of the method that it calls; empty for steps and resets.
+        failed: the error that a request ended in, by slot.
+        values: returned by method calls, by slot.
+    """
+
+    owner: int
+    slots: NDArray[np.intp]
+    remaining: int
+    method: str
+    failed: dict[int, EnvFault] = field(default_factory=dict[int, "EnvFault"])
+    values: dict[int, Any] = field(default_factory=dict[int, Any])
+
+    def submitted(self, owner: NDArray[np.int64]) -> NDArray[np.intp]:
+        """Return the slots whose requests are its own, by the `owner` of each request."""
+        return self.slots[owner[self.slots] == self.owner]
+
+    @property
+    def calls(self) -> bool:
+        """True if the requests are calls of a method."""
+        return bool(self.method)
+
+    @property
+    def faults(self) -> list[EnvFault]:
+        """The errors, each once."""
+        return list(dict.fromkeys(self.failed.values()))
+
+    def failures(self) -> list[tuple[EnvFault, NDArray[np.intp]]]:
+        """Return each error, with its own slots; those of aborted requests are not its own."""
+        own = set(self.slots.tolist())
+        slots_of = {
+            fault: [slot for slot in self.failed if slot in own and self.failed[slot] is fault]
+            for fault in self.faults
+        }
+        return [(fault, np.array(slots, np.intp)) for fault, slots in slots_of.items()]
+
+
+class Tickets:
+    """The calls that wait for their own requests.
+
+    Attributes:
+        waiting: by owner.
+    """
+
+    def __init__(self) -> None:
+        self.waiting: dict[int, Ticket] = {}
+        self._next_owner = 1
+
+    def open(self, slots: NDArray[np.intp], *, method: str = "") -> Ticket:
+        """Open a ticket for a call whose requests are about to be submitted.
+
+        Args:
+            slots: whose requests.
+            method: of the envs that is called; empty for steps and resets.
+        """
+        ticket = Ticket(self._next_owner, slots, len(slots), method)
+        self._next_owner += 1
+        self.waiting[ticket.owner] = ticket
+        return ticket
+
+    def method(self, owner: int) -> str:
+        """Return the method that the call `owner` calls, or an empty string."""
+        ticket = self.waiting.get(owner)
+        return "" if ticket is None else ticket.method
+
+
+class Numbering:
+    """The number and the operation of each slot's current request, or its last.
+
+    Attributes:
+        entry: number, slot and operation, by slot.
+        num_values: by slot, the number of its requests that are answered by a value.
+    """
+
+    def __init__(self, size: int) -> None:
+        self.entry = np.arange(size) << OP_BITS
+        self.num_values = np.zeros(size, np.int64)
+
+    def number(self, slot: int) -> int:
+        """Number of the current request; 0 before the first."""
+        return int(self.entry[slot]) >> NUMBER_SHIFT
+
+    def numbers(self, slots: Any = ...) -> NDArray[np.int64]:
+        """Numbers of the current requests."""
+        return self.entry[slots] >> NUMBER_SHIFT
+
+    def of_results(self, slots: NDArray[np.intp]) -> NDArray[np.int64]:
+        """Return the number of requests of `slots` that are answered by a result."""
+        return (self.entry[slots] >> NUMBER_SHIFT) - self.num_values[slots]
+
+    def op(self, slot: int) -> int:
+        """Operation of the current request; 0 before the first."""
+        return int(self.entry[slot]) & OP_MASK
+
+    def ops(self, slots: NDArray[np.intp]) -> NDArray[np.int64]:
+        """Operations of the current requests of `slots`."""
+        return self.entry[slots] & _OP
+
+    def awaits_value(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Return which of `slots` have requests that are answered by a value, not a result."""
+        return ANSWERS_WITH_VALUE[self.ops(slots)]
+
+    def renew(self, slots: NDArray[np.intp], op: int) -> NDArray[np.int64]:
+        """Number the next request of each of `slots`, and return their entries."""
+        if len(slots) == 1:  # As most results come one by one: in a third of the time.
+            slot = slots.item()
+            self.entry[slot] = (self.entry.item(slot) & ~OP_MASK) + (1 << NUMBER_SHIFT) + op
+            return self.entry[slots]
+        entries = self.entry[slots]
+        entries &= WITHOUT_OP
+        entries += _NEXT[op]
+        self.entry[slots] = entries
+        return entries
+
+    def into_resets(
+        self, slots: NDArray[np.intp], entries: NDArray[np.int64], which: NDArray[np.bool_]
+    ) -> None:
+        """Make resets of those steps, submitted and not yet handed over, that `which` marks."""
+        entries += which  # RESET == STEP + 1
+        self.entry[slots] = entries
+
+
+class CollectorQueue(UncollectedErrors):
+    """The results and errors that wait for the collector, in the order of their arrival.
+
+    Attributes:
+        num_ready: results; num_awaited: requests whose results it will get.
+        ready: slots of those results.
+    """
+
+    def __init__(self, conditions: Conditions, state: NDArray[np.int8]) -> None:
+        super().__init__(conditions, state)
+        self.num_ready = 0
+        self.num_awaited = 0
+        self.ready: deque[NDArray[np.intp]] = deque()
+
+    def append(self, slots: NDArray[np.intp]) -> None:
+        """Add awaited results that are ready."""
+        self.ready.append(slots)
+        self.num_ready += len(slots)
+        self.num_awaited -= len(slots)
+
+    def take(self, most: int, among: NDArray[np.bool_] | None = None) -> NDArray[np.intp]:
+        """Return slots of the collector's ready results, first come, first served.
+
+        Args:
+            most: how many at most.
+            among: of these slots only.
+        """
+        taken: list[NDArray[np.intp]] = []
+        left: list[NDArray[np.intp]] = []
+        count = 0
+        while self.ready and count < most:
+            slots = self.ready.popleft()
+            if among is not None:
+                left.append(slots[~among[slots]])
+                slots = slots[among[slots]]
+            if count + len(slots) > most:
+                self.ready.appendleft(slots[most - count :])
+                slots = slots[: most - count]
+            taken.append(slots)
+            count += len(slots)
+        if left:
+            self.ready.extendleft(slots for slots in reversed(left) if len(slots))
+        self.num_ready -= count
+        return taken[0] if len(taken) == 1 else np.concatenate(taken)
+
+    def put_back(self, slots: NDArray[np.intp]) -> None:
+        """Make taken results the next ones."""
+        self.ready.appendleft(slots)
+        self.num_ready += len(slots)
+
+    def remove(self, slots: NDArray[np.intp]) -> None:
+        """Remove results that the collector does not get."""
+        self.ready = deque(kept for q in self.ready if len(kept := q[~np.isin(q, slots)]))
+        self.num_ready -= len(slots)
+
+
+class Aborted:
+    """The slots whose outstanding requests end without a reply, whatever their hosts report.
+
+    Attributes:
+        faults: by slot, the error for a call that waits for the request.
+    """
+
+    def __init__(self, conditions: Conditions) -> None:
+        self._conditions = conditions
+        self.faults: dict[int, EnvFault] = {}
+
+    def add(self, slot: int, fault: EnvFault) -> None:
+        """Add a slot whose request is outstanding."""
+        self.faults[slot] = fault
+        self._conditions.note(ABORTING, True)
+
+    def among(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Return which of `slots` are aborted."""
+        return np.array([slot in self.faults for slot in slots.tolist()], np.bool_)
+
+    def take(self, slots: NDArray[np.intp]) -> list[EnvFault]:
+        """Remove slots whose requests have ended; return their errors."""
+        taken = [self.faults.pop(slot) for slot in slots.tolist()]
+        self._conditions.note(ABORTING, bool(self.faults))
+        return taken
+
+
+class Requests:
+    """See the module.
+
+    Args:
+        host_of: the host of each slot, in runs.
+        num_hosts: numbered from 0.
+        conditions: of the group.
+
+    Attributes:
+        hosts: the host of each slot.
+        numbering: of each slot's current request; tickets: calls that wait; collector: its queue.
+        state: `State`; owner: of the current request.
+        sent_ns: when it was sent.
+        in_flight: requests of each host that are not answered; the only count of them.
+        aborted: requests that end without a reply.
+        answered: something has ended since this was set to False.
+    """
+
+    def __init__(
+        self, host_of: NDArray[np.int64], num_hosts: int, conditions: Conditions | None = None
+    ) -> None:
+        size = len(host_of)
+        self._each = np.arange(size)
+        self.hosts = host_of
+        self.numbering = Numbering(size)
+        self.tickets = Tickets()
+        conditions = conditions or Conditions()
+        self.state = np.zeros(size, np.int8)
+        self.collector = CollectorQueue(conditions, self.state)
+        self.aborted = Aborted(conditions)
+        self.owner = np.zeros(size, np.int64)
+        self.sent_ns = np.zeros(size, np.int64)
+        self.in_flight = [0] * num_hosts
+        self.answered = False
+
+    # -- what is known ------------------------------------------------------------
+
+    def is_idle(self, slot: int) -> bool:
+        """Return True if a slot has no request, and no result or error waits to be collected."""
+        return bool(self.state[slot] == _IDLE_CODE)
+
+    def first_not_idle(self, slots: NDArray[np.intp]) -> int | None:
+        """Return the first of `slots` that is not idle, or None."""
+        states = self.state[slots]
+        return int(slots[np.flatnonzero(states)[0]]) if np.count_nonzero(states) else None
+
+    def owed(self, slots: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Return the slots of `slots` whose replies are outstanding, the oldest request first."""
+        busy = slots[self.state[slots] == _BUSY_CODE]
+        return busy[np.argsort(self.sent_ns[busy], kind="stable")]
+
+    def ready(self, slots: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Return the slots of `slots` whose results are ready."""
+        return slots[self.state[slots] == _READY_CODE]
+
+    def pending(self, among: NDArray[np.bool_] | None = None) -> tuple[int, int]:
+        """Return the number of the collector's ready results, and with outstanding ones added.
+
+        Args:
+            among: count these slots only.
+        """
+        if among is None:
+            num_ready = self.collector.num_ready
+            return num_ready, num_ready + self.collector.num_awaited
+        states = self.state[among & (self.owner == COLLECTOR)]
+        num_ready = int(np.count_nonzero(states == _READY_CODE))
+        return num_ready, num_ready + int(np.count_nonzero(states == _BUSY_CODE))
+
+    # -- asking -------------------------------------------------------------------
+
+    def submit(self, slots: NDArray[np.intp], op: int, owner: int, now: float) -> NDArray[np.int64]:
+        """Number the next request of each of `slots`, all idle; return their entries."""
+        entries = self.numbering.renew(slots, op)
+        self.sent_ns[slots] = int(now * 1e9)
+        if owner:
+            self.owner[slots] = owner
+        else:
+            self.collector.num_awaited += len(slots)
+        self.state[slots] = _BUSY_CODE
+        return entries
+
+    def by_host(self, slots: NDArray[np.intp]) -> list[tuple[int, slice]]:
+        """Each host with its part of submitted `slots`: in flight from now on.
+
+        One part for each run of slots of one host.
+        """
+        count = len(slots)
+        if not count:
+            return []
+        hosts = self.hosts[slots]
+        first = hosts.item(0)
+        if count == 1 or (first == hosts.item(-1) and not np.count_nonzero(hosts != first)):
+            self.in_flight[first] += count
+            return [(first, slice(None))]
+        parts: list[tuple[int, slice]] = []
+        start = 0
+        for end in (*((hosts[1:] != hosts[:-1]).nonzero()[0] + 1).tolist(), count):
+            host_id = hosts.item(start)
+            self.in_flight[host_id] += end - start
+            parts.append((host_id, slice(start, end)))
+            start = end
+        return parts
+
+    def number_step_at_once(self, slot: int, now: float) -> None:
+        """Number a step that is about to be executed without being submitted."""
+        self.numbering.renew(self.alone(slot), _STEP)
+        self.sent_ns[slot] = int(now * 1e9)
+
+    def answer_at_once(self, slot: int) -> None:
+        """Take note that the result of such a step lies in its row, to be handed out."""
+        self.state[slot] = _READY_CODE
+
+    def restart(self, host_id: int, slots: NDArray[np.intp]) -> NDArray[np.int64]:
+        """Number outstanding steps and resets of a host again, as resets; return their entries.
+
+        They are in flight again.
+        """
+        self.in_flight[host_id] += len(slots)
+        return self.numbering.renew(slots, _RESET)
+
+    def lose_host(self, host_id: int) -> None:
+        """Record that a host will answer none of its outstanding requests."""
+        self.in_flight[host_id] = 0
+
+    def alone(self, slot: int) -> NDArray[np.intp]:
+        """Return one slot as an array of slots."""
+        return self._each[slot : slot + 1]
+
+    # -- ending -------------------------------------------------------------------
+
+    def complete(self, reports: Sequence[tuple[int, NDArray[np.int64]]]) -> NDArray[np.intp]:
+        """Record results that are in their rows; return their slots.
+
+        Late replies, to requests that were asked anew, are dropped.
+
+        Args:
+            reports: a host, and the entries of what it has done; in the order of arrival.
+        """
+        entries = reports[0][1]
+        if len(reports) > 1:
+            entries = np.concatenate([entries for _, entries in reports])
+        slots = entries >> OP_BITS_ARRAY
+        slots &= SLOT_MASK_ARRAY
+        # A slot beyond the last one is compared with the last one's entry, which differs.
+        current = self.numbering.entry.take(slots, mode="clip") == entries
+        if np.count_nonzero(current) < len(slots):
+            slots = slots[current]
+            for host_id in {host_id for host_id, _ in reports}:
+                self.in_flight[host_id] -= int(np.count_nonzero(self.hosts[slots] == host_id))
+        else:
+            for host_id, own in reports:
+                self.in_flight[host_id] -= len(own)
+        if self.aborted.faults:
+            slots = self.end_aborted(slots)
+        self.deliver(slots)
+        return slots
+
+    def complete_one(self, host_id: int, entry: int) -> int | None:
+        """Record one result; return its slot, or None if it was late."""
+        slot = self.end(host_id, entry)
+        if slot is not None:
+            self.deliver(self.alone(slot))
+        return slot
+
+    def end(self, host_id: int, entry: int) -> int | None:
+        """End the request `entry`, and return its slot; None if nobody wants the reply any more."""
+        slot = slot_of(entry)
+        if self.state[slot] != _BUSY_CODE or self.numbering.entry.item(slot) != entry:
+            return None
+        self.in_flight[host_id] -= 1
+        if slot in self.aborted.faults:
+            self.end_aborted(self.alone(slot))
+            return None
+        return slot
+
+    def end_aborted(self, slots: NDArray[np.intp]) -> NDArray[np.intp]:
+        """End those of `slots` that are aborted, none of them in flight; return the others.
+
+        A call that waits for one gets its error, the collector nothing; the slot is free.
+        """
+        aborted = self.aborted.among(slots)
+        for owner, mine in self.owners(slots[aborted]).items():
+            faults = self.aborted.take(mine)
+            if owner > 0:
+                ticket = self.tickets.waiting[owner]
+                ticket.slots = ticket.slots[~np.isin(ticket.slots, mine)]
+                ticket.remaining -= len(mine)
+                ticket.failed.update(zip(mine.tolist(), faults, strict=True))
+            elif owner == COLLECTOR:
+                self.collector.num_awaited -= len(mine)
+            self._forget(mine)
+            self.answered = True
+        return slots[~aborted]
+
+    def join(self, slot: int, now: float) -> None:
+        """Record a first result without a request; the slot is idle."""
+        slots = self.alone(slot)
+        self.submit(slots, _JOIN, COLLECTOR, now)
+        self.deliver(slots)
+
+    def deliver(self, slots: NDArray[np.intp]) -> None:
+        """Deliver the results of `slots`, which are no longer in flight, to their owners."""
+        if not len(slots):
+            return
+        self.answered = True
+        self.state[slots] = _READY_CODE
+        collector, tickets = self.collector, self.tickets.waiting
+        if not tickets:  # As `CollectorQueue.append`, without a call.
+            collector.ready.append(slots)
+            collector.num_ready += len(slots)
+            collector.num_awaited -= len(slots)
+        elif len(tickets) == 1 and not collector.num_awaited:
+            (ticket,) = tickets.values()
+            ticket.remaining -= len(slots)
+        else:
+            owners = self.owner[slots]
+            for owner in set(owners.tolist()):
+                mine = slots[owners == owner]
+                if owner:
+                    tickets[owner].remaining -= len(mine)
+                else:
+                    collector.append(mine)
+
+    def set_value(self, slot: int, value: Any) -> None:
+        """Record the value of a method call."""
+        self.answered = True
+        owner = int(self.owner[slot])
+        if owner == NOBODY:
+            self._forget(self.alone(slot))
+        else:
+            ticket = self.tickets.waiting[owner]
+            ticket.values[slot] = value
+            ticket.remaining -= 1
+            self.state[slot] = _SPENT_CODE
+
+    def owners(self, slots: NDArray[np.intp]) -> dict[int, NDArray[np.intp]]:
+        """Return the slots of each owner among `slots`."""
+        # `np.unique` would import a module at its first call, and after a death there may be no
+        # free descriptor to read it.
+        found: list[int] = sorted({*self.owner[slots].tolist()})
+        return {owner: slots[self.owner[slots] == owner] for owner in found}
+
+    def fail(self, slots: NDArray[np.intp], owner: int, fault: EnvFault) -> None:
+        """End requests of one owner that are no longer in flight, in one error."""
+        self.answered = True
+        if owner > 0:
+            ticket = self.tickets.waiting[owner]
+            ticket.remaining -= len(slots)
+            ticket.failed |= dict.fromkeys(slots.tolist(), fault)
+            self.state[slots] = _SPENT_CODE
+        elif owner == COLLECTOR:
+            self.collector.num_awaited -= len(slots)
+            self.collector.keep(slots, fault)
+        else:
+            self._forget(slots)
+
+    def withdraw(self, slot: int) -> None:
+        """End a request of the collector without a result."""
+        self._forget(self.alone(slot))
+        self.collector.num_awaited -= 1
+
+    def _forget(self, slots: NDArray[np.intp]) -> None:
+        self.state[slots] = _IDLE_CODE
+        self.owner[slots] = COLLECTOR
+
+    # -- the collector ------------------------------------------------------------
+
+    def hand_out(self, slots: NDArray[np.intp]) -> None:
+        """Record that results were returned: their rows may be written again."""
+        self.state[slots] = _IDLE_CODE
+
+    def put_back(self, slots: NDArray[np.intp]) -> None:
+        """Make results of `slots` that were not returned wait for the collector again."""
+        kept = self.ready(slots)
+        if len(kept):
+            self.collector.put_back(kept)
+
+    def joined(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Return which of `slots` have a first result that has not been collected."""
+        ready = (self.state[slots] == _READY_CODE) & (self.owner[slots] == COLLECTOR)
+        return ready & (self.numbering.ops(slots) == _JOIN)
+
+    def claim(self, slots: NDArray[np.intp], ticket: Ticket | None) -> None:
+        """Give results of the collector to a call; None drops them."""
+        self.collector.remove(slots)
+        if ticket is None:
+            self.state[slots] = _IDLE_CODE
+        else:
+            self.owner[slots] = ticket.owner
+            ticket.remaining -= len(slots)
+
+    # -- calls that wait for their own replies ------------------------------------
+
+    def settle(self, ticket: Ticket) -> None:
+        """Close a ticket that has all replies: results may be returned, the rest is idle."""
+        del self.tickets.waiting[ticket.owner]
+        self.owner[ticket.slots] = COLLECTOR
+        if ticket.method or ticket.failed:
+            self._forget(ticket.slots[self.state[ticket.slots] == _SPENT_CODE])
+
+    def give_up(self, ticket: Ticket) -> None:
+        """Close a ticket that no longer waits: its steps and resets go to the collector."""
+        slots = ticket.slots = ticket.submitted(self.owner)
+        self.settle(ticket)
+        if ticket.calls:
+            self.owner[self.owed(slots)] = NOBODY
+            return
+        ready = self.ready(slots)
+        self.collector.num_awaited += len(self.owed(slots)) + len(ready)
+        for fault, its in ticket.failures():
+            self.collector.keep(its, fault)
+        if len(ready):
+            self.collector.append(ready)

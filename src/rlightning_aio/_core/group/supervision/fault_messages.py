@@ -1,0 +1,308 @@
+"""Messages about dead, hung and late workers: the env at fault, the cause, lost replies.
+
+`CrashLog` keeps those about deaths from filling the log.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections import Counter, deque
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+from rlightning_aio._core.hosts.base import Killable
+from rlightning_aio.errors import EnvHung, StartFailed, WorkerDied
+from rlightning_aio.protocol.entries import Operation, slot_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from rlightning_aio._core.group.state.env_table import EnvTable
+    from rlightning_aio._core.group.state.host_record import HostRecord
+    from rlightning_aio._core.group.state.requests import Requests
+    from rlightning_aio._core.hosts.base import Host
+    from rlightning_aio._core.hosts.messages import Death, ErrorText
+
+__all__ = [
+    "CrashLog",
+    "DeathReport",
+    "cause_of",
+    "culprits_of",
+    "death_report",
+    "late_fault",
+    "start_fault",
+    "without_terminal",
+]
+
+_LINES: Final = 3
+_QUIET_SECONDS: Final = 300.0
+"""Time without so many deaths, after which each has a line of its own again."""
+_SECONDS: Final = 60.0
+"""Between lines about deaths that are counted."""
+_MOST_NAMED: Final = 3
+
+_log = logging.getLogger("rlightning_aio")
+
+
+def start_fault(envs: EnvTable, record: HostRecord, death: Death) -> StartFailed:
+    """The error for a worker that exited while starting."""
+    if record.late:
+        return late_fault(envs, record, death)
+    slot = _starting(record, death)
+    return StartFailed(
+        f"{envs.describe(slot)} could not be started: its worker {death.cause}"
+        + _said(death.stderr_tail),
+        env_id=envs.env_ids[slot],
+    )
+
+
+def late_fault(envs: EnvTable, record: HostRecord, death: Death) -> StartFailed:
+    """The error for a worker that exceeded `start_timeout`."""
+    slot = _starting(record, death)
+    # An exit code only shows that it was killed; any other cause may explain the delay.
+    why = f" (it {death.cause})" if death.cause and death.exit_code is None else ""
+    return StartFailed(
+        f"{envs.describe(slot)} did not start within {record.config.start_timeout} s"
+        f"{why}; raise start_timeout if it needs longer" + _said(death.stderr_tail),
+        env_id=envs.env_ids[slot],
+    )
+
+
+def _starting(record: HostRecord, death: Death) -> int:
+    """The slot of the env that a worker was building when it died."""
+    slot = slot_of(death.requests[0]) if death.requests else 0
+    return max(slot, record.host.first_slot)
+
+
+def culprits_of(
+    record: HostRecord,
+    executing: Sequence[int],
+    requests: Requests,
+    unanswered: NDArray[np.intp],
+) -> tuple[int | None, tuple[int, ...]]:
+    """The slot of the env that a worker was executing when it hung or died, and suspects.
+
+    Args:
+        record: of its host.
+        executing: entries, as in `Death.requests`.
+        requests: of the group.
+        unanswered: its slots with a request in flight.
+
+    Without such an env there is None, and the slots of those that may be the cause: all that owed
+    a reply.
+    """
+    if record.aborted_slot is not None:
+        return record.aborted_slot, ()
+    if record.awaits_several:
+        # The worker marks whose code runs, and that of one whose request is over may run, too.
+        slot = slot_of(executing[0]) if executing and executing[0] else None
+        return (slot, ()) if slot in record.slots else (None, tuple(unanswered.tolist()))
+    slot_of_entry = {requests.numbering.entry.item(slot): slot for slot in unanswered.tolist()}
+    for entry in executing:
+        if entry in slot_of_entry:
+            return slot_of_entry[entry], ()
+    return (int(unanswered[0]) if len(unanswered) else None), ()
+
+
+def cause_of(record: HostRecord, death: Death, requests: Requests) -> str:
+    """The cause of a worker's end: the supervisor's reason for killing it, else its exit."""
+    if record.is_hung:
+        where = "" if record.culprit is None else f" in {_doing(requests, record.culprit)}"
+        return f"hung{where} and was killed"
+    if record.aborted_slot is not None:
+        return f"was killed because {_doing(requests, record.aborted_slot)} was aborted"
+    if record.rebuild_error is not None:
+        error = record.rebuild_error
+        return f"could not be rebuilt: {error.summary}"
+    if record.late:
+        why = f" (it {death.cause})" if death.exit_code is None else ""
+        return f"did not start again within {record.config.start_timeout} s and was killed{why}"
+    return death.cause
+
+
+def _doing(requests: Requests, slot: int) -> str:
+    op, method = requests.numbering.op(slot), requests.tickets.method(requests.owner.item(slot))
+    if op in (Operation.STEP, Operation.RESET, Operation.SNAPSHOT, Operation.RESTORE):
+        return f"a {Operation(op).name.lower()}"
+    return f"a call of {method}()" if method else "a call"
+
+
+def without_terminal(error: ErrorText, host: Host) -> str:
+    """A hint for the error of a debugger in a worker; empty for any other error."""
+    if error.type_name != "bdb.BdbQuit" or not isinstance(host, Killable):
+        return ""
+    return " (a worker has no terminal: debug with placement='inline')"
+
+
+@dataclass(frozen=True)
+class DeathReport:
+    """The description of a death, made when it was found.
+
+    Attributes:
+        what: the subject and the cause; last: the last request of the env at fault.
+        outcome: what happens to the worker now.
+        slot: of the env at fault, or of the first suspect.
+        suspects: slots; see `HostRecord`.
+    """
+
+    envs: EnvTable
+    death: Death
+    kind: type[WorkerDied]
+    what: str
+    last: str
+    outcome: str
+    slot: int
+    suspects: tuple[int, ...]
+
+    def message(self, unanswered: NDArray[np.intp]) -> str:
+        """The message about the death; `unanswered` had a request in flight."""
+        names = ", ".join(self._ids(unanswered)) or "none"
+        return f"{self.what} ({self.last}; envs that owed a reply: {names}); {self.outcome}"
+
+    def error(self, unanswered: NDArray[np.intp]) -> WorkerDied:
+        """The error for these slots, with the last lines of the worker's stderr."""
+        return self._error(self.message(unanswered), unanswered)
+
+    def refusal(self, unanswered: NDArray[np.intp], asked: NDArray[np.intp]) -> WorkerDied:
+        """The error for new requests to `asked`, slots of a worker that is not replaced."""
+        names = ", ".join(self._ids(asked))
+        return self._error(f"{self.message(unanswered)}; nothing was sent to {names}", asked)
+
+    def loss(self, unanswered: NDArray[np.intp], lost: NDArray[np.intp]) -> WorkerDied:
+        """The error for `lost`, slots that had replied, but whose states are gone."""
+        names = ", ".join(self._ids(lost))
+        return self._error(f"{self.message(unanswered)}; lost with it: {names}", lost)
+
+    def _error(self, message: str, slots: NDArray[np.intp]) -> WorkerDied:
+        error = self.kind(
+            message + _said(self.death.stderr_tail),
+            env_id=self.envs.env_ids[self.slot],
+            exit_code=self.death.exit_code,
+            stderr_tail=self.death.stderr_tail,
+        )
+        error.env_ids = tuple(self._ids(slots))
+        error.suspects = tuple(self.envs.env_ids[slot] for slot in self.suspects)
+        return error
+
+    def _ids(self, slots: NDArray[np.intp]) -> list[str]:
+        env_ids = self.envs.env_ids
+        chosen: list[int] = slots.tolist()
+        return [env_ids[slot] for slot in chosen]
+
+
+def death_report(
+    envs: EnvTable, record: HostRecord, death: Death, requests: Requests, outcome: str
+) -> DeathReport:
+    """Describe a death; `outcome` says what happens to the worker now."""
+    slot, config = record.blamed[0], record.config
+    slot = record.host.first_slot if slot is None else slot
+    doing, number = _doing(requests, slot), requests.numbering.number(slot)
+    last = f"last request: {f'request {number}, {doing}' if number else 'none'}"
+    what = f"the worker of {envs.describe(slot)} {death.cause}"
+    if record.suspects:
+        last = "no env's code was running"
+    elif record.is_hung:
+        stepped = requests.numbering.op(slot) == Operation.STEP
+        limit = config.step_timeout if stepped else config.reset_timeout
+        what = f"{envs.describe(slot)} took longer than {limit} s for {doing} and was killed"
+    kind = EnvHung if record.is_hung else WorkerDied
+    return DeathReport(envs, death, kind, what, last, outcome, slot, record.suspects)
+
+
+def _said(stderr_tail: str) -> str:
+    lines = stderr_tail.strip().splitlines()[-20:]
+    return ("\nThe last lines it wrote:\n  " + "\n  ".join(lines)) if lines else ""
+
+
+@dataclass
+class _Deaths:
+    """The deaths of one entry.
+
+    Attributes:
+        recent: times of the last three.
+        causes, at_fault: those that were counted since the time `since`, by cause and env.
+    """
+
+    recent: deque[float] = field(default_factory=lambda: deque[float](maxlen=_LINES))
+    since: float = math.inf
+    causes: Counter[str] = field(default_factory=Counter[str])
+    at_fault: Counter[str] = field(default_factory=Counter[str])
+
+
+class CrashLog:
+    """Deaths of workers in the log, each in a line of its own at first, then counted.
+
+    Of each entry, the first three deaths within five minutes have a line each, and further ones one
+    line a minute together. Callers pass the time in (monotonic seconds). A death after which an env
+    is given up is no part of it, as it is raised.
+
+    Attributes:
+        due: when `flush` has something to log.
+    """
+
+    def __init__(self) -> None:
+        self.due = math.inf
+        self._entries: dict[str, _Deaths] = {}
+
+    def note(self, entry: str, message: str, cause: str, at_fault: str | None, now: float) -> None:
+        """Log a death, or count it.
+
+        Args:
+            entry: of the worker.
+            message: all about the death, for a line of its own.
+            cause: in a clause, for a count.
+            at_fault: the id of the env that the worker was executing, if it is known.
+            now: the time.
+        """
+        deaths = self._entries.setdefault(entry, _Deaths())
+        recent = deaths.recent
+        if len(recent) < _LINES or now - recent[0] >= _QUIET_SECONDS:
+            recent.append(now)
+            then = ""
+            if len(recent) == _LINES and now - recent[0] < _QUIET_SECONDS:
+                then = f"; further deaths in entry {entry!r} are counted, in one line a minute"
+            _log.warning("%s%s", message, then)
+            return
+        recent.append(now)
+        if not deaths.causes:
+            deaths.since = now
+            self.due = min(self.due, now + _SECONDS)
+        deaths.causes[cause.partition(" (")[0]] += 1
+        if at_fault is not None:
+            deaths.at_fault[at_fault] += 1
+        if now >= self.due:
+            self.flush(now)
+
+    def flush(self, now: float, *, everything: bool = False) -> None:
+        """Log counts that are a minute old, or `everything`, as the group is about to close."""
+        self.due = math.inf
+        for entry, deaths in self._entries.items():
+            if not deaths.causes:
+                continue
+            if not everything and now < deaths.since + _SECONDS:
+                self.due = min(self.due, deaths.since + _SECONDS)
+                continue
+            count = deaths.causes.total()
+            whose = f"; while executing {_counted(deaths.at_fault)}" if deaths.at_fault else ""
+            _log.warning(
+                "entry %r: %d further death%s of workers within %.0f s, all replaced: %s%s",
+                entry,
+                count,
+                "s" if count > 1 else "",
+                max(now - deaths.since, 1.0),
+                _counted(deaths.causes),
+                whose,
+            )
+            deaths.causes.clear()
+            deaths.at_fault.clear()
+
+
+def _counted(counts: Counter[str]) -> str:
+    most = counts.most_common(_MOST_NAMED)
+    named = ", ".join(f"{what} ({count})" for what, count in most)
+    rest = counts.total() - sum(count for _, count in most)
+    return f"{named}, others ({rest})" if rest else named

@@ -1,0 +1,190 @@
+"""`HangDetector`: finds workers that exceed a time limit, and ends them by force.
+
+Rule: read pending output before killing a host. The worker measures how long its env takes, and
+stops its clock while it waits for the trainer to read. A worker that executes nothing gets its
+limit again whenever data passes between the two. Before a kill, the host is asked for completions
+that the trainer, late itself, has not read yet. An aborted request has a short limit.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from rlightning_aio._core.group.state.host_record import Stage
+from rlightning_aio._core.group.supervision.fault_messages import culprits_of
+from rlightning_aio.protocol.entries import Operation, slot_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    from rlightning_aio._core.group.state.host_record import HostRecord
+    from rlightning_aio._core.group.state.observed import Observed
+    from rlightning_aio._core.group.state.requests import Requests
+
+__all__ = ["HangDetector", "has_news"]
+
+_ABORT_SECONDS: Final = 0.2
+"""Limit for aborted requests to end by themselves. Most do, and no worker has to be killed."""
+_OBEY_SECONDS: Final = 5.0
+"""Limit for the exit of a killed worker to be reported. After that, the process that should have
+killed it hangs, too. Only an overloaded machine needs a tenth of it.
+"""
+
+
+class HangDetector:
+    """See the module.
+
+    Args:
+        records: of the group's hosts; the list grows until the group starts.
+        clock: monotonic seconds; asked when a host was killed.
+
+    Attributes:
+        timed: some requests have a time limit.
+        any_ending: a killed host has not reported its exit, or requests to a host that can be
+            killed were aborted. If neither holds, nothing needs to be checked.
+    """
+
+    def __init__(
+        self,
+        records: Sequence[HostRecord],
+        requests: Requests,
+        observed: Observed,
+        clock: Callable[[], float],
+    ) -> None:
+        self._records = records
+        self._requests = requests
+        self._observed = observed
+        self._clock = clock
+        self.any_ending = False
+        self._now = 0.0
+        self.timed = False
+
+    def abort(self, slots: NDArray[np.intp], now: float) -> list[tuple[int, int]]:
+        """Have hosts end the outstanding requests of `slots`, which are aborted.
+
+        A host that can't, and that can be killed, is killed if they don't end soon. Returns host
+        and entry of those that were held for a replacement, and are no longer.
+        """
+        entries, hosts = self._requests.numbering.entry[slots], self._requests.hosts[slots]
+        no_longer_held: list[tuple[int, int]] = []
+        found: list[int] = sorted({*hosts.tolist()})
+        for host_id in found:
+            record, own = self._records[host_id], entries[hosts == host_id]
+            if record.held is not None:
+                no_longer_held += [(host_id, entry) for entry in record.withdraw(own)]
+                continue
+            if record.aborting is not None:
+                record.aborting.abort(own)
+            if record.killable is not None and record.abort_by is None:
+                record.abort_by = now + _ABORT_SECONDS
+                self.any_ending = True
+        return no_longer_held
+
+    def expiries(self) -> list[float | None]:
+        """Return the times when `check` must be called."""
+        times: list[float | None] = []
+        if self.timed:
+            times += [self._expiry(r) for r in self._records if r.timed and self._in_flight(r)]
+        if self.any_ending:
+            times += [r.die_by or self._now for r in self._records if r.dying]
+            times += [r.abort_by for r in self._records]
+        return times
+
+    def check(self, now: float) -> None:
+        """Kill workers that have exceeded a limit, and destroy those that survive a kill."""
+        self._now = now
+        if self.timed:
+            for record in self._records:
+                if record.timed and self._in_flight(record):
+                    self._check_hung(record)
+        if self.any_ending:
+            for record in self._records:
+                if record.abort_by is not None:
+                    self._check_aborted(record, record.abort_by)
+            self._check_dying()
+            self.any_ending = any(r.dying or r.abort_by is not None for r in self._records)
+
+    def _check_aborted(self, record: HostRecord, by: float) -> None:
+        """Kill a worker whose aborted requests go on."""
+        aborted = [slot for slot in self._requests.aborted.faults if slot in record.slots]
+        if not aborted or record.dying:
+            record.abort_by = None
+        elif self._now >= by and not has_news(record):
+            record.abort_by, record.aborted_slot = None, aborted[0]
+            self.kill(record, dump=False)
+
+    def kill(self, record: HostRecord, *, dump: bool) -> None:
+        """Kill a host; with `dump`, its worker writes its stacks first."""
+        record.kill(dump=dump)
+        if record.killable is not None:
+            record.dying = self.any_ending = True
+
+    def _in_flight(self, record: HostRecord) -> int:
+        return self._requests.in_flight[record.host.host_id]
+
+    def _expiry(self, record: HostRecord) -> float | None:
+        """Return the time when the worker's current request exceeds its limit."""
+        if record.stage is not Stage.UP or record.is_hung:
+            return None
+        assert record.killable is not None
+        entry, since_ns = record.killable.executing()
+        limits = (record.config.step_timeout, record.config.reset_timeout)
+        shortest = min(limit for limit in limits if limit is not None)
+        if not (entry and since_ns):
+            # A stopped process executes none of its requests.
+            idle = record.idle == self._progress(record)
+            return (record.idle_since if idle else self._now) + shortest
+        op = self._requests.numbering.op(slot_of(entry))
+        limit = {Operation.STEP: limits[0], Operation.RESET: limits[1]}.get(Operation(op or 3))
+        # A request without a limit is checked again, because the next one may have a limit.
+        return self._now + shortest if limit is None else since_ns / 1e9 + limit
+
+    def _progress(self, record: HostRecord) -> tuple[int, ...]:
+        """Return numbers that change with every request, reply, part of a reply, sign of life."""
+        assert record.killable is not None
+        slots = slice(record.slots.start, record.slots.stop)
+        entries = int(self._requests.numbering.entry[slots].sum())
+        # Where all envs wait, the worker says now and then that its event loop goes on.
+        executing = record.killable.executing()
+        return self._in_flight(record), entries, record.killable.traffic, *executing
+
+    def _check_hung(self, record: HostRecord) -> None:
+        assert record.killable is not None
+        entry, since_ns = record.killable.executing()
+        if not (entry and since_ns):
+            progress = self._progress(record)
+            if progress != record.idle:
+                record.idle, record.idle_since = progress, self._now
+                return
+        expiry = self._expiry(record)
+        if expiry is None or self._now < expiry or has_news(record):
+            return
+        record.is_hung = True
+        busy = self._requests.owed(np.array(record.slots, np.intp))
+        record.culprit, record.suspects = culprits_of(record, (entry,), self._requests, busy)
+        slot = record.blamed[0]
+        if self._observed.observer is not None and slot is not None:
+            self._observed.observer.note_fate("hung", record.host.host_id, slot, "")
+        self.kill(record, dump=True)
+
+    def _check_dying(self) -> None:
+        """Destroy hosts that a kill has not ended, together with their fork server."""
+        for record in self._records:
+            if not record.dying:
+                continue
+            if record.die_by is None:
+                # The trainer may have been stopped until it was killed.
+                record.die_by = self._clock() + _OBEY_SECONDS
+            elif self._now >= record.die_by and not has_news(record):
+                assert record.killable is not None
+                record.die_by = None
+                record.killable.destroy()
+
+
+def has_news(record: HostRecord) -> bool:
+    """Read what a host has sent, and return True if there was anything."""
+    return record.killable is not None and record.killable.catch_up()

@@ -1,0 +1,226 @@
+"""Suggest a faster setting from measured times.
+
+Rule: a hint is a guess from a few numbers, and each is logged once; ``rlightning-aio tune``
+measures. An ordinary step pays for hints with one comparison.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import Counter
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+
+from rlightning_aio._core.hosts.base import Measured
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from rlightning_aio._core.group.state.host_record import HostRecord
+    from rlightning_aio._core.group.state.stats import Stats
+    from rlightning_aio.config import EnvConfig
+
+__all__ = ["HINT_AFTER_BATCHES", "Hints", "Spent", "hint", "waits"]
+
+HINT_AFTER_BATCHES: Final = 1000
+_FIRST_LOOK: Final = 8
+"""Number of batches after which envs are past their first steps, which may compile and load."""
+_SHORT_US: Final = 1000.0
+"""Limit of steps that compute, as in simulators; robots wait longer."""
+_TINY_US: Final = 30.0
+_ENOUGH_NS: Final = 20_000_000
+_ENOUGH_RESULTS: Final = 16
+_WORKERS_PER_CORE: Final = 8
+"""Envs that wait have a worker each, up to this number."""
+
+_log = logging.getLogger("rlightning_aio")
+
+
+class Spent(NamedTuple):
+    """What the envs of workers have done for a while.
+
+    Attributes:
+        results: number of steps and resets.
+        elapsed_ns: the time that has passed, summed over the workers.
+        busy_ns: of the steps and resets.
+        ran_ns: for which the workers' threads ran on a core; queued_ns: for which they waited for
+            one.
+        at_once: several envs of a worker were busy at the same time.
+    """
+
+    results: int
+    elapsed_ns: int
+    busy_ns: int
+    ran_ns: int
+    queued_ns: int
+    at_once: bool
+
+    @property
+    def is_enough(self) -> bool:
+        """True if it says anything, and other settings would change anything."""
+        least = max(_ENOUGH_NS, self.elapsed_ns / 4)
+        return self.results >= _ENOUGH_RESULTS and self.busy_ns >= least
+
+
+def waits(spent: Spent) -> bool:
+    """Return True if envs that take turns spend most of their time neither on a core nor in line.
+
+    The time in line for a core is that of other programs, which make no env wait for long.
+    """
+    return not spent.at_once and spent.ran_ns < (spent.busy_ns - spent.queued_ns) / 2
+
+
+@dataclass(frozen=True)
+class _Since:
+    """The state of the workers of an entry at a time in monotonic ns."""
+
+    at_ns: int
+    restarts: list[int]
+    ran_ns: int
+    queued_ns: int
+
+
+class Hints:
+    """Looks from time to time whether other settings would be faster, and logs it.
+
+    Args:
+        records: of the group's hosts; the list grows until the group starts.
+
+    Attributes:
+        due: the number of returned batches at which to `look` next.
+    """
+
+    def __init__(self, records: Sequence[HostRecord]) -> None:
+        self.due: float = _FIRST_LOOK
+        self._records = records
+        # By entry; one that was given a hint has none any more.
+        self._since: dict[str, _Since | None] = {}
+
+    def look(self, stats: Stats, num_cores: int) -> None:
+        """Log what the measured times suggest.
+
+        Args:
+            stats: of the group.
+            num_cores: that this process and its workers may use.
+        """
+        is_last = self.due >= HINT_AFTER_BATCHES
+        self.due = float("inf") if is_last else min(2 * self.due, HINT_AFTER_BATCHES)
+        sharing: dict[str, list[HostRecord]] = {}
+        for record in self._records:
+            if record.host.num_envs > 1 and isinstance(record.host, Measured):
+                sharing.setdefault(record.config.name, []).append(record)
+        for name, records in sharing.items():
+            self._look_at(name, records, stats, num_cores)
+        if is_last:
+            self._look_at_latencies(stats, num_cores)
+
+    def _look_at(
+        self, name: str, records: Sequence[HostRecord], stats: Stats, num_cores: int
+    ) -> None:
+        """Warn if envs that share workers wait."""
+        now, since = _now(records), self._since.get(name)
+        if now is None or (since is None and name in self._since):
+            return
+        if since is None or since.restarts != now.restarts:
+            self._since[name] = now
+            return
+        spent = _spent(records, stats, since, now)
+        if not spent.is_enough:
+            return
+        self._since[name] = now
+        config = records[0].config
+        together = max(record.host.num_envs for record in records)
+        best = -(-config.num_workers // (_WORKERS_PER_CORE * num_cores))
+        if waits(spent) and best < together:
+            self._since[name] = None
+            _log.warning("%s", _advice(name, together, best, spent))
+
+    def _look_at_latencies(self, stats: Stats, num_cores: int) -> None:
+        workers = Counter(
+            record.config.name
+            for record in self._records
+            if record.killable is not None and record.is_local
+        )
+        configs = [record.config for record in self._records]
+        text = hint(configs, workers, num_cores, stats.summary()["latency_us"])
+        if text is not None:
+            _log.info("%s; `rlightning-aio tune` measures what is best", text)
+
+
+def _now(records: Sequence[HostRecord]) -> _Since | None:
+    ran = queued = 0
+    for record in records:
+        assert isinstance(record.host, Measured)
+        times = record.host.processor_times()
+        if times is None:
+            return None
+        ran += times[0]
+        queued += times[1]
+    return _Since(time.monotonic_ns(), [record.restarts for record in records], ran, queued)
+
+
+def _spent(records: Sequence[HostRecord], stats: Stats, since: _Since, now: _Since) -> Spent:
+    slots, begun, done = stats.executed(since.at_ns)
+    results = busy = 0
+    at_once = False
+    for record in records:
+        own = (slots >= record.slots.start) & (slots < record.slots.stop)
+        results += int(np.count_nonzero(own))
+        busy += int((done[own] - begun[own]).sum())
+        at_once = at_once or _overlap(begun[own], done[own])
+    elapsed = (now.at_ns - since.at_ns) * len(records)
+    ran, queued = now.ran_ns - since.ran_ns, now.queued_ns - since.queued_ns
+    return Spent(results, elapsed, busy, ran, queued, at_once)
+
+
+def _overlap(begun: NDArray[np.int64], done: NDArray[np.int64]) -> bool:
+    order = begun.argsort()
+    return bool((begun[order][1:] < done[order][:-1]).any())
+
+
+def _advice(name: str, together: int, best: int, spent: Spent) -> str:
+    share = 100 * spent.ran_ns / max(spent.busy_ns - spent.queued_ns, 1)
+    return (
+        f"entry {name!r}: {together} envs share each worker, where only one is stepped at a time, "
+        f"and their steps wait ({share:.0f} % of their time keeps a core busy); to have them wait "
+        f"at the same time, set envs_per_process: {best} (in VectorEnv, envs_per_process={best})"
+    )
+
+
+def hint(
+    configs: Sequence[EnvConfig],
+    num_workers: Mapping[str, int],
+    num_cores: int,
+    latency_us: Mapping[str, Mapping[str, Any]],
+) -> str | None:
+    """A message that suggests a faster setting, or None.
+
+    Args:
+        configs: the entries.
+        num_workers: workers of each entry, by its name.
+        num_cores: cores that this process and its workers may use.
+        latency_us: from `EnvGroup.get_stats`; empty before anything was measured.
+    """
+    if not latency_us:
+        return None
+    step, transfer = (float(latency_us[kind]["p50"]) for kind in ("step", "transfer"))
+    measured = f"a step takes {step:.0f} µs and its transfer {transfer:.0f} µs"
+    for config in configs:
+        workers = num_workers.get(config.name, 0)
+        if workers > num_cores and workers > 1 and step < min(_SHORT_US, 10 * transfer):
+            return (
+                f"{measured}, and entry {config.name!r} has {workers} workers for {num_cores} "
+                f"cores: several envs in each (envs_per_process: "
+                f"{-(-config.num_workers // num_cores)}) would be faster"
+            )
+        if config.num_workers == 1 and workers == 1 and step < _TINY_US and transfer > 2 * step:
+            return (
+                f"{measured}: entry {config.name!r} would be faster in this process "
+                "(placement: inline)"
+            )
+    return None

@@ -1,0 +1,132 @@
+"""`Shutdown`: the end of a group's hosts: closed in order, disowned after a fork, or abandoned.
+
+Rule: it waits only by yielding a `Wait`. Left out: single deaths, which `Supervisor` handles.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from typing import TYPE_CHECKING, Final
+
+from rlightning_aio._core.group.drivers.wait import Procedure, Wait
+from rlightning_aio._core.group.state.host_record import Stage
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from rlightning_aio._core.group.state.host_record import HostRecord
+    from rlightning_aio._core.group.state.lifetime import Lifetime
+    from rlightning_aio._core.group.state.slab_layout import SlabLayout
+    from rlightning_aio._core.hosts.arena import Arena
+    from rlightning_aio._core.hosts.base import Shared
+
+__all__ = ["Shutdown"]
+
+_CLOSE_SECONDS: Final = 1.5
+"""Limit for envs to close before their worker is killed, where their entry has none."""
+_CANCEL_SECONDS: Final = 0.9
+"""What awaitable envs may take in addition to a limit of their entry: requests are cancelled before
+envs are closed, and their tasks after that."""
+_KILL_SECONDS: Final = 0.3
+"""Limit for a kill to be reported."""
+_END_SECONDS: Final = 1.5
+"""Limit for a released fork server to end its workers and pass on their output."""
+
+
+class Shutdown:
+    """See the module.
+
+    Args:
+        lifetime: of the group.
+        records: of its hosts; the list grows until the group starts.
+        resources: shared by hosts, see `base.Wiring`.
+        layout, arena: of the group; released with the hosts.
+    """
+
+    def __init__(
+        self,
+        lifetime: Lifetime,
+        records: Sequence[HostRecord],
+        resources: Mapping[object, Shared],
+        layout: SlabLayout,
+        arena: Arena,
+    ) -> None:
+        self._lifetime = lifetime
+        self._records = records
+        self._resources = resources
+        self._layout = layout
+        self._arena = arena
+
+    def close(self, now: float) -> Procedure[None]:
+        """Close all envs, and kill workers that take too long. Idempotent."""
+        if self._lifetime.closed:
+            return
+        self._lifetime.end()
+        alive = [r for r in self._records if r.stage not in (Stage.NEW, Stage.CLOSED)]
+        for record in alive:
+            record.held = record.restart_at = None
+            if record.stage in (Stage.FAILED, Stage.DOWN):
+                record.stage = Stage.CLOSED
+            else:
+                record.host.close()
+        try:
+            yield from self._until_closed(alive, now)
+        finally:
+            stuck = any(r.stage not in (Stage.NEW, Stage.CLOSED) for r in self._records)
+            self._let_go(_KILL_SECONDS if stuck else _END_SECONDS)
+
+    def _until_closed(self, records: Sequence[HostRecord], now: float) -> Procedure[None]:
+        """Wait for hosts that close; kill each when its time is up."""
+        by = {r.host.host_id: now + _seconds_for(r.config.close_timeout) for r in records}
+        killed: set[int] = set()
+        now = yield Wait(0.0)
+        while still_open := [r for r in records if r.stage is not Stage.CLOSED]:
+            for record in still_open:
+                host_id = record.host.host_id
+                if now < by[host_id]:
+                    continue
+                if host_id in killed:
+                    by[host_id] = math.inf  # A worker that survives ends with its fork server.
+                else:
+                    record.kill(dump=False)
+                    killed.add(host_id)
+                    by[host_id] = now + _KILL_SECONDS
+            until = min(by[r.host.host_id] for r in still_open)
+            if until == math.inf:
+                return
+            now = yield Wait(until)
+
+    def _let_go(self, seconds: float) -> None:
+        for record in self._records:
+            record.host.release()
+        for shared in self._resources.values():
+            shared.release(seconds)
+        self._layout.release()
+        self._arena.close()
+
+    def disown(self) -> None:
+        """Release this process's copies after a fork, without affecting the parent's group."""
+        self._lifetime.end()
+        for record in self._records:
+            if record.killable is not None:
+                record.host.release()
+        for shared in self._resources.values():
+            shared.disown()
+
+    def abandon(self) -> None:
+        """Release everything immediately: the group was garbage-collected without a close."""
+        if self._lifetime.closed:
+            return
+        self._lifetime.end()
+        started = any(r.stage is not Stage.NEW for r in self._records)
+        self._let_go(_END_SECONDS)
+        if started:
+            # The garbage collector calls this, so no caller's line would help.
+            warnings.warn(
+                "an EnvGroup was not closed; its envs were killed", ResourceWarning, stacklevel=1
+            )
+
+
+def _seconds_for(close_timeout: float | None) -> float:
+    return _CLOSE_SECONDS if close_timeout is None else close_timeout + _CANCEL_SECONDS

@@ -1,0 +1,565 @@
+"""`Supervisor`: the life of a group's hosts, from their first start to their end.
+
+It starts hosts, places their envs in slabs, and replaces dead hosts; `Shutdown` closes them. It
+returns the consequences of a death for requests (`GivenUp`, `Replaced`), and `Intake` carries them
+out. Rule: it waits only by yielding a `Wait`. Callers pass the time in, except for a death, which
+may be found at any moment, and for what a host was ordered to do: the trainer may have been stopped
+until then. `HangDetector` decides which workers are killed.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Final, TypeAlias
+
+import numpy as np
+
+from rlightning_aio._core.group.drivers.wait import Procedure, Wait, earliest
+from rlightning_aio._core.group.state.conditions import DEATH
+from rlightning_aio._core.group.state.host_record import HostRecord, Stage
+from rlightning_aio._core.group.state.slab_layout import check_actions
+from rlightning_aio._core.group.supervision.fault_messages import (
+    CrashLog,
+    cause_of,
+    culprits_of,
+    death_report,
+    late_fault,
+    start_fault,
+    without_terminal,
+)
+from rlightning_aio._core.group.supervision.hang_detector import HangDetector, has_news
+from rlightning_aio._core.group.supervision.hint import Hints
+from rlightning_aio._core.group.supervision.members import Members
+from rlightning_aio._core.group.supervision.shutdown import Shutdown
+from rlightning_aio._core.group.supervision.workers import Workers
+from rlightning_aio._core.hosts.messages import (
+    Attached,
+    Built,
+    Closed,
+    Death,
+    Died,
+    ErrorText,
+    NotBuilt,
+)
+from rlightning_aio._core.hosts.restart_pause import restart_pause
+from rlightning_aio.errors import ConfigError, GroupClosed, RemoteTraceback, StartFailed, WorkerDied
+from rlightning_aio.types import EnvMeta
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from typing import Any
+
+    from numpy.typing import NDArray
+
+    from rlightning_aio._core.group.state.observed import Fate
+    from rlightning_aio._core.group.supervision.fault_messages import DeathReport
+    from rlightning_aio._core.group.tables import Tables
+    from rlightning_aio._core.hosts.arena import Arena
+    from rlightning_aio._core.hosts.base import Host, Shared
+    from rlightning_aio.config import EnvConfig
+
+__all__ = ["LOOK_SECONDS", "GivenUp", "Lifecycle", "Replaced", "Supervisor"]
+
+LOOK_SECONDS: Final = 0.02
+"""Interval of checks in a trainer that never has to wait."""
+_DUMP_SECONDS: Final = 1.0
+"""Limit for a late worker to write its stacks and exit."""
+
+_SHORTAGE_SECONDS: Final = 30.0
+"""Time for which the system may refuse to start a replacement before that counts as a death. A
+shortage of descriptors, processes or memory is not the env's fault, and may pass."""
+
+_log = logging.getLogger("rlightning_aio")
+
+Lifecycle: TypeAlias = Built | NotBuilt | Attached | Closed
+"""Completions that only the supervisor applies."""
+ErrorFor: TypeAlias = Callable[["NDArray[np.intp]"], WorkerDied]
+"""Makes the error for some of the slots whose replies are outstanding."""
+
+
+@dataclass(frozen=True)
+class GivenUp:
+    """A host will not be replaced: its outstanding requests end in errors."""
+
+    host: Host
+    owed: NDArray[np.intp]
+    error_for: ErrorFor
+
+
+@dataclass(frozen=True)
+class Replaced:
+    """A dead host is being replaced: steps and resets are sent again, calls end in errors.
+
+    Only the user sets hardware in motion: unless the host `resets`, all its outstanding requests
+    end in errors. New requests wait until a replacement is up.
+
+    Attributes:
+        at_fault: the id of the env that the worker was executing; None if unknown.
+        suspects: ids; see `WorkerDied`.
+    """
+
+    host: Host
+    owed: NDArray[np.intp]
+    error_for: ErrorFor
+    cause: str
+    at_fault: str | None
+    suspects: tuple[str, ...]
+    resets: bool
+
+
+class Supervisor:
+    """The hosts of one group and the memory that they share with it.
+
+    Args:
+        tables: of the group.
+        arena: of the group.
+        post: appends the death of a replacement that could not be started to the queue.
+        mixed_actions: the actions of envs may differ in shape.
+        clock: monotonic seconds; asked when a host has died, or was ordered to start or to die.
+
+    Attributes:
+        hosts: in the order of their slots.
+        members: the envs that join and leave.
+        detector: finds workers that hang.
+        shutdown: ends the hosts; workers: describes them; hints: on their number; crash_log: of
+            their deaths.
+        metas: one for each local env, and for each host that envs join; empty before the start.
+        any_deaths: a worker died, and its replacement has not completed a step yet.
+        close_errors: env id and error of each env whose `close` raised.
+        resources: shared by hosts, see `base.Wiring`.
+        look_by: time by which a trainer that never waits must call `check`.
+    """
+
+    def __init__(
+        self,
+        tables: Tables,
+        arena: Arena,
+        post: Callable[[Died], object],
+        *,
+        mixed_actions: bool,
+        clock: Callable[[], float],
+    ) -> None:
+        self.hosts: list[Host] = []
+        self.any_deaths = False
+        self.metas: list[EnvMeta] = []
+        self.close_errors: list[tuple[str, ErrorText]] = []
+        self.resources: dict[object, Shared] = {}
+        self.look_by = 0.0
+        self._envs = tables.envs
+        self._requests = tables.requests
+        self._layout = tables.layout
+        self._continuity = tables.continuity
+        self._conditions = tables.conditions
+        self._observed = tables.observed
+        self._lifetime = tables.lifetime
+        self._arena = arena
+        self._post = post
+        self._clock = clock
+        self._mixed_actions = mixed_actions
+        self._records: list[HostRecord] = []
+        self.members = Members(self._envs, mixed_actions=mixed_actions)
+        self.detector = HangDetector(self._records, self._requests, self._observed, clock)
+        self.shutdown = Shutdown(self._lifetime, self._records, self.resources, self._layout, arena)
+        self.workers = Workers(self._records, self._envs, self._requests)
+        self.hints = Hints(self._records)
+        self.crash_log = CrashLog()
+        self._start_fault: Exception | None = None
+        self._now = 0.0
+        self._any_given_up = False
+
+    def add(self, host: Host, config: EnvConfig) -> None:
+        """Add a host before the start; its slots follow those of the previous host."""
+        self.hosts.append(host)
+        self._records.append(HostRecord(host, config))
+        self.detector.timed = self.detector.timed or self._records[-1].timed
+        self.members.add(host)
+
+    # -- start --------------------------------------------------------------------
+
+    def start(self, now: float) -> Procedure[list[EnvMeta]]:
+        """Build all envs in parallel and place them."""
+        if self._lifetime.closed:
+            raise GroupClosed("this group is closed; build a new one")
+        if self._lifetime.open:
+            return self.metas
+        try:
+            self._now = now
+            for record in self._records:
+                self._launch_first(record)
+            yield from self._until(Stage.BUILT)
+            self._place()
+            for record in self._records:
+                assert record.order is not None
+                record.stage = Stage.ATTACHING
+                record.host.attach(record.order)
+                record.give_time(self._clock())
+            yield from self._until(Stage.UP)
+        except BaseException:
+            yield from self.shutdown.close(self._now)
+            # Its traceback refers to the group, which would then never be garbage-collected.
+            self._start_fault = None
+            raise
+        self._lifetime.begin()
+        self.metas += [
+            EnvMeta(env_id=server_id, observation_space=None, action_space=None)
+            for server_id in self.members.server_ids
+        ]
+        return self.metas
+
+    def _launch_first(self, record: HostRecord) -> None:
+        try:
+            self._launch(record)
+        except OSError as error:
+            raise StartFailed(
+                _refusal(record, error), env_id=self._envs.env_ids[record.host.first_slot]
+            ) from error
+
+    def _launch(self, record: HostRecord) -> None:
+        record.stage = Stage.BUILDING
+        record.late = False
+        record.host.start()
+        record.give_time(self._clock())
+
+    def _until(self, stage: Stage) -> Procedure[None]:
+        # Hosts in this process have posted completions already.
+        self._now = yield Wait(0.0)
+        while any(r.stage.value < stage.value for r in self._records):
+            if self._start_fault is not None:
+                raise self._start_fault
+            self._now = yield Wait(earliest(*(r.start_by for r in self._records)))
+            if self._lifetime.closed:
+                raise GroupClosed("the group was closed while it was starting")
+            self._check_start_times()
+        if self._start_fault is not None:
+            raise self._start_fault
+
+    def _check_start_times(self) -> None:
+        for record in self._records:
+            if record.start_by is None or self._now < record.start_by:
+                continue
+            if has_news(record) or record.has_moved():
+                if not record.late:
+                    record.give_time(self._clock())
+            elif not record.late:
+                record.late = True
+                self.detector.kill(record, dump=True)
+                record.start_by = self._clock() + _DUMP_SECONDS  # The death brings its stacks.
+            else:
+                record.start_by = None  # A host that can't be killed gets no second limit.
+                if not self._lifetime.open:
+                    self._fail_start(late_fault(self._envs, record, Death("")))
+
+    def _fail_start(self, fault: Exception) -> None:
+        self._start_fault = self._start_fault or fault
+
+    def _place(self) -> None:
+        """Give each env a row in the slab of its layout."""
+        started = [env for record in self._records for env in record.started]
+        self.metas = [env.meta for env in started]
+        if not self._mixed_actions:
+            check_actions(self.metas)
+        self._layout.place(started, self._arena)
+        self._envs.note_started(started)
+        for record in self._records:
+            count = len(record.started)
+            record.order = self._layout.order_for(record.host.first_slot, count)
+
+    def handle(self, completion: Lifecycle) -> None:
+        """Apply a completion about the life of a host; `handle_exit` applies deaths."""
+        record = self._records[completion.host_id]
+        if isinstance(completion, Built):
+            self._on_built(record, completion.started)
+        elif isinstance(completion, NotBuilt):
+            slot = record.host.first_slot + completion.env_index
+            self._on_not_built(record, slot, completion.error)
+        elif isinstance(completion, Attached):
+            if record.rebuild_error is None:
+                self._on_attached(record)
+        else:
+            was_built = record.stage is not Stage.BUILDING
+            record.stage = Stage.CLOSED
+            # The start error of a host that was killed while it started is known already.
+            owed = self._requests.owed(np.array(record.slots, np.intp))
+            for index, error in completion.errors if was_built else ():
+                if len(owed) and error.type_name == "WorkerDied":
+                    late = self._envs.env_ids[owed.item(0)]
+                    error = replace(error, text=f"{error.text}; {late} owed a reply")  # noqa: PLW2901
+                env_id = self._envs.env_ids[record.host.first_slot + index]
+                self.close_errors.append((env_id, error))
+
+    def _on_built(self, record: HostRecord, started: list[Any]) -> None:
+        if record.order is None:
+            record.started = started
+            record.stage = Stage.BUILT
+            record.start_by = None
+        elif [env.layout.key for env in started] != [env.layout.key for env in record.started]:
+            error = ErrorText("ValueError", "its spaces changed with the restart", "")
+            self._on_not_built(record, record.host.first_slot, error)
+
+    def _on_attached(self, record: HostRecord) -> None:
+        record.stage = Stage.UP
+        record.start_by = None
+        record.idle = ()
+        if 0 in record.deaths.values():
+            record.deaths = {slot: count for slot, count in record.deaths.items() if count}
+            self._update_any_deaths()
+        if self._lifetime.open:
+            self._note_fate("up", record.host.host_id)
+        held, record.held = record.held, None
+        for entries, arguments in held or ():
+            record.host.submit(entries, arguments)
+
+    def _on_not_built(self, record: HostRecord, slot: int, error: ErrorText) -> None:
+        if self._lifetime.open:
+            record.rebuild_error, record.culprit = record.rebuild_error or error, slot
+            record.suspects = ()
+            self.detector.kill(record, dump=False)
+            return
+        # ConfigError keeps its type, because the config is wrong for every process.
+        if error.type_name == "rlightning_aio.errors.ConfigError":
+            self._fail_start(ConfigError(error.text))
+            return
+        fault = StartFailed(
+            f"{self._envs.describe(slot)} could not be built: {error.summary}"
+            f"{without_terminal(error, record.host)}; its __cause__ is the remote traceback",
+            env_id=self._envs.env_ids[slot],
+        )
+        fault.__cause__ = RemoteTraceback(error.traceback)
+        self._fail_start(fault)
+
+    # -- requests --------------------------------------------------------
+
+    def check_usable(self, slots: NDArray[np.intp]) -> None:
+        """Raise the error of a host that will not be restarted, if it hosts any of `slots`."""
+        if not self._any_given_up:
+            return
+        for record in self._records:
+            if record.refusal is not None:
+                asked = slots[np.isin(slots, record.slots)]
+                if len(asked):
+                    raise record.refusal(asked)
+
+    def last_deaths(self, slots: NDArray[np.intp]) -> NDArray[Any]:
+        """Return what makes errors about the last death of the worker of each of `slots`.
+
+        It is another one after each death, and None before the first.
+        """
+        deaths = np.array([record.last_death for record in self._records], object)
+        return deaths[self._requests.hosts[slots]]
+
+    def submit(
+        self, host_id: int, entries: NDArray[np.int64], arguments: Sequence[Any] | None
+    ) -> None:
+        """Pass requests to a host, or hold them until its replacement is up."""
+        held = self._records[host_id].held
+        if held is None:
+            self.hosts[host_id].submit(entries, arguments)
+        else:
+            held.append((entries, arguments))
+
+    # -- faults -------------------------------------------------------------------
+
+    def next_check(self, until: float | None = None) -> float | None:
+        """Return the time by which `check` must be called, or `until` if that is earlier."""
+        times = [until]
+        if self.detector.timed or self.detector.any_ending:
+            times += self.detector.expiries()
+        if self.any_deaths:
+            times += [due for r in self._records for due in (r.start_by, r.restart_at)]
+        if self.members.possible:
+            times.append(self.members.next_deadline())
+        return min((time for time in times if time is not None), default=None)
+
+    def check(self, now: float) -> None:
+        """Restart hosts that are due, and find silent members and workers that hang."""
+        self._now = now
+        if not self._lifetime.open:
+            raise GroupClosed("the group was closed while this call was waiting")
+        self.look_by = now + LOOK_SECONDS
+        if self.any_deaths:
+            self._check_start_times()
+            for record in self._records:
+                if record.restart_at is not None and record.restart_at <= now:
+                    self._restart(record, now)
+        if self.members.possible:
+            self.members.tick(now)
+        if self.detector.timed or self.detector.any_ending:
+            self.detector.check(now)
+        if now >= self.crash_log.due:
+            self.crash_log.flush(now)
+
+    # -- deaths -------------------------------------------------------------------
+
+    def handle_exit(self, exited: Died) -> GivenUp | Replaced | None:
+        """Replace a host whose worker has exited, or give it up.
+
+        Returns the consequences for its requests. Returns None while the group starts or closes,
+        and if the worker was a replacement that never came up: requests wait for the next one.
+        """
+        record, death = self._records[exited.host_id], exited.death
+        record.dying, record.die_by, record.abort_by = False, None, None
+        is_first_start = record.stage.value < Stage.UP.value and record.order is None
+        if is_first_start or not self._lifetime.open:
+            record.stage = Stage.CLOSED
+            self._fail_start(start_fault(self._envs, record, death))
+            return None
+        if death.refused:
+            record.restarts -= 1
+            self._on_refused(record, f"it {death.cause}", self._clock())
+            return None
+        if record.stage is not Stage.DOWN:
+            record.refusals, record.refused_since = 0, None  # It had started.
+        owed = self._requests.owed(np.array(record.slots, np.intp))
+        unanswered = self._requests.numbering.entry[owed].tolist()
+        self._continuity.drop_unfinished(record.slots, set(unanswered))
+        was_up = record.stage is Stage.UP
+        is_fault = record.aborted_slot is None
+        report, cause, is_last = self._judge(record, death, owed)
+        record.last_death = partial(report.loss, owed)
+        self._note_fate("given up" if is_last else "died", exited.host_id, cause)
+        if is_last:
+            self._requests.lose_host(exited.host_id)
+            self._give_up(record, partial(report.refusal, owed))
+            return GivenUp(record.host, owed, report.error)
+        at_fault = None if record.culprit is None else self._envs.env_ids[record.culprit]
+        message = report.message(owed)
+        if is_fault:
+            self.crash_log.note(record.config.name, message, cause, at_fault, self._clock())
+        else:
+            _log.info("%s", message)
+        self._schedule_restart(record)
+        if not was_up:
+            return None
+        self._requests.lose_host(exited.host_id)
+        resets = not record.is_hardware
+        suspects = tuple(self._envs.env_ids[slot] for slot in record.suspects)
+        return Replaced(record.host, owed, report.error, cause, at_fault, suspects, resets)
+
+    def _schedule_restart(self, record: HostRecord) -> None:
+        """Restart immediately after the first death in a row, later after further ones."""
+        now = self._clock()
+        record.stage = Stage.DOWN
+        record.start_by = None
+        in_a_row = max(record.deaths[slot] for slot in record.blamed)
+        record.restart_at = now + restart_pause(in_a_row)
+        if record.held is None:
+            record.held = []
+        if record.restart_at <= now:
+            self._restart(record, now)
+
+    def _restart(self, record: HostRecord, now: float) -> None:
+        record.restart_at = None
+        try:
+            self._launch(record)
+        except OSError as error:
+            self._on_refused(record, error, now)
+            return
+        record.restarts += 1
+        record.lost_slots.clear()
+        assert record.order is not None
+        checkpoints = self._continuity.checkpoints(record.slots)
+        # What the generators of a seeded group begin with must not be by chance.
+        seed = self._envs.last_seed.item(record.host.first_slot)
+        order = replace(
+            record.order,
+            checkpoints=checkpoints,
+            restarts=record.restarts,
+            seed=seed if seed >= 0 else None,
+        )
+        record.host.attach(order)
+        record.give_time(self._clock())
+
+    def _on_refused(self, record: HostRecord, why: OSError | str, now: float) -> None:
+        """Schedule another attempt, because the system refused to start a replacement."""
+        refusal = _refusal(record, why)
+        record.stage = Stage.DOWN
+        record.start_by = None
+        if record.refused_since is None:
+            record.refused_since = now
+        record.refusals += 1
+        pause = restart_pause(record.refusals + 1)
+        if now + pause > record.refused_since + _SHORTAGE_SECONDS:
+            self._post(Died(record.host.host_id, Death(f"could not be replaced: {refusal}")))
+            return
+        _log.warning("%s; the next attempt is in %g s", refusal, pause)
+        record.restart_at = now + pause
+
+    def _judge(
+        self, record: HostRecord, death: Death, owed: NDArray[np.intp]
+    ) -> tuple[DeathReport, str, bool]:
+        """Return the report of a death, its cause, and True if it exceeds ``max_restarts``."""
+        requests, config = self._requests, record.config
+        if record.stage is Stage.UP and not record.is_hung:
+            # A replacement that fails to start counts against the env that made it necessary.
+            found = culprits_of(record, death.requests, requests, owed)
+            record.culprit, record.suspects = found
+        is_fault = record.aborted_slot is None  # Else the caller's wish, which counts for nothing.
+        for slot in record.blamed:
+            record.deaths[slot] = record.deaths.get(slot, 0) + is_fault
+        deaths = max(record.deaths[slot] for slot in record.blamed)
+        self._note_deaths(True)
+        cause = cause_of(record, death, requests)
+        raises = config.on_worker_death == "raise"
+        is_last = is_fault and (raises or deaths > config.max_restarts)
+        if not is_fault:
+            outcome = "it is replaced"
+        elif raises:
+            outcome = "on_worker_death is 'raise', so it is not replaced"
+        elif is_last:
+            outcome = f"it is not replaced after {deaths - 1} restarts in a row (max_restarts)"
+        else:
+            pause = restart_pause(deaths)
+            outcome = f"restart {deaths} of {config.max_restarts} in a row"
+            outcome += f", in {pause:g} s" if pause else ""
+            if record.is_hardware:
+                outcome += "; it moves nothing until you reset it"
+        report = death_report(self._envs, record, replace(death, cause=cause), requests, outcome)
+        record.is_hung, record.aborted_slot, record.rebuild_error = False, None, None
+        return report, cause, is_last
+
+    def _give_up(self, record: HostRecord, refusal: ErrorFor) -> None:
+        record.stage = Stage.FAILED
+        record.start_by = record.held = None
+        record.refusal = refusal
+        self._any_given_up = True
+        self._update_any_deaths()
+
+    def note_rebuilt(self, host_id: int, slot: int, cause: str) -> None:
+        """Record that a host has rebuilt one of its envs."""
+        self._records[host_id].restarts += 1
+        self._note_fate("hung", host_id, cause, slot)
+
+    def note_lost_env(self, host_id: int, slot: int) -> None:
+        """Record that a host will not rebuild one of its envs."""
+        self._records[host_id].lost_slots.add(slot)
+
+    def _note_fate(self, fate: Fate, host_id: int, cause: str = "", slot: int = -1) -> None:
+        if self._observed.observer is not None:
+            self._observed.observer.note_fate(fate, host_id, slot, cause)
+
+    def note_step(self, slot: int) -> None:
+        """Record that an env completed a step, so it is not what its worker died of."""
+        for record in self._records:
+            if slot in record.slots and record.deaths:
+                record.deaths.pop(slot, None)
+                record.deaths.pop(None, None)
+                self._update_any_deaths()
+
+    def _update_any_deaths(self) -> None:
+        self._note_deaths(
+            any(record.deaths for record in self._records if record.stage is not Stage.FAILED)
+        )
+
+    def _note_deaths(self, any_deaths: bool) -> None:
+        self.any_deaths = any_deaths
+        self._conditions.note(DEATH, any_deaths or self._any_given_up)
+
+
+def _refusal(record: HostRecord, why: OSError | str) -> str:
+    refusal = f"can't start a worker for entry {record.config.name!r}: {why}"
+    if isinstance(why, ConnectionError):
+        return refusal
+    return f"{refusal}; check its `interpreter` and this machine's process and memory limits"

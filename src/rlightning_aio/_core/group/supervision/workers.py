@@ -1,0 +1,104 @@
+"""`Workers`: describes the current state of a group's hosts, for monitoring."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from rlightning_aio._core.group.state.host_record import Stage
+from rlightning_aio.registry import placement_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rlightning_aio._core.group.state.env_table import EnvTable
+    from rlightning_aio._core.group.state.host_record import HostRecord
+    from rlightning_aio._core.group.state.requests import Requests
+
+__all__ = ["Workers"]
+
+_MOST_LISTED: Final = 8
+_STATES: Final = {
+    Stage.NEW: "new",
+    Stage.UP: "up",
+    Stage.DOWN: "down",
+    Stage.FAILED: "failed",
+    Stage.CLOSED: "closed",
+}
+
+
+class Workers:
+    """See the module.
+
+    Args:
+        records: of the group's hosts; the list grows until the group starts.
+        envs, requests: of the group.
+    """
+
+    def __init__(self, records: Sequence[HostRecord], envs: EnvTable, requests: Requests) -> None:
+        self._records = records
+        self._envs = envs
+        self._requests = requests
+
+    def describe(self, now_ns: int) -> list[dict[str, Any]]:
+        """Describe each host and its outstanding requests, as `EnvGroup.get_workers`.
+
+        `now_ns` is from the monotonic clock.
+        """
+        return [self._described(record, now_ns) for record in self._records]
+
+    def _described(self, record: HostRecord, now_ns: int) -> dict[str, Any]:
+        env_ids, requests = self._envs.env_ids, self._requests
+        slots = np.array(record.slots, np.intp)
+        busy = requests.owed(slots)
+        lost = record.slots if record.stage is Stage.FAILED else sorted(record.lost_slots)
+        return {
+            "entry": record.config.name,
+            "env_ids": [env_id for slot in slots if (env_id := env_ids[slot])],
+            "given_up": [env_id for slot in lost if (env_id := env_ids[slot])],
+            "pid": getattr(record.host, "pid", None),
+            "state": _STATES.get(record.stage, "starting"),
+            "owed": [env_ids[slot] for slot in busy],
+            "owed_seconds": (now_ns - int(requests.sent_ns[busy[0]])) / 1e9 if len(busy) else 0.0,
+            "restarts": record.restarts,
+        }
+
+    def awaited(self, now_ns: int) -> str:
+        """Name the envs that have not started, or else those that owe a reply, the oldest first.
+
+        `now_ns` is from the monotonic clock.
+        """
+        starting = [r for r in self._records if r.stage.value < Stage.UP.value]
+        if starting:
+            names = [self._envs.env_ids[slot] for record in starting for slot in record.slots]
+            return f"not started yet: {_listed(names)}"
+        env_ids, sent_ns = self._envs.env_ids, self._requests.sent_ns
+        busy: list[int] = self._requests.owed(np.arange(len(self._envs))).tolist()
+        names = [f"{env_ids[k]} (for {(now_ns - sent_ns.item(k)) / 1e9:.1f} s)" for k in busy]
+        return f"no reply yet from {_listed(names)}" if names else "no env owes a reply"
+
+    def summary(self) -> str:
+        """Summarise entries, envs, placement and worker processes in one line."""
+        entries: dict[str, list[HostRecord]] = {}
+        for record in self._records:
+            entries.setdefault(record.config.name, []).append(record)
+        return "; ".join(f"{name}: {_entry(own)}" for name, own in entries.items())
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _MOST_LISTED} more" if len(names) > _MOST_LISTED else ""
+    return ", ".join(names[:_MOST_LISTED]) + more
+
+
+def _entry(records: Sequence[HostRecord]) -> str:
+    config = records[0].config
+    if placement_of(config.backend, config.placement).max_members:
+        return config.backend
+    sizes = f" of {config.num_envs} sub-environments" if config.num_envs > 1 else ""
+    envs = sum(record.host.num_envs for record in records)
+    workers = sum(record.killable is not None for record in records)
+    return (
+        f"{envs} env{'' if envs == 1 else 's'}{sizes}, placement {config.placement}, "
+        f"{workers} worker process{'' if workers == 1 else 'es'}"
+    )

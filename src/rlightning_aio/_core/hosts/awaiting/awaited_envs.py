@@ -1,0 +1,510 @@
+"""`AwaitedEnvs`: executes requests on awaitable envs, all at once, on one event loop.
+
+The trainer's loop host and a worker with awaitable envs are both thin layers over it. Each env has
+a task of its own (`AwaitedEnv`). A request that takes longer than its limit is cancelled; the env
+is then closed, rebuilt and reset, and that result answers the request, marked as a restart.
+Invariant: each request ends in one completion, or `done` is called for it, whatever its env does.
+Left out: how requests and completions travel.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from contextvars import Context, copy_context
+from copy import copy
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
+
+from rlightning_aio._core.hosts.awaiting.awaited_env import CANCEL_SECONDS, AwaitedEnv, end_all
+from rlightning_aio._core.hosts.awaiting.event_loop import (
+    TimeLimit,
+    cancel,
+    cancel_leftovers,
+    leave_behind,
+    log,
+    new_task,
+    place_of,
+    tasks_of,
+    time_collector,
+    watched,
+)
+from rlightning_aio._core.hosts.messages import ErrorText, Failed, NotBuilt, Raised, Result, Value
+from rlightning_aio._core.hosts.restart_pause import restart_pause
+from rlightning_aio._core.hosts.running.build_env import built_env
+from rlightning_aio._core.hosts.running.runner import disconnect_all
+from rlightning_aio.errors import EnvHung, WorkerDied
+from rlightning_aio.protocol.entries import Operation, answers_with_value, op_of, slot_of
+from rlightning_aio.protocol.entries import entry as entry_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine, Iterable
+    from typing import NoReturn
+
+    from rlightning_aio._core.hosts.messages import Completion, EnvStarted, StartOrder
+    from rlightning_aio._core.hosts.running.awaited_runner import AwaitedRunner
+
+__all__ = ["CLOSE_SECONDS", "AwaitedEnvs"]
+
+CLOSE_SECONDS: Final = 0.6
+"""How long envs may take to close, where their entry doesn't say."""
+_LEFTOVERS_SECONDS: Final = 0.1
+"""How long after the end of an env its tasks are looked for, for all that ended meanwhile."""
+
+
+class _Place:
+    """The place of an env in its host, which another env may take, and the request to it.
+
+    Attributes:
+        index: in the host.
+        context: of all envs that take the place; each has a copy.
+        env: that has it now; None while there is none.
+        runner: of that env, or of the one before.
+        entry: of the request that is being executed; 0 while there is none.
+        arguments: of that request.
+        losses: how often the env was replaced since it last completed a step.
+        lost: why there is no env.
+        leaving: the task that puts the env before away.
+        restoring: the task that makes another env.
+        fault: why the place is given up, if it is.
+    """
+
+    def __init__(self, index: int, context: Context) -> None:
+        self.index = index
+        self.context = context
+        self.env: AwaitedEnv | None = None
+        self.runner: Any = None
+        self.entry = 0
+        self.arguments: Any = None
+        self.losses = 0
+        self.lost = ""
+        self.leaving: asyncio.Task[None] | None = None
+        self.restoring: asyncio.Task[None] | None = None
+        self.fault: WorkerDied | None = None
+
+    @property
+    def name(self) -> str:
+        """The env's id, for messages."""
+        return self.runner.env.env_id
+
+
+class AwaitedEnvs:
+    """See the module.
+
+    Args:
+        host_id, first_slot: of the host.
+        order: what to build.
+        inline: see `EnvRunner`.
+        post: gets every completion.
+        done: gets the entries of requests whose results are all in their rows.
+        enter: gets an entry whenever the code of its env is about to run, and 0 after that; None:
+            nobody needs it.
+
+    Attributes:
+        num_busy: how many envs execute a request now.
+    """
+
+    def __init__(
+        self,
+        host_id: int,
+        first_slot: int,
+        order: StartOrder,
+        *,
+        inline: bool,
+        post: Callable[[Completion], object],
+        done: Callable[[int], object],
+        enter: Callable[[int], object] | None = None,
+    ) -> None:
+        time_collector()
+        self._host_id = host_id
+        self._first_slot = first_slot
+        self._order = order
+        self._inline = inline
+        self._post = post
+        self._done = done
+        self._enter = enter
+        self._watch = partial(watched, report=self._report, enter=enter)
+        self._loop: asyncio.AbstractEventLoop
+        self._places: list[_Place] = []
+        self._queue: deque[tuple[_Place, int, Any]] = deque()
+        self.num_busy = 0
+        self._most_busy = order.config.max_concurrency or len(order.worker_indices)
+        self._ending = False
+        config = order.config
+        self._close_seconds = config.close_timeout or CLOSE_SECONDS
+        limits = {Operation.STEP: config.step_timeout, Operation.RESET: config.reset_timeout}
+        self._limits = {
+            int(op): TimeLimit(seconds, self._expire)
+            for op, seconds in limits.items()
+            if seconds is not None
+        }
+        # All envs whose tasks run, and the tasks that replace envs or put them away.
+        self._envs: set[AwaitedEnv] = set()
+        self._tasks: set[asyncio.Task[None]] = set()
+        # Names of envs that have closed, until a timer looks for what they have left.
+        self._closed: dict[object, str] = {}
+        self._look: asyncio.TimerHandle | None = None
+
+    @property
+    def runners(self) -> list[AwaitedRunner]:
+        """The envs' runners, by index."""
+        return [place.runner for place in self._places]
+
+    # -- life ---------------------------------------------------------------------
+
+    def adopt(self, runners: Iterable[AwaitedRunner]) -> None:
+        """Take over envs that were built elsewhere, by index; they belong to the running loop."""
+        self._loop = asyncio.get_running_loop()
+        context = copy_context()
+        for index, runner in enumerate(runners):
+            place = _Place(index, context)
+            place.runner = runner
+            place.env = self._new_env(place, lambda runner=runner: runner)
+            self._places.append(place)
+
+    async def build(self) -> list[EnvStarted] | None:
+        """Build the envs, one in each turn of the loop; None if one can't be, which is posted."""
+        self._loop = asyncio.get_running_loop()
+        context = copy_context()
+        index = 0
+        try:
+            for index in range(len(self._order.worker_indices)):
+                place = _Place(index, context)
+                if (error := await self._build(place)) is not None:
+                    raise error
+                self._places.append(place)
+            return [runner.started() for runner in self.runners]
+        except BaseException as error:
+            self._post(NotBuilt(self._host_id, index, ErrorText.of(error)))
+            if isinstance(error, KeyboardInterrupt):
+                raise
+            return None
+
+    def _new_env(self, place: _Place, make: Callable[[], AwaitedRunner]) -> AwaitedEnv:
+        env = AwaitedEnv(place.index, make, place.context, self._watch, self._on_broken)
+        self._envs.add(env)
+        env.task.add_done_callback(lambda _: self._envs.discard(env))
+        return env
+
+    async def _build(self, place: _Place) -> BaseException | None:
+        """Build an env for a place; return the error if that fails."""
+        make: Any = partial(built_env, self._order, place.index, inline=self._inline)
+        if self._enter is not None:
+            entry = entry_of(0, self._first_slot + place.index, 0)
+            make = partial(_entered, make, self._enter, entry)
+        env = self._new_env(place, make)
+        try:
+            error = await asyncio.shield(env.made)
+        except BaseException:
+            env.leave()
+            raise
+        if error is None:
+            if place.runner is not None:
+                env.runner.place_like(place.runner)
+            place.env, place.runner = env, env.runner
+        return error
+
+    async def close(self) -> list[tuple[int, ErrorText]]:
+        """Cancel all requests and close all envs at the same time.
+
+        Returns what was wrong, with the env's index.
+        """
+        self._end()
+        await cancel(self._tasks, CANCEL_SECONDS)
+        # Others that still run were closed, and reported, when they were put away.
+        open_ = [env for env in self._envs if not env.has_closed]
+        envs = sorted(open_, key=lambda env: env.index)
+        await end_all(envs, self._close_seconds)
+        errors = [(env.index, error) for env in envs if (error := env.close_error) is not None]
+        closed = {**self._closed, **{env: env.name for env in envs}}
+        await cancel(self._leftovers(closed), CANCEL_SECONDS / 4)
+        for task in tasks_of({*closed, *self._envs}, self._loop):
+            leave_behind(task)
+        return errors
+
+    def disconnect(self) -> None:
+        """Bring the envs to a safe state: the trainer is gone."""
+        disconnect_all([place.runner for place in self._places if place.env is not None])
+
+    def release(self) -> None:
+        """Cancel everything without waiting, also tasks that envs have started. Idempotent."""
+        self._end()
+        if self._envs and not self._loop.is_closed():
+            for task in self._tasks | tasks_of(self._envs, self._loop).keys():
+                task.cancel()
+        for env in self._envs if self._envs and not self._loop.is_running() else ():
+            leave_behind(env.task)  # The warning about the group says enough.
+        self._places.clear()
+
+    def _end(self) -> None:
+        """Begin nothing more, and post nothing more."""
+        self._ending = True
+        self._queue.clear()
+        for limit in self._limits.values():
+            limit.end()
+        if self._look is not None:
+            self._look.cancel()
+
+    # -- requests -----------------------------------------------------------------
+
+    def submit(self, entry: int, arguments: Any) -> None:
+        """Execute a request; queue it while as many envs are busy as may be at once.
+
+        Args:
+            entry: of the request.
+            arguments: as of `AwaitedRunner.answer`.
+        """
+        if self._ending:
+            return
+        place = self._places[slot_of(entry) - self._first_slot]
+        self._queue.append((place, entry, arguments))
+        self._begin_queued()
+
+    def _begin_queued(self) -> None:
+        while self._queue and self.num_busy < self._most_busy:
+            place, entry, arguments = self._queue.popleft()
+            if place.fault is not None:
+                # Not at once: a completion never comes before its request was handed over.
+                fault = Failed(self._host_id, entry, copy(place.fault), for_good=True)
+                self._loop.call_soon(self._post_unless_ending, fault)
+                continue
+            self.num_busy += 1
+            place.entry, place.arguments = entry, arguments
+            if place.env is None:
+                self._restore(place)
+            else:
+                self._give(place, place.env)
+
+    def _post_unless_ending(self, completion: Completion) -> None:
+        if not self._ending:
+            self._post(completion)
+
+    def _give(self, place: _Place, env: AwaitedEnv) -> None:
+        """Have an env execute the request to its place."""
+        op = op_of(place.entry)
+        env.give(op, place.entry, place.arguments, self._on_outcome)
+        if op in self._limits:
+            self._limits[op].begin(place, self._loop)
+
+    def _on_outcome(
+        self, env: AwaitedEnv, entry: int, outcome: Any, error: BaseException | None
+    ) -> None:
+        place, op = self._places[env.index], op_of(entry)
+        if error is not None:
+            self._finish(place, Raised(self._host_id, entry, ErrorText.of(error)))
+            # In the trainer it may be the user's Ctrl-C; a worker gets none.
+            if self._inline and isinstance(error, KeyboardInterrupt):
+                self._loop.call_soon(_reraise, error)
+            return
+        if op == Operation.STEP:
+            place.losses = 0
+        if answers_with_value(op):
+            self._finish(place, Value(self._host_id, entry, outcome))
+        elif outcome is None:
+            self._finish(place, entry)
+        else:
+            self._finish(place, Result(self._host_id, entry, outcome))
+
+    def _finish(self, place: _Place, what: Completion | int) -> None:
+        """The request to a place has ended: post `what`, or call `done` for this entry."""
+        if self._ending:
+            return
+        place.entry, place.arguments = 0, None
+        self.num_busy -= 1
+        if isinstance(what, int):
+            self._done(what)
+        else:
+            self._post(what)
+        self._begin_queued()
+
+    def _report(self, entry: int, seconds: float) -> None:
+        """Report an env that has held the event loop for long."""
+        log.warning(
+            "env %r of entry %r blocked the event loop for %.0f ms in a %s; nothing else ran "
+            "meanwhile: await what it waits for, or run it by asyncio.to_thread()",
+            self._places[slot_of(entry) - self._first_slot].name,
+            self._order.config.name,
+            1e3 * seconds,
+            Operation(op_of(entry)).name.lower(),
+        )
+
+    def abort(self, entry: int) -> None:
+        """End a request at once, if it has not ended; the env that executes it is replaced."""
+        if self._ending:
+            return
+        place = self._places[slot_of(entry) - self._first_slot]
+        aborted = Raised(self._host_id, entry, ErrorText.of(asyncio.CancelledError("aborted")))
+        if place.entry == entry:
+            if place.restoring is not None:
+                place.restoring.cancel()
+            if place.env is not None:
+                self._put_away(place, place.env, "was aborted")
+            self._finish(place, aborted)
+            return
+        queued = [one for one in self._queue if one[1] != entry]
+        if len(queued) < len(self._queue):
+            self._queue = deque(queued)
+            self._post(aborted)
+
+    # -- envs that are lost -------------------------------------------------------
+
+    def _expire(self, place: _Place, seconds: float) -> None:
+        """Replace an env whose request takes too long."""
+        env = place.env
+        if self._ending or env is None:
+            return
+        doing = Operation(op_of(place.entry)).name.lower()
+        waits_in = place_of(env.answering)
+        message = f"env {place.name!r} took longer than {seconds} s for a {doing} and was cancelled"
+        if waits_in:
+            message += f" while it waited in {waits_in}"
+        self._put_away(place, env, f"hung in a {doing} and was cancelled")
+        self._restore(place, message)
+
+    def _on_broken(self, env: AwaitedEnv) -> None:
+        """An env has left by itself while it was idle."""
+        place = self._places[env.index]
+        if self._ending or place.env is not env:
+            return
+        place.env, place.lost = None, "ended while it was idle: something cancelled its task"
+        place.leaving = env.task
+
+        late = self._loop.call_later(self._close_seconds, env.cut_short, self._close_seconds)
+
+        def closed(_: object) -> None:
+            late.cancel()
+            if env.close_error is not None:
+                place.lost = f"ended while it was idle: {env.close_error.summary}"
+            self._note_closed(env)
+
+        # No task of ours waits for that: perhaps the event loop ends.
+        env.task.add_done_callback(closed)
+        if place.entry:  # It has come at the same time.
+            self._restore(place)
+
+    def _put_away(self, place: _Place, env: AwaitedEnv, cause: str) -> None:
+        """Cancel what an env is doing, and close it. What it still does goes nowhere."""
+        env.leave()
+        place.env, place.lost = None, cause
+        place.leaving = self._spawn(self._close(env))
+
+    async def _close(self, env: AwaitedEnv) -> None:
+        await end_all([env], self._close_seconds)
+        self._note_closed(env)
+
+    def _note_closed(self, env: AwaitedEnv) -> None:
+        """Report what was wrong with an env that was put away, and look for what it has left."""
+        if (error := env.close_error) is not None and not self._ending:
+            log.warning("env %r, as it was put away to be rebuilt: %s", env.name, error.summary)
+        if self._look is None and not self._ending:
+            look = self._look_for_leftovers
+            self._look = self._loop.call_later(_LEFTOVERS_SECONDS, look, context=Context())
+        self._closed[env] = env.name
+
+    def _look_for_leftovers(self) -> None:
+        closed, self._closed, self._look = self._closed, {}, None
+        self._leftovers(closed)
+
+    def _leftovers(self, names: dict[Any, str]) -> list[asyncio.Task[Any]]:
+        known = [task for env in self._envs for task in env.tasks()]
+        return cancel_leftovers(names, but=known)
+
+    def _spawn(self, coroutine: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        # In no env's context, or the end of that env would cancel it: the caller may be the task of
+        # another env, or a timer that was set there.
+        task = new_task(coroutine, self._loop, Context())
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return task
+
+    def _restore(self, place: _Place, message: str = "") -> None:
+        """Give a place another env, which answers the request to it; see `_restored`."""
+        place.restoring = self._spawn(self._restored(place, message))
+
+    async def _restored(self, place: _Place, message: str) -> None:
+        """Build another env. A step, and what the env before was lost in, is answered by its reset.
+
+        Args:
+            place: without an env, and with a request.
+            message: why the env was lost that has executed the request; empty if it was idle.
+        """
+        entry, kind = place.entry, EnvHung
+        is_reset = bool(message) or op_of(entry) == Operation.STEP
+        while True:
+            if message:
+                failed = self._counted(place, kind, message)
+                if failed is not None:
+                    self._finish(place, failed)
+                    return
+                await asyncio.sleep(restart_pause(place.losses))
+            if place.leaving is not None:
+                await asyncio.wait({place.leaving}, timeout=CANCEL_SECONDS + CLOSE_SECONDS)
+            error, env = await self._build(place), place.env
+            if env is None:
+                kind, message = WorkerDied, f"env {place.name!r} could not be rebuilt: {error!r}"
+                continue
+            if not is_reset:
+                self._give(place, env)
+                return
+            outcome = await self._reset(place, env)
+            if outcome is not None:
+                self._finish(place, outcome)
+                return
+            kind, message = EnvHung, f"env {place.name!r} took too long for the reset after that"
+
+    async def _reset(self, place: _Place, env: AwaitedEnv) -> Result | Raised | None:
+        """Begin an episode like the one that was lost; None if that takes too long."""
+        entry, cause = place.entry, place.lost
+        ended: asyncio.Future[Result | Raised] = self._loop.create_future()
+
+        def then(_: Any, entry: int, outcome: Any, error: BaseException | None) -> None:
+            if error is None:
+                ended.set_result(Result(self._host_id, entry, outcome or {}, restarted=cause))
+                return
+            text = ErrorText.of(error)
+            message = f"{text.text} (in the reset after its env {cause})"
+            error_text = ErrorText(text.type_name, message, text.traceback)
+            ended.set_result(Raised(self._host_id, entry, error_text))
+
+        env.give(Operation.RESET, entry, env.runner.reset_with, then)
+        limit = self._limits.get(Operation.RESET)
+        await asyncio.wait({ended}, timeout=None if limit is None else limit.seconds)
+        if ended.done():
+            return ended.result()
+        self._put_away(place, env, cause)
+        return None
+
+    def _counted(self, place: _Place, kind: type[WorkerDied], message: str) -> Failed | None:
+        """Count a loss of an env; return what ends its request if that was one too many."""
+        place.losses += 1
+        config = self._order.config
+        for_good = config.on_worker_death == "raise"
+        if for_good:
+            outcome = "on_worker_death is 'raise', so it is not rebuilt"
+        elif place.losses > config.max_restarts:
+            outcome = (
+                f"that was after {place.losses - 1} restarts in a row (max_restarts), so this "
+                "request ends here; the next one tries again"
+            )
+        else:
+            count = f"restart {place.losses} of {config.max_restarts} in a row"
+            log.warning("%s; %s, in %g s", message, count, restart_pause(place.losses))
+            return None
+        fault = kind(f"{message}; {outcome}", env_id=place.name, exit_code=None, stderr_tail="")
+        fault.env_ids = (place.name,)
+        if for_good:
+            place.fault = fault
+        return Failed(self._host_id, place.entry, fault, for_good)
+
+
+def _entered(make: Callable[[], Any], enter: Callable[[int], object], entry: int) -> Any:
+    """Make an env, whose code runs meanwhile."""
+    enter(entry)
+    try:
+        return make()
+    finally:
+        enter(0)
+
+
+def _reraise(error: BaseException) -> NoReturn:
+    raise error

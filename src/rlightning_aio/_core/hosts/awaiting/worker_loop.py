@@ -1,0 +1,145 @@
+"""`Awaiting`: a worker's awaitable envs, all at once, on an event loop of the worker's own.
+
+The worker's channel wakes the loop. The worker says whose code runs, and that none does while all
+envs wait: if it dies, the trainer knows which env is at fault. While envs have time limits, it also
+says every now and then that its loop is alive: the trainer kills a worker whose loop an env blocks
+for longer than the limit. Requests that only wait too long are cancelled here (see `AwaitedEnvs`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import pickle
+from typing import TYPE_CHECKING, Any, cast
+
+from rlightning_aio._core.hosts.awaiting.awaited_envs import AwaitedEnvs
+from rlightning_aio._core.hosts.awaiting.event_loop import run_loop
+from rlightning_aio._core.hosts.messages import ErrorText, Failed, Raised, Result, Value
+from rlightning_aio.protocol.frames import FrameKind
+from rlightning_aio.protocol.pickling import dumped
+
+if TYPE_CHECKING:
+    import socket
+    from collections.abc import Callable, Sequence
+
+    from rlightning_aio._core.hosts.messages import Completion, StartOrder
+    from rlightning_aio._core.hosts.running.awaited_runner import AwaitedRunner
+    from rlightning_aio._core.hosts.running.runner import EnvRunner
+
+__all__ = ["Awaiting"]
+
+
+class Awaiting:
+    """See the module.
+
+    Args:
+        order, first_slot: of the worker.
+        runners: of its envs.
+        report: takes the entries of requests whose results are all in their rows.
+        send: sends a frame: its kind, a number, a payload.
+        enter: says that an env's code runs now, by an entry; 0: none does.
+    """
+
+    def __init__(
+        self,
+        order: StartOrder,
+        first_slot: int,
+        runners: Sequence[EnvRunner],
+        report: Callable[[int], None],
+        send: Callable[[FrameKind, int, bytes], None],
+        enter: Callable[[int], None],
+    ) -> None:
+        self._send = send
+        self._enter = enter
+        self._envs = AwaitedEnvs(
+            0,
+            first_slot,
+            order,
+            inline=False,
+            post=self._post,
+            done=report,
+            enter=enter,
+        )
+        self._runners = cast("Sequence[AwaitedRunner]", runners)
+        config = order.config
+        limits = [limit for limit in (config.step_timeout, config.reset_timeout) if limit]
+        self._beat_seconds = min(limits, default=0.0) / 4
+
+    def submit(self, entry: int, arguments: Any) -> None:
+        self._envs.submit(entry, arguments)
+
+    def abort(self, entry: int) -> None:
+        """End a request without its result, if it has not ended."""
+        self._envs.abort(entry)
+
+    def serve(
+        self, channel: socket.socket, take_requests: Callable[[], bool]
+    ) -> list[tuple[int, ErrorText]]:
+        """Execute requests until there are no more, and close the envs.
+
+        Args:
+            channel: readable when there are requests.
+            take_requests: submits them; False if there will be no more. If it raises, the trainer
+                is gone: the envs come to a safe stop before they are closed.
+
+        Returns what closing has raised, with the env's index.
+        """
+        return run_loop(self._serve(channel, take_requests))
+
+    async def _serve(
+        self, channel: socket.socket, take_requests: Callable[[], bool]
+    ) -> list[tuple[int, ErrorText]]:
+        loop = asyncio.get_running_loop()
+        self._envs.adopt(self._runners)
+        ended: asyncio.Future[None] = loop.create_future()
+
+        def look() -> None:
+            try:
+                if take_requests() or ended.done():
+                    return
+            except BaseException as error:
+                loop.remove_reader(channel)
+                ended.set_exception(error)
+            else:
+                ended.set_result(None)
+
+        def beat() -> None:
+            self._enter(0)
+            loop.call_later(self._beat_seconds, beat)
+
+        if self._beat_seconds:
+            beat()
+        loop.add_reader(channel, look)
+        # uvloop has made it non-blocking; a reply that the socket can't hold waits for the trainer.
+        channel.setblocking(True)
+        look()
+        try:
+            await ended
+        except BaseException:
+            self._envs.disconnect()
+            await self._envs.close()
+            raise
+        finally:
+            loop.remove_reader(channel)
+        return await self._envs.close()
+
+    def _post(self, completion: Completion) -> None:
+        """Send a completion; what can't be pickled is an error of its request."""
+        kind, payload = FrameKind.ERROR, b""
+        assert isinstance(completion, Result | Value | Raised | Failed)
+        try:
+            if isinstance(completion, Result):
+                kind, payload = FrameKind.RESULT, dumped(completion.out_of_band, "the result")
+                if completion.restarted:
+                    kind = FrameKind.RESTARTED
+                    payload = pickle.dumps((completion.restarted, payload))
+            elif isinstance(completion, Value):
+                kind, payload = FrameKind.VALUE, dumped(completion.value, "what it returned")
+            elif isinstance(completion, Raised):
+                kind, payload = FrameKind.ERROR, pickle.dumps(completion.error)
+            else:
+                failure = completion.fault, completion.for_good
+                kind, payload = FrameKind.FAILED, pickle.dumps(failure)
+        except Exception as error:
+            kind, payload = FrameKind.ERROR, pickle.dumps(ErrorText.of(error))
+        self._send(kind, completion.entry, payload)

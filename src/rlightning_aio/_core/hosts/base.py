@@ -1,0 +1,369 @@
+"""The seam between the core of a group and the places that run envs.
+
+A `Host` starts, accepts requests, and ends. It reports everything by completions, which it appends
+to the queue of its group (see `messages`). The other protocols are optional: a host with a
+descriptor is a `Source`, a host whose results don't wake the driver is `Polled`, a host that
+executes in the thread of the caller is `Executing`, one that can end single requests is `Aborting`,
+and a host whose envs join and leave has `Membership`. The core checks for these protocols, never
+for a class of hosts.
+Left out on purpose: waiting. Neither side ever waits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar, runtime_checkable
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from rlightning_aio._core.hosts.arena import Arena
+    from rlightning_aio._core.hosts.messages import AttachOrder, Completions, StartOrder
+    from rlightning_aio.config import EnvConfig
+    from rlightning_aio.protocol.exchange import Ring
+    from rlightning_aio.protocol.rings import TrainerBell
+    from rlightning_aio.types import EnvMeta
+
+__all__ = [
+    "Aborting",
+    "Executing",
+    "Host",
+    "HostFactory",
+    "Killable",
+    "Measured",
+    "Membership",
+    "Polled",
+    "SharesThread",
+    "Source",
+    "Watcher",
+    "Wiring",
+]
+
+T = TypeVar("T")
+
+
+class Source(Protocol):
+    """An object with a descriptor, which stays the same while it is watched."""
+
+    def fileno(self) -> int:
+        """The descriptor to watch; level-triggered."""
+        ...
+
+    def on_readable(self) -> None:
+        """Read without blocking, and append completions."""
+        ...
+
+    def on_writable(self) -> None:
+        """Write pending data without blocking."""
+        ...
+
+
+class Watcher(Protocol):
+    """The part of a driver that watches sources."""
+
+    def watch(self, source: Source) -> None:
+        """Call `source.on_readable` whenever its descriptor is readable."""
+        ...
+
+    def unwatch(self, source: Source) -> None:
+        """Forget `source`; call it before its descriptor is closed."""
+        ...
+
+    def watch_writable(self, source: Source, wanted: bool) -> None:
+        """Also call `source.on_writable` whenever its descriptor is writable."""
+        ...
+
+    def wake(self) -> None:
+        """Wake all waiters, as if a source had posted a completion."""
+        ...
+
+    def read(self) -> None:
+        """Read what sources have received, without waiting, if no event loop does so anyway."""
+        ...
+
+    def interruptible(self, execute: Callable[[], T]) -> T:
+        """Call a function that runs an env; Ctrl-C may interrupt it."""
+        ...
+
+    def check_interrupt(self) -> None:
+        """Raise a Ctrl-C that was held back; results that are not handed out yet are kept."""
+        ...
+
+
+class Host(Protocol):
+    """Envs in one place, with indices from 0.
+
+    Attributes:
+        host_id: its index among the hosts of the group.
+        first_slot: slot of the env of index 0; the other envs follow.
+        num_envs: the most envs it can have.
+    """
+
+    host_id: int
+    first_slot: int
+    num_envs: int
+
+    def start(self) -> None:
+        """Begin to build the envs; `Built` or `NotBuilt` follows, or `Died`.
+
+        Called again after `Died`, for a replacement.
+
+        Raises:
+            OSError: the system refuses to start one.
+        """
+        ...
+
+    def attach(self, order: AttachOrder) -> None:
+        """Give the envs their rows; `Attached` follows.
+
+        A replacement gets this order before its envs are built, with the same rows as before.
+        """
+        ...
+
+    def packed(self, arguments: Any) -> Any:
+        """Return `arguments` in the form that `submit` sends; later changes don't affect it.
+
+        Args:
+            arguments: out of band: (action, extras), (seed, options) or (name, args, kwargs).
+
+        Raises if they can't be sent. So callers pack all arguments before they send a request.
+        """
+        ...
+
+    def submit(self, entries: NDArray[np.int64], arguments: Sequence[Any] | None = None) -> None:
+        """Send requests.
+
+        Args:
+            entries: env, number and operation of each request (see `protocol.entries`).
+            arguments: packed, one for each: (action, extras) of a step, (seed, options) of a
+                reset, (name, args, kwargs) of a call. None: they are in the rows.
+
+        One completion follows for each: `Reported`, `Result`, `Value`, `Raised`, `Failed` or
+        `Withdrawn`, with the same entry; or the host's `Died` for all.
+        """
+        ...
+
+    def close(self) -> None:
+        """Close the envs after their current requests; `Closed` follows."""
+        ...
+
+    def release(self) -> None:
+        """Release descriptors and memory immediately; no completion follows. Idempotent."""
+        ...
+
+
+@runtime_checkable
+class Measured(Protocol):
+    """A host whose envs are in a process of this machine."""
+
+    def processor_times(self) -> tuple[int, int] | None:
+        """Return the ns for which its threads have run, and have waited for a core, or None."""
+        ...
+
+
+@runtime_checkable
+class Killable(Protocol):
+    """A host that can hang, and that can be killed."""
+
+    def executing(self) -> tuple[int, int]:
+        """Return the entry being executed and its start (monotonic ns); entry 0 if none.
+
+        The start is 0 while the worker waits for the trainer to read a reply.
+        """
+        ...
+
+    @property
+    def traffic(self) -> int:
+        """A number that changes whenever a part of a reply is read, or of a request is written."""
+        ...
+
+    def catch_up(self) -> bool:
+        """Read pending replies and write pending requests, without blocking.
+
+        Returns True if anything moved. Called before a host is killed, because the trainer may be
+        the one that is late.
+        """
+        ...
+
+    def kill(self, *, dump: bool) -> None:
+        """Kill it; `Died` follows. With `dump`, it writes its stacks first."""
+        ...
+
+    def destroy(self) -> None:
+        """Kill it and the process that it depends on, if `kill` had no effect.
+
+        `Died` follows, also for other hosts that depend on that process.
+        """
+        ...
+
+
+@runtime_checkable
+class Aborting(Protocol):
+    """A host that can end a request without harm to its other envs."""
+
+    def abort(self, entries: NDArray[np.int64]) -> None:
+        """End requests soon, without blocking, as far as that is possible.
+
+        Args:
+            entries: of requests, which may have ended already.
+
+        One completion follows for each, as for any request, when nothing of it goes on in its env;
+        nobody uses what it holds.
+        """
+        ...
+
+
+@runtime_checkable
+class Polled(Protocol):
+    """A host with results that don't wake the driver."""
+
+    def poll(self) -> None:
+        """Append completions of finished requests, without blocking."""
+        ...
+
+
+@runtime_checkable
+class SharesThread(Protocol):
+    """A host whose envs make progress only while the driver waits in its event loop."""
+
+    shares_thread: bool
+
+
+@runtime_checkable
+class Executing(Protocol):
+    """A host that executes requests in the thread of the caller."""
+
+    def execute_next(self) -> bool:
+        """Execute one waiting request; return False if there is none.
+
+        Its completion is in the queue after `poll`.
+        """
+        ...
+
+    def poll(self) -> None:
+        """Append completions, as of `Polled`."""
+        ...
+
+
+@runtime_checkable
+class Membership(Host, Protocol):
+    """A host whose envs join and leave (an env_server).
+
+    It also posts results that answer no request (`Joined`), and its results wake the driver.
+
+    Attributes:
+        server_id: the name of its envs in a batch.
+    """
+
+    server_id: str
+
+    def address(self) -> str:
+        """Return the address that clients connect to, as ``tcp://host:port``.
+
+        Raises:
+            RuntimeError: it does not listen yet.
+        """
+        ...
+
+    def members(self) -> Mapping[str, EnvMeta]:
+        """Return the envs that have joined, by the name of their client."""
+        ...
+
+    def member_indices(self) -> list[int]:
+        """Return the indices of the envs that have joined, in the order of their names."""
+        ...
+
+    def num_sub_envs(self, index: int) -> int:
+        """Return the number of sub-environments of an env that has joined."""
+        ...
+
+    def check_step(self, index: int, action: Any, extras: dict[str, Any]) -> None:
+        """Raise `BadAction` if an env can't get these; `NO_ACTION` means the action in the row."""
+        ...
+
+    def check_reset(self, index: int, seed: int | None, options: dict[str, Any]) -> None:
+        """Raise ValueError if an env can't get these."""
+        ...
+
+    def missing(self, waited: float) -> float | None:
+        """Return the seconds that a reset may wait for missing envs; None if none is missing.
+
+        Args:
+            waited: seconds that it has waited already.
+
+        Raises:
+            TimeoutError: it has waited longer than that.
+        """
+        ...
+
+    def poll(self) -> None:
+        """Append completions, as of `Polled`."""
+        ...
+
+    def is_readable(self) -> bool:
+        """Return True if `tick` would read anything."""
+        ...
+
+    def deadline(self) -> float | None:
+        """Return the latest time for the next `tick` (monotonic seconds); None if there is none."""
+        ...
+
+    def tick(self, now: float) -> None:
+        """Read what clients sent, and find clients that are gone. `now` is monotonic seconds."""
+        ...
+
+
+@dataclass(frozen=True)
+class Wiring:
+    """The parts of a group that its hosts use.
+
+    Attributes:
+        completions: the queue.
+        watcher: the driver.
+        arena: the shared memory.
+        bell, bell_offset: workers wake the trainer by it; its offset in the arena.
+        rings: by host, those of live workers.
+        num_hosts: of the group.
+        configs: all entries.
+        objection: returns the reason why an env that joins by itself is refused, or None.
+        is_idle: True if a slot has no request and no result to collect.
+        resources: shared by hosts of one kind, and made by the first of them; released by
+            `release(seconds)` after the hosts.
+        shares_thread: other tasks run in the trainer's thread while a procedure waits.
+    """
+
+    completions: Completions
+    watcher: Watcher
+    arena: Arena
+    bell: TrainerBell
+    bell_offset: int
+    rings: list[Ring | None]
+    num_hosts: int
+    configs: Sequence[EnvConfig]
+    objection: Callable[[EnvMeta], str | None]
+    is_idle: Callable[[int], bool]
+    resources: dict[object, Shared]
+    shares_thread: bool = False
+
+
+class Shared(Protocol):
+    """A resource that several hosts share."""
+
+    def release(self, seconds: float) -> None:
+        """End it; kill what is still running after `seconds`."""
+        ...
+
+    def disown(self) -> None:
+        """Drop it in a forked process; the parent continues to use it."""
+        ...
+
+
+class HostFactory(Protocol):
+    """Makes a host, as its class does."""
+
+    def __call__(
+        self, host_id: int, first_slot: int, order: StartOrder, wiring: Wiring
+    ) -> Host: ...

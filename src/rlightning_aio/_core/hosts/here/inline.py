@@ -1,0 +1,237 @@
+"""`InlineHost`: envs in the process of the trainer, with the same rows and rules.
+
+Requests wait in a queue, so sending never blocks; while a driver waits, it executes the next one
+(`group.poller`, `group.steps`). An env blocks the process while it steps, unless its own thread
+computes the step and an event loop waits for it (`_Threads`). An env that crashes ends the trainer.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
+
+import numpy as np
+
+from rlightning_aio._core.hosts.inbox import Inbox
+from rlightning_aio._core.hosts.messages import (
+    Built,
+    Closed,
+    ErrorText,
+    NotBuilt,
+    Raised,
+    Reported,
+    Result,
+    Value,
+    Withdrawn,
+)
+from rlightning_aio._core.hosts.running.build_env import built_envs
+from rlightning_aio._core.hosts.running.copied import copied
+from rlightning_aio._core.hosts.running.runner import attach_here, close_all
+from rlightning_aio.protocol.entries import Operation, answers_with_value, op_of, slot_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    from rlightning_aio._core.hosts.base import Watcher, Wiring
+    from rlightning_aio._core.hosts.messages import AttachOrder, EnvStarted, OutOfBand, StartOrder
+    from rlightning_aio._core.hosts.running.runner import EnvRunner
+
+__all__ = ["InlineHost"]
+
+_Waiting: TypeAlias = "tuple[int, Callable[[], Any]]"
+"""An entry, and the function that executes it."""
+_STEP: Final = int(Operation.STEP)
+
+
+class InlineHost:
+    """Runs envs in this process; see `base.Host`, `Aborting`, `Executing` and `Polled`."""
+
+    def __init__(self, host_id: int, first_slot: int, order: StartOrder, wiring: Wiring) -> None:
+        self.host_id = host_id
+        self.first_slot = first_slot
+        self.num_envs = len(order.worker_indices)
+        self._order = order
+        self._arena = wiring.arena
+        self._post = wiring.completions.append
+        self._runners: list[EnvRunner] = []
+        self._queue: deque[_Waiting] = deque()
+        # Entries of results in rows that were not reported yet.
+        self._done: list[int] = []
+        self._watcher = wiring.watcher
+        self._shares_thread = wiring.shares_thread
+        self._threads: _Threads | None = None
+
+    def start(self) -> None:
+        """Build the envs immediately."""
+        try:
+            started = self._watcher.interruptible(self._built)
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
+            index = min(len(self._runners), self.num_envs - 1)
+            self._post(NotBuilt(self.host_id, index, ErrorText.of(error)))
+            return
+        if self._shares_thread:
+            self._threads = _Threads(self._runners, self._queue, self._watcher)
+        self._post(Built(self.host_id, started))
+
+    def _built(self) -> list[EnvStarted]:
+        for runner in built_envs(self._order, inline=True):
+            self._runners.append(runner)
+        return [runner.started() for runner in self._runners]
+
+    def attach(self, order: AttachOrder) -> None:
+        attach_here(self._runners, order, self._arena, self.host_id, self._post)
+
+    def packed(self, arguments: Any) -> Any:
+        return copied(arguments)
+
+    def submit(self, entries: NDArray[np.int64], arguments: Sequence[Any] | None = None) -> None:
+        asked = cast("list[int]", entries.tolist())
+        for position, entry in enumerate(asked):
+            index = slot_of(entry) - self.first_slot
+            runner = self._runners[index]
+            if arguments is not None:
+                execute = partial(runner.execute, op_of(entry), arguments[position])
+            elif op_of(entry) != _STEP:
+                execute = runner.reset_from_row
+            elif runner.begin_step is None or runner.env.steps_briefly:
+                execute = runner.step
+            else:
+                try:
+                    execute = runner.begin_step()
+                except BaseException as error:
+                    # Raised later: the other requests of this batch must be sent first.
+                    execute = partial(_reraise, error)
+                else:
+                    if self._threads is not None and index in self._threads.indices:
+                        self._threads.unfinished[index] = entry, execute
+                        continue
+            self._queue.append((entry, execute))
+
+    def abort(self, entries: NDArray[np.int64]) -> None:
+        """See `base.Aborting`. Steps that simulators have begun by themselves are executed."""
+        aborted = set(cast("list[int]", entries.tolist()))
+        for waiting in list(self._queue):
+            entry = waiting[0]
+            runner = self._runners[slot_of(entry) - self.first_slot]
+            if entry in aborted and runner.begin_step is None:
+                self._queue.remove(waiting)
+                self._post(Withdrawn(self.host_id, entry))
+
+    def execute_next(self) -> bool:
+        if not self._queue:
+            return False
+        entry, execute = self._queue.popleft()
+        try:
+            outcome = self._watcher.interruptible(execute)
+        except BaseException as error:
+            self._raised(entry, error)
+            return True
+        if outcome is None and not answers_with_value(op_of(entry)):
+            self._done.append(entry)
+            return True
+        self.poll()
+        if answers_with_value(op_of(entry)):
+            self._post(Value(self.host_id, entry, outcome))
+        else:
+            self._post(Result(self.host_id, entry, outcome or {}))
+        return True
+
+    def _raised(self, entry: int, error: BaseException) -> None:
+        self.poll()  # Earlier results come first.
+        self._post(Raised(self.host_id, entry, ErrorText.of(error)))
+        if isinstance(error, KeyboardInterrupt):
+            raise error  # It is meant for the program, but the request ends, too.
+
+    def poll(self) -> None:
+        if self._done:
+            self._post(Reported(self.host_id, np.array(self._done, np.int64)))
+            self._done.clear()
+
+    def step_now(self) -> OutOfBand | None:
+        """Step env 0 with the action in its row; the queue must have no request to it."""
+        return self._watcher.interruptible(self._runners[0].step)
+
+    def step_next(self) -> tuple[int, OutOfBand | None] | None:
+        """Execute the next request if it is a step or a reset, without a completion.
+
+        Returns its entry, and what of the result is out of band. None if there is no such request,
+        or after an error, which is posted.
+        """
+        if not self._queue or self._done or answers_with_value(op_of(self._queue[0][0])):
+            return None
+        entry, execute = self._queue.popleft()
+        try:
+            return entry, self._watcher.interruptible(execute)
+        except BaseException as error:
+            self._raised(entry, error)
+            return None
+
+    def close(self) -> None:
+        """Close the envs immediately."""
+        errors = close_all(self._runners)
+        self.release()
+        self._post(Closed(self.host_id, errors))
+
+    def release(self) -> None:
+        """Drop the envs and their requests."""
+        self._runners.clear()
+        self._queue.clear()
+        if self._threads is not None:
+            self._threads.close()
+            self._threads = None
+
+
+class _Threads:
+    """Steps that envs compute in their own threads; see `base.Source`.
+
+    Such a step joins the queue when the thread is done, so executing the rest of it doesn't wait.
+
+    Args:
+        runners: of the host's envs.
+        queue: of the host.
+        watcher: the driver.
+
+    Attributes:
+        indices: of the envs that report the end of a step.
+        unfinished: running steps, by the index of their env.
+    """
+
+    def __init__(
+        self, runners: Sequence[EnvRunner], queue: deque[_Waiting], watcher: Watcher
+    ) -> None:
+        self.unfinished: dict[int, _Waiting] = {}
+        self._queue, self._watcher = queue, watcher
+        self._inbox = inbox = Inbox()
+        self.indices = {
+            index
+            for index, runner in enumerate(runners)
+            if runner.env.on_stepped(partial(inbox.put, partial(self._ended, index)))
+        }
+        watcher.watch(self)
+
+    def _ended(self, index: int) -> None:
+        self._queue.append(self.unfinished.pop(index))
+
+    def fileno(self) -> int:
+        return self._inbox.descriptor
+
+    def on_readable(self) -> None:
+        for task in self._inbox.take():
+            task()
+
+    def on_writable(self) -> None:
+        """Do nothing: it has nothing to write."""
+
+    def close(self) -> None:
+        """Forget running steps."""
+        self._watcher.unwatch(self)
+        self._inbox.close()
+
+
+def _reraise(error: BaseException) -> OutOfBand | None:
+    raise error

@@ -1,0 +1,478 @@
+"""The fork server: a small process that forks workers and reports their exit.
+
+One runs for each combination of interpreter and environment variables. It has imported the modules
+of the simulator, so a worker starts in milliseconds. It keeps the last lines that each worker wrote
+to stderr. When the trainer closes its end of the socket or dies, all workers are killed.
+Rule: it has one thread when it forks. It builds no env.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import faulthandler
+import fcntl
+import gc
+import importlib
+import os
+import select
+import signal
+import socket
+import sys
+import termios
+import threading
+import time
+import traceback
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+from rlightning_aio._core.hosts.process.fork_messages import (
+    Exited,
+    Fork,
+    Forked,
+    Kill,
+    MessageSocket,
+    NotForked,
+    Preload,
+    Ready,
+)
+from rlightning_aio._core.hosts.standard_streams import occupy_standard_streams
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import FrameType
+
+    from rlightning_aio._core.hosts.process.fork_messages import Message
+
+__all__ = ["BOOTSTRAP", "DUMP_SIGNAL", "die_with_parent", "main"]
+
+BOOTSTRAP: Final = """
+import os, sys
+def fail(text):
+    os.write(int(sys.argv[2]), b"!" + text[-60000:].encode("utf-8", "replace"))
+    os._exit(1)
+if sys.path[0] == "":
+    del sys.path[0]
+if sys.version_info < (3, 11):
+    fail("its interpreter %s is Python %s, and workers need Python 3.11 or later"
+         % (sys.executable, ".".join(map(str, sys.version_info[:3]))))
+try:
+    import importlib.util as u
+    s = u.spec_from_file_location(
+        "rlightning_aio", sys.argv[1] + "/__init__.py", submodule_search_locations=[sys.argv[1]])
+    m = sys.modules["rlightning_aio"] = u.module_from_spec(s)
+    s.loader.exec_module(m)
+    from rlightning_aio._core.hosts.process.fork_server import main
+except BaseException:
+    import traceback
+    fail(traceback.format_exc())
+main(int(sys.argv[2]), int(sys.argv[3]))
+"""
+"""Runs `main` of this package, even if the interpreter has another version of it installed.
+
+If that fails, the only packet is `FAILED` and the reason.
+"""
+
+DUMP_SIGNAL: Final = signal.SIGRTMIN + 7
+_TAIL_BYTES: Final = 8192
+_CHUNK_BYTES: Final = 1 << 16
+_GRACE_SECONDS: Final = 1.2
+"""Time for workers to notice that the trainer is gone, and to stop a robot."""
+_DUMP_SECONDS: Final = 0.3
+_ERROR_CHARACTERS: Final = 60_000
+_OUTLET_BYTES: Final = 1 << 20
+_READ_SECONDS: Final = 0.2
+"""If the reader of stderr reads nothing for this long, it is considered gone."""
+_STDERR: Final = 2
+
+
+@dataclass
+class _Child:
+    """A worker. Its end of the channel stays open here until its exit is handled, so that it can be
+    shut down when the trainer is gone.
+    """
+
+    host_id: int
+    pid: int
+    stderr: int
+    channel: int
+    tail: bytearray = field(default_factory=bytearray)
+    kill_at: float | None = None
+    silent: bool = False
+
+
+class _Outlet:
+    """Forwards the stderr of workers, and never blocks.
+
+    The stderr of the trainer may be a pipe without a reader. Then output waits here, and when
+    there is too much of it, in the pipes of the workers.
+    """
+
+    def __init__(self, poll: select.poll) -> None:
+        self._poll = poll
+        self._waiting = bytearray()
+
+    @property
+    def full(self) -> bool:
+        return len(self._waiting) > _OUTLET_BYTES
+
+    def write(self, data: bytes) -> None:
+        self._waiting += data
+        self.flush()
+
+    def empty(self, until: float) -> None:
+        """Write the rest while the reader reads."""
+        reader = select.poll()
+        reader.register(_STDERR, select.POLLOUT)
+        while self._waiting and time.monotonic() < until and reader.poll(_READ_SECONDS * 1000):
+            self.flush()
+
+    def flush(self) -> None:
+        """Write without blocking; poll for more room if necessary."""
+        probe = select.poll()
+        probe.register(_STDERR, select.POLLOUT)
+        while self._waiting:
+            events = probe.poll(0)
+            if not events:
+                self._poll.register(_STDERR, select.POLLOUT)
+                return
+            try:
+                # A pipe that is writable takes this much without blocking.
+                del self._waiting[: os.write(_STDERR, self._waiting[: select.PIPE_BUF])]
+            except OSError:
+                self._waiting.clear()  # The reader is gone.
+        with contextlib.suppress(KeyError):
+            self._poll.unregister(_STDERR)
+
+
+def die_with_parent() -> None:
+    """Make the kernel kill this process when its parent dies (Linux)."""
+    with contextlib.suppress(OSError, AttributeError):
+        pr_set_pdeathsig = 1
+        ctypes.CDLL(None, use_errno=True).prctl(pr_set_pdeathsig, signal.SIGKILL)
+
+
+def _on_child(signal_number: int, frame: FrameType | None) -> None:
+    """Do nothing: a signal with a handler reaches the wake-up descriptor."""
+
+
+class _ForkServer:
+    """Forks workers and handles their exits.
+
+    Args:
+        trainer: the socket.
+        trainer_process: a descriptor of the process (-1 if unknown).
+    """
+
+    def __init__(self, trainer: MessageSocket, trainer_process: int) -> None:
+        self._trainer = trainer
+        self._trainer_process = trainer_process
+        self._children: dict[int, _Child] = {}
+        self._poll = select.poll()
+        if trainer_process >= 0:
+            self._poll.register(trainer_process, select.POLLIN)
+        self._outlet = _Outlet(self._poll)
+        # A byte arrives here whenever a child exits.
+        self._wakeup, wakeup = socket.socketpair()
+        self._wakeup.setblocking(False)
+        wakeup.setblocking(False)
+        self._wakeup_writer = wakeup
+        signal.set_wakeup_fd(wakeup.fileno(), warn_on_full_buffer=False)
+        signal.signal(signal.SIGCHLD, _on_child)
+        self._poll.register(self._wakeup, select.POLLIN)
+
+    def serve(self) -> None:
+        """Serve until the trainer is gone; then end all workers."""
+        while self._step(self._next_kill()):
+            pass
+        self._end_all()
+
+    def _next_kill(self) -> float | None:
+        times = [child.kill_at for child in self._children.values() if child.kill_at is not None]
+        return min(times) if times else None
+
+    def _step(self, until: float | None) -> bool:
+        timeout = None if until is None else max(0.0, until - time.monotonic()) * 1000
+        events = select.POLLIN | select.POLLOUT if self._trainer.waiting else select.POLLIN
+        self._poll.register(self._trainer, events)
+        for descriptor, _ in self._poll.poll(timeout):
+            if descriptor == self._trainer_process:
+                return False
+            if descriptor == self._trainer.fileno():
+                self._trainer.flush()
+                if not self._obey():
+                    return False
+            else:
+                self._attend(descriptor)
+        self._kill_due()
+        self._handle_exits()
+        return True
+
+    def _attend(self, descriptor: int) -> None:
+        if descriptor == self._wakeup.fileno():
+            with contextlib.suppress(BlockingIOError):
+                self._wakeup.recv(4096)
+        elif descriptor == _STDERR:
+            self._outlet.flush()
+            self._choose_readable()
+        else:
+            self._forward(descriptor)
+
+    def _obey(self) -> bool:
+        try:
+            received = self._trainer.receive()
+        except EOFError:
+            return False
+        if received is None:
+            return True
+        if isinstance(received.message, Fork):
+            self._fork(received.message, received.descriptors)
+        elif isinstance(received.message, Kill):
+            self._kill(received.message)
+        return True
+
+    def _fork(self, order: Fork, descriptors: list[int]) -> None:
+        pipe: list[int] = []
+        parent = os.getpid()
+        try:
+            if len(descriptors) < 2:
+                raise OSError("its descriptors didn't arrive: too many are open")
+            pipe += os.pipe()
+            pid = os.fork()
+        except OSError as error:
+            for descriptor in (*pipe, *descriptors):
+                os.close(descriptor)
+            self._trainer.send(NotForked(order.place.host_id, str(error)))
+            return
+        reader, writer = pipe
+        channel, arena = descriptors
+        if pid == 0:
+            _run_worker(self._become_worker, parent, writer, order, channel, arena)
+        os.close(writer)
+        os.close(arena)
+        os.set_blocking(reader, False)
+        self._children[pid] = _Child(order.place.host_id, pid, reader, channel)
+        self._choose_readable()
+        self._trainer.send(Forked(order.place.host_id, pid))
+
+    def _become_worker(self) -> None:
+        """Release in the child what belongs to the fork server."""
+        signal.set_wakeup_fd(-1)
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        for child in self._children.values():
+            os.close(child.stderr)
+            os.close(child.channel)
+        if self._trainer_process >= 0:
+            os.close(self._trainer_process)
+        for end in (self._trainer, self._wakeup, self._wakeup_writer):
+            end.close()
+
+    def _kill(self, order: Kill) -> None:
+        for child in self._children.values():
+            if child.host_id == order.host_id:
+                if order.dump:
+                    os.kill(child.pid, DUMP_SIGNAL)
+                child.kill_at = time.monotonic() + (_DUMP_SECONDS if order.dump else 0.0)
+        self._choose_readable()
+
+    def _kill_due(self) -> None:
+        now = time.monotonic()
+        for child in self._children.values():
+            if child.kill_at is not None and child.kill_at <= now:
+                os.kill(child.pid, signal.SIGKILL)
+                child.kill_at = None
+
+    def _choose_readable(self) -> None:
+        """Read from all workers; if too much output waits, only from those about to be killed."""
+        for child in self._children.values():
+            readable = not child.silent and (not self._outlet.full or child.kill_at is not None)
+            if readable:
+                self._poll.register(child.stderr, select.POLLIN)
+            else:
+                with contextlib.suppress(KeyError):
+                    self._poll.unregister(child.stderr)
+
+    def _forward(self, descriptor: int) -> None:
+        """Forward the stderr of a worker, and keep the end of it."""
+        for child in self._children.values():
+            if child.stderr == descriptor:
+                self._drain(child)
+
+    def _drain(self, child: _Child, most: int = _CHUNK_BYTES) -> None:
+        try:
+            data = os.read(child.stderr, most)
+        except BlockingIOError:
+            return
+        if not data:
+            child.silent = True
+            self._choose_readable()
+            return
+        child.tail += data
+        del child.tail[:-_TAIL_BYTES]
+        was_full = self._outlet.full
+        self._outlet.write(data)
+        if self._outlet.full != was_full:
+            self._choose_readable()
+
+    def _handle_exits(self) -> None:
+        """Report the workers that exited."""
+        for pid in list(self._children):
+            ended, status = os.waitpid(pid, os.WNOHANG)
+            if not ended:
+                continue
+            child = self._children.pop(pid)
+            # Only what is in the pipe now: a process that it started may continue to write.
+            if unread := _unread(child.stderr):
+                self._drain(child, unread)
+            with contextlib.suppress(KeyError):
+                self._poll.unregister(child.stderr)
+            os.close(child.stderr)
+            tail = bytes(child.tail).decode(errors="replace")
+            self._trainer.send(Exited(child.host_id, os.waitstatus_to_exitcode(status), tail))
+            os.close(child.channel)
+
+    def _end_all(self) -> None:
+        """Close the channels of all workers, then kill those that still run."""
+        self._poll.unregister(self._trainer)
+        self._trainer.close()
+        if self._trainer_process >= 0:
+            self._poll.unregister(self._trainer_process)
+        for child in self._children.values():
+            # A process that the trainer forked may still have the other end open.
+            with (
+                socket.socket(fileno=os.dup(child.channel)) as channel,
+                contextlib.suppress(OSError),
+            ):
+                channel.shutdown(socket.SHUT_RDWR)
+        until = time.monotonic() + _GRACE_SECONDS
+        while self._children and time.monotonic() < until:
+            self._wait_for_children(until)
+        for pid in self._children:
+            os.kill(pid, signal.SIGKILL)
+        self._outlet.empty(until)
+
+    def _wait_for_children(self, until: float) -> None:
+        for descriptor, _ in self._poll.poll(max(0.0, until - time.monotonic()) * 1000):
+            self._attend(descriptor)
+        self._handle_exits()
+
+
+def _unread(pipe: int) -> int:
+    """Return the number of unread bytes."""
+    return int.from_bytes(fcntl.ioctl(pipe, termios.FIONREAD, bytes(4)), sys.byteorder)
+
+
+def _run_worker(
+    leave: Callable[[], None], parent: int, stderr: int, order: Fork, channel: int, arena: int
+) -> None:
+    """Run a worker in a forked child; never returns."""
+    code = 1
+    try:
+        # Standard output too: a program may read that of the trainer.
+        os.dup2(stderr, 1)
+        os.dup2(stderr, 2)
+        os.close(stderr)
+        leave()
+        die_with_parent()
+        if os.getppid() != parent:
+            os._exit(1)
+        faulthandler.enable(all_threads=True)
+        faulthandler.register(DUMP_SIGNAL, all_threads=True)
+        # Not at the top: the fork server sends messages before imports that may fail.
+        from rlightning_aio._core.hosts.process import worker  # noqa: PLC0415
+
+        trainer = socket.socket(fileno=channel)
+        worker.main(trainer, arena, order.place)
+        code = 0
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        with contextlib.suppress(Exception):
+            sys.stdout.flush()
+            sys.stderr.flush()
+        os._exit(code)
+
+
+def _watch_trainer(trainer: MessageSocket, process: int, finished: socket.socket) -> None:
+    """Exit if the trainer dies while modules are still being imported."""
+    poll = select.poll()
+    poll.register(trainer, select.POLLRDHUP)
+    poll.register(finished, select.POLLIN)
+    if process >= 0:
+        poll.register(process, select.POLLIN)
+    for descriptor, _ in poll.poll():
+        if descriptor != finished.fileno():
+            os._exit(0)
+
+
+def _import(trainer: MessageSocket, process: int, modules: tuple[str, ...]) -> str | None:
+    """Import the modules of workers; return an error of ours. Envs report those of simulators."""
+    finish, finished = socket.socketpair()
+    watcher = threading.Thread(
+        target=_watch_trainer, args=(trainer, process, finished), daemon=True
+    )
+    watcher.start()
+    error = None
+    try:
+        importlib.import_module("rlightning_aio._core.hosts.process.worker")
+        # Each worker gets the config of its entry, and would import this itself.
+        importlib.import_module("rlightning_aio.config")
+        for module in modules:
+            with contextlib.suppress(Exception):
+                importlib.import_module(module)
+    except Exception:
+        error = traceback.format_exc()[-_ERROR_CHARACTERS:]
+    finish.close()
+    watcher.join()
+    finished.close()
+    return error
+
+
+def _process_of(pid: int) -> int:
+    """Return a descriptor that is readable once process `pid` is dead; -1 if not supported.
+
+    The socket is not enough: if the trainer forked, its child has it open, too.
+    """
+    try:
+        return os.pidfd_open(pid)
+    except ProcessLookupError:
+        os._exit(0)
+    except (AttributeError, OSError):
+        return -1
+
+
+def _first_message(trainer: MessageSocket) -> Message:
+    poll = select.poll()
+    poll.register(trainer, select.POLLIN)
+    while True:
+        poll.poll()
+        received = trainer.receive()
+        if received is not None:
+            return received.message
+
+
+def main(descriptor: int, trainer_pid: int) -> None:
+    """Serve the trainer at the other end of socket `descriptor`; never returns."""
+    # The mask is inherited from the thread of the trainer. Blocked signals would not report exits,
+    # write stacks, or end workers.
+    signal.pthread_sigmask(signal.SIG_SETMASK, ())
+    occupy_standard_streams()
+    trainer = MessageSocket(socket.socket(fileno=descriptor))
+    process = _process_of(trainer_pid)
+    try:
+        preload = _first_message(trainer)
+    except EOFError:
+        os._exit(0)
+    assert isinstance(preload, Preload)
+    if preload.path is not None:
+        sys.path[:] = preload.path
+    # Garbage collection takes a tenth of the import time, finds hardly anything, and would write
+    # to memory that workers share with this process.
+    gc.disable()
+    error = _import(trainer, process, preload.modules)
+    gc.freeze()
+    gc.enable()
+    trainer.send(Ready(error))
+    if error is None:
+        _ForkServer(trainer, process).serve()
+    os._exit(0)

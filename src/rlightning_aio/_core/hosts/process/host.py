@@ -1,0 +1,428 @@
+"""`ProcessHost`: the life of a worker process; `ForkServer`: the trainer's handle on its parent.
+
+A worker is watched through its channel (see `link`) and by the fork server, which is its parent, so
+no death goes unnoticed.
+Left out on purpose: decisions about a death, which the supervisor makes.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from rlightning_aio._core.hosts.arena import map_shared
+from rlightning_aio._core.hosts.messages import Closed, Death, Died, ErrorText, WorkerPlace
+from rlightning_aio._core.hosts.process.fork_messages import (
+    Exited,
+    Fork,
+    Forked,
+    Kill,
+    MessageSocket,
+    NotForked,
+    Preload,
+    Ready,
+)
+from rlightning_aio._core.hosts.process.fork_server import BOOTSTRAP
+from rlightning_aio._core.hosts.process.link import Link
+from rlightning_aio._core.hosts.process.processor_times import processor_times
+from rlightning_aio._core.hosts.standard_streams import occupy_standard_streams
+from rlightning_aio.protocol.entries import number_of, slot_of
+from rlightning_aio.protocol.frames import FrameKind
+from rlightning_aio.protocol.pickling import dumped, dumped_with_code
+from rlightning_aio.protocol.rings import rings_size
+from rlightning_aio.registry import ENVS
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from rlightning_aio._core.hosts.arena import Arena
+    from rlightning_aio._core.hosts.base import Watcher, Wiring
+    from rlightning_aio._core.hosts.messages import AttachOrder, StartOrder
+    from rlightning_aio._core.hosts.process.fork_messages import Message
+    from rlightning_aio.config import EnvConfig
+
+__all__ = ["ForkServer", "ProcessHost", "ending"]
+
+_STDERR: Final = 2
+_ONE_THREAD = dict.fromkeys(
+    (
+        "OMP_NUM_THREADS",
+        "OPENBLAS_NUM_THREADS",
+        "MKL_NUM_THREADS",
+        "NUMEXPR_NUM_THREADS",
+        "VECLIB_MAXIMUM_THREADS",
+    ),
+    "1",
+)
+
+
+class ForkServer:
+    """The trainer's handle on one fork server.
+
+    Args:
+        interpreter: its Python.
+        env_vars: added to the environment of the trainer.
+        preload: modules to import before the first fork.
+        watcher: the driver.
+    """
+
+    @classmethod
+    def shared(cls, config: EnvConfig, wiring: Wiring) -> ForkServer:
+        """Return the fork server of the group for the interpreter and env_vars of an entry."""
+        key = (cls, *_surroundings(config))
+        fork_server = wiring.resources.get(key)
+        if fork_server is None:
+            preload: dict[str, None] = {}
+            for other in wiring.configs:
+                backend = ENVS.described(other.backend)
+                if _surroundings(other) == _surroundings(config) and backend is not None:
+                    preload.update(dict.fromkeys(backend.preload))
+            env_vars = dict(config.env_vars)
+            fork_server = cls(config.interpreter, env_vars, tuple(preload), wiring.watcher)
+            wiring.resources[key] = fork_server
+        assert isinstance(fork_server, ForkServer)
+        return fork_server
+
+    def __init__(
+        self,
+        interpreter: str | None,
+        env_vars: dict[str, str],
+        preload: tuple[str, ...],
+        watcher: Watcher,
+    ) -> None:
+        self._interpreter = interpreter
+        self._env_vars = env_vars
+        self._preload = preload
+        self._watcher = watcher
+        self._hosts: dict[int, ProcessHost] = {}
+        self._messages: MessageSocket | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+        self._ready = False
+        # The reason of its exit, if that says more than the exit code.
+        self._failure: str | None = None
+
+    def fileno(self) -> int:
+        """Return the descriptor of the socket to the fork server."""
+        assert self._messages is not None
+        return self._messages.fileno()
+
+    def fork(self, host: ProcessHost, channel: socket.socket, arena: Arena, order: Fork) -> None:
+        """Start a worker for `host`, and first the fork server if it isn't running.
+
+        Args:
+            host: of the worker.
+            channel: the worker's end, which is closed here.
+            arena: of the group.
+            order: for the fork server.
+        """
+        messages = self._messages or self._launch()
+        self._hosts[order.place.host_id] = host
+        messages.send(order, channel, (arena.descriptor,))
+        self._watcher.watch_writable(self, messages.waiting)
+
+    def on_writable(self) -> None:
+        """Send waiting messages; a fork server reads nothing while it imports modules."""
+        if self._messages is not None:
+            self._messages.flush()
+            self._watcher.watch_writable(self, self._messages.waiting)
+
+    def kill(self, host: ProcessHost, *, dump: bool) -> None:
+        """Kill the worker of `host`, if it still runs."""
+        if not self._ready and self._process is not None:
+            self._failure = f"it was killed while it was importing {self._imports}"
+            self._process.kill()  # It hangs in an import and reads no messages.
+        elif self._messages is not None:
+            self._messages.send(Kill(host.host_id, dump))
+            self._watcher.watch_writable(self, self._messages.waiting)
+
+    def destroy(self) -> None:
+        """Kill the fork server itself; the kernel then kills its workers."""
+        if self._process is not None:
+            self._failure = "it didn't react to any request, and was killed"
+            self._process.kill()
+
+    @property
+    def _imports(self) -> str:
+        return ", ".join(self._preload) or "its modules"
+
+    def _launch(self) -> MessageSocket:
+        self._ready = False
+        self._failure = None
+        package = str(Path(__file__).parents[3])
+        command = [self._interpreter or sys.executable, "-c", BOOTSTRAP, package]
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        try:
+            self._process = subprocess.Popen(
+                [*command, str(theirs.fileno()), str(os.getpid())],
+                pass_fds=[theirs.fileno()],
+                env={**os.environ, **_ONE_THREAD, **self._env_vars},
+                stdin=subprocess.DEVNULL,
+                # Only the trainer should react to Ctrl-C in the terminal.
+                start_new_session=True,
+            )
+        except BaseException:
+            ours.close()
+            raise
+        finally:
+            theirs.close()
+        messages = self._messages = MessageSocket(ours)
+        try:
+            self._watcher.watch(self)
+        except BaseException:
+            self._end(0.0)
+            raise
+        path = None if self._interpreter else list(sys.path)
+        messages.send(Preload(path, self._preload))
+        return messages
+
+    def on_readable(self) -> None:
+        """Read messages of the fork server, and pass them to the hosts of its workers."""
+        try:
+            while self._messages is not None and (received := self._messages.receive()) is not None:
+                self._handle(received.message)
+        except EOFError:
+            self._lost()
+
+    def _handle(self, message: Message) -> None:
+        if isinstance(message, Ready):
+            self._ready = message.error is None
+            self._failure = message.error
+        elif isinstance(message, Forked):
+            self._hosts[message.host_id].pid = message.pid
+        elif isinstance(message, Exited):
+            host = self._hosts.pop(message.host_id)
+            host.on_exit(message.exit_code, message.stderr_tail)
+        elif isinstance(message, NotForked):
+            self._hosts.pop(message.host_id).on_refused(message.why)
+
+    def _lost(self) -> None:
+        """Handle the exit of the fork server; the kernel killed its workers."""
+        hosts = list(self._hosts.values())
+        self._hosts.clear()
+        exit_code = self._end(0.0)
+        why = self._failure
+        if why is None:
+            why = f"it {ending(exit_code)}"
+            if not self._ready:
+                why += f" while it was importing {self._imports}"
+            if not self._ready and self._interpreter:
+                why += f"; is {self._interpreter} a Python with the packages that workers need?"
+        for host in hosts:
+            host.on_fork_server_lost(why.rstrip())
+
+    def release(self, seconds: float) -> None:
+        """End the fork server, which ends its workers within `seconds`."""
+        self._end(seconds)
+
+    def disown(self) -> None:
+        if self._messages is not None:
+            self._messages.close()
+            self._messages = None
+        if self._process is not None:
+            self._process.returncode = 0  # The child of another process, so no warning is due.
+            self._process = None
+
+    def _end(self, seconds: float) -> int:
+        """End it, as `release` does; return its exit code, or 0 if it wasn't running."""
+        if self._messages is not None:
+            self._watcher.unwatch(self)
+            self._messages.close()
+            self._messages = None
+        process, self._process = self._process, None
+        if process is None:
+            return 0
+        try:
+            return process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            process.kill()  # The kernel then kills its workers.
+            return process.wait()
+
+
+def _surroundings(config: EnvConfig) -> tuple[object, ...]:
+    return config.interpreter, tuple(sorted(config.env_vars.items()))
+
+
+class ProcessHost:
+    """The trainer's handle on one worker process; see `base.Host`, `Killable` and `Polled`."""
+
+    def __init__(self, host_id: int, first_slot: int, order: StartOrder, wiring: Wiring) -> None:
+        self.host_id = host_id
+        self.first_slot = first_slot
+        self.num_envs = len(order.worker_indices)
+        self.pid: int | None = None
+        self._start_payload = dumped_with_code(order)
+        self._fork_server = ForkServer.shared(order.config, wiring)
+        self._wiring = wiring
+        self._place = WorkerPlace(
+            host_id,
+            wiring.num_hosts,
+            first_slot,
+            self.num_envs,
+            wiring.bell_offset,
+            wiring.arena.append(rings_size(self.num_envs)),
+        )
+        self._rings: memoryview | None = None
+        self._link: Link | None = None
+        self._alive = False
+        self._closing = False
+        self._killed = ""
+
+    # -- life ---------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Fork a worker (a new one, after a death) and send it the order to build its envs."""
+        self._closing = False
+        self._killed = ""
+        ours, theirs = _new_channel()
+        try:
+            ours.setblocking(False)
+            if self._rings is None:
+                size = rings_size(self.num_envs)
+                self._rings = map_shared(
+                    self._wiring.arena.descriptor, self._place.rings_offset, size
+                )
+            self._link = Link(self._place, self._rings, self._wiring, ours)
+            self._fork_server.fork(self, theirs, self._wiring.arena, Fork(self._place))
+        except BaseException:
+            # The supervisor may try again, when there are descriptors.
+            self.release()
+            ours.close()
+            theirs.close()
+            raise
+        self._alive = True
+        self._link.send(FrameKind.START, payload=self._start_payload)
+
+    def attach(self, order: AttachOrder) -> None:
+        if self._link is not None:
+            self._link.send(FrameKind.ATTACH, payload=pickle.dumps(order))
+
+    def kill(self, *, dump: bool) -> None:
+        self._killed = "did not close in time and was killed" if self._closing else ""
+        self._fork_server.kill(self, dump=dump)
+
+    def destroy(self) -> None:
+        self._fork_server.destroy()
+
+    def close(self) -> None:
+        self._closing = True
+        if self._alive and self._link is not None:
+            self._link.send(FrameKind.CLOSE)
+        else:
+            self._wiring.completions.append(Closed(self.host_id, []))
+
+    def release(self) -> None:
+        self._hang_up()
+        self._rings = None
+
+    def _hang_up(self) -> None:
+        self._alive = False
+        if self._link is not None:
+            self._link.hang_up()
+            self._link = None
+
+    def on_exit(self, exit_code: int, stderr_tail: str) -> None:
+        """Handle the exit of the worker; read its pending output first."""
+        if self._link is not None:
+            self._link.on_readable()
+        by_us = self._killed and exit_code == -signal.SIGKILL
+        self._ended(self._killed if by_us else ending(exit_code), exit_code, stderr_tail)
+
+    def on_refused(self, why: str) -> None:
+        """Handle that the worker could not be forked."""
+        self._ended(f"could not be forked: {why}", None, "", refused=True)
+
+    def on_fork_server_lost(self, why: str) -> None:
+        """Handle the exit of the fork server, which ended the worker, too."""
+        self._ended(f"ended with its fork server: {why}", None, "")
+
+    def _ended(
+        self, cause: str, exit_code: int | None, stderr_tail: str, *, refused: bool = False
+    ) -> None:
+        link, post = self._link, self._wiring.completions.append
+        if link is None:
+            return
+        link.poll()
+        requests = link.last_requests()
+        self._hang_up()
+        self.pid = None
+        if not self._closing:
+            post(Died(self.host_id, Death(cause, exit_code, stderr_tail, requests, refused)))
+            return
+        errors = link.close_errors
+        if errors is None:
+            # Before that env it has closed all others, unless it was in a request.
+            is_closing = requests[0] and not number_of(requests[0])
+            first = slot_of(requests[0]) - self.first_slot if is_closing else 0
+            text = ErrorText("WorkerDied", f"its worker {cause}", stderr_tail)
+            errors = [(index, text) for index in range(first, self.num_envs)]
+        post(Closed(self.host_id, errors))
+
+    # -- requests and replies -----------------------------------------------------
+
+    def packed(self, arguments: Any) -> bytes:
+        return dumped(arguments, "it")
+
+    def submit(self, entries: NDArray[np.int64], arguments: Sequence[bytes] | None = None) -> None:
+        if self._link is not None:
+            self._link.submit(entries, arguments)
+
+    def abort(self, entries: NDArray[np.int64]) -> None:
+        """See `base.Aborting`. A worker only reads this between requests, if its envs block."""
+        if self._link is not None:
+            for entry in entries.tolist():
+                self._link.send(FrameKind.ABORT, entry)
+
+    def poll(self) -> None:
+        if self._link is not None:
+            self._link.poll()
+
+    def executing(self) -> tuple[int, int]:
+        return (0, 0) if self._link is None else self._link.executing()
+
+    def processor_times(self) -> tuple[int, int] | None:
+        return None if self.pid is None else processor_times(self.pid)
+
+    @property
+    def traffic(self) -> int:
+        return 0 if self._link is None else self._link.traffic
+
+    def catch_up(self) -> bool:
+        posted, traffic = len(self._wiring.completions), self.traffic
+        self._fork_server.on_readable()
+        if self._link is not None:
+            self._link.catch_up()
+        return (len(self._wiring.completions), self.traffic) != (posted, traffic)
+
+
+def _new_channel() -> tuple[socket.socket, socket.socket]:
+    """Make a pair of sockets, neither of which takes the place of a standard stream."""
+    ours, theirs = socket.socketpair()
+    if min(ours.fileno(), theirs.fileno()) > _STDERR:
+        return ours, theirs
+    ours.close()
+    theirs.close()
+    occupy_standard_streams()  # The program has closed some since the group was built.
+    return socket.socketpair()
+
+
+def ending(exit_code: int) -> str:
+    """Say in a clause how a process ended; `exit_code` is negative for a signal."""
+    if exit_code >= 0:
+        return f"exited with code {exit_code}"
+    try:
+        name = signal.Signals(-exit_code).name
+    except ValueError:
+        name = f"signal {-exit_code}"
+    hint = ""
+    if exit_code == -signal.SIGKILL:
+        hint = " (if you didn't, the kernel may have run out of memory: see dmesg)"
+    return f"was killed by {name}{hint}"

@@ -1,0 +1,425 @@
+"""The worker process of a process host: a plain blocking loop around a few envs.
+
+Rule: one thread, no asyncio. Requests are executed in the order of sending, and every
+request gets exactly one reply with its own entry. An idle worker spins for a moment (see
+`spinner`), then sleeps on its channel.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import pickle
+import socket
+import sys
+import time
+import traceback
+from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
+
+from rlightning_aio._core.hosts.arena import make_private, map_shared
+from rlightning_aio._core.hosts.messages import ErrorText
+from rlightning_aio._core.hosts.running.build_env import built_envs
+from rlightning_aio._core.hosts.running.runner import attach_all, close_all, disconnect_all
+from rlightning_aio._core.hosts.spinner import Spinner
+from rlightning_aio.envs.results import is_awaitable
+from rlightning_aio.protocol.entries import (
+    Operation,
+    answers_with_value,
+    entry,
+    op_of,
+    slot_of,
+)
+from rlightning_aio.protocol.exchange import CAREFUL
+from rlightning_aio.protocol.frames import BELL, CHUNK_BYTES, Frame, FrameKind, FrameReader, encode
+from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
+from rlightning_aio.protocol.pickling import dumped, dumped_with_code
+from rlightning_aio.protocol.rings import WorkerBell, WorkerRings, bell_size, rings_size
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from rlightning_aio._core.hosts.messages import AttachOrder, OutOfBand, StartOrder, WorkerPlace
+    from rlightning_aio._core.hosts.running.env_steps import Execute
+    from rlightning_aio._core.hosts.running.runner import EnvRunner
+
+__all__ = ["Worker", "main"]
+
+_STEP = int(Operation.STEP)
+
+
+class TrainerGone(Exception):
+    """The trainer closed the channel, or died."""
+
+
+class Worker:
+    """Serves the envs of one worker until it gets `CLOSE` or the trainer is gone.
+
+    Args:
+        channel: blocking stream socket to the trainer.
+        arena: descriptor of the group's shared memory.
+        rings: of this worker.
+        first_slot: slot of its first env in the group.
+        shared: memory that is mapped already.
+    """
+
+    def __init__(
+        self,
+        channel: socket.socket,
+        arena: int,
+        rings: WorkerRings,
+        first_slot: int,
+        shared: Sequence[memoryview] = (),
+    ) -> None:
+        self._channel = channel
+        self._first_slot = first_slot
+        self._arena = arena
+        self._frames = FrameReader()
+        self._rings = rings
+        self._runners: list[EnvRunner] = []
+        self._steps: list[Execute] = []
+        self._schemas = InfoSchemas(self._send_schema)
+        self._timed = False
+        self._spinner = Spinner(enabled=False)
+        self._attached = False
+        self._closing = False
+        self._awaits = False
+        self._submit: Callable[[int, Any], None]
+        self._abort_awaited: Callable[[int], None]
+        self._order: StartOrder
+        self._shared = list(shared)
+        self._is_child = False
+
+    def serve(self) -> None:
+        """Serve until it gets `CLOSE` or the trainer is gone; close the envs in any case."""
+        try:
+            while not self._attached and not self._closing:
+                self._receive(0)
+            if self._awaits and not self._closing:
+                self._serve_awaitable()
+            while not self._closing:
+                self.run_requests()
+                self._wait()
+        except TrainerGone as gone:
+            if not self._closing:
+                disconnect_all(self._runners)
+            if not isinstance(gone.__cause__, BrokenPipeError | ConnectionResetError | None):
+                raise
+        finally:
+            if not self._closing:
+                self._close_envs()
+
+    def _serve_awaitable(self) -> None:
+        """Serve envs whose `reset` and `step` are coroutine functions concurrently."""
+        # Not at the top: no other worker needs asyncio.
+        from rlightning_aio._core.hosts.awaiting.worker_loop import Awaiting  # noqa: PLC0415
+
+        rings, ring, send = self._rings, self._ring, self._send
+        awaiting = Awaiting(
+            self._order,
+            self._first_slot,
+            self._runners,
+            lambda entry: rings.report(entry, ring),
+            send,
+            lambda entry: rings.begin(entry, time.monotonic_ns()),
+        )
+        self._submit, self._abort_awaited = awaiting.submit, awaiting.abort
+        try:
+            errors = awaiting.serve(self._channel, self._take_requests)
+        finally:
+            self._closing = True  # The event loop has closed them.
+        send(FrameKind.CLOSED, payload=pickle.dumps(errors))
+
+    def _take_requests(self) -> bool:
+        """Read requests and begin to execute them; return False to close."""
+        rings = self._rings
+        while not self._closing:
+            self._receive(socket.MSG_DONTWAIT)
+            for request in rings.requests():
+                self._submit(request, None)
+            # From now on the trainer sends a wake-up for each request, even if envs are busy.
+            if rings.fall_asleep() and not self._closing:
+                return True
+        return False
+
+    def run_requests(self) -> None:
+        """Execute the requests in the ring, and frames as they arrive."""
+        rings = self._rings
+        while not self._closing:
+            if rings.has_frame():
+                self._receive_some()
+            elif not rings.serve(
+                self._run,
+                self._finish,
+                self._ring,
+                self._receive_some,
+                self._steps,
+                self._first_slot,
+            ):
+                break
+        rings.idle()
+
+    def _run(self, request: int) -> bool:
+        """Execute one request of the ring; return True if its row holds the whole reply.
+
+        Most steps are executed by `exchange.serve` itself.
+        """
+        if self._closing:
+            return False
+        index = slot_of(request) - self._first_slot
+        if self._timed:
+            self._rings.begin(request, time.monotonic_ns())
+        try:
+            out_of_band = (
+                self._steps[index]()
+                if op_of(request) == _STEP
+                else self._runners[index].reset_from_row()
+            )
+        except BaseException as error:
+            self._finish(request, error)
+            return False
+        if out_of_band is None and not self._is_child:
+            return True
+        self._finish(request, out_of_band)
+        return False
+
+    def _finish(self, request: int, outcome: Any) -> None:
+        """Reply to a step or reset whose outcome is not in its row alone.
+
+        Args:
+            request: the entry.
+            outcome: what is out of band, or the exception that the env raised.
+        """
+        failed = isinstance(outcome, BaseException)
+        if self._is_child:
+            _end_child(outcome if failed else None)
+        if failed:
+            self._send_error(request, outcome)
+        else:
+            self._send_result(request, outcome)
+
+    def _ring(self) -> None:
+        self._write(BELL)
+
+    def _wait(self) -> None:
+        """Return when there may be a request."""
+        if self._closing or self._spinner.spin(self._rings.has_news):
+            return
+        if self._rings.fall_asleep():
+            self._receive(0)
+            self._rings.wake_up()
+            self._spinner.slept()
+
+    def _receive_some(self) -> None:
+        """Execute the frames that the channel holds."""
+        self._receive(socket.MSG_DONTWAIT)
+
+    def _receive(self, flags: int) -> None:
+        try:
+            data = self._channel.recv(CHUNK_BYTES, flags)
+        except BlockingIOError:
+            return
+        except ConnectionResetError:  # It died before it read everything.
+            data = b""
+        if not data:
+            raise TrainerGone
+        for frame in self._frames.feed(data):
+            self._rings.frame_seen()
+            self._handle(frame)
+
+    def _handle(self, frame: Frame) -> None:
+        """Execute one frame and answer it."""
+        try:
+            self._handlers[frame.kind](self, frame)
+        finally:
+            self._rings.idle()
+
+    def become_child(self) -> None:
+        """Release the channel and the shared memory in a process that an env forked.
+
+        It continues in the code of the env. It ends if that code returns.
+        """
+        self._is_child = True
+        self._rings.own[CAREFUL] = 1
+        self._channel.close()
+        for memory in self._shared:
+            make_private(memory)
+
+    def _begin(self, request: int) -> None:
+        """Publish the current request, in case the worker dies in it."""
+        if self._is_child:
+            _end_child(sys.exception())
+        self._rings.begin(request, time.monotonic_ns())
+
+    def _begin_with(self, index: int) -> None:
+        """Publish which env is being built or closed."""
+        self._begin(entry(0, self._first_slot + index, 0))
+
+    def _start(self, frame: Frame) -> None:
+        order: StartOrder | None = None
+        try:
+            self._begin_with(0)
+            order = pickle.loads(frame.payload)
+            assert order is not None
+            if order.core is not None:
+                os.sched_setaffinity(0, {order.core})
+            self._spinner = Spinner(enabled=order.spins)
+            config = order.config
+            self._timed = (config.step_timeout or config.reset_timeout) is not None
+            self._rings.own[CAREFUL] = self._timed
+            self._order = order
+            for runner in built_envs(order):
+                self._runners.append(runner)
+                self._begin_with(len(self._runners) % len(order.worker_indices))
+            self._awaits = any(is_awaitable(runner.env) for runner in self._runners)
+            started = dumped_with_code([runner.started() for runner in self._runners])
+        except BaseException as error:
+            index = len(self._runners)
+            if order is not None:
+                index = min(index, len(order.worker_indices) - 1)
+            self._send(FrameKind.START_ERROR, index, pickle.dumps(ErrorText.of(error)))
+            return
+        # These objects stay. Without them the garbage collector saves time and copied pages.
+        gc.collect()
+        gc.freeze()
+        self._send(FrameKind.STARTED, payload=started)
+
+    def _attach(self, frame: Frame) -> None:
+        """Map the slabs from the inherited descriptor of the arena."""
+        order: AttachOrder = pickle.loads(frame.payload)
+        announce = self._schemas.announce
+        attach_all(self._runners, order, self._map_part, announce, self._send_checkpoint)
+        self._steps = [runner.step for runner in self._runners]
+        os.close(self._arena)
+        self._attached = True
+        self._send(FrameKind.ATTACHED)
+
+    def _map_part(self, offset: int, size: int) -> memoryview:
+        memory = map_shared(self._arena, offset, size)
+        self._shared.append(memory)
+        return memory
+
+    def _request(self, frame: Frame) -> None:
+        """Execute a request whose arguments came out of band."""
+        request, op = frame.number, op_of(frame.number)
+        self._begin(request)
+        try:
+            arguments = pickle.loads(frame.payload)
+            if self._awaits:
+                self._submit(request, arguments)
+                return
+            index = slot_of(request) - self._first_slot
+            runner = self._runners[index]
+            outcome = runner.execute(op, arguments)
+            self._steps[index] = runner.step  # A call may start or stop filming.
+            if answers_with_value(op):
+                self._send(FrameKind.VALUE, request, dumped(outcome, "what it returned"))
+            elif outcome is None:
+                self._rings.report(request, self._ring)
+            else:
+                self._send_result(request, outcome)
+        except TrainerGone:
+            raise
+        except BaseException as error:
+            self._send_error(request, error)
+
+    def _abort(self, frame: Frame) -> None:
+        """Cancel a request to an awaitable env; any other ends by itself, or with this worker."""
+        if self._awaits:
+            for request in self._rings.requests():  # It may be the newest.
+                self._submit(request, None)
+            self._abort_awaited(frame.number)
+
+    def _close(self, frame: Frame) -> None:
+        del frame
+        self._closing = True
+        self._rings.own[CAREFUL] = 1
+        if self._awaits and self._attached:
+            return  # The event loop closes them.
+        errors = self._close_envs()
+        self._send(FrameKind.CLOSED, payload=pickle.dumps(errors))
+
+    _handlers: ClassVar[dict[int, Callable[[Worker, Frame], None]]] = {
+        FrameKind.START: _start,
+        FrameKind.ATTACH: _attach,
+        FrameKind.REQUEST: _request,
+        FrameKind.ABORT: _abort,
+        FrameKind.CLOSE: _close,
+    }
+
+    def _close_envs(self) -> list[tuple[int, ErrorText]]:
+        return close_all(self._runners, self._begin_with)
+
+    def _write(self, data: bytes) -> None:
+        if self._is_child:
+            _end_child(sys.exception())
+        try:
+            try:
+                sent = self._channel.send(data, socket.MSG_DONTWAIT)
+            except BlockingIOError:
+                sent = 0
+            if sent < len(data):
+                self._write_rest(memoryview(data)[sent:])
+        except BaseException as error:
+            # No frame can follow a partial one, and this is not an error of an env.
+            raise TrainerGone from error
+
+    def _write_rest(self, rest: memoryview) -> None:
+        """Write data that the channel had no room for.
+
+        This waits for the trainer, so it doesn't count as time of the env.
+        """
+        paused_ns = time.monotonic_ns()
+        since_ns = self._rings.pause()
+        self._channel.sendall(rest)
+        self._rings.resume(since_ns + time.monotonic_ns() - paused_ns)
+
+    def _send(self, kind: FrameKind, number: int = 0, payload: bytes = b"") -> None:
+        self._write(encode(kind, number, payload))
+        self._rings.count_frame()
+
+    def _send_result(self, request: int, out_of_band: OutOfBand) -> None:
+        try:
+            payload = dumped(out_of_band, "the result")
+        except BaseException as error:
+            self._send_error(request, error)
+            return
+        self._send(FrameKind.RESULT, request, payload)
+
+    def _send_error(self, request: int, error: BaseException) -> None:
+        self._send(FrameKind.ERROR, request, pickle.dumps(ErrorText.of(error)))
+
+    def _send_checkpoint(self, index: int, checkpoint: bytes, before: bool) -> None:
+        self._send(FrameKind.SAVED, index << 1 | before, checkpoint)
+
+    def _send_schema(self, number: int, schema: InfoSchema) -> None:
+        self._send(FrameKind.INFO_SCHEMA, number, pickle.dumps(schema))
+
+
+def _end_child(error: BaseException | None) -> NoReturn:
+    """End a process that an env forked; print its error, and send no reply."""
+    code = 1
+    if isinstance(error, SystemExit) and (error.code is None or isinstance(error.code, int)):
+        code = error.code or 0
+    elif error is not None:
+        traceback.print_exception(error)
+    else:
+        sys.stderr.write(
+            "a process that an env forked has returned from the env's code and ends here; it "
+            "should have ended by os._exit\n"
+        )
+    with contextlib.suppress(Exception):
+        sys.stdout.flush()
+        sys.stderr.flush()
+    os._exit(code)
+
+
+def main(channel: socket.socket, arena: int, place: WorkerPlace) -> None:
+    """Run a worker in this process until it has closed."""
+    bell_memory = map_shared(arena, place.bell_offset, bell_size(place.num_hosts))
+    bell = WorkerBell(bell_memory, place.num_hosts, place.host_id)
+    rings_memory = map_shared(arena, place.rings_offset, rings_size(place.num_envs))
+    rings = WorkerRings(rings_memory, place.num_envs, bell)
+    worker = Worker(channel, arena, rings, place.first_slot, (bell_memory, rings_memory))
+    os.register_at_fork(after_in_child=worker.become_child)
+    worker.serve()

@@ -1,0 +1,103 @@
+"""Builds envs; no other module calls the class of an env."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from gymnasium.error import UnregisteredEnv
+
+from rlightning_aio._core.hosts.running.known_tasks import register_tasks
+from rlightning_aio._core.hosts.running.runner import EnvRunner, seed_generators
+from rlightning_aio.envs.results import is_awaitable
+from rlightning_aio.registry import ENVS, placement_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from rlightning_aio._core.hosts.messages import StartOrder
+    from rlightning_aio.config import EnvConfig
+    from rlightning_aio.envs.base import BaseEnv
+
+__all__ = ["build_env", "built_env", "built_envs"]
+
+
+def build_env(
+    config: EnvConfig,
+    env_class: type[BaseEnv] | None = None,
+    worker_index: int = 0,
+    preprocess_fn: Any = None,
+) -> BaseEnv:
+    """Import the modules of the entry and build one env; `env_class` None resolves it."""
+    for module in config.imports:
+        importlib.import_module(module)
+    env_class = env_class or ENVS.resolve(config.backend)
+    return env_class(config, worker_index=worker_index, preprocess_fn=preprocess_fn)
+
+
+def built_envs(order: StartOrder, *, inline: bool = False) -> Iterator[EnvRunner]:
+    """Build the envs of a host one after the other.
+
+    A worker has its own numbers: those that fork servers fork have the same generators.
+    """
+    if not inline:
+        seed_generators()
+    for place in range(len(order.worker_indices)):
+        yield built_env(order, place, inline=inline)
+
+
+def built_env(order: StartOrder, place: int, *, inline: bool = False) -> EnvRunner:
+    """Build one env of a host.
+
+    Args:
+        order: of the host.
+        place: the env's index in the host.
+        inline: see `EnvRunner`.
+
+    Raises:
+        TypeError: the env is awaitable and its placement can't await it, or the reverse.
+    """
+    config, index = order.config, order.worker_indices[place]
+    makers: Any = config.make_env
+    if isinstance(makers, tuple):
+        config = config.model_copy(update={"make_env": makers[place]})
+    env = _built(order, config, index, order.preprocess_fns[place])
+    env.trainer_pid = None if inline else order.trainer_pid
+    video = config.video
+    filmed = video is not None and index in video.envs
+    return _runner_class(env, config)(env, inline=inline, video=video if filmed else None)
+
+
+def _runner_class(env: BaseEnv, config: EnvConfig) -> type[EnvRunner]:
+    awaits = placement_of(config.backend, config.placement).awaits
+    if not is_awaitable(env):
+        if awaits == "only":
+            raise TypeError(
+                f"env {env.env_id!r} would block the event loop, for its reset and step are not "
+                "`async def`; make them so, or use placement: process or inline"
+            )
+        return EnvRunner
+    if awaits == "never":
+        raise TypeError(
+            f"env {env.env_id!r} is awaitable (its step is `async def`), and placement "
+            f"{config.placement!r} has no event loop for it; use placement: loop or process"
+        )
+    if config.snapshot_every is not None:
+        raise TypeError(
+            f"env {env.env_id!r} is awaitable (its step is `async def`), and snapshot_every is not "
+            "available for such envs; call group.snapshot() instead"
+        )
+    # Not at the top: few workers need it.
+    from rlightning_aio._core.hosts.running.awaited_runner import AwaitedRunner  # noqa: PLC0415
+
+    return AwaitedRunner
+
+
+def _built(order: StartOrder, config: EnvConfig, index: int, preprocess_fn: Any) -> BaseEnv:
+    if order.tasks:
+        # Only if one is missing: a module that registers it here would cause a warning.
+        with contextlib.suppress(UnregisteredEnv):
+            return build_env(config, order.env_class, index, preprocess_fn)
+        register_tasks(order.tasks)
+    return build_env(config, order.env_class, index, preprocess_fn)

@@ -1,0 +1,204 @@
+"""Checkpoints: state and last result of an env, which let it continue in another worker.
+
+A checkpoint is one pickle. Shown again, its result is no transition: no reward, no end, `is_reset`.
+Observation, info and the sums of its episodes are as before, so the env continues as it would
+have. `Saver` sends checkpoints to the trainer, which keeps the last one for a replacement of the
+worker; `group.continuity` decides when it is used.
+"""
+
+from __future__ import annotations
+
+import pickle
+import time
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from rlightning_aio.protocol.columns import row_reader
+from rlightning_aio.protocol.entries import Operation
+from rlightning_aio.protocol.info import PICKLED
+from rlightning_aio.protocol.pickling import dumped
+from rlightning_aio.types import EnvRet
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from rlightning_aio._core.hosts.messages import OutOfBand
+    from rlightning_aio._core.hosts.running.env_steps import Execute
+    from rlightning_aio._core.hosts.running.row_writer import RowWriter
+    from rlightning_aio.envs.base import BaseEnv
+    from rlightning_aio.protocol.slab import Slab
+    from rlightning_aio.types import MultiAgentEnvRet
+
+__all__ = ["Checkpoints", "Saver", "Send"]
+
+Send: TypeAlias = "Callable[[bytes, bool], None]"
+"""Sends a checkpoint. The flag is True if it is from before the current request."""
+
+
+@dataclass(frozen=True)
+class _ShownResult:
+    """A result taken out of its row.
+
+    Attributes:
+        observation, info: of the result.
+        whole: the result itself, where it was returned without a copy.
+        returns, lengths, over: of the current episodes, in the shape of the row's columns.
+    """
+
+    observation: Any
+    info: dict[str, Any]
+    whole: Any
+    returns: NDArray[Any]
+    lengths: NDArray[Any]
+    over: NDArray[Any]
+
+
+class Checkpoints:
+    """Saves and restores one env.
+
+    Args:
+        env: the env.
+        slab, row: where its results are.
+        writer: of that row.
+
+    Attributes:
+        has_result: the env was reset, here or before its checkpoint was taken.
+    """
+
+    def __init__(self, env: BaseEnv, slab: Slab, row: int, writer: RowWriter) -> None:
+        self._env, self._slab, self._row, self._writer = env, slab, row, writer
+        self._restored: _ShownResult | None = None
+        self.has_result = False
+
+    def take(self) -> bytes:
+        """Return a checkpoint.
+
+        Raises:
+            NotImplementedError: the env returns results of some sub-environments at a time.
+            TypeError: its state can't be pickled.
+        """
+        if self._writer.partial_results:
+            raise NotImplementedError(
+                f"env {self._env.env_id!r} returns results of some sub-environments at a time; "
+                "there is no moment at which all of them are idle"
+            )
+        shown_result = self._restored
+        if shown_result is None and self.has_result:
+            shown_result = self._read()
+        is_unshown = self._restored is not None
+        return dumped((self._env.save_state(), shown_result, is_unshown), "its state")
+
+    def _read(self) -> _ShownResult:
+        """Return a copy of the row and of what was out of band."""
+        slab, row, whole = self._slab, self._row, self._writer.whole
+        mark = int(slab.info_mark[row])
+        out_of_band = self._writer.out_of_band
+        info = out_of_band.get("info", {}) if mark == PICKLED else self._writer.read_info(mark)
+        observation = None
+        if slab.observation is None:
+            observation = out_of_band.get("observation")
+        elif whole is None:
+            observation = row_reader(slab.layout.observation_space, slab.observation, row)()
+        sums = (slab.episode_return, slab.episode_length, slab.over)
+        return _ShownResult(observation, info, whole, *(column[row, ...].copy() for column in sums))
+
+    def load(self, checkpoint: bytes, *, show: bool) -> None:
+        """Restore the env.
+
+        With `show`, its next reset `AS_RESTORED` shows the saved result; otherwise only if that
+        had still to be shown when the checkpoint was taken.
+        """
+        state, shown_result, is_unshown = pickle.loads(checkpoint)
+        self._env.load_state(state)
+        self.has_result = shown_result is not None
+        self._restored = shown_result if show or is_unshown else None
+
+    def resume(self, checkpoint: bytes) -> None:
+        """Restore an env that was just built."""
+        try:
+            self.load(checkpoint, show=True)
+        except ValueError:
+            # The first reset may create parts of the state.
+            self._env.reset()
+            self.load(checkpoint, show=True)
+
+    def note_result(self) -> None:
+        """Record that the env was reset."""
+        self.has_result = True
+
+    def forget_result(self) -> None:
+        """Drop a restored result that was not shown: the env is about to be reset."""
+        self._restored = None
+
+    def must_show(self) -> bool:
+        """Return True if the reset in the row asks for the restored result; forget it otherwise."""
+        if self._restored is not None and self._slab.take_as_restored(self._row):
+            return True
+        self._restored = None
+        return False
+
+    def show(self) -> OutOfBand | None:
+        """Write the restored result into the row; return what is out of band."""
+        shown_result, self._restored = self._restored, None
+        assert shown_result is not None
+        slab, row, writer = self._slab, self._row, self._writer
+        slab.reward[row, ...] = 0.0
+        slab.flags[row, ...] = False
+        slab.is_reset[row, ...] = True
+        slab.over[row, ...] = shown_result.over
+        slab.episode_return[row, ...] = shown_result.returns
+        slab.episode_length[row, ...] = shown_result.lengths
+        writer.row_changed()
+        writer.write_times(time.monotonic_ns(), 0)
+        if (whole := shown_result.whole) is not None:
+            return writer.hand_over_whole(_without_transition(whole))
+        return writer.write_data(shown_result.observation, shown_result.info)
+
+
+def _without_transition(result: EnvRet | MultiAgentEnvRet) -> EnvRet | MultiAgentEnvRet:
+    """Copy a result without its reward and ends."""
+    nothing: dict[str, Any] = {}
+    reward, end = (0.0, False) if isinstance(result, EnvRet) else (nothing, nothing)
+    ends = {"last_terminated": end, "last_truncated": end}
+    return result.model_copy(update={"last_reward": reward, **ends})
+
+
+class Saver:
+    """Sends checkpoints of an env: after each reset, each end, and every `every` steps in between.
+
+    It also sends one before a reset that follows a step, because generators and wrappers may keep
+    state from one episode to the next. So the last checkpoint and the last result always belong
+    to the same episode.
+    """
+
+    def __init__(
+        self, checkpoints: Checkpoints, over: NDArray[Any], every: int, send: Send
+    ) -> None:
+        self._checkpoints, self._over, self._every, self._send = checkpoints, over, every, send
+        self._num_steps = 0
+
+    def wrap(self, op: int, execute: Execute) -> Execute:
+        """Return `execute`, a step or a reset, with the checkpoints that belong to it."""
+        return partial(self._reset if op == Operation.RESET else self._step, execute)
+
+    def _step(self, step: Execute) -> OutOfBand | None:
+        outcome = step()
+        self._num_steps += 1
+        if self._num_steps >= self._every or self._over.all():
+            self.save()
+        return outcome
+
+    def _reset(self, reset: Execute) -> OutOfBand | None:
+        if self._num_steps:
+            self.save(before=True)
+        outcome = reset()
+        self.save()
+        return outcome
+
+    def save(self, *, before: bool = False) -> None:
+        """Send a checkpoint, which is from `before` the current request or after it."""
+        self._send(self._checkpoints.take(), before)
+        self._num_steps = 0

@@ -1,0 +1,1 @@
+"""`rollout` and `eval`: play episodes, film them, and show what came of them."""

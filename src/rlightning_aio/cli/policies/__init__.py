@@ -1,0 +1,1 @@
+"""Policies of commands: by import path, from files of Stable-Baselines3, or random, with masks."""

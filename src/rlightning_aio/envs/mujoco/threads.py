@@ -1,0 +1,294 @@
+"""Many MuJoCo simulations of one model, stepped by MuJoCo's own C++ threads.
+
+This is the C interface of `mujoco.batch` (mjbatch.h, MuJoCo 3.17 and later), called through ctypes:
+its Python class lacks `mjb_apply`, the only fast way to contact forces (`mujoco_forces`). Calls
+release the GIL.
+Rule: a simulation is a row of numbers, the integration state; everything else is an output that is
+valid after a call. Left out: which numbers a task observes (`mujoco_tasks`).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import time
+import weakref
+from ctypes import POINTER, byref, c_bool, c_char_p, c_int, c_void_p
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from rlightning_aio.envs.mujoco.forces import StepsWithForces, compiled
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+__all__ = ["Simulations", "state_of"]
+
+# Its stubs are incomplete.
+mujoco: Any = import_module("mujoco")
+
+_INTEGRATION: Final = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+_STATE_FIELDS: Final = ("qpos", "qvel", "ctrl", "qacc_warmstart")
+_UNSTABLE: Final = {
+    int(warning): name
+    for warning, name in (
+        (mujoco.mjtWarning.mjWARN_BADQPOS, "position"),
+        (mujoco.mjtWarning.mjWARN_BADQVEL, "velocity"),
+        (mujoco.mjtWarning.mjWARN_BADQACC, "acceleration"),
+    )
+}
+"""Warnings upon which MuJoCo resets a simulation to the defaults of its model."""
+_DTYPES: Final = {8: np.float64, 4: np.int32, 1: np.uint8}
+
+
+class _Config(ctypes.Structure):
+    _fields_ = (("nthread", c_int), ("persistent", c_bool))
+
+
+@cache
+def _library() -> Any:
+    """MuJoCo's library.
+
+    Raises:
+        NotImplementedError: this version has no batches.
+    """
+    folder = Path(mujoco.__file__).parent
+    (path,) = [*folder.glob("libmujoco.so*"), *folder.glob("libmujoco*.dylib")][:1]
+    library: Any = ctypes.CDLL(os.fspath(path))
+    try:
+        library.mjb_apply  # noqa: B018
+    except AttributeError:
+        raise NotImplementedError(
+            f"mujoco {mujoco.__version__} has no batches; install mujoco 3.17 or later"
+        ) from None
+    for name, result in (
+        ("makeBatch", c_void_p),
+        ("state", c_void_p),
+        ("stateComponent", c_void_p),
+        ("output", c_void_p),
+        ("expand", c_void_p),
+        ("warning", c_void_p),
+        ("status", c_void_p),
+        ("error", c_char_p),
+    ):
+        getattr(library, f"mjb_{name}").restype = result
+    library.mjb_deleteBatch.argtypes = [c_void_p]
+    return library
+
+
+def state_of(model: Any, data: Any, row: NDArray[np.float64]) -> None:
+    """Write the integration state of `data` to `row`."""
+    mujoco.mj_getState(model, data, row, _INTEGRATION)
+
+
+class Simulations:
+    """Simulations of one model.
+
+    Fields have MuJoCo's names: ``simulations.qpos`` is a live array ``[count, nq]``. Fields of the
+    state may be written; others are outputs of the last call on each simulation.
+
+    Args:
+        model: shared by all simulations, so changes of it take effect; copied if `own_models`.
+        count: the number of simulations.
+        num_threads: number of threads for steps, including the caller's.
+        forces: compute contact forces (``cfrc_ext``) after each step.
+        own_models: each simulation has its own values of fields passed to `expand`.
+
+    Attributes:
+        rows: states of the simulations, ``[count, ...]`` float64.
+        busy_ns: duration of the last call of `step`; 0 before the first.
+
+    Raises:
+        NotImplementedError: MuJoCo is older than 3.17.
+    """
+
+    def __init__(
+        self,
+        model: Any,
+        count: int,
+        num_threads: int,
+        *,
+        forces: bool,
+        own_models: bool = False,
+    ) -> None:
+        self._library = library = _library()
+        self.count, self._model = count, model
+        self._template = mujoco.MjData(model)
+        function = compiled() if forces else None
+        self._with_forces: StepsWithForces | None = None
+        if function is not None:
+            self._with_forces = StepsWithForces(library, function, count, self._template)
+        # Without the compiled function, MuJoCo must keep what forces are computed from.
+        self._keeps_data = forces and function is None
+        config = _Config(min(num_threads, count), self._keeps_data)
+        error = ctypes.create_string_buffer(1000)
+        address = library.mjb_makeBatch(
+            c_void_p(model._address),  # noqa: SLF001  # Intended for this use.
+            count,
+            byref(config),
+            error,
+            len(error),
+        )
+        if not address:
+            raise RuntimeError(f"MuJoCo can't make {count} simulations: {error.value.decode()}")
+        self._batch = c_void_p(address)
+        self._own_models = own_models
+        self.close = weakref.finalize(self, library.mjb_deleteBatch, c_void_p(address))
+        if not own_models:
+            models = (c_void_p * count)(*[model._address] * count)  # noqa: SLF001
+            library.mjb_setModels(self._batch, models)
+        size = library.mjb_nstate(self._batch)
+        self.rows = _array(library.mjb_state(self._batch), np.float64, (count, size))
+        num_warnings = int(mujoco.mjtWarning.mjNWARNING)
+        self._warnings = _array(
+            library.mjb_warning(self._batch), np.int32, (count, num_warnings, 2)
+        )[..., 1]
+        self._status = _array(library.mjb_status(self._batch), np.int32, (count,))
+        self._expanded: dict[str, NDArray[Any]] = {}
+        self.busy_ns = 0
+
+    def __getattr__(self, name: str) -> NDArray[Any]:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        found = self.__dict__[name] = self._field(name)
+        return found
+
+    def _field(self, name: str) -> NDArray[Any]:
+        shape = getattr(self._template, name).shape
+        size, width = c_int(), c_int()
+        if name in _STATE_FIELDS:
+            bit = getattr(mujoco.mjtState, f"mjSTATE_{name.removeprefix('qacc_').upper()}")
+            address = self._library.mjb_stateComponent(self._batch, int(bit), byref(size))
+            first = (address - self.rows.ctypes.data) // self.rows.itemsize
+            return self.rows[:, first : first + size.value]
+        if self._with_forces is not None:
+            return self._with_forces.output(name)
+        address = self._library.mjb_output(self._batch, name.encode(), byref(size), byref(width))
+        if not address:
+            raise AttributeError(f"MuJoCo's batches have no field {name!r}")
+        return _array(address, _DTYPES[width.value], (self.count, *shape))
+
+    # -- models -------------------------------------------------------------------------
+
+    def expand(self, name: str) -> NDArray[Any]:
+        """Give each simulation its own value of a model field, initially that of the model.
+
+        Call `set_const` after a change.
+
+        Args:
+            name: of the field, in `MjModel` or, after ``opt.``, in `MjOption`.
+
+        Returns:
+            The values, ``[count, ...]``.
+
+        Raises:
+            AttributeError: there is no such field, or it can't differ.
+        """
+        owner = self._model.opt if name.startswith("opt.") else self._model
+        template: NDArray[Any] = np.asarray(getattr(owner, name.removeprefix("opt."), None))
+        width, address = c_int(), None
+        if template.dtype.kind == "f":
+            encoded = name.encode()
+            address = self._library.mjb_expand(self._batch, encoded, None, byref(width))
+        if not address:
+            raise AttributeError(f"MuJoCo has no number {name!r} that simulations can differ in")
+        found = _array(address, _DTYPES[width.value], (self.count, *template.shape))
+        self._expanded[name] = found
+        return found
+
+    def model_field(self, name: str) -> NDArray[Any]:
+        """A field of the model: ``[count, ...]`` if simulations differ in it, else the model's."""
+        found = self._expanded.get(name)
+        return getattr(self._model, name) if found is None else found
+
+    def set_const(self, ids: NDArray[np.int32] | None = None) -> None:
+        """Compute the fields that depend on others, in the models of all simulations or of `ids`.
+
+        Raises:
+            ValueError: MuJoCo refuses the values.
+        """
+        chosen, count = _chosen(ids)
+        if self._library.mjb_setConst(self._batch, chosen, count):
+            raise ValueError(f"MuJoCo refuses a model: {'; '.join(self._failures().values())}")
+
+    def show_model(self, k: int) -> None:
+        """Write the model of simulation `k` to the common model, if simulations differ."""
+        if self._own_models:
+            address = c_void_p(self._model._address)  # noqa: SLF001
+            self._library.mjb_getModel(self._batch, k, address)
+
+    # -- steps --------------------------------------------------------------------------
+
+    def step(self, num_steps: int, ids: NDArray[np.int32] | None = None) -> dict[int, str]:
+        """Take `num_steps` steps of MuJoCo in the simulations `ids`, or in all.
+
+        Returns:
+            Reasons of failures by simulation. After an error of MuJoCo the simulation is in its
+            previous state; if it became unstable, MuJoCo resets it to the defaults of the model.
+        """
+        library, began = self._library, time.monotonic_ns()
+        chosen, count = _chosen(ids)
+        if self._with_forces is not None:
+            num_failed = self._with_forces.step(self._batch, chosen, count, num_steps)
+        else:
+            num_failed = library.mjb_step(self._batch, chosen, count, num_steps, 0)
+        failures = self._failures() if num_failed or np.count_nonzero(self._warnings) else {}
+        if self._keeps_data:
+            forces = library.mj_rnePostConstraint  # It ignores the further arguments.
+            library.mjb_apply(self._batch, chosen, count, forces, None, False)
+            # Computes nothing, but copies the outputs.
+            library.mjb_forward(self._batch, chosen, count, 0)
+        self.busy_ns = time.monotonic_ns() - began
+        return failures
+
+    def _failures(self) -> dict[int, str]:
+        failures: dict[int, str] = {}
+        for warning, name in _UNSTABLE.items():
+            for k in np.flatnonzero(self._warnings[:, warning]).tolist():
+                failures[k] = f"NaN, infinite or huge {name}: the simulation is unstable"
+        self._warnings[:] = 0
+        for k in np.flatnonzero(self._status).tolist():
+            failures[k] = " ".join(self._library.mjb_error(self._batch, k).decode().split())
+        return failures
+
+    def data_of(self, k: int, before: NDArray[np.float64], num_steps: int) -> Any:
+        """All data of simulation `k` after its last step, by repeating that step.
+
+        Args:
+            k: position of the simulation.
+            before: its state before the step.
+            num_steps: number of MuJoCo's steps in it; 0 after a reset.
+        """
+        self.show_model(k)
+        data = mujoco.MjData(self._model)
+        mujoco.mj_setState(self._model, data, before, _INTEGRATION)
+        if not num_steps:
+            warmstart = data.qacc_warmstart.copy()
+            data.qacc_warmstart[:] = 0  # As in the reset.
+            mujoco.mj_forward(self._model, data)
+            data.qacc_warmstart[:] = warmstart  # The state itself stays as it is.
+            return data
+        data.ctrl[:] = self.ctrl[k]
+        mujoco.mj_step(self._model, data, num_steps)
+        mujoco.mj_rnePostConstraint(self._model, data)
+        return data
+
+
+def _chosen(ids: NDArray[np.int32] | None) -> tuple[Any, int]:
+    """Convert ids of simulations to C arguments."""
+    if ids is None:
+        return None, 0
+    return ids.ctypes.data_as(POINTER(c_int)), len(ids)
+
+
+def _array(address: int, dtype: Any, shape: tuple[int, ...]) -> NDArray[Any]:
+    """MuJoCo's memory as an array."""
+    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    if not size:
+        return np.empty(shape, dtype)
+    memory: Any = (ctypes.c_char * size).from_address(address)
+    return np.frombuffer(memory, dtype).reshape(shape)

@@ -1,0 +1,142 @@
+"""`callable`: envs that come from a callable of the user's, wrapped as its author likes."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from inspect import iscoroutinefunction
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+
+from rlightning_aio.envs.base import BaseEnv, PreprocessFn, result_of
+from rlightning_aio.envs.simulators.gymnasium import GymnasiumEnv, outdated_assets_accepted
+from rlightning_aio.envs.sub_envs.only_sub_env import OnlySubEnv
+from rlightning_aio.errors import ConfigError
+from rlightning_aio.registry import load
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable
+
+    from rlightning_aio.config import EnvConfig
+    from rlightning_aio.types import EnvRet, PolicyResponse
+
+__all__ = ["env_of_callable"]
+
+
+def env_of_callable(
+    config: EnvConfig, worker_index: int = 0, preprocess_fn: PreprocessFn | None = None
+) -> BaseEnv:
+    """Call what the entry names with its ``env_kwargs``, and make an env of what it returns.
+
+    Args:
+        config: with ``make_env``, or a ``task`` that reads ``module:function``.
+        worker_index: of the env within its entry.
+        preprocess_fn: turns a `PolicyResponse` into what the env steps with.
+
+    Raises:
+        TypeError: what it returns is no env.
+        ConfigError: the entry asks for what the env can't be given from outside.
+    """
+    make: Any = load(config.task) if config.make_env is None else config.make_env
+    # The env needs no copy of what made it.
+    config = config.model_copy(update={"make_env": None})
+    with outdated_assets_accepted() if "mujoco" in sys.modules else contextlib.nullcontext():
+        made = make(**config.env_kwargs)
+    if isinstance(made, BaseEnv):
+        return _adopted(made, config, worker_index, preprocess_fn)
+    if isinstance(made, gym.Env | gym.vector.VectorEnv):
+        return _GivenEnv(made, config, worker_index, preprocess_fn)
+    if iscoroutinefunction(getattr(made, "step", None)):
+        return _AwaitableEnv(made, config, worker_index, preprocess_fn)
+    raise TypeError(
+        f"the callable of entry {config.name!r} must return a gymnasium.Env, a "
+        "gymnasium.vector.VectorEnv, a BaseEnv, or an object with their reset and step as "
+        f"`async def`, not {type(made).__name__}"
+    )
+
+
+def _adopted(
+    env: BaseEnv, config: EnvConfig, worker_index: int, preprocess_fn: PreprocessFn | None
+) -> BaseEnv:
+    """An env that was made without knowing its entry, as one of the entry's."""
+    if preprocess_fn is not None:
+        env._preprocess_fn = preprocess_fn  # pyright: ignore[reportPrivateUsage]
+    env.config = config.model_copy(update={"num_envs": env.config.num_envs})
+    env.worker_index = worker_index
+    env.env_id = f"{config.name}-{worker_index}"
+    env.max_episode_steps = config.max_episode_steps or env.max_episode_steps
+    return env
+
+
+class _GivenEnv(GymnasiumEnv):
+    def __init__(
+        self,
+        made: Any,
+        config: EnvConfig,
+        worker_index: int,
+        preprocess_fn: PreprocessFn | None,
+    ) -> None:
+        self._made = made
+        super().__init__(config, worker_index, preprocess_fn)
+
+    def _make(self) -> Any:
+        made, config = self._made, self.config
+        is_vector = isinstance(self._made, gym.vector.VectorEnv)
+        if config.num_envs not in (1, made.num_envs if is_vector else 1):
+            raise ConfigError(
+                f"entry {config.name!r}, num_envs: {config.num_envs}, but its callable returned "
+                f"{f'{made.num_envs} of them' if is_vector else 'a single env'}; leave "
+                "num_envs out"
+            )
+        if config.max_episode_steps is None:
+            return OnlySubEnv(made) if is_vector and made.num_envs == 1 else made
+        if is_vector:
+            raise ConfigError(
+                f"entry {config.name!r}, max_episode_steps: a vector env keeps its own limits; set "
+                "it where the envs are made"
+            )
+        return gym.wrappers.TimeLimit(made, config.max_episode_steps)
+
+
+class _AwaitableEnv(BaseEnv):
+    """An object with Gymnasium's methods; its `reset` and `step` are coroutine functions."""
+
+    def __init__(
+        self,
+        made: Any,
+        config: EnvConfig,
+        worker_index: int,
+        preprocess_fn: PreprocessFn | None,
+    ) -> None:
+        super().__init__(config, worker_index, preprocess_fn)
+        self.env = made
+        self.switches_task = bool(getattr(made, "switches_task", False))
+
+    async def reset(
+        self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
+    ) -> EnvRet:
+        observation, info = await self.env.reset(seed=seed, options=options)
+        return result_of(self.env_id, (observation, 0.0, False, False, info))
+
+    async def step(self, policy_resp: PolicyResponse) -> EnvRet:
+        return result_of(self.env_id, await self.env.step(self._preprocess_fn(policy_resp)))
+
+    def bare_step(self) -> Any:
+        return self._step_made
+
+    def _step_made(self, action: Any) -> Any:
+        # Looked up anew: a restore replaces an object that has slots only.
+        return self.env.step(action)
+
+    def call_wrapped(self, name: str, /, *args: object, **kwargs: object) -> Any:
+        """Say why the vector interfaces, which ask for attributes, can't have this env."""
+        del name, args, kwargs
+        raise TypeError(
+            f"env {self.env_id!r} is awaitable (its step is `async def`), and the vector "
+            "interfaces take gymnasium.Env only; step it through build_env_group"
+        )
+
+    def close(self) -> Awaitable[None] | None:
+        close = getattr(self.env, "close", None)
+        return None if close is None else close()
