@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 import rlightning_aio as rl
 from rlightning_aio import sync
-from rlightning_aio._core.group.api.sync import SyncDriver
+from rlightning_aio._core.group.drivers.sync_driver import SyncDriver
 from rlightning_aio.collecting import Collector, Record, RecordedGroup, ReplayedGroup
 from rlightning_aio.errors import EnvFault, EnvRaised, ReplayDiverged
 

@@ -18,7 +18,7 @@ __all__ = ["BREAK", "Interruptible", "Procedure", "run", "run_as_one_call"]
 
 if TYPE_CHECKING:
     from rlightning_aio._core.group.api.sync import EnvGroup as SyncEnvGroup
-    from rlightning_aio._core.group.api.sync import SyncDriver
+    from rlightning_aio._core.group.drivers.sync_driver import SyncDriver
 
 T = TypeVar("T")
 

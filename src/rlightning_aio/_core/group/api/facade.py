@@ -7,8 +7,9 @@ import os
 import time
 import warnings
 import weakref
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 
+from rlightning_aio._core.group.drivers.driver import this_process
 from rlightning_aio._core.group.drivers.scope import Scope
 from rlightning_aio._core.group.drivers.wait import CollectRules
 from rlightning_aio._core.group.engine.checked import DEBUG, CheckedSteps
@@ -16,18 +17,18 @@ from rlightning_aio._core.group.engine.steps import Steps
 from rlightning_aio._core.group.setup.build import assemble
 from rlightning_aio._core.group.state.observed import NO_SPAN
 from rlightning_aio._core.group.timeline.trace import Trace
-from rlightning_aio._core.hosts.base import Watcher
 from rlightning_aio.batch import BatchedData
-from rlightning_aio.errors import BadAction, RLightningError
+from rlightning_aio.errors import BadAction
 from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet, PolicyResponse
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence, Sized
+    from collections.abc import Mapping, Sequence
     from contextlib import AbstractContextManager
     from pathlib import Path
 
     import gymnasium as gym
 
+    from rlightning_aio._core.group.drivers.driver import Driver
     from rlightning_aio._core.group.drivers.wait import Procedure
     from rlightning_aio._core.group.engine.core import Core
     from rlightning_aio._core.group.setup.plan import Plan
@@ -35,10 +36,8 @@ if TYPE_CHECKING:
 __all__ = [
     "AutoResetContext",
     "Facade",
-    "forked_from",
     "only_result",
     "steps_of",
-    "this_process",
 ]
 
 
@@ -85,43 +84,6 @@ class AutoResetContext(Scope):
 
     def _leave(self) -> None:
         self._core.continuity.end()
-
-
-class Driver(Watcher, Protocol):
-    """Waits for the sources of a group.
-
-    Attributes:
-        completions: queue of the outcomes that sources posted.
-        drain: applies them; the driver calls it whenever the queue isn't empty.
-    """
-
-    completions: Sized
-
-    drain: Callable[[], None]
-
-    def check_caller(self) -> None:
-        """Raise `RLightningError` if another thread uses the group, or another loop owns it."""
-        ...
-
-    def call(self, function: Callable[..., None], *args: Any) -> None:
-        """Call a function of the group that doesn't wait, after `check_caller`."""
-        ...
-
-    def forget(self) -> None:
-        """Forget all sources without unregistering them, as the parent still watches them."""
-        ...
-
-
-this_process: Final = [os.getpid()]
-"""The pid, updated in forked children; `os.getpid` would double the time of each check."""
-
-
-def forked_from(pid: int) -> RLightningError:
-    """The error for a call in a child forked by process `pid`."""
-    return RLightningError(
-        f"this group belongs to process {pid}, which has forked this one; only that process can "
-        "use and close the group; build another one here"
-    )
 
 
 class Facade:
