@@ -17,7 +17,7 @@ from patience import HANG
 
 import rlightning_aio
 import rlightning_aio.sync
-from rlightning_aio._core.hosts.process.host import ForkServer
+from rlightning_aio._core.hosts.process.host import ForkServerHandle
 
 if TYPE_CHECKING:
     from rlightning_aio.batch import BatchedData
@@ -147,8 +147,8 @@ def marked(ret: EnvRet) -> bool:
     return True
 
 
-def fork_server_of(group: Any) -> ForkServer:
+def fork_server_of(group: Any) -> ForkServerHandle:
     """Return the only fork server of a group."""
     shared = group._core.supervisor.resources.values()
-    (server,) = (one for one in shared if isinstance(one, ForkServer))
+    (server,) = (one for one in shared if isinstance(one, ForkServerHandle))
     return server

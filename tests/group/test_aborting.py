@@ -212,4 +212,4 @@ async def test_ordinary_steps_go_on_after_an_abort(start: Any, entry: Any) -> No
         assert batch.reward.tolist() == [1] * 4
         before = batch
     conditions = getattr(group, "wrapped", group)._core.parts.tables.conditions
-    assert not conditions.active & (ABORTING | DEATH | LOST_EPISODE)
+    assert not conditions.unusual & (ABORTING | DEATH | LOST_EPISODE)

@@ -112,7 +112,7 @@ def test_a_lost_episode_resumes_from_its_last_valid_checkpoint() -> None:
     assert continuity.checkpoints([0]) == (b"third",)
     reports, seeds = continuity.report_losses(SLOT, STEP)
     assert (reports.tolist(), seeds.tolist()) == ([True], [AS_RESTORED])
-    assert continuity.answered(SLOT) == [Report(0, "was killed", "env-1", 2)]
+    assert continuity.take_answers(SLOT) == [Report(0, "was killed", "env-1", 2)]
     shown = part_of([0], [True], [False])
     continuity.returned(SLOT, [shown], continuity.judge(SLOT, [shown]))
     assert continuity.positions(SLOT) == [Position(3, is_cut=False)]
@@ -123,7 +123,7 @@ def test_an_env_that_is_being_reset_or_due_does_not_resume() -> None:
     continuity = in_phase(LossPhase.LOST)
     reports, seeds = continuity.report_losses(SLOT, ~STEP)
     assert (reports.tolist(), seeds.tolist()) == ([True], [NO_SEED])
-    assert continuity.answered(SLOT) == [Report(0, "was killed", None, None)]
+    assert continuity.take_answers(SLOT) == [Report(0, "was killed", None, None)]
 
 
 def test_an_env_that_dies_while_it_resumes_resumes_again() -> None:
@@ -132,7 +132,7 @@ def test_an_env_that_dies_while_it_resumes_resumes_again() -> None:
     continuity.lose([0], "was killed again", from_checkpoint=True)
     _, seeds = continuity.report_losses(SLOT, ~STEP)
     assert seeds.tolist() == [AS_RESTORED]
-    assert continuity.answered(SLOT) == [Report(0, "was killed again", None, 0)]
+    assert continuity.take_answers(SLOT) == [Report(0, "was killed again", None, 0)]
 
 
 @pytest.mark.parametrize("shown", [LossPhase.SHOWING, LossPhase.RESUMING])
@@ -141,7 +141,7 @@ def test_the_steps_of_an_episode_that_could_not_be_shown_do_not_count(shown: Los
     continuity = in_phase(shown)
     continuity.raised(0)
     continuity.note_resets([0])
-    assert continuity.answered(SLOT) == []
+    assert continuity.take_answers(SLOT) == []
     first = part_of([0], [True], [False])
     continuity.returned(SLOT, [first], continuity.judge(SLOT, [first]))
     assert continuity.positions(SLOT) == [Position(0, is_cut=False)]

@@ -54,12 +54,12 @@ def test_interrupting_a_synchronous_init_raises_the_interrupt() -> None:
         import rlightning_aio.sync
         from rlightning_aio._core.hosts.process import host as process
 
-        launch = process.ForkServer._launch
+        launch = process.ForkServerHandle._launch
         def announced(server):
             messages = launch(server)
             print("started", flush=True)
             return messages
-        process.ForkServer._launch = announced
+        process.ForkServerHandle._launch = announced
 
         group = rlightning_aio.sync.build_env_group({ENTRY!r})
         try:

@@ -85,7 +85,7 @@ class Twins(RuleBasedStateMachine):
             self.finish_all(group)
             self.firsts.append(running.result()[0])
         self.groups[1].conditions.note(UNLIKE_ENVS, True)
-        assert not self.groups[0].conditions.active
+        assert not self.groups[0].conditions.unusual
 
     @staticmethod
     def finish_all(group: FakeGroup) -> None:
@@ -278,7 +278,7 @@ class Twins(RuleBasedStateMachine):
             assert getattr(ordinary.collector, name) == getattr(general.collector, name), name
         stats = [group.core.stats.by_env() for group in self.groups]
         assert stats[0] == stats[1]
-        active = [group.conditions.active & ~UNLIKE_ENVS for group in self.groups]
+        active = [group.conditions.unusual & ~UNLIKE_ENVS for group in self.groups]
         assert active[0] == active[1]
 
 

@@ -94,15 +94,15 @@ def test_a_worker_waits_for_work_between_its_requests_alone(group: Any, tmp_path
 def test_nothing_is_left_behind(group: Any, tmp_path: Path) -> None:
     """After a trace, nothing observes the core, steps are ordinary again, and spans do nothing."""
     core = group._core
-    before = core._conditions.active
+    before = core._conditions.unusual
     trace = group.trace(tmp_path / "run.json")
     trace.start()
     assert core.observed.observer is trace
-    assert core._conditions.active == before | RECORDING
+    assert core._conditions.unusual == before | RECORDING
     trace.stop()
     trace.stop()
     assert core.observed.observer is None
-    assert core._conditions.active == before
+    assert core._conditions.unusual == before
     assert group.span("policy") is group.span("learner")
     assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
 

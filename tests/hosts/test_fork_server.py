@@ -14,7 +14,7 @@ from rlightning_aio._core.hosts.arena import Arena
 from rlightning_aio._core.hosts.messages import WorkerPlace
 from rlightning_aio._core.hosts.process import fork_server
 from rlightning_aio._core.hosts.process.fork_messages import Exited, Fork
-from rlightning_aio._core.hosts.process.host import ForkServer
+from rlightning_aio._core.hosts.process.host import ForkServerHandle
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -39,7 +39,7 @@ class Asker:
 def lost(interpreter: str) -> str:
     """Return the reason why a fork server ended, as a trainer gets it that reads late."""
     asker: Any = Asker()
-    server = ForkServer(interpreter, {}, ("gymnasium",), asker)
+    server = ForkServerHandle(interpreter, {}, ("gymnasium",), asker)
     channel, worker = socket.socketpair()
     arena = Arena()
     server.fork(asker, worker, arena, Fork(WorkerPlace(0, 1, 0, 1, 0, 0)))

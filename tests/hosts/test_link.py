@@ -31,7 +31,7 @@ from rlightning_aio._core.hosts.messages import (
     StartOrder,
     Value,
 )
-from rlightning_aio._core.hosts.process.host import ForkServer, ProcessHost, _surroundings
+from rlightning_aio._core.hosts.process.host import ForkServerHandle, ProcessHost, _surroundings
 from rlightning_aio.config import EnvConfig
 from rlightning_aio.protocol.entries import Operation, entry
 from rlightning_aio.protocol.frames import BELL, FrameKind, FrameReader, encode
@@ -63,7 +63,7 @@ class EndsTheProgram:
         return sys.exit, (3,)
 
 
-class StandIn(ForkServer):
+class StandIn(ForkServerHandle):
     """Starts nothing, and records orders."""
 
     def __init__(self) -> None:
@@ -104,7 +104,7 @@ class Scene:
             configs=[CONFIG],
             objection=lambda meta: None,
             is_idle=lambda slot: True,
-            resources={(ForkServer, *_surroundings(CONFIG)): self.fork_server},
+            resources={(ForkServerHandle, *_surroundings(CONFIG)): self.fork_server},
         )
         order = StartOrder(CONFIG, None, (0, 1), (None, None), spins=False, core=None)
         self.host = ProcessHost(0, 0, order, wiring)

@@ -307,7 +307,7 @@ class Facade:
     @property
     def resets_by_itself(self) -> bool:
         """True while an `auto_reset` context is open."""
-        return self._core.continuity.active
+        return self._core.continuity.auto_reset_is_open
 
     # -- measurements -------------------------------------------------------------
 

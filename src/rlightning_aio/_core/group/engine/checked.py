@@ -200,7 +200,7 @@ class CheckedSteps(Steps):
             super()._publish(slots, now)
 
     def _hand_out(self, slots: NDArray[np.intp], *, synchronous: bool) -> Any:
-        if self._conditions.active:
+        if self._conditions.unusual:
             return super()._hand_out(slots, synchronous=synchronous)
         with cast("CheckedRequests", self._requests).changes((Event.HANDED_OUT, slots)):
             return super()._hand_out(slots, synchronous=synchronous)

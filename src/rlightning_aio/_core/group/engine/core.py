@@ -347,7 +347,7 @@ class Core:
         send = partial(self._send_steps, batch, slots, now)
         ticket, _ = yield from self.waiting.ask(now, slots, send)
         results, flags = self.settled(ticket, slots)
-        return results, flags if self.continuity.active else None
+        return results, flags if self.continuity.auto_reset_is_open else None
 
     def settled(self, ticket: Ticket, slots: NDArray[np.intp]) -> tuple[BatchedData, Flags]:
         """Return the results of a call in its order, or raise its faults with the results."""

@@ -234,7 +234,7 @@ class Intake:
     def _note_answered(self, slots: NDArray[np.intp]) -> None:
         """Mark results that report a loss, and let steps show that a replacement works."""
         if self._continuity.exceptional:
-            for report in self._continuity.answered(slots):
+            for report in self._continuity.take_answers(slots):
                 self._results.mark_restarted(report)
         if self._supervisor.any_deaths:
             for slot in slots.tolist():

@@ -2,7 +2,7 @@
 
 Ordinary is a batch that answers the group's own results and goes to envs in worker processes, or
 to envs of one inline host. Everything else takes the general path (`core`), which is correct for
-all cases. One attribute tells them apart: `Conditions.active`. It is asked at the start of each of
+all cases. One attribute tells them apart: `Conditions.unusual`. It is asked at the start of each of
 the three parts (send, wait, hand out), so a death or an error in the middle of a step has the rest
 of it take the general path.
 In reading order: validate, write actions, number and publish; wait; verify, gather.
@@ -127,7 +127,7 @@ class Steps:
 
     def step_async(self, batch: BatchedData, now: float) -> None:
         """Send a batch of steps."""
-        slots = None if self._conditions.active else self._written(batch)
+        slots = None if self._conditions.unusual else self._written(batch)
         if slots is None:
             self._core.step_async(batch, now)
             return
@@ -140,19 +140,19 @@ class Steps:
         self, batch: BatchedData, now: float
     ) -> Procedure[tuple[BatchedData, list[bool] | None]]:
         """Send a batch of steps and wait for all of them."""
-        slots = None if self._conditions.active else self._written(batch)
+        slots = None if self._conditions.unusual else self._written(batch)
         if slots is None:
             return (yield from self._core.step(batch, now))
         if self._alone is not None and not self._continuity.due[0]:
             self._step_at_once(self._alone, now)
             results, flags = self._hand_out(slots, synchronous=True)
-            return results, flags if self._continuity.active else None
+            return results, flags if self._continuity.auto_reset_is_open else None
         requests = self._requests
         ticket = requests.tickets.open(slots)
         try:
             requests.owner[slots] = ticket.owner
             self._publish(slots, now)
-            while ticket.remaining > 0 and not self._conditions.active:
+            while ticket.remaining > 0 and not self._conditions.unusual:
                 yield from self._turn(ticket.remaining)
                 self._complete()
             if ticket.remaining > 0:
@@ -168,7 +168,7 @@ class Steps:
             results, flags = self._core.settled(ticket, slots)
         else:
             results, flags = self._hand_out(slots, synchronous=True)
-        return results, flags if self._continuity.active else None
+        return results, flags if self._continuity.auto_reset_is_open else None
 
     def collect(self, now: float, rules: CollectRules) -> Procedure[tuple[BatchedData, list[bool]]]:
         """Wait for results by `rules`, and return them."""
@@ -181,7 +181,7 @@ class Steps:
         ):
             core.collecting = True
             try:
-                while not self._conditions.active:
+                while not self._conditions.unusual:
                     self._complete()
                     ready = requests.collector.num_ready
                     total = ready + requests.collector.num_awaited
@@ -194,7 +194,7 @@ class Steps:
                 core.collecting = False
                 if not self._waiting.wanted:
                     self._bell.disarm()
-        if self._conditions.active or not most:
+        if self._conditions.unusual or not most:
             return (yield from core.collect(now, rules))
         slots = requests.collector.take(most)
         if rules.ordered:
@@ -218,7 +218,7 @@ class Steps:
         if self._completions:
             self._intake.drain()
         answer = answer_of(batch, self._core)
-        if answer is None or self._conditions.active:
+        if answer is None or self._conditions.unusual:
             return None
         slots, columns = answer
         if len(self._requests.state[slots].nonzero()[0]) or not len(slots):
@@ -294,7 +294,7 @@ class Steps:
         if out_of_band:
             self._results.keep_at_once(slot_of(entry), out_of_band)
         self._requests.complete_one(0, entry)
-        self._requests.answered = False
+        self._requests.has_news = False
         if len(self._waiting.wanted) > 0:
             self._watcher.wake()  # Another call may have what it waits for.
         return True
@@ -332,7 +332,7 @@ class Steps:
                 supervisor.look_by = now + LOOK_SECONDS
         finally:
             all_wanted.remove(wanted)
-        if self._conditions.active or now >= supervisor.look_by:
+        if self._conditions.unusual or now >= supervisor.look_by:
             waiting.check(now)
 
     # -- verify, gather ---------------------------------------------------------------
@@ -345,7 +345,7 @@ class Steps:
         if bell.counters == bell.read_by_worker:
             return
         slots = None
-        if not self._conditions.active:
+        if not self._conditions.unusual:
             slots = kernel.complete(
                 bell.counters,
                 bell.read,
@@ -358,7 +358,7 @@ class Steps:
             self._waiting.poll()
             return
         requests.deliver(slots)
-        requests.answered = False
+        requests.has_news = False
         if self._waiting.wanted:
             self._watcher.wake()  # Another call may have what it waits for.
 
@@ -366,7 +366,7 @@ class Steps:
         self, slots: NDArray[np.intp], *, synchronous: bool
     ) -> tuple[BatchedData, list[bool]]:
         """The results of `slots`, all ready; see `Core.hand_out`."""
-        if self._conditions.active:
+        if self._conditions.unusual:
             return self._core.hand_out(slots, synchronous=synchronous)
         requests, results, continuity = self._requests, self._results, self._continuity
         try:

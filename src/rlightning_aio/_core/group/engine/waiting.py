@@ -59,8 +59,8 @@ class Waiting:
         is applied, also if another call applies it here.
         """
         self._intake.drain()
-        if self._requests.answered:
-            self._requests.answered = False
+        if self._requests.has_news:
+            self._requests.has_news = False
             self.wake()
 
     def wake(self) -> None:

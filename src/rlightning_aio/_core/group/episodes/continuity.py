@@ -173,7 +173,7 @@ class Continuity:
         exceptional: some env is not intact, so results must be checked for reports.
         due: by slot, whether the env is reset in place of its next step; all False while no
             context is open.
-        active: an `auto_reset` context is open.
+        auto_reset_is_open: an `auto_reset` context is open.
         mark_truncated: mark results at the step limit as truncated.
     """
 
@@ -196,7 +196,7 @@ class Continuity:
         self._checkpoints: dict[int, _Checkpoint] = {}
         self._pending: dict[int, _Checkpoint] = {}
         self.exceptional = False
-        self.active = False
+        self.auto_reset_is_open = False
         self.mark_truncated = False
 
     # -- the context ------------------------------------------------------------------
@@ -211,14 +211,14 @@ class Continuity:
                 has none.
             RuntimeError: the context is open already.
         """
-        if self.active:
+        if self.auto_reset_is_open:
             raise RuntimeError("auto_reset contexts don't nest; leave the open one first")
         self._limits = self._chosen_limits(max_episode_steps)
         self._uses_own_limits = max_episode_steps is None
         self._margin = 0
         self._resets_ended = on_done
         self.mark_truncated = mark_truncated
-        self.active = True
+        self.auto_reset_is_open = True
         self._conditions.note(CUT_BEFORE, False)
         self._update_due()
 
@@ -257,7 +257,7 @@ class Continuity:
     def end(self) -> None:
         """Close the context: steps are plain again."""
         self._limits = None
-        self.active = self.mark_truncated = False
+        self.auto_reset_is_open = self.mark_truncated = False
         self._update_due()
 
     def note_joined(self, slot: int) -> None:
@@ -270,13 +270,13 @@ class Continuity:
 
     def begin_steps(self, slots: NDArray[np.intp]) -> NDArray[np.bool_]:
         """Note steps that are about to be sent; return which of `slots` are reset instead."""
-        if not self.active:
+        if not self.auto_reset_is_open:
             self._cut[slots] = False  # Outside the context a step continues the episode.
             self._update_due()
         return self.due[slots]
 
     def _update_due(self) -> None:
-        if not self.active:
+        if not self.auto_reset_is_open:
             self.due[:] = False
             self._conditions.note(CUT_BEFORE, len(self._cut.nonzero()[0]) > 0)
         elif self._resets_ended:
@@ -361,7 +361,7 @@ class Continuity:
             for kept in (self._pending, self._checkpoints, self._restored):
                 kept.pop(slot, None)
 
-    def answered(self, slots: NDArray[np.intp]) -> list[Report]:
+    def take_answers(self, slots: NDArray[np.intp]) -> list[Report]:
         """Record that results of `slots` arrived, and return the losses that they report."""
         reports: list[Report] = []
         for slot in slots.tolist():

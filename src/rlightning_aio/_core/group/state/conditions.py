@@ -1,6 +1,6 @@
 """`Conditions`: whether anything is unlike an ordinary step.
 
-The ordinary step (`steps`) asks one question about everything else: is `active` 0? The component
+The ordinary step (`steps`) asks one question about everything else: is `unusual` 0? The component
 that knows of a condition sets it and clears it; while any is set, the general path is taken.
 """
 
@@ -48,14 +48,14 @@ class Conditions:
     """The conditions of one group.
 
     Attributes:
-        active: the sum of those that are set; 0 in an ordinary step.
+        unusual: the sum of those that are set; 0 in an ordinary step.
     """
 
-    __slots__ = ("active",)
+    __slots__ = ("unusual",)
 
     def __init__(self) -> None:
-        self.active = CLOSED | FIRST_RESULTS
+        self.unusual = CLOSED | FIRST_RESULTS
 
     def note(self, condition: int, holds: bool) -> None:
         """Set or clear a condition."""
-        self.active = self.active | condition if holds else self.active & ~condition
+        self.unusual = self.unusual | condition if holds else self.unusual & ~condition

@@ -275,7 +275,7 @@ class Requests:
         sent_ns: when it was sent.
         in_flight: requests of each host that are not answered; the only count of them.
         aborted: requests that end without a reply.
-        answered: something has ended since this was set to False.
+        has_news: something has ended since this was set to False.
     """
 
     def __init__(
@@ -293,7 +293,7 @@ class Requests:
         self.owner = np.zeros(size, np.int64)
         self.sent_ns = np.zeros(size, np.int64)
         self.in_flight = [0] * num_hosts
-        self.answered = False
+        self.has_news = False
 
     # -- what is known ------------------------------------------------------------
 
@@ -451,7 +451,7 @@ class Requests:
             elif owner == COLLECTOR:
                 self.collector.num_awaited -= len(mine)
             self._forget(mine)
-            self.answered = True
+            self.has_news = True
         return slots[~aborted]
 
     def join(self, slot: int, now: float) -> None:
@@ -464,7 +464,7 @@ class Requests:
         """Deliver the results of `slots`, which are no longer in flight, to their owners."""
         if not len(slots):
             return
-        self.answered = True
+        self.has_news = True
         self.state[slots] = _READY_CODE
         collector, tickets = self.collector, self.tickets.waiting
         if not tickets:  # As `CollectorQueue.append`, without a call.
@@ -485,7 +485,7 @@ class Requests:
 
     def set_value(self, slot: int, value: Any) -> None:
         """Record the value of a method call."""
-        self.answered = True
+        self.has_news = True
         owner = int(self.owner[slot])
         if owner == NOBODY:
             self._forget(self.alone(slot))
@@ -504,7 +504,7 @@ class Requests:
 
     def fail(self, slots: NDArray[np.intp], owner: int, fault: EnvFault) -> None:
         """End requests of one owner that are no longer in flight, in one error."""
-        self.answered = True
+        self.has_news = True
         if owner > 0:
             ticket = self.tickets.waiting[owner]
             ticket.remaining -= len(slots)

@@ -146,7 +146,7 @@ def place_of(answering: Any) -> str:
     )
 
 
-class _Executing(Protocol):
+class _Watched(Protocol):
     entry: int
 
 
@@ -165,13 +165,13 @@ class TimeLimit:
     def __init__(self, seconds: float, expire: Callable[[Any, float], None]) -> None:
         self.seconds = seconds
         self._expire = expire
-        self._running: deque[tuple[float, _Executing, int]] = deque()
+        self._running: deque[tuple[float, _Watched, int]] = deque()
         self._timer: asyncio.TimerHandle
         self._is_set = False
         self._late: dict[int, asyncio.TimerHandle] = {}
         self._num_late = 0
 
-    def begin(self, env: _Executing, loop: asyncio.AbstractEventLoop) -> None:
+    def begin(self, env: _Watched, loop: asyncio.AbstractEventLoop) -> None:
         """`env` begins to execute `env.entry`, which is another one as soon as that has ended."""
         running = self._running
         while running and running[0][1].entry != running[0][2]:
@@ -191,7 +191,7 @@ class TimeLimit:
         """Find the requests whose time is up, and when to look for the next ones."""
         self._is_set = False
         now, lateness = time.monotonic(), 0.0
-        late: list[tuple[_Executing, int]] = []
+        late: list[tuple[_Watched, int]] = []
         while self._running:
             expiry, env, entry = self._running[0]
             if env.entry == entry and expiry > now:
@@ -207,7 +207,7 @@ class TimeLimit:
             more = self.seconds / 10 + lateness
             self._late[number] = loop.call_later(more, self._judge, number, late)
 
-    def _judge(self, number: int, late: list[tuple[_Executing, int]]) -> None:
+    def _judge(self, number: int, late: list[tuple[_Watched, int]]) -> None:
         del self._late[number]
         for env, entry in late:
             if env.entry == entry:

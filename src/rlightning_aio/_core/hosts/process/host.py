@@ -1,4 +1,5 @@
-"""`ProcessHost`: the life of a worker process; `ForkServer`: the trainer's handle on its parent.
+"""`ProcessHost`: the life of a worker process; `ForkServerHandle`: the trainer's handle on its
+parent.
 
 A worker is watched through its channel (see `link`) and by the fork server, which is its parent, so
 no death goes unnoticed.
@@ -50,7 +51,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.process.fork_messages import Message
     from rlightning_aio.config import EnvConfig
 
-__all__ = ["ForkServer", "ProcessHost", "ending"]
+__all__ = ["ForkServerHandle", "ProcessHost", "ending"]
 
 _STDERR: Final = 2
 _ONE_THREAD = dict.fromkeys(
@@ -65,7 +66,7 @@ _ONE_THREAD = dict.fromkeys(
 )
 
 
-class ForkServer:
+class ForkServerHandle:
     """The trainer's handle on one fork server.
 
     Args:
@@ -76,7 +77,7 @@ class ForkServer:
     """
 
     @classmethod
-    def shared(cls, config: EnvConfig, wiring: Wiring) -> ForkServer:
+    def shared(cls, config: EnvConfig, wiring: Wiring) -> ForkServerHandle:
         """Return the fork server of the group for the interpreter and env_vars of an entry."""
         key = (cls, *_surroundings(config))
         fork_server = wiring.resources.get(key)
@@ -89,7 +90,7 @@ class ForkServer:
             env_vars = dict(config.env_vars)
             fork_server = cls(config.interpreter, env_vars, tuple(preload), wiring.watcher)
             wiring.resources[key] = fork_server
-        assert isinstance(fork_server, ForkServer)
+        assert isinstance(fork_server, ForkServerHandle)
         return fork_server
 
     def __init__(
@@ -260,7 +261,7 @@ class ProcessHost:
         self.num_envs = len(order.worker_indices)
         self.pid: int | None = None
         self._start_payload = dumped_with_code(order)
-        self._fork_server = ForkServer.shared(order.config, wiring)
+        self._fork_server = ForkServerHandle.shared(order.config, wiring)
         self._wiring = wiring
         self._place = WorkerPlace(
             host_id,
