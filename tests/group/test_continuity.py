@@ -46,7 +46,7 @@ EVENTS: dict[LossEvent, Callable[[Continuity], object]] = {
     LossEvent.RESUME_SENT: lambda c: c.report_losses(SLOT, STEP),
     LossEvent.RESET_SENT: lambda c: c.note_resets([0]),
     LossEvent.SHOW_SENT: lambda c: c.note_shows([0], [Position(3, is_cut=False)]),
-    LossEvent.ANSWERED: lambda c: c.answered(SLOT),
+    LossEvent.ANSWERED: lambda c: c.take_answers(SLOT),
     LossEvent.RAISED: lambda c: c.raised(0),
     LossEvent.GIVEN_UP: lambda c: c.give_up([0]),
 }
