@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from types import FrameType
 
 
+DRIVER = ("/group/api/sync.py", "/group/drivers/sync_driver.py")
+
+
 def press() -> None:
     """Press Ctrl-C."""
     signal.raise_signal(signal.SIGINT)
@@ -49,7 +52,7 @@ class Strike:
 
     def _counts(self, path: str) -> bool:
         holds_back = signal.getsignal(signal.SIGINT) is not signal.default_int_handler
-        return holds_back or not path.endswith("/_core/group/api/sync.py")
+        return holds_back or not path.endswith(DRIVER)
 
 
 def struck(
