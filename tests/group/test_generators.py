@@ -52,7 +52,7 @@ class AwaitableDice:
 DICE = pytest.mark.parametrize("make", [Dice, AwaitableDice])
 
 
-def rolled(make: Any, seed: int | None, *, options: Any = None, count: int = 3) -> list[Any]:
+def rolled(make: Any, seed: int | None, *, options: Any = None, count: int = 2) -> list[Any]:
     """The numbers of a reset, three steps, a death, three steps, and all of it again, by env."""
     found: list[Any] = []
     config = EnvConfig(name="d", make_env=make, num_workers=count, envs_per_process=1)
