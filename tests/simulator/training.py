@@ -122,6 +122,8 @@ class Training(InContext):
     # -- operations
 
     plain = False
+    replays = False
+    """Nothing was cut off when it was recorded, and envs may be slower now."""
 
     async def op_rollout(self, rng: Random) -> bool:
         """Collect a rollout, or be disturbed meanwhile."""
@@ -129,7 +131,7 @@ class Training(InContext):
         cancels = self.is_async and "cancel" in self.features and rng.random() < 0.3
         seconds = rng.choice([1e-5, 1e-3, 0.1]) if cancels and not self.plain else None
         try:
-            if seconds is None:
+            if seconds is None or self.replays:
                 found = await self.done(self.collector.collect())
             else:
                 async with asyncio.timeout(seconds):
@@ -194,7 +196,7 @@ class Training(InContext):
         await self.start()
         self.context = self.group.auto_reset(self.limit)
         self.context.__enter__()
-        self.kept, self.plain = [], False
+        self.kept, self.plain, self.replays = [], False, True
         self._begin_with(ReplayedGroup(self.group, record))
         for op in self.program.ops:
             if op.name == "rollout":
