@@ -115,8 +115,10 @@ class Core:
         self._arrivals = Arrivals(tables, self.results, self.stats)
         self.intake = Intake(parts.completions, tables, supervisor, self.results, self._arrivals)
         self.drain = self.intake.drain
-        self._dispatch = Dispatch(tables, supervisor, parts.poller, self.intake, parts.watcher)
         self.waiting = Waiting(requests, supervisor, parts.poller, self.intake, parts.watcher)
+        self._dispatch = Dispatch(
+            tables, supervisor, parts.poller, self.intake, self.waiting, parts.watcher
+        )
         self.calls = Calls(tables, self._dispatch, self.intake, self.waiting)
         self._snapshots = Snapshots(
             envs, supervisor, self._dispatch, self.calls, continuity, self.waiting

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.engine.actions import OutOfBandSteps
     from rlightning_aio._core.group.engine.intake import Intake
     from rlightning_aio._core.group.engine.poller import Poller
+    from rlightning_aio._core.group.engine.waiting import Waiting
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables
     from rlightning_aio._core.hosts.base import Host, Membership, Watcher
@@ -38,6 +39,7 @@ class Dispatch:
         supervisor: Supervisor,
         poller: Poller,
         intake: Intake,
+        waiting: Waiting,
         watcher: Watcher,
     ) -> None:
         self._envs = tables.envs
@@ -46,6 +48,7 @@ class Dispatch:
         self._supervisor = supervisor
         self._poller = poller
         self._intake = intake
+        self._waiting = waiting
         self._watcher = watcher
 
     def distinct(self, env_ids: Sequence[str]) -> NDArray[np.intp]:
@@ -96,10 +99,7 @@ class Dispatch:
         while not self._requests.is_idle(slot) and self._poller.execute(1, None):
             self._intake.drain()
         if not self._requests.is_idle(slot):  # Perhaps nobody waits who would replace its worker.
-            self._poller.poll()  # An env that has replied is not hung.
-            self._intake.drain()
-            self._supervisor.check(now)
-            self._intake.drain()
+            self._waiting.check(now)
         return self._requests.is_idle(slot)
 
     def check_local(self, slots: NDArray[np.intp], what: str) -> None:
