@@ -68,8 +68,7 @@ class _CheckedQueue(CollectorQueue):
             super().keep(slots, fault)
 
     def free(self, slots: Sequence[int]) -> NDArray[np.intp]:
-        failed = np.array([slot for slot in slots if slot in self.failed], np.intp)
-        with self._changes((Event.FREED, failed)):
+        with self._changes((Event.FREED, self.with_errors(slots))):
             return super().free(slots)
 
 

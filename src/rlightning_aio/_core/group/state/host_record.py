@@ -46,7 +46,7 @@ class HostRecord:
         started: its envs, once built.
         order: the rows of its envs, once assigned.
         start_by: the deadline of its start; late: it missed that, and is being killed.
-        traffic: see `Killable`, at the last `has_moved`.
+        traffic: see `Killable`, when `note_traffic` was last called.
         restart_at: the time of its next restart; restarts: the number so far.
         refusals: consecutive attempts to start a replacement that the system refused;
             refused_since: the time of the first.
@@ -124,6 +124,11 @@ class HostRecord:
         """The keys of `deaths` that the last death counts for."""
         return self.suspects or (self.culprit,)
 
+    @property
+    def deaths_in_a_row(self) -> int:
+        """The deaths in a row of the env with the most, of those blamed for the last one."""
+        return max(self.deaths[slot] for slot in self.blamed)
+
     def withdraw(self, entries: NDArray[np.int64]) -> list[int]:
         """Hold some requests no longer; return those that it has held."""
         withdrawn: list[int] = []
@@ -140,10 +145,10 @@ class HostRecord:
     def give_time(self, now: float) -> None:
         """Count the time of its start from now on."""
         self.start_by = now + self.config.start_timeout
-        self.has_moved()
+        self.note_traffic()
 
-    def has_moved(self) -> bool:
-        """Return True if data has passed between it and the trainer since this was last asked."""
+    def note_traffic(self) -> bool:
+        """Note what has passed between it and the trainer; True if that is more than last time."""
         before = self.traffic
         self.traffic = before if self.killable is None else self.killable.traffic
         return self.traffic != before

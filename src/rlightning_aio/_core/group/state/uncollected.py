@@ -63,9 +63,13 @@ class UncollectedErrors:
         self._conditions.note(FAULT, bool(self.faults))
         return self.free([slot for slot, own in self.failed.items() if own is fault])
 
+    def with_errors(self, slots: Sequence[int]) -> NDArray[np.intp]:
+        """Return those of `slots` whose errors wait."""
+        return np.array([slot for slot in slots if slot in self.failed], np.intp)
+
     def free(self, slots: Sequence[int]) -> NDArray[np.intp]:
         """Free those of `slots` whose errors wait, and return them; the errors stay."""
-        free = np.array([slot for slot in slots if slot in self.failed], np.intp)
+        free = self.with_errors(slots)
         self._state[free] = _IDLE_CODE
         for slot in free.tolist():
             del self.failed[slot]

@@ -146,7 +146,7 @@ class DeathReport:
         what: the subject and the cause; last: the last request of the env at fault.
         outcome: what happens to the worker now.
         slot: of the env at fault, or of the first suspect.
-        suspects: slots; see `HostRecord`.
+        suspects: ids; see `WorkerDied`.
     """
 
     envs: EnvTable
@@ -156,7 +156,7 @@ class DeathReport:
     last: str
     outcome: str
     slot: int
-    suspects: tuple[int, ...]
+    suspects: tuple[str, ...]
 
     def message(self, unanswered: NDArray[np.intp]) -> str:
         """The message about the death; `unanswered` had a request in flight."""
@@ -185,7 +185,7 @@ class DeathReport:
             stderr_tail=self.death.stderr_tail,
         )
         error.env_ids = tuple(self._ids(slots))
-        error.suspects = tuple(self.envs.env_ids[slot] for slot in self.suspects)
+        error.suspects = self.suspects
         return error
 
     def _ids(self, slots: NDArray[np.intp]) -> list[str]:
@@ -210,7 +210,8 @@ def death_report(
         limit = config.step_timeout if stepped else config.reset_timeout
         what = f"{envs.describe(slot)} took longer than {limit} s for {doing} and was killed"
     kind = EnvHung if record.is_hung else WorkerDied
-    return DeathReport(envs, death, kind, what, last, outcome, slot, record.suspects)
+    suspects = tuple(envs.env_ids[slot] for slot in record.suspects)
+    return DeathReport(envs, death, kind, what, last, outcome, slot, suspects)
 
 
 def _said(stderr_tail: str) -> str:

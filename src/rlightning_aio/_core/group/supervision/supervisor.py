@@ -240,7 +240,7 @@ class Supervisor:
         for record in self._records:
             if record.start_by is None or self._now < record.start_by:
                 continue
-            if has_news(record) or record.has_moved():
+            if has_news(record) or record.note_traffic():
                 if not record.late:
                     record.give_time(self._clock())
             elif not record.late:
@@ -435,16 +435,14 @@ class Supervisor:
             return None
         self._requests.lose_host(exited.host_id)
         resets = not record.is_hardware
-        suspects = tuple(self._envs.env_ids[slot] for slot in record.suspects)
-        return Replaced(record.host, owed, report.error, cause, at_fault, suspects, resets)
+        return Replaced(record.host, owed, report.error, cause, at_fault, report.suspects, resets)
 
     def _schedule_restart(self, record: HostRecord) -> None:
         """Restart immediately after the first death in a row, later after further ones."""
         now = self._clock()
         record.stage = Stage.DOWN
         record.start_by = None
-        in_a_row = max(record.deaths[slot] for slot in record.blamed)
-        record.restart_at = now + restart_pause(in_a_row)
+        record.restart_at = now + restart_pause(record.deaths_in_a_row)
         if record.held is None:
             record.held = []
         if record.restart_at <= now:
@@ -494,12 +492,11 @@ class Supervisor:
         requests, config = self._requests, record.config
         if record.stage is Stage.UP and not record.is_hung:
             # A replacement that fails to start counts against the env that made it necessary.
-            found = culprits_of(record, death.requests, requests, owed)
-            record.culprit, record.suspects = found
+            record.culprit, record.suspects = culprits_of(record, death.requests, requests, owed)
         is_fault = record.aborted_slot is None  # Else the caller's wish, which counts for nothing.
         for slot in record.blamed:
             record.deaths[slot] = record.deaths.get(slot, 0) + is_fault
-        deaths = max(record.deaths[slot] for slot in record.blamed)
+        deaths = record.deaths_in_a_row
         self._note_deaths(True)
         cause = cause_of(record, death, requests)
         raises = config.on_worker_death == "raise"
