@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 import pytest
@@ -13,13 +13,14 @@ from group.fake_host import ACTION_SPACE, LAYOUT, OBSERVATION_SPACE, Running
 from rlightning_aio._core.group.episodes.continuity import Continuity
 from rlightning_aio._core.group.state.conditions import Conditions
 from rlightning_aio._core.group.state.env_table import EnvTable
+from rlightning_aio._core.group.state.host_loss import HostLoss
 from rlightning_aio._core.group.state.lifetime import Lifetime
 from rlightning_aio._core.group.state.observed import Observed
 from rlightning_aio._core.group.state.request_states import COLLECTOR
 from rlightning_aio._core.group.state.requests import Requests
 from rlightning_aio._core.group.state.slab_layout import SlabLayout
 from rlightning_aio._core.group.supervision import hang_detector
-from rlightning_aio._core.group.supervision.supervisor import GivenUp, Replaced, Supervisor
+from rlightning_aio._core.group.supervision.supervisor import Supervisor
 from rlightning_aio._core.group.tables import Tables
 from rlightning_aio._core.hosts.arena import Arena
 from rlightning_aio._core.hosts.messages import (
@@ -44,6 +45,14 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.drivers.wait import Procedure
 
 KILLED = Death("was killed by SIGKILL", -9)
+
+
+def is_replaced(loss: HostLoss | None) -> TypeGuard[HostLoss]:
+    return loss is not None and loss.replaced
+
+
+def is_given_up(loss: HostLoss | None) -> TypeGuard[HostLoss]:
+    return loss is not None and not loss.replaced
 
 
 @dataclass
@@ -166,7 +175,7 @@ class Fleet:
         awaits: the envs are awaitable.
 
     Attributes:
-        verdicts: the outcome of each death.
+        losses: the outcome of each death.
     """
 
     def __init__(
@@ -175,7 +184,7 @@ class Fleet:
         self.now = 1000.0
         self.completions: deque[Any] = deque()
         self.log: list[str] = []
-        self.verdicts: list[GivenUp | Replaced | None] = []
+        self.losses: list[HostLoss | None] = []
         self.running: list[Running] = []
         config = EnvConfig(
             **{"name": "e", "backend": "gymnasium", "task": "x", "start_timeout": 10.0, **fields}
@@ -227,7 +236,7 @@ class Fleet:
         raise AssertionError("the supervisor turns in circles instead of waiting")
 
     def drain(self) -> None:
-        """Act as the core: send owed requests again to a replacement."""
+        """Act as the core: start a replacement, and send it what the dead worker owed."""
         while self.completions:
             completion = self.completions.popleft()
             for running in self.running:
@@ -235,15 +244,20 @@ class Fleet:
             if not isinstance(completion, Died):
                 self.supervisor.handle(completion)
                 continue
-            verdict = self.supervisor.handle_exit(completion)
-            self.verdicts.append(verdict)
-            if isinstance(verdict, Replaced):
-                host_id = verdict.host.host_id
-                entries = self.requests.restart(host_id, verdict.owed)
-                if len(entries):
-                    self.supervisor.submit(host_id, entries, None)
-            elif verdict is not None:
-                self.requests.fail(verdict.owed, COLLECTOR, verdict.error_for(verdict.owed))
+            loss = self.supervisor.handle_exit(completion)
+            self.losses.append(loss)
+            if loss is not None:
+                self.carry_out(loss)
+
+    def carry_out(self, loss: HostLoss) -> None:
+        self.requests.lose_host(loss.host_id)
+        if not loss.replaced:
+            self.requests.fail(loss.owed, COLLECTOR, loss.error(loss.owed))
+            return
+        self.supervisor.replace(loss.host_id)
+        entries = self.requests.restart(loss.host_id, loss.owed)
+        if len(entries):
+            self.supervisor.submit(loss.host_id, entries, None)
 
     def start(self) -> Running:
         return self.begin(self.supervisor.start(self.now))
@@ -275,11 +289,11 @@ class Fleet:
         self.check()
         return passed
 
-    def die(self, host_id: int, *requests: int) -> GivenUp | Replaced | None:
+    def die(self, host_id: int, *requests: int) -> HostLoss | None:
         """Let a worker die while it executes `requests`; return the outcome."""
         self.completions.append(Died(host_id, Death(KILLED.cause, -9, "last words", requests)))
         self.drain()
-        return self.verdicts[-1]
+        return self.losses[-1]
 
     def reply(self, slot: int) -> None:
         """Complete a step and collect it."""
@@ -434,9 +448,9 @@ def test_a_host_that_survives_a_kill_is_destroyed_with_its_fork_server(
         ours.check()
         assert ours.log == ["dump and kill 0"] + destroyed * ["destroy 0"]
         ours.check()
-    verdict = ours.die(0)
-    assert isinstance(verdict, Replaced)
-    assert verdict.cause == "hung in a step and was killed"
+    loss = ours.die(0)
+    assert is_replaced(loss)
+    assert loss.death.cause == "hung in a step and was killed"
     assert ours.supervisor.next_check() is None or ours.supervisor.next_check() > ours.now
     ours.now += 60
     ours.check()
@@ -471,23 +485,23 @@ def test_an_env_that_executes_too_long_is_killed(fleet: Callable[..., Fleet]) ->
     ours.check()
     ours.check()
     assert ours.log == ["dump and kill 1"]
-    verdict = ours.die(1)
-    assert isinstance(verdict, Replaced)
-    assert verdict.cause == "hung in a step and was killed"
-    error = verdict.error_for(verdict.owed)
+    loss = ours.die(1)
+    assert is_replaced(loss)
+    assert loss.death.cause == "hung in a step and was killed"
+    error = loss.error(loss.owed)
     assert isinstance(error, EnvHung)
     assert (error.env_id, error.env_ids) == ("e-2", ("e-1", "e-2"))
     assert "took longer than 5.0 s for a step" in str(error)
 
 
-def ended_as_hung(ours: Fleet) -> Replaced:
+def ended_as_hung(ours: Fleet) -> HostLoss:
     """Return the outcome for host 0, whose time is almost over."""
     ours.now += 0.2
     ours.check()
     assert ours.log[0] == "dump and kill 0"
-    (verdict,) = ours.verdicts
-    assert isinstance(verdict, Replaced)
-    return verdict
+    (loss,) = ours.losses
+    assert is_replaced(loss)
+    return loss
 
 
 def test_a_stopped_process_is_found_by_its_doing_nothing(fleet: Callable[..., Fleet]) -> None:
@@ -501,9 +515,9 @@ def test_a_stopped_process_is_found_by_its_doing_nothing(fleet: Callable[..., Fl
     ours.now += 4.9
     ours.check()
     assert ours.log == []
-    verdict = ended_as_hung(ours)
-    assert verdict.owed.tolist() == [1]
-    assert verdict.error_for(verdict.owed).env_id == "e-1"
+    loss = ended_as_hung(ours)
+    assert loss.owed.tolist() == [1]
+    assert loss.error(loss.owed).env_id == "e-1"
 
 
 def test_each_part_that_is_read_restarts_the_time_of_a_large_reply(
@@ -520,8 +534,8 @@ def test_each_part_that_is_read_restarts_the_time_of_a_large_reply(
         ours.now += 4.9
         ours.check()
     assert ours.log == []
-    verdict = ended_as_hung(ours)
-    assert verdict.error_for(verdict.owed).env_id == "e-1"
+    loss = ended_as_hung(ours)
+    assert loss.error(loss.owed).env_id == "e-1"
 
 
 def test_an_answered_request_is_not_blamed_for_a_hang(fleet: Callable[..., Fleet]) -> None:
@@ -533,9 +547,9 @@ def test_an_answered_request_is_not_blamed_for_a_hang(fleet: Callable[..., Fleet
     ours.check()
     ours.now += 5
     ours.check()
-    (verdict,) = ours.verdicts
-    assert isinstance(verdict, Replaced)
-    assert verdict.error_for(verdict.owed).env_id == "e-1"
+    (loss,) = ours.losses
+    assert is_replaced(loss)
+    assert loss.error(loss.owed).env_id == "e-1"
 
 
 def test_an_event_loop_that_goes_on_is_not_killed(fleet: Callable[..., Fleet]) -> None:
@@ -548,10 +562,10 @@ def test_an_event_loop_that_goes_on_is_not_killed(fleet: Callable[..., Fleet]) -
         ours.now += 4.9
         ours.check()
     assert ours.log == []
-    verdict = ended_as_hung(ours)
-    assert (verdict.at_fault, verdict.suspects) == (None, ("e-0", "e-2"))
-    assert verdict.cause == "hung and was killed"
-    error = verdict.error_for(verdict.owed)
+    loss = ended_as_hung(ours)
+    assert (loss.at_fault, loss.suspects) == (None, ("e-0", "e-2"))
+    assert loss.death.cause == "hung and was killed"
+    error = loss.error(loss.owed)
     assert isinstance(error, EnvHung)
     assert (error.env_id, error.suspects) == ("e-0", ("e-0", "e-2"))
     assert "no env's code was running; envs that owed a reply: e-0, e-2" in str(error)
@@ -567,9 +581,9 @@ def test_an_env_that_blocks_the_event_loop_is_at_fault(fleet: Callable[..., Flee
     ours.now += 4.9
     ours.check()
     assert ours.log == []
-    verdict = ended_as_hung(ours)
-    assert (verdict.at_fault, verdict.suspects) == ("e-2", ())
-    assert verdict.cause == "hung in a step and was killed"
+    loss = ended_as_hung(ours)
+    assert (loss.at_fault, loss.suspects) == ("e-2", ())
+    assert loss.death.cause == "hung in a step and was killed"
 
 
 def test_a_late_trainer_reads_pending_replies_before_it_kills(
@@ -625,17 +639,19 @@ def test_without_a_limit_a_request_may_take_any_time(fleet: Callable[..., Fleet]
 
 
 def test_a_dead_host_is_replaced(fleet: Callable[..., Fleet]) -> None:
-    """It is started and gets its rows again; the verdict has what it owed."""
+    """It is started and gets its rows again; the loss has what it owed."""
     ours = fleet((1, 3))
     entries = ours.ask(1, 3)
     ours.completions.append(Died(1, Death("left", 3, "last words", (entries[1],))))
-    verdict = ours.supervisor.handle_exit(ours.completions.popleft())
-    assert isinstance(verdict, Replaced)
-    assert (verdict.host, verdict.owed.tolist(), verdict.cause) == (ours.hosts[1], [1, 3], "left")
-    assert ours.requests.in_flight == [0, 0]
+    loss = ours.supervisor.handle_exit(ours.completions.popleft())
+    assert is_replaced(loss)
+    assert (loss.slots, loss.owed.tolist(), loss.death.cause) == (range(1, 4), [1, 3], "left")
+    assert ours.log == []
+    ours.carry_out(loss)
+    assert ours.requests.in_flight == [0, 2]
     assert ours.log == ["start 1", "attach 1"]
     assert ours.supervisor.any_deaths
-    error = verdict.error_for(np.array([1]))
+    error = loss.error(np.array([1]))
     assert (error.env_id, error.env_ids, error.exit_code) == ("e-3", ("e-1",), 3)
     assert "restart 1 of 3 in a row" in str(error)
     assert str(error).endswith("last words")
@@ -654,9 +670,9 @@ def test_a_dead_host_may_be_given_up(
     """Later requests to its envs raise the cause; the other envs can be used."""
     ours = fleet((2, 1), **fields)
     ours.ask(1, 2)
-    verdict = ours.die(0)
-    assert isinstance(verdict, GivenUp)
-    assert (verdict.host, verdict.owed.tolist()) == (ours.hosts[0], [1])
+    loss = ours.die(0)
+    assert is_given_up(loss)
+    assert (loss.host_id, loss.owed.tolist()) == (0, [1])
     assert ours.log == []
     with pytest.raises(WorkerDied, match=why):
         raise ours.requests.collector.faults[0]
@@ -671,7 +687,7 @@ def test_restarts_are_counted_for_each_culprit(fleet: Callable[..., Fleet]) -> N
     ours = fleet((2,), max_restarts=2)
     for slot in (0, 1, 0, 1):
         (entry,) = ours.ask(slot)
-        assert isinstance(ours.die(0, entry), Replaced)
+        assert is_replaced(ours.die(0, entry))
         if ours.supervisor.next_check() is not None:
             ours.wait()
         # A reset of the replacement proves nothing yet.
@@ -680,10 +696,10 @@ def test_restarts_are_counted_for_each_culprit(fleet: Callable[..., Fleet]) -> N
     ours.ask(0)
     ours.reply(0)
     (entry,) = ours.ask(0)
-    assert isinstance(ours.die(0, entry), Replaced)
+    assert is_replaced(ours.die(0, entry))
     ours.reply(0)
     (entry,) = ours.ask(1)
-    assert isinstance(ours.die(0, entry), GivenUp)
+    assert is_given_up(ours.die(0, entry))
 
 
 @pytest.mark.parametrize("executing", [0, 1])
@@ -693,12 +709,12 @@ def test_of_awaitable_envs_the_one_whose_code_ran_is_at_fault(
     """Not the one that was asked first; if all waited, those that owed a reply are suspected."""
     ours = fleet((3, 1), awaits=True)
     asked = ours.ask(0, 1)
-    verdict = ours.die(0, (0, asked[1])[executing], *asked)
-    assert isinstance(verdict, Replaced)
-    error = verdict.error_for(np.array([1]))
+    loss = ours.die(0, (0, asked[1])[executing], *asked)
+    assert is_replaced(loss)
+    error = loss.error(np.array([1]))
     suspects = () if executing else ("e-0", "e-1")
     at_fault = "e-1" if executing else None
-    assert (verdict.at_fault, verdict.suspects) == (at_fault, suspects)
+    assert (loss.at_fault, loss.suspects) == (at_fault, suspects)
     assert (error.env_id, error.suspects) == (at_fault or "e-0", suspects)
     assert error.env_ids == ("e-1",)
 
@@ -706,8 +722,8 @@ def test_of_awaitable_envs_the_one_whose_code_ran_is_at_fault(
 def test_a_worker_of_one_env_has_no_suspects(fleet: Callable[..., Fleet]) -> None:
     """Nor has one that owed nothing."""
     ours = fleet((1, 2), awaits=True)
-    verdicts = [ours.die(0, 0, *ours.ask(0)), ours.die(1, 0)]
-    found = [(v.at_fault, v.suspects) for v in verdicts if isinstance(v, Replaced)]
+    losses = [ours.die(0, 0, *ours.ask(0)), ours.die(1, 0)]
+    found = [(v.at_fault, v.suspects) for v in losses if v]
     assert found == [("e-0", ()), (None, ())]
 
 
@@ -716,7 +732,7 @@ def test_each_suspect_uses_its_own_restarts(fleet: Callable[..., Fleet]) -> None
     ours = fleet((2,), awaits=True, max_restarts=2)
     for _ in range(2):
         ours.ask(0, 1)
-        assert isinstance(ours.die(0, 0), Replaced)
+        assert is_replaced(ours.die(0, 0))
         if ours.supervisor.next_check() is not None:
             ours.wait()
         for slot in (0, 1):  # Resets, which prove nothing.
@@ -726,12 +742,12 @@ def test_each_suspect_uses_its_own_restarts(fleet: Callable[..., Fleet]) -> None
     ours.ask(0)
     ours.reply(0)
     ours.ask(0)
-    assert isinstance(ours.die(0, 0), Replaced)
+    assert is_replaced(ours.die(0, 0))
     ours.reply(0)
     ours.ask(1)
-    verdict = ours.die(0, 0)
-    assert isinstance(verdict, GivenUp)
-    assert "after 2 restarts in a row" in str(verdict.error_for(verdict.owed))
+    loss = ours.die(0, 0)
+    assert is_given_up(loss)
+    assert "after 2 restarts in a row" in str(loss.error(loss.owed))
 
 
 @pytest.mark.parametrize("later", [False, True])
@@ -743,7 +759,7 @@ def test_a_shortage_of_half_a_minute_costs_no_restarts(
     ours.hosts[0].refusal, ours.hosts[0].refused_later = OSError("too many open files"), later
     ours.ask(0, 1)
     ours.die(0)
-    assert isinstance(ours.verdicts[0], Replaced)
+    assert is_replaced(ours.losses[0])
     pauses = []
     for _ in range(10):
         ours.reply(1)
@@ -753,13 +769,13 @@ def test_a_shortage_of_half_a_minute_costs_no_restarts(
         pauses.append(round(ours.wait() + 1e-3, 6))
     assert pauses == [0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0, 5.0, 5.0]
     attempts = 11 if later else 0
-    assert len(ours.verdicts) == 1 + attempts + 1, "the last attempt was one too many"
-    assert ours.verdicts[-1] is None, "a replacement that was never up owes nothing"
+    assert len(ours.losses) == 1 + attempts + 1, "the last attempt was one too many"
+    assert ours.losses[-1] is None, "a replacement that was never up owes nothing"
     assert round(ours.wait(), 6) == 0.1, "this must be the second restart in a row"
-    verdict = ours.verdicts[-1]
-    assert isinstance(verdict, GivenUp)
-    assert verdict.owed.tolist() == [0]
-    error = str(verdict.error_for(verdict.owed))
+    loss = ours.losses[-1]
+    assert is_given_up(loss)
+    assert loss.owed.tolist() == [0]
+    error = str(loss.error(loss.owed))
     why = "it could not be forked: too many open" if later else "too many open"
     assert f"could not be replaced: can't start a worker for entry 'e': {why}" in error
     assert "after 2 restarts in a row" in error
@@ -793,7 +809,7 @@ def test_thousands_of_restarts_are_attempts_like_the_first(fleet: Callable[..., 
         if ours.supervisor._records[0].restart_at is not None:
             ours.wait()
     ours.die(0)
-    assert isinstance(ours.verdicts[-1], GivenUp)
+    assert is_given_up(ours.losses[-1])
     assert ours.log.count("start 0") == 5000
     assert "after 5000 restarts in a row" in str(ours.requests.collector.faults[0])
 
@@ -819,7 +835,7 @@ def test_requests_to_a_host_that_is_down_wait_for_its_replacement(
     ours.wait()
     assert ours.hosts[0].asked == [entry, *asked]
     assert ours.requests.in_flight == [2, 0]
-    assert [type(verdict) for verdict in ours.verdicts] == [Replaced, type(None)]
+    assert [type(loss) for loss in ours.losses] == [HostLoss, type(None)]
     # The time begins when the replacement is up: until then it had nothing to execute.
     ours.check()
     assert ours.log[-2:] == ["start 0", "attach 0"]
@@ -893,7 +909,7 @@ def test_a_replacement_that_is_late_is_killed(fleet: Callable[..., Fleet]) -> No
     ours.now += 10
     ours.check()
     assert ours.log == ["start 0", "dump and kill 0"]
-    assert isinstance(ours.verdicts[1], GivenUp)
+    assert is_given_up(ours.losses[1])
     assert "did not start again within 10.0 s" in str(ours.requests.collector.faults[0])
 
 
@@ -1004,7 +1020,7 @@ def test_closing_never_hangs(fleet: Callable[..., Fleet]) -> None:
 def test_a_death_while_closing_closes_the_host(fleet: Callable[..., Fleet]) -> None:
     """Nothing is replaced, and no wait goes on; a host that was given up is closed already."""
     ours = fleet((1, 1), max_restarts=0)
-    assert isinstance(ours.die(1), GivenUp)
+    assert is_given_up(ours.die(1))
     ours.hosts[0].closes = False
     closing = ours.close()
     assert ours.die(0) is None
@@ -1036,7 +1052,7 @@ def test_a_worker_that_crashes_again_and_again_does_not_fill_the_log(
     ours = fleet((1,), max_restarts=99)
     for _ in range(30):
         (entry,) = ours.ask(0)
-        assert isinstance(ours.die(0, entry), Replaced)
+        assert is_replaced(ours.die(0, entry))
         while ours.supervisor.next_check() is not None:
             ours.wait()
         assert ours.requests.complete_one(0, ours.requests.numbering.entry.item(0)) == 0

@@ -14,7 +14,6 @@ import numpy as np
 from rlightning_aio._core.group.episodes.continuity import Report
 from rlightning_aio._core.group.state.request_states import COLLECTOR
 from rlightning_aio._core.group.supervision.fault_messages import without_terminal
-from rlightning_aio._core.group.supervision.supervisor import GivenUp, Replaced
 from rlightning_aio._core.hosts.messages import (
     Attached,
     Built,
@@ -44,7 +43,6 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.engine.results import Results
     from rlightning_aio._core.group.supervision.supervisor import Supervisor
     from rlightning_aio._core.group.tables import Tables
-    from rlightning_aio._core.hosts.base import Host
     from rlightning_aio._core.hosts.messages import Completions
     from rlightning_aio.errors import EnvFault
 
@@ -197,39 +195,44 @@ class Intake:
             self._requests.fail(mine, owner, error_for(mine))
 
     def _on_died(self, completion: Died) -> None:
-        outcome = self._supervisor.handle_exit(completion)
-        if isinstance(outcome, GivenUp):
-            self._continuity.give_up(_slots_of_host(outcome.host))
-            self._fail(self._requests.end_aborted(outcome.owed), outcome.error_for)
-        elif outcome is not None:
-            self._replace_host(outcome)
+        """Carry out what a death means: mark lost, end requests, replace, send again."""
+        loss = self._supervisor.handle_exit(completion)
+        if loss is None:
+            return
+        requests, continuity = self._requests, self._continuity
+        # The episodes of aborted requests were over before.
+        lost = [slot for slot in loss.slots if slot not in requests.aborted.faults]
+        requests.lose_host(loss.host_id)
+        owed = requests.end_aborted(loss.owed)
+        if not loss.replaced:
+            continuity.give_up(loss.slots)
+            self._fail(owed, loss.error)
+            return
+        self._keep_ready(loss.slots)
+        if loss.resets:
+            about = loss.death.cause, loss.at_fault, loss.suspects
+            continuity.lose(lost, *about, from_checkpoint=True)
+        # A replacement answers steps and resets, but not calls.
+        again = ~requests.numbering.awaits_value(owed) & loss.resets
+        self._fail(owed[~again], loss.error)
+        self._supervisor.replace(loss.host_id)
+        self._send_again(loss.host_id, owed[again])
 
-    def _replace_host(self, outcome: Replaced) -> None:
-        """Send the outstanding requests of a dead worker to its replacement."""
-        host, slots = outcome.host, _slots_of_host(outcome.host)
-        # Their episodes were over before.
-        others = [slot for slot in slots if slot not in self._requests.aborted.faults]
-        owed = self._requests.end_aborted(outcome.owed)
+    def _keep_ready(self, slots: range) -> None:
+        """Decode infos of results that are ready, as a replacement announces other schemas."""
         for slot in self._requests.ready(np.array(slots, np.intp)).tolist():
-            # Decoded now, because the replacement announces other schemas.
             self._results.detach_info(slot)
         self._results.begin_schemas(slots)
-        if not outcome.resets:
-            self._fail(owed, outcome.error_for)
+
+    def _send_again(self, host_id: int, slots: NDArray[np.intp]) -> None:
+        """Send the steps and resets that a dead worker owed, as resets."""
+        if not len(slots):
             return
-        self._continuity.lose(
-            others, outcome.cause, outcome.at_fault, outcome.suspects, from_checkpoint=True
-        )
-        # A replacement answers steps and resets, but not calls.
-        calls = self._requests.numbering.awaits_value(owed)
-        self._fail(owed[calls], outcome.error_for)
-        owed = owed[~calls]
-        if len(owed):
-            is_step = self._requests.numbering.ops(owed) == int(Operation.STEP)
-            _, seeds = self._continuity.report_losses(owed, is_step)
-            entries = self._requests.restart(host.host_id, owed)
-            self._layout.write_seeds(owed, seeds)
-            self._supervisor.submit(host.host_id, entries, None)
+        is_step = self._requests.numbering.ops(slots) == int(Operation.STEP)
+        _, seeds = self._continuity.report_losses(slots, is_step)
+        entries = self._requests.restart(host_id, slots)
+        self._layout.write_seeds(slots, seeds)
+        self._supervisor.submit(host_id, entries, None)
 
     def _note_answered(self, slots: NDArray[np.intp]) -> None:
         """Mark results that report a loss, and let steps show that a replacement works."""
@@ -240,7 +243,3 @@ class Intake:
             for slot in slots.tolist():
                 if self._requests.numbering.op(slot) == Operation.STEP:
                     self._supervisor.note_step(slot)
-
-
-def _slots_of_host(host: Host) -> range:
-    return range(host.first_slot, host.first_slot + host.num_envs)

@@ -109,7 +109,7 @@ class Snapshots:
         snapshots = unpack(data)
         slots = self._slots_for(snapshots, env_ids)
         self._check_restorable(slots)
-        deaths = self._supervisor.last_deaths(slots)
+        deaths = self._supervisor.last_losses(slots)
         before, now = yield from self._take(now, slots)
         for slot, snapshot, (own, _) in zip(slots.tolist(), snapshots, before, strict=True):
             check_same(snapshot, own.identity, self._envs.describe(slot))
@@ -159,11 +159,12 @@ class Snapshots:
         try:
             ticket, now = yield from self._load(now, slots, states)
             values_of([ticket])
-            last = self._supervisor.last_deaths(slots)
+            last = self._supervisor.last_losses(slots)
             for death in last[last != deaths]:
-                raise death(slots[last == death])  # Its envs had replied, so nobody has heard.
+                # Its envs had replied, so nobody has heard.
+                raise death.silent(slots[last == death])
         except EnvFault as fault:
-            alive = self._supervisor.last_deaths(slots) == deaths
+            alive = self._supervisor.last_losses(slots) == deaths
             kept = [before[k] for k in np.flatnonzero(alive).tolist()]
             lost = yield from self._undo(now, slots[alive], kept)
             note = "nothing was restored: the other envs are where they were before"

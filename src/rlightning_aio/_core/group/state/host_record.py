@@ -12,14 +12,14 @@ from rlightning_aio._core.hosts.base import Aborting, Killable
 from rlightning_aio.registry import ENVS, placement_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
+    from rlightning_aio._core.group.state.host_loss import HostLoss
     from rlightning_aio._core.hosts.base import Host
     from rlightning_aio._core.hosts.messages import AttachOrder, EnvStarted, ErrorText
     from rlightning_aio.config import EnvConfig
-    from rlightning_aio.errors import WorkerDied
 
 __all__ = ["HostRecord", "Stage"]
 
@@ -34,6 +34,8 @@ class Stage(Enum):
     UP = auto()
     DOWN = auto()
     """Dead, and to be restarted."""
+    REBUILDING = auto()
+    """A replacement is starting."""
     FAILED = auto()
     CLOSED = auto()
 
@@ -50,8 +52,7 @@ class HostRecord:
         restart_at: the time of its next restart; restarts: the number so far.
         refusals: consecutive attempts to start a replacement that the system refused;
             refused_since: the time of the first.
-        held: requests (entries and arguments) since its death, kept until a replacement is up;
-            None while it needs none.
+        held: requests (entries and arguments) since its death, kept until a replacement is up.
         deaths: by slot, deaths of workers that this env is blamed for, since it last completed a
             step; key None for deaths of unknown cause.
         culprit: the slot of the env that the last worker was executing when it died.
@@ -63,8 +64,7 @@ class HostRecord:
         idle: its progress when it was last seen idle, and idle_since the time (`HangDetector`).
         rebuild_error: the error of its replacement while rebuilding the envs.
         lost_slots: of envs that are not rebuilt though their host goes on.
-        last_death: makes the error for slots whose states were lost in it.
-        refusal: makes the error for new requests to slots of a host that was given up.
+        last_loss: its last death.
         killable: the host, if it can be killed; aborting: if it can end single requests.
         is_local: its envs use this machine's cores; is_hardware: they move in the real world.
         slots: of its envs.
@@ -83,7 +83,7 @@ class HostRecord:
     restarts: int = 0
     refusals: int = 0
     refused_since: float | None = None
-    held: list[tuple[NDArray[np.int64], Sequence[Any] | None]] | None = None
+    held: list[tuple[NDArray[np.int64], Sequence[Any] | None]] = field(default_factory=list[Any])
     deaths: dict[int | None, int] = field(default_factory=dict[int | None, int])
     culprit: int | None = None
     suspects: tuple[int, ...] = ()
@@ -96,8 +96,7 @@ class HostRecord:
     idle_since: float = 0.0
     rebuild_error: ErrorText | None = None
     lost_slots: set[int] = field(default_factory=set[int])
-    last_death: Callable[[NDArray[np.intp]], WorkerDied] | None = None
-    refusal: Callable[[NDArray[np.intp]], WorkerDied] | None = None
+    last_loss: HostLoss | None = None
     killable: Killable | None = field(init=False)
     aborting: Aborting | None = field(init=False)
     timed: bool = field(init=False)
@@ -113,6 +112,16 @@ class HostRecord:
         self.is_local = placement_of(self.config.backend, self.config.placement).local
         self.is_hardware = ENVS.is_hardware(self.config.backend)
         self.slots = range(self.host.first_slot, self.host.first_slot + self.host.num_envs)
+
+    @property
+    def is_down(self) -> bool:
+        """Its worker has died, and its replacement is not up yet: it holds requests."""
+        return self.stage in (Stage.DOWN, Stage.REBUILDING)
+
+    @property
+    def is_starting(self) -> bool:
+        """It, or its replacement, is not up yet, and on its way."""
+        return self.stage.value < Stage.UP.value or self.stage is Stage.REBUILDING
 
     @property
     def awaits_several(self) -> bool:
@@ -133,7 +142,7 @@ class HostRecord:
         """Hold some requests no longer; return those that it has held."""
         withdrawn: list[int] = []
         kept: list[tuple[NDArray[np.int64], Sequence[Any] | None]] = []
-        for held, arguments in self.held or ():
+        for held, arguments in self.held:
             stays = ~np.isin(held, entries)
             own: list[int] = stays.nonzero()[0].tolist()
             if own:

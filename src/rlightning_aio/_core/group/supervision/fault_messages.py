@@ -11,6 +11,9 @@ from collections import Counter, deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
+from rlightning_aio._core.group.state.host_loss import HostLoss, last_lines
 from rlightning_aio._core.hosts.base import Killable
 from rlightning_aio.errors import EnvHung, StartFailed, WorkerDied
 from rlightning_aio.protocol.entries import Operation, slot_of
@@ -18,7 +21,6 @@ from rlightning_aio.protocol.entries import Operation, slot_of
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    import numpy as np
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.state.env_table import EnvTable
@@ -29,10 +31,9 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CrashLog",
-    "DeathReport",
     "cause_of",
     "culprits_of",
-    "death_report",
+    "host_loss",
     "late_fault",
     "start_fault",
     "without_terminal",
@@ -55,7 +56,7 @@ def start_fault(envs: EnvTable, record: HostRecord, death: Death) -> StartFailed
     slot = _starting(record, death)
     return StartFailed(
         f"{envs.describe(slot)} could not be started: its worker {death.cause}"
-        + _said(death.stderr_tail),
+        + last_lines(death.stderr_tail),
         env_id=envs.env_ids[slot],
     )
 
@@ -67,7 +68,7 @@ def late_fault(envs: EnvTable, record: HostRecord, death: Death) -> StartFailed:
     why = f" (it {death.cause})" if death.cause and death.exit_code is None else ""
     return StartFailed(
         f"{envs.describe(slot)} did not start within {record.config.start_timeout} s"
-        f"{why}; raise start_timeout if it needs longer" + _said(death.stderr_tail),
+        f"{why}; raise start_timeout if it needs longer" + last_lines(death.stderr_tail),
         env_id=envs.env_ids[slot],
     )
 
@@ -138,68 +139,18 @@ def without_terminal(error: ErrorText, host: Host) -> str:
     return " (a worker has no terminal: debug with placement='inline')"
 
 
-@dataclass(frozen=True)
-class DeathReport:
-    """The description of a death, made when it was found.
-
-    Attributes:
-        what: the subject and the cause; last: the last request of the env at fault.
-        outcome: what happens to the worker now.
-        slot: of the env at fault, or of the first suspect.
-        suspects: ids; see `WorkerDied`.
-    """
-
-    envs: EnvTable
-    death: Death
-    kind: type[WorkerDied]
-    what: str
-    last: str
-    outcome: str
-    slot: int
-    suspects: tuple[str, ...]
-
-    def message(self, unanswered: NDArray[np.intp]) -> str:
-        """The message about the death; `unanswered` had a request in flight."""
-        names = ", ".join(self._ids(unanswered)) or "none"
-        return f"{self.what} ({self.last}; envs that owed a reply: {names}); {self.outcome}"
-
-    def error(self, unanswered: NDArray[np.intp]) -> WorkerDied:
-        """The error for these slots, with the last lines of the worker's stderr."""
-        return self._error(self.message(unanswered), unanswered)
-
-    def refusal(self, unanswered: NDArray[np.intp], asked: NDArray[np.intp]) -> WorkerDied:
-        """The error for new requests to `asked`, slots of a worker that is not replaced."""
-        names = ", ".join(self._ids(asked))
-        return self._error(f"{self.message(unanswered)}; nothing was sent to {names}", asked)
-
-    def loss(self, unanswered: NDArray[np.intp], lost: NDArray[np.intp]) -> WorkerDied:
-        """The error for `lost`, slots that had replied, but whose states are gone."""
-        names = ", ".join(self._ids(lost))
-        return self._error(f"{self.message(unanswered)}; lost with it: {names}", lost)
-
-    def _error(self, message: str, slots: NDArray[np.intp]) -> WorkerDied:
-        error = self.kind(
-            message + _said(self.death.stderr_tail),
-            env_id=self.envs.env_ids[self.slot],
-            exit_code=self.death.exit_code,
-            stderr_tail=self.death.stderr_tail,
-        )
-        error.env_ids = tuple(self._ids(slots))
-        error.suspects = self.suspects
-        return error
-
-    def _ids(self, slots: NDArray[np.intp]) -> list[str]:
-        env_ids = self.envs.env_ids
-        chosen: list[int] = slots.tolist()
-        return [env_ids[slot] for slot in chosen]
-
-
-def death_report(
-    envs: EnvTable, record: HostRecord, death: Death, requests: Requests, outcome: str
-) -> DeathReport:
+def host_loss(
+    envs: EnvTable,
+    requests: Requests,
+    record: HostRecord,
+    death: Death,
+    outcome: str,
+    *,
+    replaced: bool,
+) -> HostLoss:
     """Describe a death; `outcome` says what happens to the worker now."""
     slot, config = record.blamed[0], record.config
-    slot = record.host.first_slot if slot is None else slot
+    slot = record.slots.start if slot is None else slot
     doing, number = _doing(requests, slot), requests.numbering.number(slot)
     last = f"last request: {f'request {number}, {doing}' if number else 'none'}"
     what = f"the worker of {envs.describe(slot)} {death.cause}"
@@ -209,14 +160,22 @@ def death_report(
         stepped = requests.numbering.op(slot) == Operation.STEP
         limit = config.step_timeout if stepped else config.reset_timeout
         what = f"{envs.describe(slot)} took longer than {limit} s for {doing} and was killed"
-    kind = EnvHung if record.is_hung else WorkerDied
-    suspects = tuple(envs.env_ids[slot] for slot in record.suspects)
-    return DeathReport(envs, death, kind, what, last, outcome, slot, suspects)
-
-
-def _said(stderr_tail: str) -> str:
-    lines = stderr_tail.strip().splitlines()[-20:]
-    return ("\nThe last lines it wrote:\n  " + "\n  ".join(lines)) if lines else ""
+    return HostLoss(
+        host_id=record.host.host_id,
+        slots=record.slots,
+        owed=requests.owed(np.array(record.slots, np.intp)),
+        death=death,
+        replaced=replaced,
+        resets=not record.is_hardware,
+        kind=EnvHung if record.is_hung else WorkerDied,
+        what=what,
+        last=last,
+        outcome=outcome,
+        env_ids=envs.env_ids,
+        env_id=envs.env_ids[slot],
+        at_fault=None if record.culprit is None else envs.env_ids[record.culprit],
+        suspects=tuple(envs.env_ids[slot] for slot in record.suspects),
+    )
 
 
 @dataclass

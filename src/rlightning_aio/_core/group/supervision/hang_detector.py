@@ -74,7 +74,7 @@ class HangDetector:
         found: list[int] = sorted({*hosts.tolist()})
         for host_id in found:
             record, own = self._records[host_id], entries[hosts == host_id]
-            if record.held is not None:
+            if record.is_down:
                 no_longer_held += [(host_id, entry) for entry in record.withdraw(own)]
                 continue
             if record.aborting is not None:

@@ -65,7 +65,7 @@ class Shutdown:
         self._lifetime.end()
         alive = [r for r in self._records if r.stage not in (Stage.NEW, Stage.CLOSED)]
         for record in alive:
-            record.held = record.restart_at = None
+            record.held, record.restart_at = [], None
             if record.stage in (Stage.FAILED, Stage.DOWN):
                 record.stage = Stage.CLOSED
             else:

@@ -1,8 +1,8 @@
 """`Supervisor`: the life of a group's hosts, from their first start to their end.
 
 It starts hosts, places their envs in slabs, and replaces dead hosts; `Shutdown` closes them. It
-returns the consequences of a death for requests (`GivenUp`, `Replaced`), and `Intake` carries them
-out. Rule: it waits only by yielding a `Wait`. Callers pass the time in, except for a death, which
+returns what a death means for envs and their requests (`HostLoss`), and `Intake` carries it out.
+Rule: it waits only by yielding a `Wait`. Callers pass the time in, except for a death, which
 may be found at any moment, and for what a host was ordered to do: the trainer may have been stopped
 until then. `HangDetector` decides which workers are killed.
 """
@@ -10,9 +10,7 @@ until then. `HangDetector` decides which workers are killed.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
@@ -25,7 +23,7 @@ from rlightning_aio._core.group.supervision.fault_messages import (
     CrashLog,
     cause_of,
     culprits_of,
-    death_report,
+    host_loss,
     late_fault,
     start_fault,
     without_terminal,
@@ -45,23 +43,23 @@ from rlightning_aio._core.hosts.messages import (
     NotBuilt,
 )
 from rlightning_aio._core.hosts.restart_pause import restart_pause
-from rlightning_aio.errors import ConfigError, GroupClosed, RemoteTraceback, StartFailed, WorkerDied
+from rlightning_aio.errors import ConfigError, GroupClosed, RemoteTraceback, StartFailed
 from rlightning_aio.types import EnvMeta
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
     from typing import Any
 
     from numpy.typing import NDArray
 
+    from rlightning_aio._core.group.state.host_loss import HostLoss
     from rlightning_aio._core.group.state.observed import Fate
-    from rlightning_aio._core.group.supervision.fault_messages import DeathReport
     from rlightning_aio._core.group.tables import Tables
     from rlightning_aio._core.hosts.arena import Arena
     from rlightning_aio._core.hosts.base import Host, Shared
     from rlightning_aio.config import EnvConfig
 
-__all__ = ["LOOK_SECONDS", "GivenUp", "Lifecycle", "Replaced", "Supervisor"]
+__all__ = ["LOOK_SECONDS", "Lifecycle", "Supervisor"]
 
 LOOK_SECONDS: Final = 0.02
 """Interval of checks in a trainer that never has to wait."""
@@ -76,38 +74,6 @@ _log = logging.getLogger("rlightning_aio")
 
 Lifecycle: TypeAlias = Built | NotBuilt | Attached | Closed
 """Completions that only the supervisor applies."""
-ErrorFor: TypeAlias = Callable[["NDArray[np.intp]"], WorkerDied]
-"""Makes the error for some of the slots whose replies are outstanding."""
-
-
-@dataclass(frozen=True)
-class GivenUp:
-    """A host will not be replaced: its outstanding requests end in errors."""
-
-    host: Host
-    owed: NDArray[np.intp]
-    error_for: ErrorFor
-
-
-@dataclass(frozen=True)
-class Replaced:
-    """A dead host is being replaced: steps and resets are sent again, calls end in errors.
-
-    Only the user sets hardware in motion: unless the host `resets`, all its outstanding requests
-    end in errors. New requests wait until a replacement is up.
-
-    Attributes:
-        at_fault: the id of the env that the worker was executing; None if unknown.
-        suspects: ids; see `WorkerDied`.
-    """
-
-    host: Host
-    owed: NDArray[np.intp]
-    error_for: ErrorFor
-    cause: str
-    at_fault: str | None
-    suspects: tuple[str, ...]
-    resets: bool
 
 
 class Supervisor:
@@ -211,14 +177,14 @@ class Supervisor:
 
     def _launch_first(self, record: HostRecord) -> None:
         try:
-            self._launch(record)
+            self._launch(record, Stage.BUILDING)
         except OSError as error:
             raise StartFailed(
                 _refusal(record, error), env_id=self._envs.env_ids[record.host.first_slot]
             ) from error
 
-    def _launch(self, record: HostRecord) -> None:
-        record.stage = Stage.BUILDING
+    def _launch(self, record: HostRecord, stage: Stage) -> None:
+        record.stage = stage
         record.late = False
         record.host.start()
         record.give_time(self._clock())
@@ -279,7 +245,7 @@ class Supervisor:
             if record.rebuild_error is None:
                 self._on_attached(record)
         else:
-            was_built = record.stage is not Stage.BUILDING
+            was_built = record.stage not in (Stage.BUILDING, Stage.REBUILDING)
             record.stage = Stage.CLOSED
             # The start error of a host that was killed while it started is known already.
             owed = self._requests.owed(np.array(record.slots, np.intp))
@@ -291,7 +257,7 @@ class Supervisor:
                 self.close_errors.append((env_id, error))
 
     def _on_built(self, record: HostRecord, started: list[Any]) -> None:
-        if record.order is None:
+        if record.stage is Stage.BUILDING:
             record.started = started
             record.stage = Stage.BUILT
             record.start_by = None
@@ -308,8 +274,8 @@ class Supervisor:
             self._update_any_deaths()
         if self._lifetime.open:
             self._note_fate("up", record.host.host_id)
-        held, record.held = record.held, None
-        for entries, arguments in held or ():
+        held, record.held = record.held, []
+        for entries, arguments in held:
             record.host.submit(entries, arguments)
 
     def _on_not_built(self, record: HostRecord, slot: int, error: ErrorText) -> None:
@@ -337,28 +303,25 @@ class Supervisor:
         if not self._any_given_up:
             return
         for record in self._records:
-            if record.refusal is not None:
+            if record.stage is Stage.FAILED and record.last_loss is not None:
                 asked = slots[np.isin(slots, record.slots)]
                 if len(asked):
-                    raise record.refusal(asked)
+                    raise record.last_loss.refusal(asked)
 
-    def last_deaths(self, slots: NDArray[np.intp]) -> NDArray[Any]:
-        """Return what makes errors about the last death of the worker of each of `slots`.
-
-        It is another one after each death, and None before the first.
-        """
-        deaths = np.array([record.last_death for record in self._records], object)
-        return deaths[self._requests.hosts[slots]]
+    def last_losses(self, slots: NDArray[np.intp]) -> NDArray[Any]:
+        """Return the last `HostLoss` of the host of each of `slots`; None before the first."""
+        losses = np.array([record.last_loss for record in self._records], object)
+        return losses[self._requests.hosts[slots]]
 
     def submit(
         self, host_id: int, entries: NDArray[np.int64], arguments: Sequence[Any] | None
     ) -> None:
         """Pass requests to a host, or hold them until its replacement is up."""
-        held = self._records[host_id].held
-        if held is None:
-            self.hosts[host_id].submit(entries, arguments)
+        record = self._records[host_id]
+        if record.is_down:
+            record.held.append((entries, arguments))
         else:
-            held.append((entries, arguments))
+            record.host.submit(entries, arguments)
 
     # -- faults -------------------------------------------------------------------
 
@@ -382,8 +345,7 @@ class Supervisor:
         if self.any_deaths:
             self._check_start_times()
             for record in self._records:
-                if record.restart_at is not None and record.restart_at <= now:
-                    self._restart(record, now)
+                self._restart_due(record, now)
         if self.members.possible:
             self.members.tick(now)
         if self.detector.timed or self.detector.any_ending:
@@ -393,16 +355,16 @@ class Supervisor:
 
     # -- deaths -------------------------------------------------------------------
 
-    def handle_exit(self, exited: Died) -> GivenUp | Replaced | None:
-        """Replace a host whose worker has exited, or give it up.
+    def handle_exit(self, exited: Died) -> HostLoss | None:
+        """Decide what the end of a worker means, which `Intake` carries out.
 
-        Returns the consequences for its requests. Returns None while the group starts or closes,
-        and if the worker was a replacement that never came up: requests wait for the next one.
+        Returns None where it means nothing for requests: while the group starts or closes, and if
+        the worker was a replacement that never came up. Requests wait for the next one then, which
+        is started here.
         """
         record, death = self._records[exited.host_id], exited.death
         record.dying, record.die_by, record.abort_by = False, None, None
-        is_first_start = record.stage.value < Stage.UP.value and record.order is None
-        if is_first_start or not self._lifetime.open:
+        if not self._lifetime.open:
             record.stage = Stage.CLOSED
             self._fail_start(start_fault(self._envs, record, death))
             return None
@@ -416,42 +378,32 @@ class Supervisor:
         unanswered = self._requests.numbering.entry[owed].tolist()
         self._continuity.drop_unfinished(record.slots, set(unanswered))
         was_up = record.stage is Stage.UP
-        is_fault = record.aborted_slot is None
-        report, cause, is_last = self._judge(record, death, owed)
-        record.last_death = partial(report.loss, owed)
-        self._note_fate("given up" if is_last else "died", exited.host_id, cause)
-        if is_last:
-            self._requests.lose_host(exited.host_id)
-            self._give_up(record, partial(report.refusal, owed))
-            return GivenUp(record.host, owed, report.error)
-        at_fault = None if record.culprit is None else self._envs.env_ids[record.culprit]
-        message = report.message(owed)
-        if is_fault:
-            self.crash_log.note(record.config.name, message, cause, at_fault, self._clock())
-        else:
-            _log.info("%s", message)
-        self._schedule_restart(record)
-        if not was_up:
-            return None
-        self._requests.lose_host(exited.host_id)
-        resets = not record.is_hardware
-        return Replaced(record.host, owed, report.error, cause, at_fault, report.suspects, resets)
-
-    def _schedule_restart(self, record: HostRecord) -> None:
-        """Restart immediately after the first death in a row, later after further ones."""
-        now = self._clock()
-        record.stage = Stage.DOWN
+        loss = record.last_loss = self._judged(record, death, owed)
         record.start_by = None
-        record.restart_at = now + restart_pause(record.deaths_in_a_row)
-        if record.held is None:
-            record.held = []
-        if record.restart_at <= now:
+        if not loss.replaced:
+            record.stage, record.held = Stage.FAILED, []
+            self._any_given_up = True
+            self._update_any_deaths()
+            return loss
+        record.stage = Stage.DOWN
+        record.restart_at = self._clock() + restart_pause(record.deaths_in_a_row)
+        if was_up:
+            return loss
+        self.replace(record.host.host_id)
+        return None
+
+    def replace(self, host_id: int) -> None:
+        """Start the replacement of a host at once, if it needn't pause: `check` starts others."""
+        self._restart_due(self._records[host_id], self._clock())
+
+    def _restart_due(self, record: HostRecord, now: float) -> None:
+        if record.restart_at is not None and record.restart_at <= now:
             self._restart(record, now)
 
     def _restart(self, record: HostRecord, now: float) -> None:
         record.restart_at = None
         try:
-            self._launch(record)
+            self._launch(record, Stage.REBUILDING)
         except OSError as error:
             self._on_refused(record, error, now)
             return
@@ -485,10 +437,8 @@ class Supervisor:
         _log.warning("%s; the next attempt is in %g s", refusal, pause)
         record.restart_at = now + pause
 
-    def _judge(
-        self, record: HostRecord, death: Death, owed: NDArray[np.intp]
-    ) -> tuple[DeathReport, str, bool]:
-        """Return the report of a death, its cause, and True if it exceeds ``max_restarts``."""
+    def _judged(self, record: HostRecord, death: Death, owed: NDArray[np.intp]) -> HostLoss:
+        """Count a death, decide if the host is replaced, and report it."""
         requests, config = self._requests, record.config
         if record.stage is Stage.UP and not record.is_hung:
             # A replacement that fails to start counts against the env that made it necessary.
@@ -498,14 +448,13 @@ class Supervisor:
             record.deaths[slot] = record.deaths.get(slot, 0) + is_fault
         deaths = record.deaths_in_a_row
         self._note_deaths(True)
-        cause = cause_of(record, death, requests)
         raises = config.on_worker_death == "raise"
-        is_last = is_fault and (raises or deaths > config.max_restarts)
+        replaced = not is_fault or (not raises and deaths <= config.max_restarts)
         if not is_fault:
             outcome = "it is replaced"
         elif raises:
             outcome = "on_worker_death is 'raise', so it is not replaced"
-        elif is_last:
+        elif not replaced:
             outcome = f"it is not replaced after {deaths - 1} restarts in a row (max_restarts)"
         else:
             pause = restart_pause(deaths)
@@ -513,16 +462,17 @@ class Supervisor:
             outcome += f", in {pause:g} s" if pause else ""
             if record.is_hardware:
                 outcome += "; it moves nothing until you reset it"
-        report = death_report(self._envs, record, replace(death, cause=cause), requests, outcome)
+        death = replace(death, cause=cause_of(record, death, requests))
+        loss = host_loss(self._envs, requests, record, death, outcome, replaced=replaced)
+        self._note_fate("died" if replaced else "given up", loss.host_id, death.cause)
+        if not is_fault:
+            _log.info("%s", loss.message)
+        elif replaced:
+            self.crash_log.note(
+                config.name, loss.message, death.cause, loss.at_fault, self._clock()
+            )
         record.is_hung, record.aborted_slot, record.rebuild_error = False, None, None
-        return report, cause, is_last
-
-    def _give_up(self, record: HostRecord, refusal: ErrorFor) -> None:
-        record.stage = Stage.FAILED
-        record.start_by = record.held = None
-        record.refusal = refusal
-        self._any_given_up = True
-        self._update_any_deaths()
+        return loss
 
     def note_rebuilt(self, host_id: int, slot: int, cause: str) -> None:
         """Record that a host has rebuilt one of its envs."""

@@ -69,7 +69,7 @@ class Workers:
 
         `now_ns` is from the monotonic clock.
         """
-        starting = [r for r in self._records if r.stage.value < Stage.UP.value]
+        starting = [r for r in self._records if r.is_starting]
         if starting:
             names = [self._envs.env_ids[slot] for record in starting for slot in record.slots]
             return f"not started yet: {_listed(names)}"
