@@ -179,7 +179,7 @@ async def test_a_thread_that_ends_is_replaced(
     async with facade.build(entry("one")) as group:
         await group.reset(seed=1)
         with monkeypatch.context() as patch:
-            patch.delattr(thread_host, "Value")
+            patch.delattr(thread_host, "execute")
             with pytest.raises(rlightning_aio.WorkerDied, match="ended in NameError"):
                 await group["one-0"].call("double", 1)
         batch, _ = await group.step(steps(one_0=[0.0, 1.0]))

@@ -10,9 +10,10 @@ import time
 from patience import HANG
 from protocol.memory_of_rings import both_sides
 
+from rlightning_aio._core.hosts.messages import Saved
 from rlightning_aio._core.hosts.process.worker import Worker
 from rlightning_aio.protocol.entries import Operation, entry
-from rlightning_aio.protocol.frames import FrameKind, FrameReader
+from rlightning_aio.protocol.frames import FrameReader
 
 
 def test_the_time_of_a_request_excludes_the_wait_for_the_trainer() -> None:
@@ -23,10 +24,10 @@ def test_the_time_of_a_request_excludes_the_wait_for_the_trainer() -> None:
         worker = Worker(theirs, -1, rings, 0)
         request, began = entry(1, 0, Operation.STEP), time.monotonic_ns()
         rings.begin(request, began)
-        worker._send(FrameKind.SAVED, 0, b"small")
+        worker._post(Saved(0, 0, b"small", before=False))
         assert trainer.current() == (request, began)
-        large = (FrameKind.SAVED, 0, bytes(1 << 23))
-        writing = threading.Thread(target=worker._send, args=large)
+        large = Saved(0, 0, bytes(1 << 23), before=False)
+        writing = threading.Thread(target=worker._post, args=[large])
         writing.start()
         until = time.monotonic() + HANG
         while trainer.current() != (request, 0) and time.monotonic() < until:

@@ -20,25 +20,19 @@ import numpy as np
 
 from rlightning_aio._core.hosts.arena import map_shared
 from rlightning_aio._core.hosts.messages import (
-    Attached,
     Built,
     Closed,
     Death,
     Died,
     ErrorText,
-    NewSchema,
     NotBuilt,
-    Raised,
     Reported,
-    Result,
-    Saved,
-    Value,
 )
 from rlightning_aio._core.hosts.running.build_env import built_envs
 from rlightning_aio._core.hosts.running.copied import copied
+from rlightning_aio._core.hosts.running.execution import execute
 from rlightning_aio._core.hosts.running.runner import attach_all, close_all
-from rlightning_aio.protocol.entries import Operation, answers_with_value, op_of, slot_of
-from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
+from rlightning_aio.protocol.entries import slot_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -165,7 +159,6 @@ class EnvThread(threading.Thread):
         self._host_id = host_id
         self._first_slot = first_slot
         self._runners: list[EnvRunner] = []
-        self._schemas = InfoSchemas(self._announce)
 
     def run(self) -> None:
         """Execute the tasks, which report errors of envs; any other error ends the worker."""
@@ -183,13 +176,6 @@ class EnvThread(threading.Thread):
     def _post(self, completion: Completion) -> None:
         self.posted.append(completion)
         os.eventfd_write(self.bell, 1)
-
-    def _announce(self, number: int, schema: InfoSchema) -> None:
-        """Post a new schema of infos, before the first row that uses it."""
-        self._post(NewSchema(self._host_id, number, schema))
-
-    def _save(self, index: int, checkpoint: bytes, before: bool) -> None:
-        self._post(Saved(self._host_id, index, checkpoint, before))
 
     # -- tasks --------------------------------------------------------------------
 
@@ -209,30 +195,18 @@ class EnvThread(threading.Thread):
 
     def attach(self, order: AttachOrder, map_part: Callable[[int, int], memoryview]) -> None:
         """Give each env its row, except while closing, when the arena may be gone."""
-        if self.closing:
-            return
-        attach_all(self._runners, order, map_part, self._schemas.announce, self._save)
-        self._post(Attached(self._host_id))
+        if not self.closing:
+            attach_all(self._runners, order, map_part, self._host_id, self._post)
 
     def execute(self, entry: int, arguments: Any) -> None:
         """Execute one request, and post its completion."""
         if self.closing:
             return
-        runner, op = self._runners[slot_of(entry) - self._first_slot], op_of(entry)
-        try:
-            if arguments is not None:
-                outcome = runner.execute(op, arguments)
-            else:
-                outcome = runner.step() if op == Operation.STEP else runner.reset_from_row()
-        except BaseException as error:  # noqa: BLE001  # An env may raise anything.
-            self._post(Raised(self._host_id, entry, ErrorText.of(error)))
-            return
-        if answers_with_value(op):
-            self._post(Value(self._host_id, entry, outcome))
-        elif outcome is None:  # The row holds the whole result.
-            self._post(Reported(self._host_id, np.array([entry], np.int64)))
-        else:
-            self._post(Result(self._host_id, entry, outcome))
+        runner = self._runners[slot_of(entry) - self._first_slot]
+        completion = execute(self._host_id, runner, entry, arguments)
+        if completion is None:  # The row holds the whole result.
+            completion = Reported(self._host_id, np.array([entry], np.int64))
+        self._post(completion)
 
     def close(self) -> None:
         """Close the envs, and post what they raised."""

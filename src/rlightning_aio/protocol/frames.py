@@ -47,7 +47,7 @@ class Frame(NamedTuple):
     payload: bytes
 
 
-def encode(kind: FrameKind, number: int = 0, payload: bytes = b"") -> bytes:
+def encode(kind: int, number: int = 0, payload: bytes = b"") -> bytes:
     """Encode one frame."""
     return HEADER.pack(len(payload), kind, number) + payload
 

@@ -29,12 +29,13 @@ from rlightning_aio._core.hosts.awaiting.event_loop import (
     time_collector,
     watched,
 )
-from rlightning_aio._core.hosts.messages import ErrorText, Failed, NotBuilt, Raised, Result, Value
+from rlightning_aio._core.hosts.messages import ErrorText, Failed, NotBuilt, Raised, Result
 from rlightning_aio._core.hosts.restart_pause import restart_pause
 from rlightning_aio._core.hosts.running.build_env import built_env
+from rlightning_aio._core.hosts.running.execution import completion_of
 from rlightning_aio._core.hosts.running.runner import disconnect_all
 from rlightning_aio.errors import EnvHung, WorkerDied
-from rlightning_aio.protocol.entries import Operation, answers_with_value, op_of, slot_of
+from rlightning_aio.protocol.entries import Operation, op_of, slot_of
 from rlightning_aio.protocol.entries import entry as entry_of
 
 if TYPE_CHECKING:
@@ -289,32 +290,24 @@ class AwaitedEnvs:
     def _on_outcome(
         self, env: AwaitedEnv, entry: int, outcome: Any, error: BaseException | None
     ) -> None:
-        place, op = self._places[env.index], op_of(entry)
-        if error is not None:
-            self._finish(place, Raised(self._host_id, entry, ErrorText.of(error)))
-            # In the trainer it may be the user's Ctrl-C; a worker gets none.
-            if self._inline and isinstance(error, KeyboardInterrupt):
-                self._loop.call_soon(_reraise, error)
-            return
-        if op == Operation.STEP:
+        place = self._places[env.index]
+        if error is None and op_of(entry) == Operation.STEP:
             place.losses = 0
-        if answers_with_value(op):
-            self._finish(place, Value(self._host_id, entry, outcome))
-        elif outcome is None:
-            self._finish(place, entry)
-        else:
-            self._finish(place, Result(self._host_id, entry, outcome))
+        self._finish(place, completion_of(self._host_id, entry, outcome, error))
+        # In the trainer it may be the user's Ctrl-C; a worker gets none.
+        if self._inline and isinstance(error, KeyboardInterrupt):
+            self._loop.call_soon(_reraise, error)
 
-    def _finish(self, place: _Place, what: Completion | int) -> None:
-        """The request to a place has ended: post `what`, or call `done` for this entry."""
+    def _finish(self, place: _Place, completion: Completion | None) -> None:
+        """Report that the request to a place has ended; None: its row holds the whole result."""
         if self._ending:
             return
-        place.entry, place.arguments = 0, None
+        entry, place.entry, place.arguments = place.entry, 0, None
         self.num_busy -= 1
-        if isinstance(what, int):
-            self._done(what)
+        if completion is None:
+            self._done(entry)
         else:
-            self._post(what)
+            self._post(completion)
         self._begin_queued()
 
     def _report(self, entry: int, seconds: float) -> None:

@@ -9,20 +9,16 @@ for longer than the limit. Requests that only wait too long are cancelled here (
 from __future__ import annotations
 
 import asyncio
-import pickle
 from typing import TYPE_CHECKING, Any, cast
 
 from rlightning_aio._core.hosts.awaiting.awaited_envs import AwaitedEnvs
 from rlightning_aio._core.hosts.awaiting.event_loop import run_loop
-from rlightning_aio._core.hosts.messages import ErrorText, Failed, Raised, Result, Value
-from rlightning_aio.protocol.frames import FrameKind
-from rlightning_aio.protocol.pickling import dumped
 
 if TYPE_CHECKING:
     import socket
     from collections.abc import Callable, Sequence
 
-    from rlightning_aio._core.hosts.messages import Completion, StartOrder
+    from rlightning_aio._core.hosts.messages import Completion, ErrorText, StartOrder
     from rlightning_aio._core.hosts.running.awaited_runner import AwaitedRunner
     from rlightning_aio._core.hosts.running.runner import EnvRunner
 
@@ -36,7 +32,7 @@ class Awaiting:
         order, first_slot: of the worker.
         runners: of its envs.
         report: takes the entries of requests whose results are all in their rows.
-        send: sends a frame: its kind, a number, a payload.
+        post: sends a completion.
         enter: says that an env's code runs now, by an entry; 0: none does.
     """
 
@@ -46,17 +42,16 @@ class Awaiting:
         first_slot: int,
         runners: Sequence[EnvRunner],
         report: Callable[[int], None],
-        send: Callable[[FrameKind, int, bytes], None],
+        post: Callable[[Completion], None],
         enter: Callable[[int], None],
     ) -> None:
-        self._send = send
         self._enter = enter
         self._envs = AwaitedEnvs(
             0,
             first_slot,
             order,
             inline=False,
-            post=self._post,
+            post=post,
             done=report,
             enter=enter,
         )
@@ -122,24 +117,3 @@ class Awaiting:
         finally:
             loop.remove_reader(channel)
         return await self._envs.close()
-
-    def _post(self, completion: Completion) -> None:
-        """Send a completion; what can't be pickled is an error of its request."""
-        kind, payload = FrameKind.ERROR, b""
-        assert isinstance(completion, Result | Value | Raised | Failed)
-        try:
-            if isinstance(completion, Result):
-                kind, payload = FrameKind.RESULT, dumped(completion.out_of_band, "the result")
-                if completion.restarted:
-                    kind = FrameKind.RESTARTED
-                    payload = pickle.dumps((completion.restarted, payload))
-            elif isinstance(completion, Value):
-                kind, payload = FrameKind.VALUE, dumped(completion.value, "what it returned")
-            elif isinstance(completion, Raised):
-                kind, payload = FrameKind.ERROR, pickle.dumps(completion.error)
-            else:
-                failure = completion.fault, completion.for_good
-                kind, payload = FrameKind.FAILED, pickle.dumps(failure)
-        except Exception as error:
-            kind, payload = FrameKind.ERROR, pickle.dumps(ErrorText.of(error))
-        self._send(kind, completion.entry, payload)

@@ -13,21 +13,20 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
 
 import numpy as np
 
+from rlightning_aio._core.hosts.arena import map_shared
 from rlightning_aio._core.hosts.inbox import Inbox
 from rlightning_aio._core.hosts.messages import (
     Built,
     Closed,
     ErrorText,
     NotBuilt,
-    Raised,
     Reported,
-    Result,
-    Value,
     Withdrawn,
 )
 from rlightning_aio._core.hosts.running.build_env import built_envs
 from rlightning_aio._core.hosts.running.copied import copied
-from rlightning_aio._core.hosts.running.runner import attach_here, close_all
+from rlightning_aio._core.hosts.running.execution import completion_of
+from rlightning_aio._core.hosts.running.runner import attach_all, close_all
 from rlightning_aio.protocol.entries import Operation, answers_with_value, op_of, slot_of
 
 if TYPE_CHECKING:
@@ -36,7 +35,13 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio._core.hosts.base import Watcher, Wiring
-    from rlightning_aio._core.hosts.messages import AttachOrder, EnvStarted, OutOfBand, StartOrder
+    from rlightning_aio._core.hosts.messages import (
+        AttachOrder,
+        Completion,
+        EnvStarted,
+        OutOfBand,
+        StartOrder,
+    )
     from rlightning_aio._core.hosts.running.runner import EnvRunner
 
 __all__ = ["InlineHost"]
@@ -84,7 +89,8 @@ class InlineHost:
         return [runner.started() for runner in self._runners]
 
     def attach(self, order: AttachOrder) -> None:
-        attach_here(self._runners, order, self._arena, self.host_id, self._post)
+        map_part = partial(map_shared, self._arena.descriptor)
+        attach_all(self._runners, order, map_part, self.host_id, self._post)
 
     def packed(self, arguments: Any) -> Any:
         return copied(arguments)
@@ -131,19 +137,19 @@ class InlineHost:
         except BaseException as error:
             self._raised(entry, error)
             return True
-        if outcome is None and not answers_with_value(op_of(entry)):
-            self._done.append(entry)
-            return True
-        self.poll()
-        if answers_with_value(op_of(entry)):
-            self._post(Value(self.host_id, entry, outcome))
-        else:
-            self._post(Result(self.host_id, entry, outcome or {}))
+        self._report(entry, completion_of(self.host_id, entry, outcome))
         return True
 
+    def _report(self, entry: int, completion: Completion | None) -> None:
+        """Post a completion after all earlier ones; None: the row holds the whole result."""
+        if completion is None:
+            self._done.append(entry)
+        else:
+            self.poll()
+            self._post(completion)
+
     def _raised(self, entry: int, error: BaseException) -> None:
-        self.poll()  # Earlier results come first.
-        self._post(Raised(self.host_id, entry, ErrorText.of(error)))
+        self._report(entry, completion_of(self.host_id, entry, None, error))
         if isinstance(error, KeyboardInterrupt):
             raise error  # It is meant for the program, but the request ends, too.
 

@@ -8,6 +8,7 @@ Left out: what becomes of a request (see `AwaitedEnvs`).
 from __future__ import annotations
 
 import asyncio
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from rlightning_aio._core.hosts.awaiting.awaited_envs import AwaitedEnvs
 from rlightning_aio._core.hosts.awaiting.event_loop import new_task
 from rlightning_aio._core.hosts.messages import Built, Closed, Reported, Result
 from rlightning_aio._core.hosts.running.copied import copied
-from rlightning_aio._core.hosts.running.runner import attach_here
+from rlightning_aio._core.hosts.running.runner import attach_all
 from rlightning_aio.protocol.rings import WorkerBell, bell_size
 
 if TYPE_CHECKING:
@@ -66,7 +67,8 @@ class LoopHost:
             self._post(Built(self.host_id, started))
 
     def attach(self, order: AttachOrder) -> None:
-        attach_here(self._envs.runners, order, self._wiring.arena, self.host_id, self._post)
+        map_part = partial(map_shared, self._wiring.arena.descriptor)
+        attach_all(self._envs.runners, order, map_part, self.host_id, self._post)
 
     def close(self) -> None:
         """See `base.Host.close`. Requests that are being executed are cancelled."""

@@ -7,22 +7,10 @@ Left out on purpose: the life of the worker (see `process`), and the effects of 
 from __future__ import annotations
 
 import errno
-import pickle
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from rlightning_aio._core.hosts.messages import (
-    Attached,
-    Built,
-    ErrorText,
-    Failed,
-    NewSchema,
-    NotBuilt,
-    Raised,
-    Reported,
-    Result,
-    Saved,
-    Value,
-)
+from rlightning_aio._core.hosts.completion_frames import completion_in
+from rlightning_aio._core.hosts.messages import Closed, Reported
 from rlightning_aio.protocol.frames import BELL, CHUNK_BYTES, Frame, FrameKind, FrameReader, encode
 from rlightning_aio.protocol.rings import TrainerRings
 
@@ -34,7 +22,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio._core.hosts.base import Wiring
-    from rlightning_aio._core.hosts.messages import WorkerPlace
+    from rlightning_aio._core.hosts.messages import ErrorText, WorkerPlace
 
 __all__ = ["Link"]
 
@@ -194,44 +182,11 @@ class Link:
         self.poll()
 
     def _receive(self, frame: Frame) -> None:
-        kind, number, payload = frame
-        host_id, post = self._host_id, self._completions.append
-        if kind == FrameKind.RESULT:
-            post(Result(host_id, number, payload))
-        elif kind == FrameKind.SAVED:
-            post(Saved(host_id, number >> 1, payload, bool(number & 1)))
-        elif kind == FrameKind.INFO_SCHEMA:
-            post(NewSchema(host_id, number, pickle.loads(payload)))
-        elif kind == FrameKind.ERROR:
-            post(Raised(host_id, number, pickle.loads(payload)))
-        elif kind == FrameKind.RESTARTED:
-            cause, packed = pickle.loads(payload)
-            post(Result(host_id, number, packed, restarted=cause))
-        elif kind == FrameKind.FAILED:
-            post(Failed(host_id, number, *pickle.loads(payload)))
-        elif kind == FrameKind.START_ERROR:
-            post(NotBuilt(host_id, number, pickle.loads(payload)))
-        elif kind == FrameKind.ATTACHED:
-            post(Attached(host_id))
-        elif kind == FrameKind.CLOSED:
-            self.close_errors = pickle.loads(payload)
+        completion = completion_in(self._host_id, frame)
+        if isinstance(completion, Closed):  # Posted when the worker has ended.
+            self.close_errors = completion.errors
         else:
-            self._receive_object(kind, number, payload)
-
-    def _receive_object(self, kind: int, number: int, payload: bytes) -> None:
-        """Read an object whose class may be unknown here."""
-        host_id, post = self._host_id, self._completions.append
-        value: Any
-        try:
-            value = pickle.loads(payload)
-        except KeyboardInterrupt:
-            raise
-        except BaseException as error:  # Unpickling may raise anything.
-            text = ErrorText.of(error)
-            starts = kind == FrameKind.STARTED
-            post(NotBuilt(host_id, 0, text) if starts else Raised(host_id, number, text))
-            return
-        post(Built(host_id, value) if kind == FrameKind.STARTED else Value(host_id, number, value))
+            self._completions.append(completion)
 
     # -- the state of the worker ------------------------------------------------------
 

@@ -15,37 +15,38 @@ import socket
 import sys
 import time
 import traceback
-from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
+from typing import TYPE_CHECKING, Any, ClassVar, Final, NoReturn
 
 from rlightning_aio._core.hosts.arena import make_private, map_shared
-from rlightning_aio._core.hosts.messages import ErrorText
+from rlightning_aio._core.hosts.completion_frames import frame_of
+from rlightning_aio._core.hosts.messages import Built, Closed, ErrorText, NotBuilt
 from rlightning_aio._core.hosts.running.build_env import built_envs
+from rlightning_aio._core.hosts.running.execution import completion_of, execute
 from rlightning_aio._core.hosts.running.runner import attach_all, close_all, disconnect_all
 from rlightning_aio._core.hosts.spinner import Spinner
 from rlightning_aio.envs.results import is_awaitable
-from rlightning_aio.protocol.entries import (
-    Operation,
-    answers_with_value,
-    entry,
-    op_of,
-    slot_of,
-)
+from rlightning_aio.protocol.entries import Operation, entry, op_of, slot_of
 from rlightning_aio.protocol.exchange import CAREFUL
 from rlightning_aio.protocol.frames import BELL, CHUNK_BYTES, Frame, FrameKind, FrameReader, encode
-from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
-from rlightning_aio.protocol.pickling import dumped, dumped_with_code
 from rlightning_aio.protocol.rings import WorkerBell, WorkerRings, bell_size, rings_size
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from rlightning_aio._core.hosts.messages import AttachOrder, OutOfBand, StartOrder, WorkerPlace
+    from rlightning_aio._core.hosts.messages import (
+        AttachOrder,
+        Completion,
+        StartOrder,
+        WorkerPlace,
+    )
     from rlightning_aio._core.hosts.running.env_steps import Execute
     from rlightning_aio._core.hosts.running.runner import EnvRunner
 
 __all__ = ["Worker", "main"]
 
-_STEP = int(Operation.STEP)
+_STEP: Final = int(Operation.STEP)
+_HOST_ID: Final = 0
+"""The host of its completions; the trainer knows which it is."""
 
 
 class TrainerGone(Exception):
@@ -78,7 +79,6 @@ class Worker:
         self._rings = rings
         self._runners: list[EnvRunner] = []
         self._steps: list[Execute] = []
-        self._schemas = InfoSchemas(self._send_schema)
         self._timed = False
         self._spinner = Spinner(enabled=False)
         self._attached = False
@@ -114,13 +114,13 @@ class Worker:
         # Not at the top: no other worker needs asyncio.
         from rlightning_aio._core.hosts.awaiting.worker_loop import Awaiting  # noqa: PLC0415
 
-        rings, ring, send = self._rings, self._ring, self._send
+        rings, ring = self._rings, self._ring
         awaiting = Awaiting(
             self._order,
             self._first_slot,
             self._runners,
             lambda entry: rings.report(entry, ring),
-            send,
+            self._post,
             lambda entry: rings.begin(entry, time.monotonic_ns()),
         )
         self._submit, self._abort_awaited = awaiting.submit, awaiting.abort
@@ -128,7 +128,7 @@ class Worker:
             errors = awaiting.serve(self._channel, self._take_requests)
         finally:
             self._closing = True  # The event loop has closed them.
-        send(FrameKind.CLOSED, payload=pickle.dumps(errors))
+        self._post(Closed(_HOST_ID, errors))
 
     def _take_requests(self) -> bool:
         """Read requests and begin to execute them; return False to close."""
@@ -166,21 +166,17 @@ class Worker:
         """
         if self._closing:
             return False
-        index = slot_of(request) - self._first_slot
         if self._timed:
             self._rings.begin(request, time.monotonic_ns())
-        try:
-            out_of_band = (
-                self._steps[index]()
-                if op_of(request) == _STEP
-                else self._runners[index].reset_from_row()
-            )
+        index = slot_of(request) - self._first_slot
+        is_step = op_of(request) == _STEP
+        try:  # As `exchange.serve` does; `execute` would take a microsecond more.
+            outcome = self._steps[index]() if is_step else self._runners[index].reset_from_row()
         except BaseException as error:
-            self._finish(request, error)
-            return False
-        if out_of_band is None and not self._is_child:
+            outcome = error
+        if outcome is None and not self._is_child:
             return True
-        self._finish(request, out_of_band)
+        self._finish(request, outcome)
         return False
 
     def _finish(self, request: int, outcome: Any) -> None:
@@ -190,13 +186,18 @@ class Worker:
             request: the entry.
             outcome: what is out of band, or the exception that the env raised.
         """
-        failed = isinstance(outcome, BaseException)
+        error = outcome if isinstance(outcome, BaseException) else None
+        self._on_end(error)
+        completion = completion_of(_HOST_ID, request, outcome, error)
+        if completion is not None:
+            self._post(completion)
+
+    def _on_end(self, error: BaseException | None) -> None:
+        """Look at what a request has raised, if it has, before that is sent."""
         if self._is_child:
-            _end_child(outcome if failed else None)
-        if failed:
-            self._send_error(request, outcome)
-        else:
-            self._send_result(request, outcome)
+            _end_child(error)
+        if isinstance(error, TrainerGone):  # A checkpoint, say, could not be sent.
+            raise error
 
     def _ring(self) -> None:
         self._write(BELL)
@@ -272,27 +273,25 @@ class Worker:
                 self._runners.append(runner)
                 self._begin_with(len(self._runners) % len(order.worker_indices))
             self._awaits = any(is_awaitable(runner.env) for runner in self._runners)
-            started = dumped_with_code([runner.started() for runner in self._runners])
+            started = [runner.started() for runner in self._runners]
         except BaseException as error:
             index = len(self._runners)
             if order is not None:
                 index = min(index, len(order.worker_indices) - 1)
-            self._send(FrameKind.START_ERROR, index, pickle.dumps(ErrorText.of(error)))
+            self._post(NotBuilt(_HOST_ID, index, ErrorText.of(error)))
             return
         # These objects stay. Without them the garbage collector saves time and copied pages.
         gc.collect()
         gc.freeze()
-        self._send(FrameKind.STARTED, payload=started)
+        self._post(Built(_HOST_ID, started))
 
     def _attach(self, frame: Frame) -> None:
         """Map the slabs from the inherited descriptor of the arena."""
         order: AttachOrder = pickle.loads(frame.payload)
-        announce = self._schemas.announce
-        attach_all(self._runners, order, self._map_part, announce, self._send_checkpoint)
+        attach_all(self._runners, order, self._map_part, _HOST_ID, self._post)
         self._steps = [runner.step for runner in self._runners]
         os.close(self._arena)
         self._attached = True
-        self._send(FrameKind.ATTACHED)
 
     def _map_part(self, offset: int, size: int) -> memoryview:
         memory = map_shared(self._arena, offset, size)
@@ -301,27 +300,19 @@ class Worker:
 
     def _request(self, frame: Frame) -> None:
         """Execute a request whose arguments came out of band."""
-        request, op = frame.number, op_of(frame.number)
+        request = frame.number
         self._begin(request)
-        try:
-            arguments = pickle.loads(frame.payload)
-            if self._awaits:
-                self._submit(request, arguments)
-                return
-            index = slot_of(request) - self._first_slot
-            runner = self._runners[index]
-            outcome = runner.execute(op, arguments)
-            self._steps[index] = runner.step  # A call may start or stop filming.
-            if answers_with_value(op):
-                self._send(FrameKind.VALUE, request, dumped(outcome, "what it returned"))
-            elif outcome is None:
-                self._rings.report(request, self._ring)
-            else:
-                self._send_result(request, outcome)
-        except TrainerGone:
-            raise
-        except BaseException as error:
-            self._send_error(request, error)
+        if self._awaits:
+            self._submit(request, frame.payload)
+            return
+        index = slot_of(request) - self._first_slot
+        runner = self._runners[index]
+        completion = execute(_HOST_ID, runner, request, frame.payload, self._on_end)
+        self._steps[index] = runner.step  # A call may start or stop filming.
+        if completion is None:
+            self._rings.report(request, self._ring)
+        else:
+            self._post(completion)
 
     def _abort(self, frame: Frame) -> None:
         """Cancel a request to an awaitable env; any other ends by itself, or with this worker."""
@@ -336,8 +327,7 @@ class Worker:
         self._rings.own[CAREFUL] = 1
         if self._awaits and self._attached:
             return  # The event loop closes them.
-        errors = self._close_envs()
-        self._send(FrameKind.CLOSED, payload=pickle.dumps(errors))
+        self._post(Closed(_HOST_ID, self._close_envs()))
 
     _handlers: ClassVar[dict[int, Callable[[Worker, Frame], None]]] = {
         FrameKind.START: _start,
@@ -374,26 +364,10 @@ class Worker:
         self._channel.sendall(rest)
         self._rings.resume(since_ns + time.monotonic_ns() - paused_ns)
 
-    def _send(self, kind: FrameKind, number: int = 0, payload: bytes = b"") -> None:
-        self._write(encode(kind, number, payload))
+    def _post(self, completion: Completion) -> None:
+        """Send a completion to the trainer."""
+        self._write(encode(*frame_of(completion)))
         self._rings.count_frame()
-
-    def _send_result(self, request: int, out_of_band: OutOfBand) -> None:
-        try:
-            payload = dumped(out_of_band, "the result")
-        except BaseException as error:
-            self._send_error(request, error)
-            return
-        self._send(FrameKind.RESULT, request, payload)
-
-    def _send_error(self, request: int, error: BaseException) -> None:
-        self._send(FrameKind.ERROR, request, pickle.dumps(ErrorText.of(error)))
-
-    def _send_checkpoint(self, index: int, checkpoint: bytes, before: bool) -> None:
-        self._send(FrameKind.SAVED, index << 1 | before, checkpoint)
-
-    def _send_schema(self, number: int, schema: InfoSchema) -> None:
-        self._send(FrameKind.INFO_SCHEMA, number, pickle.dumps(schema))
 
 
 def _end_child(error: BaseException | None) -> NoReturn:

@@ -2,7 +2,7 @@
 
 It runs as a Ray actor, but doesn't depend on Ray: its methods are called one after the other, with
 arrays, bytes and text. Objects that may have a user's class travel as pickles. Only the methods
-here and in `ray_host` unpickle them, and report errors.
+here and in `ray.host` unpickle them, and report errors.
 Rule: one call executes the requests of a batch in turn, and answers each of them.
 """
 
@@ -14,18 +14,18 @@ import sys
 import tempfile
 import time
 from dataclasses import replace
-from functools import partial
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from rlightning_aio._core.hosts.messages import ErrorText
+from rlightning_aio._core.hosts.completion_frames import frame_of
+from rlightning_aio._core.hosts.messages import Built, ErrorText, NewSchema, NotBuilt
 from rlightning_aio._core.hosts.ray.row_table import RowTable
 from rlightning_aio._core.hosts.running.build_env import built_envs
-from rlightning_aio._core.hosts.running.runner import close_all, resume_all
-from rlightning_aio.protocol.entries import Operation, answers_with_value, op_of, slot_of
-from rlightning_aio.protocol.info import InfoSchema, InfoSchemas
-from rlightning_aio.protocol.pickling import dumped, dumped_with_code
+from rlightning_aio._core.hosts.running.execution import execute
+from rlightning_aio._core.hosts.running.runner import close_all, give_rows, resume_all
+from rlightning_aio.protocol.entries import op_of, slot_of
+from rlightning_aio.protocol.frames import FrameKind
 from rlightning_aio.protocol.slab import Slab
 
 if TYPE_CHECKING:
@@ -33,13 +33,15 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from rlightning_aio._core.hosts.messages import AttachOrder, StartOrder
+    from rlightning_aio._core.hosts.messages import AttachOrder, Completion, StartOrder
     from rlightning_aio._core.hosts.ray.row_table import Columns
     from rlightning_aio._core.hosts.running.runner import EnvRunner
+    from rlightning_aio.protocol.frames import Frame
 
-_NONE: Final = np.empty(0, np.int64)
+__all__ = ["Batch", "EnvActor", "Late", "Reply"]
 
-__all__ = ["Batch", "EnvActor", "Late", "NotStarted", "Reply"]
+_HOST_ID: Final = 0
+"""The host of its completions; the trainer knows which it is."""
 
 
 class Batch(NamedTuple):
@@ -57,38 +59,26 @@ class Batch(NamedTuple):
 
 
 class Reply(NamedTuple):
-    """The outcome of a batch; each entry is in one of the first four.
+    """The outcome of a batch.
 
     Attributes:
         done: entries whose whole result is in the columns.
-        partial: entries whose result is partly out of band, with that part (a pickle).
-        values: of calls, pickled.
-        errors: raised by requests.
-        columns: results of `done`, then of `partial`; see `RowTable.results`.
-        schemas: new schemas of infos, with their numbers.
-        saved: checkpoints, as in `messages.Saved`, without the host.
+        frames: all other completions, in order.
+        columns: results of `done`, then those that the frames complete; see `RowTable.results`.
     """
 
     done: NDArray[np.int64]
-    partial: list[tuple[int, bytes]]
-    values: list[tuple[int, bytes]]
-    errors: list[tuple[int, ErrorText]]
+    frames: list[Frame]
     columns: Columns
-    schemas: list[tuple[int, InfoSchema]]
-    saved: list[tuple[int, bytes, bool]]
 
     def with_rows(self) -> NDArray[np.int64]:
         """Return the entries of the results in `columns`, in order."""
-        if not self.partial:
-            return self.done
-        return np.array([*self.done.tolist(), *(entry for entry, _ in self.partial)], np.int64)
+        return _with_rows(self.done, self.frames)
 
 
-class NotStarted(NamedTuple):
-    """The env of index `env_index` could not be built."""
-
-    env_index: int
-    error: ErrorText
+def _with_rows(done: NDArray[np.int64], frames: list[Frame]) -> NDArray[np.int64]:
+    partial = [frame.number for frame in frames if frame.kind == FrameKind.RESULT]
+    return np.array([*done.tolist(), *partial], np.int64) if partial else done
 
 
 class Late(NamedTuple):
@@ -119,30 +109,27 @@ class EnvActor:
         self._first_slot = first_slot
         self._limits = limits
         self._runners: list[EnvRunner] = []
-        self._new_schemas: list[tuple[int, InfoSchema]] = []
-        self._schemas = InfoSchemas(self._announce)
-        self._saved: list[tuple[int, bytes, bool]] = []
+        self._frames: list[Frame] = []
         self._info_width = 0
         # The current entry and its start (monotonic ns); another thread reads them.
         self._executing = (0, 0)
 
-    def _announce(self, number: int, schema: InfoSchema) -> None:
-        self._new_schemas.append((number, schema))
-
-    def _save(self, index: int, checkpoint: bytes, before: bool) -> None:
-        self._saved.append((index, checkpoint, before))
+    def _post(self, completion: Completion) -> None:
+        """Have the next reply report a completion."""
+        if isinstance(completion, NewSchema):
+            self._info_width = max(self._info_width, completion.schema.size)
+        self._frames.append(frame_of(completion))
 
     def hello(self) -> None:
         """Return, which shows that a node has started this actor."""
 
-    def build(self, order: bytes) -> bytes | NotStarted:
+    def build(self, order: bytes) -> Frame:
         """Build the envs, and give each a row in this process.
 
         Args:
             order: a `StartOrder`, pickled.
 
-        Returns:
-            `EnvStarted` of each, pickled.
+        Returns `Built` or `NotBuilt`.
         """
         given: StartOrder | None = None
         try:
@@ -151,63 +138,42 @@ class EnvActor:
             given = replace(given, trainer_pid=None)
             for runner in built_envs(given):
                 self._runners.append(runner)
-            started = dumped_with_code([runner.started() for runner in self._runners])
-            self._attach()
+            places = list(_placed_here(self._runners))
+            give_rows(places, _HOST_ID, self._post)
+            self._table = RowTable(self._first_slot, [(slab, row) for _, slab, row in places])
+            return frame_of(Built(_HOST_ID, [runner.started() for runner in self._runners]))
         except BaseException as error:
             index = len(self._runners)
             if given is not None:
                 index = min(index, len(given.worker_indices) - 1)
-            return NotStarted(index, ErrorText.of(error))
-        return started
+            return frame_of(NotBuilt(_HOST_ID, index, ErrorText.of(error)))
 
-    def _attach(self) -> None:
-        places = list(_placed_here(self._runners))
-        for index, (runner, (slab, row)) in enumerate(zip(self._runners, places, strict=True)):
-            runner.attach(slab, row, self._schemas.announce, partial(self._save, index))
-        self._table = RowTable(self._first_slot, places)
-
-    def resume(self, order: AttachOrder) -> NotStarted | None:
-        """Seed a replacement and restore its envs."""
+    def resume(self, order: AttachOrder) -> Frame | None:
+        """Seed a replacement and restore its envs; return `NotBuilt` if that fails."""
         try:
             resume_all(self._runners, order)
         except BaseException as error:
-            return NotStarted(0, ErrorText.of(error))
+            return frame_of(NotBuilt(_HOST_ID, 0, ErrorText.of(error)))
         return None
 
     def execute(self, batch: Batch) -> Reply:
         """Execute requests one after the other."""
         entries, columns, arguments = batch
         self._table.put_requests(entries, columns, seeds=arguments is None)
-        done: list[int] = []
-        reply = Reply(_NONE, [], [], [], [], [], [])
+        in_rows: list[int] = []
         for position, entry in enumerate(entries.tolist()):
             self._executing = entry, time.monotonic_ns()
+            runner = self._runners[slot_of(entry) - self._first_slot]
             given = None if arguments is None else arguments[position]
-            try:
-                outcome = self._execute(entry, given)
-                if answers_with_value(op_of(entry)):
-                    reply.values.append((entry, dumped(outcome, "what it returned")))
-                elif outcome is None:
-                    done.append(entry)
-                else:
-                    reply.partial.append((entry, dumped(outcome, "the result")))
-            except BaseException as error:
-                reply.errors.append((entry, ErrorText.of(error)))
+            completion = execute(_HOST_ID, runner, entry, given)
+            if completion is None:
+                in_rows.append(entry)
+            else:
+                self._post(completion)
         self._executing = 0, 0
-        return self._with_rows(reply._replace(done=np.array(done, np.int64)))
-
-    def _execute(self, entry: int, arguments: bytes | None) -> Any:
-        runner, op = self._runners[slot_of(entry) - self._first_slot], op_of(entry)
-        if arguments is not None:
-            return runner.execute(op, pickle.loads(arguments))
-        return runner.step() if op == Operation.STEP else runner.reset_from_row()
-
-    def _with_rows(self, reply: Reply) -> Reply:
-        schemas, self._new_schemas = self._new_schemas, []
-        self._info_width = max([self._info_width, *(schema.size for _, schema in schemas)])
-        columns = self._table.results(reply.with_rows(), self._info_width)
-        saved, self._saved = self._saved, []
-        return reply._replace(columns=columns, schemas=schemas, saved=saved)
+        done = np.array(in_rows, np.int64)
+        frames, self._frames = self._frames, []
+        return Reply(done, frames, self._table.results(_with_rows(done, frames), self._info_width))
 
     def watch(self) -> Late:
         """Return when a request exceeds its time limit; runs in its own thread."""
@@ -229,8 +195,8 @@ class EnvActor:
         return close_all(self._runners)
 
 
-def _placed_here(runners: Sequence[EnvRunner]) -> Iterator[tuple[Slab, int]]:
-    """Yield a row for each env, in memory of this process; equal layouts share a slab."""
+def _placed_here(runners: Sequence[EnvRunner]) -> Iterator[tuple[EnvRunner, Slab, int]]:
+    """Yield each env with a row in memory of this process; equal layouts share a slab."""
     counts: dict[tuple[object, ...], int] = {}
     for runner in runners:
         counts[runner.layout.key] = counts.get(runner.layout.key, 0) + 1
@@ -241,7 +207,7 @@ def _placed_here(runners: Sequence[EnvRunner]) -> Iterator[tuple[Slab, int]]:
         key, count = layout.key, counts[layout.key]
         if key not in slabs:
             slabs[key] = Slab(layout, memoryview(bytearray(layout.size(count))), count)
-        yield slabs[key], rows[key]
+        yield runner, slabs[key], rows[key]
         rows[key] += 1
 
 

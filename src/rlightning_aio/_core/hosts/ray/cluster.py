@@ -1,6 +1,6 @@
 """Everything that we use of Ray: a connection, actors, calls, and the errors that report an end.
 
-Rule: no other module of the package imports Ray, and only `ray_host` uses this one. A call doesn't
+Rule: no other module of the package imports Ray, and only `ray.host` uses this one. A call doesn't
 block: a thread of Ray passes its outcome to a function. Only connecting to a cluster blocks, once.
 """
 

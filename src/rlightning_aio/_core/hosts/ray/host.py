@@ -9,7 +9,6 @@ Left out on purpose: calls to Ray (see `ray`), and the execution of requests (se
 from __future__ import annotations
 
 import os
-import pickle
 import sys
 import time
 from collections import deque
@@ -17,6 +16,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio._core.hosts.arena import map_shared
+from rlightning_aio._core.hosts.completion_frames import completion_in
 from rlightning_aio._core.hosts.inbox import Inbox
 from rlightning_aio._core.hosts.messages import (
     Attached,
@@ -25,15 +25,9 @@ from rlightning_aio._core.hosts.messages import (
     Death,
     Died,
     ErrorText,
-    NewSchema,
-    NotBuilt,
-    Raised,
     Reported,
-    Result,
-    Saved,
-    Value,
 )
-from rlightning_aio._core.hosts.ray.actor import Batch, Late, NotStarted, Reply
+from rlightning_aio._core.hosts.ray.actor import Batch, Late, Reply
 from rlightning_aio._core.hosts.ray.cluster import (
     RayConnection,
     actor_class,
@@ -46,6 +40,7 @@ from rlightning_aio._core.hosts.ray.cluster import (
 from rlightning_aio._core.hosts.ray.row_table import RowTable
 from rlightning_aio._core.hosts.running.runner import placed
 from rlightning_aio.protocol.entries import Operation, op_of
+from rlightning_aio.protocol.frames import Frame
 from rlightning_aio.protocol.pickling import dumped, dumped_with_code
 
 if TYPE_CHECKING:
@@ -55,7 +50,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio._core.hosts.base import Wiring
-    from rlightning_aio._core.hosts.messages import AttachOrder, Completion, EnvStarted, StartOrder
+    from rlightning_aio._core.hosts.messages import AttachOrder, EnvStarted, StartOrder
     from rlightning_aio.config import EnvConfig
 
 __all__ = ["RayHost"]
@@ -289,25 +284,23 @@ class RayHost:
         if self._has_returned(outcome):
             life.has_place = True
 
-    def _on_built(self, life: _Life, outcome: bytes | NotStarted | Exception) -> None:
+    def _on_built(self, life: _Life, outcome: Frame | Exception) -> None:
         if not self._has_returned(outcome):
             return
-        started: Any = _loaded(outcome) if isinstance(outcome, bytes) else outcome
-        if isinstance(started, ErrorText):  # It can't be unpickled here.
-            started = NotStarted(0, started)
-        if isinstance(started, NotStarted):
-            self._post(NotBuilt(self.host_id, started.env_index, started.error))
+        assert not isinstance(outcome, Exception)
+        completion = completion_in(self.host_id, outcome)
+        self._post(completion)
+        if not isinstance(completion, Built):
             return
-        self._started = started
+        self._started = completion.started
         life.is_built = True
-        self._post(Built(self.host_id, started))
         if self._table is not None:  # A replacement has its rows already.
             self._post(Attached(self.host_id))
 
-    def _on_resumed(self, life: _Life, outcome: NotStarted | Exception | None) -> None:
+    def _on_resumed(self, life: _Life, outcome: Frame | Exception | None) -> None:
         del life
-        if self._has_returned(outcome) and isinstance(outcome, NotStarted):
-            self._post(NotBuilt(self.host_id, outcome.env_index, outcome.error))
+        if self._has_returned(outcome) and isinstance(outcome, Frame):
+            self._post(completion_in(self.host_id, outcome))
 
     def _on_late(self, life: _Life, outcome: Late | Exception) -> None:
         if self._has_returned(outcome):
@@ -320,27 +313,16 @@ class RayHost:
             assert isinstance(outcome, Reply)
             life.sent.popleft()
             life.began_ns = time.monotonic_ns()
-            self._wiring.completions.extend(self._apply(outcome))
+            self._apply(outcome)
 
-    def _apply(self, reply: Reply) -> list[Completion]:
-        """Write results into their rows, and return the completions of a batch."""
+    def _apply(self, reply: Reply) -> None:
+        """Write results into their rows, and post the completions of a batch."""
         assert self._table is not None
-        host_id = self.host_id
         self._table.put_results(reply.with_rows(), reply.columns, time.monotonic_ns())
-        completions: list[Completion] = [NewSchema(host_id, *schema) for schema in reply.schemas]
-        completions += [Saved(host_id, *saved) for saved in reply.saved]
+        for frame in reply.frames:
+            self._post(completion_in(self.host_id, frame))
         if len(reply.done):
-            completions.append(Reported(host_id, reply.done))
-        completions += [Result(host_id, entry, packed) for entry, packed in reply.partial]
-        for entry, packed in reply.values:
-            value = _loaded(packed)
-            completions.append(
-                Raised(host_id, entry, value)
-                if isinstance(value, ErrorText)
-                else Value(host_id, entry, value)
-            )
-        completions += [Raised(host_id, entry, error) for entry, error in reply.errors]
-        return completions
+            self._post(Reported(self.host_id, reply.done))
 
     def _on_closed(self, life: _Life, outcome: Any) -> None:
         del life
@@ -353,13 +335,3 @@ def _limits(config: EnvConfig) -> dict[int, float]:
     """Return the time limits in seconds, by operation."""
     limits = {Operation.STEP: config.step_timeout, Operation.RESET: config.reset_timeout}
     return {int(op): limit for op, limit in limits.items() if limit is not None}
-
-
-def _loaded(packed: bytes) -> Any:
-    """Unpickle an object whose class may be unknown here; return the error as an `ErrorText`."""
-    try:
-        return pickle.loads(packed)
-    except KeyboardInterrupt:
-        raise
-    except BaseException as error:  # Unpickling may raise anything.
-        return ErrorText.of(error)

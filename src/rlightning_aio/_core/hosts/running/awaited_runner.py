@@ -10,7 +10,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from rlightning_aio._core.hosts.messages import NO_ACTION, STEP_IN_ROW
-from rlightning_aio._core.hosts.running.runner import EnvRunner
+from rlightning_aio._core.hosts.running.runner import EnvRunner, loaded
 from rlightning_aio.envs.results import one_result
 from rlightning_aio.protocol.entries import Operation
 
@@ -55,10 +55,11 @@ class AwaitedRunner(EnvRunner):
 
         Args:
             op: the operation.
-            arguments: as of `EnvRunner.execute`; None if they are in the row.
+            arguments: as of `EnvRunner.execute`.
 
         Returns the part of the result that is out of band; for a call, its value.
         """
+        arguments = loaded(arguments)
         if op == Operation.STEP:
             action, extras = arguments or STEP_IN_ROW
             if action is NO_ACTION:

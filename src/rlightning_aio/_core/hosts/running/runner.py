@@ -7,6 +7,7 @@ Gymnasium env takes a short way (`env_steps.ShortWay`).
 from __future__ import annotations
 
 import contextlib
+import pickle
 import random
 import time
 from functools import partial
@@ -14,7 +15,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 
-from rlightning_aio._core.hosts.arena import map_shared
 from rlightning_aio._core.hosts.messages import (
     NO_ACTION,
     RECORD_VIDEO,
@@ -46,9 +46,8 @@ from rlightning_aio.protocol.info import InfoSchemas
 from rlightning_aio.protocol.slab import RowLayout, Slab
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterator, Sequence
+    from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
 
-    from rlightning_aio._core.hosts.arena import Arena
     from rlightning_aio._core.hosts.filming.camera import Camera
     from rlightning_aio._core.hosts.messages import AttachOrder, Completion
     from rlightning_aio._core.hosts.running.checkpoint import Send
@@ -61,13 +60,19 @@ if TYPE_CHECKING:
 __all__ = [
     "EnvRunner",
     "attach_all",
-    "attach_here",
     "close_all",
     "disconnect_all",
+    "give_rows",
+    "loaded",
     "placed",
     "resume_all",
     "seed_generators",
 ]
+
+
+def loaded(arguments: Any) -> Any:
+    """Return the arguments of a request, which may be pickled."""
+    return pickle.loads(arguments) if type(arguments) is bytes else arguments
 
 
 def seed_generators(*entropy: int) -> None:
@@ -191,10 +196,17 @@ class EnvRunner:
             self.begin_step = None
 
     def execute(self, op: int, arguments: Any) -> Any:
-        """Execute a request whose arguments came out of band.
+        """Execute a request.
+
+        Args:
+            op: the operation.
+            arguments: as of `base.Host.submit`, or pickled; None if they are in the row.
 
         Returns the part of the result that is out of band; for a call, its value.
         """
+        if arguments is None:
+            return self.step() if op == Operation.STEP else self.reset_from_row()
+        arguments = loaded(arguments)
         if op == Operation.CALL:
             if arguments[0] == RECORD_VIDEO:
                 return self._record_video(*arguments[1])
@@ -448,43 +460,45 @@ def placed(
         yield runner, slabs[slab_index], row
 
 
+def give_rows(
+    placed_runners: Iterable[tuple[EnvRunner, Slab, int]],
+    host_id: int,
+    post: Callable[[Completion], None],
+) -> None:
+    """Give each env of a host the row for its results.
+
+    Args:
+        placed_runners: the host's envs, by index, each with its slab and row.
+        host_id: of the host.
+        post: gets completions: new schemas of infos, and checkpoints.
+    """
+
+    def save(index: int, checkpoint: bytes, before: bool) -> None:
+        post(Saved(host_id, index, checkpoint, before))
+
+    schemas = InfoSchemas(lambda number, schema: post(NewSchema(host_id, number, schema)))
+    for index, (runner, slab, row) in enumerate(placed_runners):
+        runner.attach(slab, row, schemas.announce, partial(save, index))
+
+
 def attach_all(
     runners: Sequence[EnvRunner],
     order: AttachOrder,
     map_part: Callable[[int, int], memoryview],
-    announce: Callable[[InfoSchema], int],
-    send_checkpoint: Callable[[int, bytes, bool], None],
+    host_id: int,
+    post: Callable[[Completion], None],
 ) -> None:
-    """Give each env of a host the row for its results, and restore those that have a checkpoint.
+    """Give the envs of a host their rows, restore those that have a checkpoint, and post that.
 
     Args:
         runners: of the host's envs.
         order: of the group.
         map_part: maps a part of the arena, given its offset and size.
-        announce: sends a new schema of infos to the trainer, and returns its number.
-        send_checkpoint: sends the env's index and a checkpoint, as in `messages.Saved`.
+        host_id: of the host.
+        post: gets completions, as of `give_rows`, and `Attached`.
     """
-    for index, (runner, slab, row) in enumerate(placed(runners, order, map_part)):
-        runner.attach(slab, row, announce, partial(send_checkpoint, index))
+    give_rows(placed(runners, order, map_part), host_id, post)
     resume_all(runners, order)
-
-
-def attach_here(
-    runners: Sequence[EnvRunner],
-    order: AttachOrder,
-    arena: Arena,
-    host_id: int,
-    post: Callable[[Completion], None],
-) -> None:
-    """Do as `attach_all` for a host in the trainer's process, whose completions `post` gets."""
-    schemas = InfoSchemas(lambda number, schema: post(NewSchema(host_id, number, schema)))
-    attach_all(
-        runners,
-        order,
-        partial(map_shared, arena.descriptor),
-        schemas.announce,
-        lambda index, checkpoint, before: post(Saved(host_id, index, checkpoint, before)),
-    )
     post(Attached(host_id))
 
 

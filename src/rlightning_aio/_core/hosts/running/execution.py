@@ -1,0 +1,66 @@
+"""Executes a request on an env, and makes the completion that reports its outcome.
+
+Every host with envs of its own uses it, in whatever process and thread; hosts differ in when they
+execute a request, and in where they put its completion.
+Left out: what a request does to an env (see `EnvRunner`), and how a completion travels.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from rlightning_aio._core.hosts.messages import ErrorText, Raised, Result, Value
+from rlightning_aio.protocol.entries import answers_with_value, op_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from rlightning_aio._core.hosts.running.runner import EnvRunner
+
+__all__ = ["completion_of", "execute"]
+
+
+def execute(
+    host_id: int,
+    runner: EnvRunner,
+    entry: int,
+    arguments: Any,
+    on_end: Callable[[BaseException | None], object] | None = None,
+) -> Result | Value | Raised | None:
+    """Execute one request.
+
+    Args:
+        host_id: of the env's host.
+        runner: of the env.
+        entry: of the request.
+        arguments: as of `EnvRunner.execute`.
+        on_end: called after that, with what it has raised, if it has.
+
+    Returns its completion, or None if the row holds the whole result.
+    """
+    outcome = error = None
+    try:
+        outcome = runner.execute(op_of(entry), arguments)
+    except BaseException as raised:
+        error = raised
+    if on_end is not None:
+        on_end(error)
+    return completion_of(host_id, entry, outcome, error)
+
+
+def completion_of(
+    host_id: int, entry: int, outcome: Any, error: BaseException | None = None
+) -> Result | Value | Raised | None:
+    """Return the completion of a request, or None if the row holds the whole result.
+
+    Args:
+        host_id: of the env's host.
+        entry: of the request.
+        outcome: the part of the result that is out of band; for a call, its value.
+        error: what the env has raised instead.
+    """
+    if error is not None:
+        return Raised(host_id, entry, ErrorText.of(error))
+    if answers_with_value(op_of(entry)):
+        return Value(host_id, entry, outcome)
+    return None if outcome is None else Result(host_id, entry, outcome)
