@@ -8,8 +8,7 @@ from collections import Counter
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from rlightning_aio._core.group.setup.devices import check_own_devices, dealt_out
-from rlightning_aio._core.group.setup.plan import Plan, PreprocessFn, place_of
-from rlightning_aio._core.group.setup.videos import filmed_alone
+from rlightning_aio._core.group.setup.plan import Plan, PreprocessFn, filmed_alone, place_of
 from rlightning_aio._core.hosts.messages import StartOrder
 from rlightning_aio._core.hosts.running.known_tasks import known_tasks
 from rlightning_aio.config import EnvConfig, moved
