@@ -49,7 +49,7 @@ STACKS = {
 
 def any_killed(group: Any) -> bool:
     """Return True if a worker was killed, or will be once it has written its stacks."""
-    return any(record.dying or record.restarts for record in group._core.supervisor._records)
+    return any(record.dying or record.restarts for record in group._core.supervisor.records)
 
 
 @kinds_on_both_drivers("hangs", STACKS)
@@ -271,7 +271,7 @@ def test_replacement_that_hangs_is_replaced_until_there_are_too_many(
     kwargs = {"faults": {"building": "sleep"}, "while_exists": str(broken)}
     config = two_workers(env_kwargs=kwargs, max_restarts=1)
     group, tokens = start(config), Tokens()
-    for member in group.group._core.supervisor._records:
+    for member in group.group._core.supervisor.records:
         member.config = member.config.model_copy(update={"start_timeout": LIMIT})
     broken.touch()
     with pytest.raises(WorkerDied, match=f"did not start again within {LIMIT} s") as caught:
@@ -287,7 +287,7 @@ def test_a_replacement_that_hangs_is_found_without_any_wait(start: Start, tmp_pa
     kwargs = {"faults": {"building": "sleep"}, "while_exists": str(broken)}
     group = start(two_workers(env_kwargs=kwargs, max_restarts=1))
     tokens = Tokens()
-    for member in group.group._core.supervisor._records:
+    for member in group.group._core.supervisor.records:
         member.config = member.config.model_copy(update={"start_timeout": LIMIT})
     broken.touch()
     os.kill(pid_of(group, "faulty-0"), signal.SIGKILL)

@@ -179,7 +179,7 @@ def test_other_envs_that_share_workers_get_no_warning(
 def test_too_few_measurements_are_no_reason(caplog: pytest.LogCaptureFixture) -> None:
     """Of few steps, of short ones, without accounts, or of a worker that was replaced."""
     few, short, unknown, replaced, alone = (Machine(k) for k in (1, 4, 4, 4, 1))
-    few.workers[0].num_envs = 2
+    few.records[0].slots = range(2)
     unknown.workers[1].ran = None
     for machine in (few, short, unknown, replaced, alone):
         machine.look()

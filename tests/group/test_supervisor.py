@@ -792,12 +792,12 @@ def test_each_shortage_has_its_own_half_minute(fleet: Callable[..., Fleet], late
         ours.hosts[0].refusal = OSError("too many open files")
         (entry,) = ours.ask(0)
         ours.die(0, entry)
-        while ours.now < ours.supervisor._records[0].refused_since + 20:
+        while ours.now < ours.supervisor.records[0].refused_since + 20:
             ours.wait()
         ours.hosts[0].refusal = None
         ours.wait()
         ours.reply(0)
-    assert ours.supervisor._records[0].restarts == 3
+    assert ours.supervisor.records[0].restarts == 3
 
 
 def test_thousands_of_restarts_are_attempts_like_the_first(fleet: Callable[..., Fleet]) -> None:
@@ -806,7 +806,7 @@ def test_thousands_of_restarts_are_attempts_like_the_first(fleet: Callable[..., 
     ours.ask(0)
     for _ in range(5000):
         ours.die(0)
-        if ours.supervisor._records[0].restart_at is not None:
+        if ours.supervisor.records[0].restart_at is not None:
             ours.wait()
     ours.die(0)
     assert is_given_up(ours.losses[-1])
@@ -888,7 +888,7 @@ def test_a_replacement_with_other_spaces_gets_no_requests(fleet: Callable[..., F
     ours = fleet(max_restarts=1)
     ours.hosts[0].dies = False
     (entry,) = ours.ask(0)
-    started = ours.supervisor._records[0].started
+    started = ours.supervisor.records[0].started
     other = RowLayout(ACTION_SPACE, ACTION_SPACE, (), ())
     started[0] = replace(started[0], layout=other)
     ours.die(0)

@@ -200,7 +200,7 @@ def test_a_replacement_without_a_place_says_what_it_lacks(nodes: Any) -> None:
         group.init()
         batch, _ = group.reset()
         # From here on; the first start may take what it needs on a busy machine.
-        record = group.group._core.supervisor._records[0]
+        record = group.group._core.supervisor.records[0]
         record.config = record.config.model_copy(update={"start_timeout": 5.0})
         nodes.remove_node(node, allow_graceful=False)
         lacks = r"did not start again within 5\.0 s.*could not be placed: it asks for 1 only"

@@ -136,8 +136,8 @@ class Core:
 
     def start(self, now: float) -> Procedure[list[EnvMeta]]:
         """Start the hosts."""
-        for host in self.supervisor.hosts:
-            self.results.begin_schemas(range(host.first_slot, host.first_slot + host.num_envs))
+        for record in self.supervisor.records:
+            self.results.begin_schemas(record.slots)
         with self.observed.call("init", now):
             return (yield from self.supervisor.start(now))
 

@@ -170,15 +170,15 @@ class Intake:
         self._fail(self._requests.alone(slot), lambda _: away)
 
     def _on_new_schema(self, completion: NewSchema) -> None:
-        host = self._supervisor.hosts[completion.host_id]
-        self._results.note_schema(host.first_slot, completion.number, completion.schema)
+        slots = self._supervisor.records[completion.host_id].slots
+        self._results.note_schema(slots.start, completion.number, completion.schema)
 
     def _on_joined(self, completion: Joined) -> None:
-        first_slot = self._supervisor.hosts[completion.host_id].first_slot
-        self._arrivals.join(completion, first_slot, self.now)
+        slots = self._supervisor.records[completion.host_id].slots
+        self._arrivals.join(completion, slots.start, self.now)
 
     def _on_saved(self, completion: Saved) -> None:
-        slot = self._supervisor.hosts[completion.host_id].first_slot + completion.env_index
+        slot = self._supervisor.records[completion.host_id].slots[completion.env_index]
         if slot in self._requests.aborted.faults:
             return  # Of an episode that the caller has ended.
         numbering = self._requests.numbering

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rlightning_aio._core.hosts.base import Aborting, Killable
+from rlightning_aio._core.hosts.base import Aborting, Killable, Measured, Membership
+from rlightning_aio._core.hosts.limits import RestartPolicy, limits_of
 from rlightning_aio.registry import ENVS, placement_of
 
 if TYPE_CHECKING:
@@ -65,10 +66,13 @@ class HostRecord:
         rebuild_error: the error of its replacement while rebuilding the envs.
         lost_slots: of envs that are not rebuilt though their host goes on.
         last_loss: its last death.
-        killable: the host, if it can be killed; aborting: if it can end single requests.
+        killable: the host, if it can be killed; aborting: if it can end single requests; measured:
+            if its use of the cores is known; membership: if envs join and leave it.
+        limits: the time limits of requests, by operation.
+        timed: some of its requests have a time limit, which the supervisor watches.
+        restart_policy: how many deaths in a row are borne.
         is_local: its envs use this machine's cores; is_hardware: they move in the real world.
         slots: of its envs.
-        timed: some of its requests have a time limit, which the supervisor watches.
     """
 
     host: Host
@@ -99,16 +103,23 @@ class HostRecord:
     last_loss: HostLoss | None = None
     killable: Killable | None = field(init=False)
     aborting: Aborting | None = field(init=False)
+    measured: Measured | None = field(init=False)
+    membership: Membership | None = field(init=False)
+    limits: dict[int, float] = field(init=False)
     timed: bool = field(init=False)
+    restart_policy: RestartPolicy = field(init=False)
     is_local: bool = field(init=False)
     is_hardware: bool = field(init=False)
     slots: range = field(init=False)
 
     def __post_init__(self) -> None:
-        limits = (self.config.step_timeout, self.config.reset_timeout)
         self.killable = self.host if isinstance(self.host, Killable) else None
         self.aborting = self.host if isinstance(self.host, Aborting) else None
-        self.timed = self.killable is not None and limits != (None, None)
+        self.measured = self.host if isinstance(self.host, Measured) else None
+        self.membership = self.host if isinstance(self.host, Membership) else None
+        self.limits = limits_of(self.config)
+        self.timed = self.killable is not None and bool(self.limits)
+        self.restart_policy = RestartPolicy(self.config, "replaced")
         self.is_local = placement_of(self.config.backend, self.config.placement).local
         self.is_hardware = ENVS.is_hardware(self.config.backend)
         self.slots = range(self.host.first_slot, self.host.first_slot + self.host.num_envs)

@@ -76,7 +76,7 @@ def late_fault(envs: EnvTable, record: HostRecord, death: Death) -> StartFailed:
 def _starting(record: HostRecord, death: Death) -> int:
     """The slot of the env that a worker was building when it died."""
     slot = slot_of(death.requests[0]) if death.requests else 0
-    return max(slot, record.host.first_slot)
+    return max(slot, record.slots.start)
 
 
 def culprits_of(
@@ -149,7 +149,7 @@ def host_loss(
     replaced: bool,
 ) -> HostLoss:
     """Describe a death; `outcome` says what happens to the worker now."""
-    slot, config = record.blamed[0], record.config
+    slot = record.blamed[0]
     slot = record.slots.start if slot is None else slot
     doing, number = _doing(requests, slot), requests.numbering.number(slot)
     last = f"last request: {f'request {number}, {doing}' if number else 'none'}"
@@ -157,8 +157,8 @@ def host_loss(
     if record.suspects:
         last = "no env's code was running"
     elif record.is_hung:
-        stepped = requests.numbering.op(slot) == Operation.STEP
-        limit = config.step_timeout if stepped else config.reset_timeout
+        # Of a stopped worker, whose env may have been called, the shortest one counts.
+        limit = record.limits.get(requests.numbering.op(slot), min(record.limits.values()))
         what = f"{envs.describe(slot)} took longer than {limit} s for {doing} and was killed"
     return HostLoss(
         host_id=record.host.host_id,

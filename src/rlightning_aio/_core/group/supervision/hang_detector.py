@@ -14,7 +14,7 @@ import numpy as np
 
 from rlightning_aio._core.group.state.host_record import Stage
 from rlightning_aio._core.group.supervision.fault_messages import culprits_of
-from rlightning_aio.protocol.entries import Operation, slot_of
+from rlightning_aio.protocol.entries import slot_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -132,14 +132,12 @@ class HangDetector:
             return None
         assert record.killable is not None
         entry, since_ns = record.killable.executing()
-        limits = (record.config.step_timeout, record.config.reset_timeout)
-        shortest = min(limit for limit in limits if limit is not None)
+        shortest = min(record.limits.values())
         if not (entry and since_ns):
             # A stopped process executes none of its requests.
             idle = record.idle == self._progress(record)
             return (record.idle_since if idle else self._now) + shortest
-        op = self._requests.numbering.op(slot_of(entry))
-        limit = {Operation.STEP: limits[0], Operation.RESET: limits[1]}.get(Operation(op or 3))
+        limit = record.limits.get(self._requests.numbering.op(slot_of(entry)))
         # A request without a limit is checked again, because the next one may have a limit.
         return self._now + shortest if limit is None else since_ns / 1e9 + limit
 

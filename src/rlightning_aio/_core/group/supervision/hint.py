@@ -14,8 +14,6 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from rlightning_aio._core.hosts.base import Measured
-
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
@@ -112,7 +110,7 @@ class Hints:
         self.due = float("inf") if is_last else min(2 * self.due, HINT_AFTER_BATCHES)
         sharing: dict[str, list[HostRecord]] = {}
         for record in self._records:
-            if record.host.num_envs > 1 and isinstance(record.host, Measured):
+            if len(record.slots) > 1 and record.measured is not None:
                 sharing.setdefault(record.config.name, []).append(record)
         for name, records in sharing.items():
             self._look_at(name, records, stats, num_cores)
@@ -134,7 +132,7 @@ class Hints:
             return
         self._since[name] = now
         config = records[0].config
-        together = max(record.host.num_envs for record in records)
+        together = max(len(record.slots) for record in records)
         best = -(-config.num_workers // (_WORKERS_PER_CORE * num_cores))
         if waits(spent) and best < together:
             self._since[name] = None
@@ -155,8 +153,8 @@ class Hints:
 def _now(records: Sequence[HostRecord]) -> _Since | None:
     ran = queued = 0
     for record in records:
-        assert isinstance(record.host, Measured)
-        times = record.host.processor_times()
+        assert record.measured is not None
+        times = record.measured.processor_times()
         if times is None:
             return None
         ran += times[0]

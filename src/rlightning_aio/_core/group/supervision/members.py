@@ -8,7 +8,6 @@ import numpy as np
 
 from rlightning_aio._core.group.drivers.wait import earliest
 from rlightning_aio._core.group.state.slab_layout import check_actions
-from rlightning_aio._core.hosts.base import Membership
 from rlightning_aio.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -17,7 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.state.env_table import EnvTable
-    from rlightning_aio._core.hosts.base import Host
+    from rlightning_aio._core.hosts.base import Membership
     from rlightning_aio.types import EnvMeta
 
 __all__ = ["Members"]
@@ -37,11 +36,10 @@ class Members:
         self._servers: list[Membership] = []
         self.possible = False
 
-    def add(self, host: Host) -> None:
-        """Add a host, if envs join it."""
-        if isinstance(host, Membership):
-            self._servers.append(host)
-            self.possible = True
+    def add(self, server: Membership) -> None:
+        """Add a host that envs join."""
+        self._servers.append(server)
+        self.possible = True
 
     @property
     def server_ids(self) -> list[str]:

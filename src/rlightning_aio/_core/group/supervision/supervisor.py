@@ -33,6 +33,7 @@ from rlightning_aio._core.group.supervision.hint import Hints
 from rlightning_aio._core.group.supervision.members import Members
 from rlightning_aio._core.group.supervision.shutdown import Shutdown
 from rlightning_aio._core.group.supervision.workers import Workers
+from rlightning_aio._core.hosts.limits import restart_pause
 from rlightning_aio._core.hosts.messages import (
     Attached,
     Built,
@@ -42,7 +43,6 @@ from rlightning_aio._core.hosts.messages import (
     ErrorText,
     NotBuilt,
 )
-from rlightning_aio._core.hosts.restart_pause import restart_pause
 from rlightning_aio.errors import ConfigError, GroupClosed, RemoteTraceback, StartFailed
 from rlightning_aio.types import EnvMeta
 
@@ -87,7 +87,7 @@ class Supervisor:
         clock: monotonic seconds; asked when a host has died, or was ordered to start or to die.
 
     Attributes:
-        hosts: in the order of their slots.
+        hosts: in the order of their slots; records: of them.
         members: the envs that join and leave.
         detector: finds workers that hang.
         shutdown: ends the hosts; workers: describes them; hints: on their number; crash_log: of
@@ -109,6 +109,7 @@ class Supervisor:
         clock: Callable[[], float],
     ) -> None:
         self.hosts: list[Host] = []
+        self.records: list[HostRecord] = []
         self.any_deaths = False
         self.metas: list[EnvMeta] = []
         self.close_errors: list[tuple[str, ErrorText]] = []
@@ -125,12 +126,11 @@ class Supervisor:
         self._post = post
         self._clock = clock
         self._mixed_actions = mixed_actions
-        self._records: list[HostRecord] = []
         self.members = Members(self._envs, mixed_actions=mixed_actions)
-        self.detector = HangDetector(self._records, self._requests, self._observed, clock)
-        self.shutdown = Shutdown(self._lifetime, self._records, self.resources, self._layout, arena)
-        self.workers = Workers(self._records, self._envs, self._requests)
-        self.hints = Hints(self._records)
+        self.detector = HangDetector(self.records, self._requests, self._observed, clock)
+        self.shutdown = Shutdown(self._lifetime, self.records, self.resources, self._layout, arena)
+        self.workers = Workers(self.records, self._envs, self._requests)
+        self.hints = Hints(self.records)
         self.crash_log = CrashLog()
         self._start_fault: Exception | None = None
         self._now = 0.0
@@ -139,9 +139,11 @@ class Supervisor:
     def add(self, host: Host, config: EnvConfig) -> None:
         """Add a host before the start; its slots follow those of the previous host."""
         self.hosts.append(host)
-        self._records.append(HostRecord(host, config))
-        self.detector.timed = self.detector.timed or self._records[-1].timed
-        self.members.add(host)
+        record = HostRecord(host, config)
+        self.records.append(record)
+        self.detector.timed = self.detector.timed or record.timed
+        if record.membership is not None:
+            self.members.add(record.membership)
 
     # -- start --------------------------------------------------------------------
 
@@ -153,11 +155,11 @@ class Supervisor:
             return self.metas
         try:
             self._now = now
-            for record in self._records:
+            for record in self.records:
                 self._launch_first(record)
             yield from self._until(Stage.BUILT)
             self._place()
-            for record in self._records:
+            for record in self.records:
                 assert record.order is not None
                 record.stage = Stage.ATTACHING
                 record.host.attach(record.order)
@@ -180,7 +182,7 @@ class Supervisor:
             self._launch(record, Stage.BUILDING)
         except OSError as error:
             raise StartFailed(
-                _refusal(record, error), env_id=self._envs.env_ids[record.host.first_slot]
+                _refusal(record, error), env_id=self._envs.env_ids[record.slots.start]
             ) from error
 
     def _launch(self, record: HostRecord, stage: Stage) -> None:
@@ -192,10 +194,10 @@ class Supervisor:
     def _until(self, stage: Stage) -> Procedure[None]:
         # Hosts in this process have posted completions already.
         self._now = yield Wait(0.0)
-        while any(r.stage.value < stage.value for r in self._records):
+        while any(r.stage.value < stage.value for r in self.records):
             if self._start_fault is not None:
                 raise self._start_fault
-            self._now = yield Wait(earliest(*(r.start_by for r in self._records)))
+            self._now = yield Wait(earliest(*(r.start_by for r in self.records)))
             if self._lifetime.closed:
                 raise GroupClosed("the group was closed while it was starting")
             self._check_start_times()
@@ -203,7 +205,7 @@ class Supervisor:
             raise self._start_fault
 
     def _check_start_times(self) -> None:
-        for record in self._records:
+        for record in self.records:
             if record.start_by is None or self._now < record.start_by:
                 continue
             if has_news(record) or record.note_traffic():
@@ -223,24 +225,23 @@ class Supervisor:
 
     def _place(self) -> None:
         """Give each env a row in the slab of its layout."""
-        started = [env for record in self._records for env in record.started]
+        started = [env for record in self.records for env in record.started]
         self.metas = [env.meta for env in started]
         if not self._mixed_actions:
             check_actions(self.metas)
         self._layout.place(started, self._arena)
         self._envs.note_started(started)
-        for record in self._records:
+        for record in self.records:
             count = len(record.started)
-            record.order = self._layout.order_for(record.host.first_slot, count)
+            record.order = self._layout.order_for(record.slots.start, count)
 
     def handle(self, completion: Lifecycle) -> None:
         """Apply a completion about the life of a host; `handle_exit` applies deaths."""
-        record = self._records[completion.host_id]
+        record = self.records[completion.host_id]
         if isinstance(completion, Built):
             self._on_built(record, completion.started)
         elif isinstance(completion, NotBuilt):
-            slot = record.host.first_slot + completion.env_index
-            self._on_not_built(record, slot, completion.error)
+            self._on_not_built(record, record.slots[completion.env_index], completion.error)
         elif isinstance(completion, Attached):
             if record.rebuild_error is None:
                 self._on_attached(record)
@@ -253,7 +254,7 @@ class Supervisor:
                 if len(owed) and error.type_name == "WorkerDied":
                     late = self._envs.env_ids[owed.item(0)]
                     error = replace(error, text=f"{error.text}; {late} owed a reply")  # noqa: PLW2901
-                env_id = self._envs.env_ids[record.host.first_slot + index]
+                env_id = self._envs.env_ids[record.slots[index]]
                 self.close_errors.append((env_id, error))
 
     def _on_built(self, record: HostRecord, started: list[Any]) -> None:
@@ -263,7 +264,7 @@ class Supervisor:
             record.start_by = None
         elif [env.layout.key for env in started] != [env.layout.key for env in record.started]:
             error = ErrorText("ValueError", "its spaces changed with the restart", "")
-            self._on_not_built(record, record.host.first_slot, error)
+            self._on_not_built(record, record.slots.start, error)
 
     def _on_attached(self, record: HostRecord) -> None:
         record.stage = Stage.UP
@@ -302,7 +303,7 @@ class Supervisor:
         """Raise the error of a host that will not be restarted, if it hosts any of `slots`."""
         if not self._any_given_up:
             return
-        for record in self._records:
+        for record in self.records:
             if record.stage is Stage.FAILED and record.last_loss is not None:
                 asked = slots[np.isin(slots, record.slots)]
                 if len(asked):
@@ -310,14 +311,14 @@ class Supervisor:
 
     def last_losses(self, slots: NDArray[np.intp]) -> NDArray[Any]:
         """Return the last `HostLoss` of the host of each of `slots`; None before the first."""
-        losses = np.array([record.last_loss for record in self._records], object)
+        losses = np.array([record.last_loss for record in self.records], object)
         return losses[self._requests.hosts[slots]]
 
     def submit(
         self, host_id: int, entries: NDArray[np.int64], arguments: Sequence[Any] | None
     ) -> None:
         """Pass requests to a host, or hold them until its replacement is up."""
-        record = self._records[host_id]
+        record = self.records[host_id]
         if record.is_down:
             record.held.append((entries, arguments))
         else:
@@ -331,7 +332,7 @@ class Supervisor:
         if self.detector.timed or self.detector.any_ending:
             times += self.detector.expiries()
         if self.any_deaths:
-            times += [due for r in self._records for due in (r.start_by, r.restart_at)]
+            times += [due for r in self.records for due in (r.start_by, r.restart_at)]
         if self.members.possible:
             times.append(self.members.next_deadline())
         return min((time for time in times if time is not None), default=None)
@@ -344,7 +345,7 @@ class Supervisor:
         self.look_by = now + LOOK_SECONDS
         if self.any_deaths:
             self._check_start_times()
-            for record in self._records:
+            for record in self.records:
                 self._restart_due(record, now)
         if self.members.possible:
             self.members.tick(now)
@@ -362,7 +363,7 @@ class Supervisor:
         the worker was a replacement that never came up. Requests wait for the next one then, which
         is started here.
         """
-        record, death = self._records[exited.host_id], exited.death
+        record, death = self.records[exited.host_id], exited.death
         record.dying, record.die_by, record.abort_by = False, None, None
         if not self._lifetime.open:
             record.stage = Stage.CLOSED
@@ -394,7 +395,7 @@ class Supervisor:
 
     def replace(self, host_id: int) -> None:
         """Start the replacement of a host at once, if it needn't pause: `check` starts others."""
-        self._restart_due(self._records[host_id], self._clock())
+        self._restart_due(self.records[host_id], self._clock())
 
     def _restart_due(self, record: HostRecord, now: float) -> None:
         if record.restart_at is not None and record.restart_at <= now:
@@ -412,7 +413,7 @@ class Supervisor:
         assert record.order is not None
         checkpoints = self._continuity.checkpoints(record.slots)
         # What the generators of a seeded group begin with must not be by chance.
-        seed = self._envs.last_seed.item(record.host.first_slot)
+        seed = self._envs.last_seed.item(record.slots.start)
         order = replace(
             record.order,
             checkpoints=checkpoints,
@@ -439,7 +440,7 @@ class Supervisor:
 
     def _judged(self, record: HostRecord, death: Death, owed: NDArray[np.intp]) -> HostLoss:
         """Count a death, decide if the host is replaced, and report it."""
-        requests, config = self._requests, record.config
+        requests = self._requests
         if record.stage is Stage.UP and not record.is_hung:
             # A replacement that fails to start counts against the env that made it necessary.
             record.culprit, record.suspects = culprits_of(record, death.requests, requests, owed)
@@ -448,20 +449,11 @@ class Supervisor:
             record.deaths[slot] = record.deaths.get(slot, 0) + is_fault
         deaths = record.deaths_in_a_row
         self._note_deaths(True)
-        raises = config.on_worker_death == "raise"
-        replaced = not is_fault or (not raises and deaths <= config.max_restarts)
-        if not is_fault:
-            outcome = "it is replaced"
-        elif raises:
-            outcome = "on_worker_death is 'raise', so it is not replaced"
-        elif not replaced:
-            outcome = f"it is not replaced after {deaths - 1} restarts in a row (max_restarts)"
-        else:
-            pause = restart_pause(deaths)
-            outcome = f"restart {deaths} of {config.max_restarts} in a row"
-            outcome += f", in {pause:g} s" if pause else ""
-            if record.is_hardware:
-                outcome += "; it moves nothing until you reset it"
+        policy = record.restart_policy
+        replaced = not is_fault or policy.bears(deaths)
+        outcome = policy.outcome(deaths) if is_fault else "it is replaced"
+        if is_fault and replaced and record.is_hardware:
+            outcome += "; it moves nothing until you reset it"
         death = replace(death, cause=cause_of(record, death, requests))
         loss = host_loss(self._envs, requests, record, death, outcome, replaced=replaced)
         self._note_fate("died" if replaced else "given up", loss.host_id, death.cause)
@@ -469,19 +461,19 @@ class Supervisor:
             _log.info("%s", loss.message)
         elif replaced:
             self.crash_log.note(
-                config.name, loss.message, death.cause, loss.at_fault, self._clock()
+                record.config.name, loss.message, death.cause, loss.at_fault, self._clock()
             )
         record.is_hung, record.aborted_slot, record.rebuild_error = False, None, None
         return loss
 
     def note_rebuilt(self, host_id: int, slot: int, cause: str) -> None:
         """Record that a host has rebuilt one of its envs."""
-        self._records[host_id].restarts += 1
+        self.records[host_id].restarts += 1
         self._note_fate("hung", host_id, cause, slot)
 
     def note_lost_env(self, host_id: int, slot: int) -> None:
         """Record that a host will not rebuild one of its envs."""
-        self._records[host_id].lost_slots.add(slot)
+        self.records[host_id].lost_slots.add(slot)
 
     def _note_fate(self, fate: Fate, host_id: int, cause: str = "", slot: int = -1) -> None:
         if self._observed.observer is not None:
@@ -489,7 +481,7 @@ class Supervisor:
 
     def note_step(self, slot: int) -> None:
         """Record that an env completed a step, so it is not what its worker died of."""
-        for record in self._records:
+        for record in self.records:
             if slot in record.slots and record.deaths:
                 record.deaths.pop(slot, None)
                 record.deaths.pop(None, None)
@@ -497,7 +489,7 @@ class Supervisor:
 
     def _update_any_deaths(self) -> None:
         self._note_deaths(
-            any(record.deaths for record in self._records if record.stage is not Stage.FAILED)
+            any(record.deaths for record in self.records if record.stage is not Stage.FAILED)
         )
 
     def _note_deaths(self, any_deaths: bool) -> None:

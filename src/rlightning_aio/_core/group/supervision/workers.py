@@ -96,7 +96,7 @@ def _entry(records: Sequence[HostRecord]) -> str:
     if placement_of(config.backend, config.placement).max_members:
         return config.backend
     sizes = f" of {config.num_envs} sub-environments" if config.num_envs > 1 else ""
-    envs = sum(record.host.num_envs for record in records)
+    envs = sum(len(record.slots) for record in records)
     workers = sum(record.killable is not None for record in records)
     return (
         f"{envs} env{'' if envs == 1 else 's'}{sizes}, placement {config.placement}, "

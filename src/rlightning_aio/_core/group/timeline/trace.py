@@ -22,7 +22,6 @@ from rlightning_aio._core.group.drivers.scope import Scope
 from rlightning_aio._core.group.state.request_states import State
 from rlightning_aio._core.group.timeline.file import HostTrack, Timeline, events
 from rlightning_aio._core.group.timeline.records import Mark, Records
-from rlightning_aio._core.hosts.base import Killable, Membership
 from rlightning_aio.files import check_writable, write_file
 from rlightning_aio.protocol.entries import Operation
 
@@ -34,8 +33,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.engine.core import Core
+    from rlightning_aio._core.group.state.host_record import HostRecord
     from rlightning_aio._core.group.state.observed import Fate
-    from rlightning_aio._core.hosts.base import Host
     from rlightning_aio.batch.columns import ResultColumns
 
 __all__ = ["Trace"]
@@ -158,14 +157,15 @@ class Trace(Scope):
     def _note_unanswered(self, slot: int, state: str, now: int) -> None:
         """Mark a request without a result, from its start in the env, or else from its sending."""
         requests = self._core.requests
-        host = self._core.supervisor.hosts[requests.hosts.item(slot)]
+        host_id = requests.hosts.item(slot)
+        killable = self._core.supervisor.records[host_id].killable
         # Only workers with time limits report the request that they execute. An actor's time may
         # be in the future, as it includes an allowance for the transfer.
-        entry, since = host.executing() if isinstance(host, Killable) else (0, 0)
+        entry, since = (0, 0) if killable is None else killable.executing()
         if entry != requests.numbering.entry.item(slot) or not 0 < since <= now:
             since = requests.sent_ns.item(slot)
         name = f"{Operation(requests.numbering.op(slot)).name.lower()}, {state}"
-        self._mark(name, now, host.host_id, slot, began=since)
+        self._mark(name, now, host_id, slot, began=since)
 
     def _note_unfinished(self) -> None:
         if self._core.lifetime.open:
@@ -181,19 +181,20 @@ class Trace(Scope):
             began=self._began,
             since=max(self._began, records.complete_since),
             lanes=self._lanes.names,
-            hosts=[self._track(host) for host in self._core.supervisor.hosts],
+            hosts=[self._track(record) for record in self._core.supervisor.records],
             spans=records.spans(),
             results=records.results(),
             marks=list(records.marks),
         )
 
-    def _track(self, host: Host) -> HostTrack:
-        envs, first = self._core.envs, host.first_slot
-        names = envs.env_ids[first : first + host.num_envs]
-        if isinstance(host, Membership):
-            return HostTrack(f"env_server {host.server_id}", "all clients", first, names)
-        where = "worker" if isinstance(host, Killable) else "inline"
-        name = f"{where} {host.host_id} ({envs.configs[first].name})"
+    def _track(self, record: HostRecord) -> HostTrack:
+        first = record.slots.start
+        names = self._core.envs.env_ids[first : record.slots.stop]
+        if record.membership is not None:
+            server_id = record.membership.server_id
+            return HostTrack(f"env_server {server_id}", "all clients", first, names)
+        where = "inline" if record.killable is None else "worker"
+        name = f"{where} {record.host.host_id} ({record.config.name})"
         return HostTrack(name, "worker", first, names)
 
 

@@ -29,8 +29,8 @@ from rlightning_aio._core.hosts.awaiting.event_loop import (
     time_collector,
     watched,
 )
+from rlightning_aio._core.hosts.limits import RestartPolicy, limits_of, restart_pause
 from rlightning_aio._core.hosts.messages import ErrorText, Failed, NotBuilt, Raised, Result
-from rlightning_aio._core.hosts.restart_pause import restart_pause
 from rlightning_aio._core.hosts.running.build_env import built_env
 from rlightning_aio._core.hosts.running.execution import completion_of
 from rlightning_aio._core.hosts.running.runner import disconnect_all
@@ -133,11 +133,9 @@ class AwaitedEnvs:
         self._ending = False
         config = order.config
         self._close_seconds = config.close_timeout or CLOSE_SECONDS
-        limits = {Operation.STEP: config.step_timeout, Operation.RESET: config.reset_timeout}
+        self._restarts = RestartPolicy(config, "rebuilt")
         self._limits = {
-            int(op): TimeLimit(seconds, self._expire)
-            for op, seconds in limits.items()
-            if seconds is not None
+            op: TimeLimit(seconds, self._expire) for op, seconds in limits_of(config).items()
         }
         # All envs whose tasks run, and the tasks that replace envs or put them away.
         self._envs: set[AwaitedEnv] = set()
@@ -470,19 +468,13 @@ class AwaitedEnvs:
     def _counted(self, place: _Place, kind: type[WorkerDied], message: str) -> Failed | None:
         """Count a loss of an env; return what ends its request if that was one too many."""
         place.losses += 1
-        config = self._order.config
-        for_good = config.on_worker_death == "raise"
-        if for_good:
-            outcome = "on_worker_death is 'raise', so it is not rebuilt"
-        elif place.losses > config.max_restarts:
-            outcome = (
-                f"that was after {place.losses - 1} restarts in a row (max_restarts), so this "
-                "request ends here; the next one tries again"
-            )
-        else:
-            count = f"restart {place.losses} of {config.max_restarts} in a row"
-            log.warning("%s; %s, in %g s", message, count, restart_pause(place.losses))
+        outcome = self._restarts.outcome(place.losses)
+        if self._restarts.bears(place.losses):
+            log.warning("%s; %s", message, outcome)
             return None
+        for_good = self._restarts.raises
+        if not for_good:
+            outcome += ", so this request ends here; the next one tries again"
         fault = kind(f"{message}; {outcome}", env_id=place.name, exit_code=None, stderr_tail="")
         fault.env_ids = (place.name,)
         if for_good:

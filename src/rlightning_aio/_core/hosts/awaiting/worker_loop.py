@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from rlightning_aio._core.hosts.awaiting.awaited_envs import AwaitedEnvs
 from rlightning_aio._core.hosts.awaiting.event_loop import run_loop
+from rlightning_aio._core.hosts.limits import limits_of
 
 if TYPE_CHECKING:
     import socket
@@ -56,9 +57,7 @@ class Awaiting:
             enter=enter,
         )
         self._runners = cast("Sequence[AwaitedRunner]", runners)
-        config = order.config
-        limits = [limit for limit in (config.step_timeout, config.reset_timeout) if limit]
-        self._beat_seconds = min(limits, default=0.0) / 4
+        self._beat_seconds = min(limits_of(order.config).values(), default=0.0) / 4
 
     def submit(self, entry: int, arguments: Any) -> None:
         self._envs.submit(entry, arguments)

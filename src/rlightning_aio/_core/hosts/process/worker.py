@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, NoReturn
 
 from rlightning_aio._core.hosts.arena import make_private, map_shared
 from rlightning_aio._core.hosts.completion_frames import frame_of
+from rlightning_aio._core.hosts.limits import limits_of
 from rlightning_aio._core.hosts.messages import Built, Closed, ErrorText, NotBuilt
 from rlightning_aio._core.hosts.running.build_env import built_envs
 from rlightning_aio._core.hosts.running.execution import completion_of, execute
@@ -265,8 +266,7 @@ class Worker:
             if order.core is not None:
                 os.sched_setaffinity(0, {order.core})
             self._spinner = Spinner(enabled=order.spins)
-            config = order.config
-            self._timed = (config.step_timeout or config.reset_timeout) is not None
+            self._timed = bool(limits_of(order.config))
             self._rings.own[CAREFUL] = self._timed
             self._order = order
             for runner in built_envs(order):

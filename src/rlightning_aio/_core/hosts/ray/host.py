@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 from rlightning_aio._core.hosts.arena import map_shared
 from rlightning_aio._core.hosts.completion_frames import completion_in
 from rlightning_aio._core.hosts.inbox import Inbox
+from rlightning_aio._core.hosts.limits import limits_of
 from rlightning_aio._core.hosts.messages import (
     Attached,
     Built,
@@ -39,7 +40,7 @@ from rlightning_aio._core.hosts.ray.cluster import (
 )
 from rlightning_aio._core.hosts.ray.row_table import RowTable
 from rlightning_aio._core.hosts.running.runner import placed
-from rlightning_aio.protocol.entries import Operation, op_of
+from rlightning_aio.protocol.entries import op_of
 from rlightning_aio.protocol.frames import Frame
 from rlightning_aio.protocol.pickling import dumped, dumped_with_code
 
@@ -51,7 +52,6 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.hosts.base import Wiring
     from rlightning_aio._core.hosts.messages import AttachOrder, EnvStarted, StartOrder
-    from rlightning_aio.config import EnvConfig
 
 __all__ = ["RayHost"]
 
@@ -123,7 +123,7 @@ class RayHost:
         self.first_slot = first_slot
         self.num_envs = len(order.worker_indices)
         self._config = order.config
-        self._limits = _limits(order.config)
+        self._limits = limits_of(order.config)
         self._actor_class = actor_class(order.config, watched=bool(self._limits))
         self._start_payload = dumped_with_code(order)
         self._wiring = wiring
@@ -329,9 +329,3 @@ class RayHost:
         if self._has_returned(outcome):
             self.release()
             self._post(Closed(self.host_id, outcome))
-
-
-def _limits(config: EnvConfig) -> dict[int, float]:
-    """Return the time limits in seconds, by operation."""
-    limits = {Operation.STEP: config.step_timeout, Operation.RESET: config.reset_timeout}
-    return {int(op): limit for op, limit in limits.items() if limit is not None}

@@ -1,0 +1,62 @@
+"""What an entry allows its envs: time for a request, and restarts in a row."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from rlightning_aio.protocol.entries import Operation
+
+if TYPE_CHECKING:
+    from rlightning_aio.config import EnvConfig
+
+__all__ = ["RestartPolicy", "limits_of", "restart_pause"]
+
+_FIRST_SECONDS: Final = 0.1
+_LONGEST_SECONDS: Final = 5.0
+
+
+def limits_of(config: EnvConfig) -> dict[int, float]:
+    """The time limits of requests in seconds, by operation; one without a limit is absent."""
+    limits = {Operation.STEP: config.step_timeout, Operation.RESET: config.reset_timeout}
+    return {int(op): limit for op, limit in limits.items() if limit is not None}
+
+
+def restart_pause(losses: int) -> float:
+    """Return the seconds to wait before the restart that follows `losses` losses in a row.
+
+    The first restart is immediate, the second comes after a tenth of a second, and each later one
+    after twice the previous pause, up to five seconds.
+    """
+    if losses <= 1:
+        return 0.0
+    return min(_FIRST_SECONDS * 2.0 ** min(losses - 2, 10), _LONGEST_SECONDS)
+
+
+class RestartPolicy:
+    """How many losses in a row an entry bears, of a worker or of an awaitable env.
+
+    Args:
+        config: of the entry.
+        done: the participle of what follows a loss: "replaced" or "rebuilt".
+
+    Attributes:
+        raises: no loss is borne.
+    """
+
+    def __init__(self, config: EnvConfig, done: str) -> None:
+        self.raises = config.on_worker_death == "raise"
+        self._most = config.max_restarts
+        self._done = done
+
+    def bears(self, losses: int) -> bool:
+        """Return True if a restart follows `losses` in a row."""
+        return not self.raises and losses <= self._most
+
+    def outcome(self, losses: int) -> str:
+        """Say in a clause what follows `losses` in a row."""
+        if self.raises:
+            return f"on_worker_death is 'raise', so it is not {self._done}"
+        if losses > self._most:
+            return f"it is not {self._done} after {losses - 1} restarts in a row (max_restarts)"
+        pause = restart_pause(losses)
+        return f"restart {losses} of {self._most} in a row" + (f", in {pause:g} s" if pause else "")
