@@ -111,16 +111,7 @@ class EnvGroup(GroupInterface):
         return await self._driver.run(self._core.restore(time.monotonic(), snapshot, env_ids))
 
     def __getitem__(self, env_id: str) -> EnvHandle:
-        """Return a handle on one env (`EnvHandle`), or on one env_server (`ServerHandle`).
-
-        Raises:
-            UnknownEnv: the group has neither of that id.
-        """
-        server = self._core.supervisor.members.server(env_id)
-        if server is not None:
-            return ServerHandle(self, self._core, self._driver, server)
-        self._core.envs.find_one(env_id)
-        return EnvHandle(self, self._core, self._driver, env_id)
+        return self._handle(env_id, EnvHandle, ServerHandle)
 
     def episode(
         self, env_id: str, seed: int | None = None, options: dict[str, Any] | None = None

@@ -6,7 +6,7 @@ there; "cancelled" below means a cancelled task, or Ctrl-C in a synchronous prog
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from rlightning_aio._core.group.api.facade import Facade
 
@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from rlightning_aio.types import EnvMeta, PolicyResponse
 
 __all__ = ["EnvHandleInterface", "GroupInterface", "ServerHandleInterface"]
+
+E = TypeVar("E", bound="EnvHandleInterface")
+S = TypeVar("S", bound="ServerHandleInterface")
 
 
 class GroupInterface(Facade):
@@ -251,6 +254,21 @@ class GroupInterface(Facade):
             GroupClosed: the group was not initialised, or is closed.
         """
         raise NotImplementedError
+
+    def __getitem__(self, env_id: str) -> Any:
+        """Return a handle on one env (`EnvHandle`), or on one env_server (`ServerHandle`).
+
+        Raises:
+            UnknownEnv: the group has neither of that id.
+        """
+        raise NotImplementedError
+
+    def _handle(self, env_id: str, of_env: type[E], of_server: type[S]) -> E | S:
+        server = self._core.supervisor.members.server(env_id)
+        if server is not None:
+            return of_server(self, self._core, self._driver, server)
+        self._core.envs.find_one(env_id)
+        return of_env(self, self._core, self._driver, env_id)
 
     def offload(self) -> Any:
         """Free the device memory of every local env until `reload`.
