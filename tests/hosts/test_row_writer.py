@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 CONFIG = EnvConfig(name="plain", backend="gymnasium", task="x")
 SPACE = spaces.Box(-99, 99, (2,), np.float64)
+ORIGIN = np.zeros(2)
 
 infos = st.one_of(
     st.just({}),
@@ -80,6 +81,23 @@ class Renewed(Plain):
     """The observation of a step that ends an episode begins the next one."""
 
     mode = AutoresetMode.SAME_STEP
+
+
+def begin(
+    writer: RowWriter, info: Any, observation: Any = ORIGIN, extra: dict[str, Any] | None = None
+) -> Any:
+    return writer.write_reset((observation, 0.0, False, False, info), 0, extra)
+
+
+def step(
+    writer: RowWriter,
+    reward: Any,
+    terminated: Any,
+    truncated: Any,
+    info: Any,
+    observation: Any = ORIGIN,
+) -> Any:
+    return writer.write_step((observation, reward, terminated, truncated, info), 0)
 
 
 def new_slab(layout: RowLayout, rows: int = 2) -> Slab:
@@ -141,15 +159,13 @@ def test_the_short_way_writes_the_same_rows(kind: type[Plain], history: list[Any
         if what == "reset":
             env.next = then
             found = runner.reset_from_row()
-            writer.begin_episode(then)
-            expected = writer.write_data(observation, then)
+            expected = begin(writer, then, observation)
         else:
             row.slab.action[1] = 2
             env.next = then
             found = runner.step()
             reward, terminated, truncated, info = then
-            writer.write_ends(float(reward), terminated, truncated, info)
-            expected = writer.write_data(observation, info)
+            expected = step(writer, float(reward), terminated, truncated, info, observation)
         assert row.contents(found) == long.contents(expected)
         assert not row.slab.flags[0].any()
         assert row.slab.done_ns[1] >= row.slab.busy_ns[1] >= 0
@@ -254,33 +270,33 @@ def test_a_row_has_flags_and_sums(
 ) -> None:
     """The second of two sub-environments ends in the second step."""
     writer, slab = writer_of(mode, (2,))
-    writer.begin_episode({})
+    begin(writer, {})
     assert flags_and_sums(slab) == [[True] * 2, [False] * 2, [0] * 2, [0] * 2]
     assert slab.reward[0].tolist() == [0, 0]
     no = np.zeros(2, bool)
-    writer.write_ends(np.ones(2), no, no, {})
+    step(writer, np.ones(2), no, no, {})
     assert flags_and_sums(slab) == [[False] * 2, [False] * 2, [1] * 2, [1] * 2]
-    writer.write_ends(np.ones(2), np.array([False, True]), no, {})
+    step(writer, np.ones(2), np.array([False, True]), no, {})
     assert flags_and_sums(slab) == [[False] * 2, [False, True], [2] * 2, [2] * 2]
     assert slab.terminated[0].tolist() == [False, True]
-    writer.write_ends(np.ones(2), no, no, {})
+    step(writer, np.ones(2), no, no, {})
     assert flags_and_sums(slab) == after_the_end
-    writer.write_ends(np.ones(2), no, no, {})
+    step(writer, np.ones(2), no, no, {})
     assert flags_and_sums(slab) == then
-    writer.begin_episode({})
+    begin(writer, {})
     assert flags_and_sums(slab) == [[True] * 2, [False] * 2, [0] * 2, [0] * 2]
 
 
 def test_a_sub_environment_resets_itself_for_all_of_its_agents() -> None:
     """If only one of them ended, the result is a step."""
     writer, slab = writer_of("next_step", (2, 3), ("ann", "bob"))
-    writer.begin_episode({})
+    begin(writer, {})
     assert slab.is_reset[0].all()
     no = np.zeros((2, 3), bool)
     # No agent ends in sub-environment 0, one in 1, both in 2.
-    writer.write_ends(np.ones((2, 3)), np.array([[0, 1, 1], [0, 0, 1]], bool), no, {})
+    step(writer, np.ones((2, 3)), np.array([[0, 1, 1], [0, 0, 1]], bool), no, {})
     assert not slab.is_reset[0].any()
-    writer.write_ends(np.ones((2, 3)), no, no, {})
+    step(writer, np.ones((2, 3)), no, no, {})
     assert slab.is_reset[0].tolist() == [[False, False, True]] * 2
 
 
@@ -288,16 +304,14 @@ def test_a_partial_result_has_the_sums_of_its_own_sub_environments() -> None:
     """They are in the order of the result."""
     writer, slab = writer_of("next_step", (2,), partial_of=4)
     no = np.zeros(2, bool)
-    writer.begin_episode({"env_id": np.array([3, 1])})
+    begin(writer, {"env_id": np.array([3, 1])})
     assert flags_and_sums(slab) == [[True] * 2, [False] * 2, [0] * 2, [0] * 2]
-    writer.write_ends(np.ones(2), no, no, {"env_id": np.array([1, 2])})
+    step(writer, np.ones(2), no, no, {"env_id": np.array([1, 2])})
     # The first result of sub-environment 2 is its first observation.
     assert flags_and_sums(slab) == [[False, True], [False, False], [1, 0], [1, 0]]
-    writer.write_ends(
-        np.array([5.0, 6.0]), np.array([True, False]), no, {"env_id": np.array([2, 1])}
-    )
+    step(writer, np.array([5.0, 6.0]), np.array([True, False]), no, {"env_id": np.array([2, 1])})
     assert flags_and_sums(slab) == [[False, False], [True, False], [5, 7], [1, 2]]
-    writer.write_ends(np.ones(2), no, no, {"env_id": np.array([3, 2])})
+    step(writer, np.ones(2), no, no, {"env_id": np.array([3, 2])})
     assert flags_and_sums(slab) == [[False, True], [False, False], [1, 0], [1, 0]]
 
 
@@ -309,26 +323,25 @@ def test_infos_that_do_not_fit_go_out_of_band() -> None:
     row = Row(RowLayout(SPACE, spaces.Discrete(2), (), ()))
     writer = RowWriter(row.slab, 1, env_id="e-0", autoreset="disabled", announce=row.announce)
     observation = np.array([1.0, 2.0])
-    assert writer.write_data(observation, {"x": 1.5}) is None
+    assert begin(writer, {"x": 1.5}, observation) is None
     assert row.info(None) == {"x": 1.5}
     assert row.slab.observation[1].tolist() == [1, 2]
-    assert writer.write_data(observation, {}) is None
+    assert begin(writer, {}, observation) is None
     assert row.slab.info_mark[1] == NO_INFO
     nested = {"nested": {"x": 1}}
-    assert writer.write_data(observation, nested) == {"info": nested}
+    assert begin(writer, nested, observation) == {"info": nested}
     assert row.slab.info_mark[1] == PICKLED
-    assert writer.write_data(observation, {}, {"e": 1}) == {"extra": {"e": 1}}
+    assert begin(writer, {}, observation, {"e": 1}) == {"extra": {"e": 1}}
     texts = Row(RowLayout(spaces.Text(9), spaces.Discrete(2), (), ()))
     writer = RowWriter(texts.slab, 1, env_id="e-0", autoreset="disabled", announce=texts.announce)
-    assert writer.write_observation is None
-    assert writer.write_data("abc", {"x": 2.5}) == {"observation": "abc"}
+    assert begin(writer, {"x": 2.5}, "abc") == {"observation": "abc"}
     assert texts.info(None) == {"x": 2.5}
 
 
 def test_without_schemas_infos_are_not_packed() -> None:
     """An env_server writes so: infos of clients arrive in their own bytes."""
     writer, slab = writer_of("disabled", ())
-    assert writer.write_data(np.zeros(2), {"x": 1.5}) == {"info": {"x": 1.5}}
+    assert begin(writer, {"x": 1.5}, np.zeros(2)) == {"info": {"x": 1.5}}
     assert slab.info_mark[0] == PICKLED
 
 
@@ -337,9 +350,9 @@ def test_observations_that_are_handed_over_stay_out_of_the_row() -> None:
     layout = RowLayout(SPACE, spaces.Discrete(2), (), (), observations_out_of_band=True)
     slab, observation = new_slab(layout, 1), np.array([1.0, 2.0])
     writer = RowWriter(
-        slab, 0, env_id="e-0", autoreset="disabled", announce=infos_out_of_band, copies=True
+        slab, 0, env_id="e-0", autoreset="disabled", announce=infos_out_of_band, stays_here=True
     )
-    found = writer.write_data(observation, {"x": [1]})
+    found = begin(writer, {"x": [1]}, observation)
     assert found is not None
     observation[:] = 9
     assert found["observation"].tolist() == [1, 2]
@@ -367,7 +380,7 @@ def test_rewards_of_any_container_get_the_shape_of_the_row(
         ends = np.zeros(head, bool)
     if len(head) == 2:
         ends = {agent: np.zeros(head[1], bool) for agent in agents}
-    writer.write_ends(value, ends, ends, {})
+    step(writer, value, ends, ends, {})
     assert (slab.reward[0] == np.full(head, 2)).all()
 
 
@@ -377,4 +390,4 @@ def test_a_value_with_a_wrong_shape_is_named(what: str) -> None:
     writer, _ = writer_of("disabled", (3,))
     good = {"reward": np.zeros(3), "terminated": np.zeros(3, bool), "truncated": np.zeros(3, bool)}
     with pytest.raises(ValueError, match=rf"{what} of env 'e-0' has shape \(2,\), expected \(3,\)"):
-        writer.write_ends(*{**good, what: np.zeros(2)}.values(), {})
+        step(writer, *{**good, what: np.zeros(2)}.values(), {})

@@ -88,19 +88,15 @@ class _ClientRow:
 
     def write(self, result: RemoteResult) -> OutOfBand | None:
         """Write a result into the row; return the parts that have no place there."""
-        writer = self._writer
-        if result.is_reset or result.is_loss:
-            # An episode that a loss has cut short is not counted.
-            writer.begin_episode(result.info)
-            if result.is_loss:
-                self._slab.truncated[self._row] = True
-        else:
-            ends = result.reward, result.terminated, result.truncated
-            writer.write_ends(*ends, result.info)
-        writer.write_times(time.monotonic_ns(), result.busy_ns)
+        ends = result.reward, result.terminated, result.truncated
+        parts = result.observation, *ends, result.info
         # Statistics use this machine's clock; the result has the time of its client's.
         self._sent_ns[self._row] = result.sent_ns or time.time_ns()
-        return writer.write_data(result.observation, result.info, result.extra)
+        if result.is_reset or result.is_loss:
+            return self._writer.write_reset(
+                parts, result.busy_ns, result.extra, is_loss=result.is_loss
+            )
+        return self._writer.write_step(parts, result.busy_ns, result.extra)
 
     def write_first(self, result: RemoteResult) -> OutOfBand | None:
         """Write a first result, when the group accepts it."""

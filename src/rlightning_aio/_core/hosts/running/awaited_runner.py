@@ -16,8 +16,6 @@ from rlightning_aio.protocol.entries import Operation
 
 if TYPE_CHECKING:
     from rlightning_aio._core.hosts.messages import OutOfBand
-    from rlightning_aio._core.hosts.running.checkpoint import Send
-    from rlightning_aio.protocol.slab import RowLayout
 
 __all__ = ["Abandoned", "AwaitedRunner"]
 
@@ -38,12 +36,11 @@ class AwaitedRunner(EnvRunner):
     is_abandoned = False
     reset_with: tuple[Any, Any] = (None, None)
 
-    def _bind(self, layout: RowLayout, send_checkpoint: Send | None) -> None:
-        """Prepare steps; `answer` executes everything."""
-        del send_checkpoint  # `snapshot_every` is refused.
+    def _bind(self) -> None:
+        """Prepare steps; `answer` executes everything, and `snapshot_every` is refused."""
         bare = self.env.bare_step()
         self._step_env: Any = self.env.step if bare is None else bare
-        self._store_bare = None if bare is None else self._bare_store(layout)
+        self._is_bare = bare is not None
 
     def place_like(self, other: AwaitedRunner) -> None:
         """Take over the row of `other`, which this env replaces, and its episode."""
@@ -95,11 +92,11 @@ class AwaitedRunner(EnvRunner):
         if self.is_abandoned:
             raise Abandoned
         stepped = method == "step"
-        if stepped and self._store_bare is not None:
-            out_of_band = self._store_bare(returned, busy_ns)
+        if stepped and self._is_bare:
+            out_of_band = self._writer.write_step(returned, busy_ns)
         else:
             result = one_result(self.env, method, returned)
-            out_of_band = self._store(result, busy_ns, stepped=stepped)
+            out_of_band = self._write(result, busy_ns, stepped=stepped)
         if self._camera is not None:
             self._camera.see()
         return out_of_band

@@ -9,16 +9,11 @@ worker; `group.continuity` decides when it is used.
 from __future__ import annotations
 
 import pickle
-import time
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from rlightning_aio.protocol.columns import row_reader
 from rlightning_aio.protocol.entries import Operation
-from rlightning_aio.protocol.info import PICKLED
 from rlightning_aio.protocol.pickling import dumped
-from rlightning_aio.types import EnvRet
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -27,33 +22,14 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.hosts.messages import OutOfBand
     from rlightning_aio._core.hosts.running.env_steps import Execute
-    from rlightning_aio._core.hosts.running.row_writer import RowWriter
+    from rlightning_aio._core.hosts.running.row_writer import RowWriter, ShownResult
     from rlightning_aio.envs.base import BaseEnv
     from rlightning_aio.protocol.slab import Slab
-    from rlightning_aio.types import MultiAgentEnvRet
 
 __all__ = ["Checkpoints", "Saver", "Send"]
 
 Send: TypeAlias = "Callable[[bytes, bool], None]"
 """Sends a checkpoint. The flag is True if it is from before the current request."""
-
-
-@dataclass(frozen=True)
-class _ShownResult:
-    """A result taken out of its row.
-
-    Attributes:
-        observation, info: of the result.
-        whole: the result itself, where it was returned without a copy.
-        returns, lengths, over: of the current episodes, in the shape of the row's columns.
-    """
-
-    observation: Any
-    info: dict[str, Any]
-    whole: Any
-    returns: NDArray[Any]
-    lengths: NDArray[Any]
-    over: NDArray[Any]
 
 
 class Checkpoints:
@@ -70,7 +46,7 @@ class Checkpoints:
 
     def __init__(self, env: BaseEnv, slab: Slab, row: int, writer: RowWriter) -> None:
         self._env, self._slab, self._row, self._writer = env, slab, row, writer
-        self._restored: _ShownResult | None = None
+        self._restored: ShownResult | None = None
         self.has_result = False
 
     def take(self) -> bytes:
@@ -87,23 +63,9 @@ class Checkpoints:
             )
         shown_result = self._restored
         if shown_result is None and self.has_result:
-            shown_result = self._read()
+            shown_result = self._writer.shown_result()
         is_unshown = self._restored is not None
         return dumped((self._env.save_state(), shown_result, is_unshown), "its state")
-
-    def _read(self) -> _ShownResult:
-        """Return a copy of the row and of what was out of band."""
-        slab, row, whole = self._slab, self._row, self._writer.whole
-        mark = int(slab.info_mark[row])
-        out_of_band = self._writer.out_of_band
-        info = out_of_band.get("info", {}) if mark == PICKLED else self._writer.read_info(mark)
-        observation = None
-        if slab.observation is None:
-            observation = out_of_band.get("observation")
-        elif whole is None:
-            observation = row_reader(slab.layout.observation_space, slab.observation, row)()
-        sums = (slab.episode_return, slab.episode_length, slab.over)
-        return _ShownResult(observation, info, whole, *(column[row, ...].copy() for column in sums))
 
     def load(self, checkpoint: bytes, *, show: bool) -> None:
         """Restore the env.
@@ -144,26 +106,7 @@ class Checkpoints:
         """Write the restored result into the row; return what is out of band."""
         shown_result, self._restored = self._restored, None
         assert shown_result is not None
-        slab, row, writer = self._slab, self._row, self._writer
-        slab.reward[row, ...] = 0.0
-        slab.flags[row, ...] = False
-        slab.is_reset[row, ...] = True
-        slab.over[row, ...] = shown_result.over
-        slab.episode_return[row, ...] = shown_result.returns
-        slab.episode_length[row, ...] = shown_result.lengths
-        writer.row_changed()
-        writer.write_times(time.monotonic_ns(), 0)
-        if (whole := shown_result.whole) is not None:
-            return writer.hand_over_whole(_without_transition(whole))
-        return writer.write_data(shown_result.observation, shown_result.info)
-
-
-def _without_transition(result: EnvRet | MultiAgentEnvRet) -> EnvRet | MultiAgentEnvRet:
-    """Copy a result without its reward and ends."""
-    nothing: dict[str, Any] = {}
-    reward, end = (0.0, False) if isinstance(result, EnvRet) else (nothing, nothing)
-    ends = {"last_terminated": end, "last_truncated": end}
-    return result.model_copy(update={"last_reward": reward, **ends})
+        return self._writer.write_shown(shown_result)
 
 
 class Saver:

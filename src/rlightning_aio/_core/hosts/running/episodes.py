@@ -51,9 +51,10 @@ class EpisodeSums:
         """Begin new episodes; those that `begun` leaves out begin with their next result."""
         self.returns[...] = 0.0
         self.lengths[...] = 0
-        self.over[...] = True
-        self.over[begun] = False
-        self._any_over = bool(self.over.any())
+        self.over[...] = is_partial = begun is not ...
+        if is_partial:
+            self.over[begun] = False
+        self._any_over = is_partial and bool(self.over.any())
 
     def row_changed(self) -> None:
         """Read what others wrote into the row."""

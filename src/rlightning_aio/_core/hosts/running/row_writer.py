@@ -4,34 +4,64 @@ A row holds observation, reward and ends, and also whether it is a reset, whethe
 over, and the episode's return and length so far. Data without a place in the row (a nested info,
 an observation without a fixed size) is returned, to be sent out of band; None means that the row
 holds all of the result.
+Rule: only `write_step`, `write_reset` and `write_shown` write columns of results, and one function
+beside them, `kernel.row_step`, which writes what `write_step` would for a plain Gymnasium env.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from rlightning_aio._core.hosts.running.copied import copied
 from rlightning_aio._core.hosts.running.episodes import EpisodeSums
-from rlightning_aio.envs.tensors import as_numpy
-from rlightning_aio.protocol.columns import fitted_tree, row_writer
+from rlightning_aio.envs.base import result_of
+from rlightning_aio.envs.tensors import as_numpy, holds_tensor
+from rlightning_aio.protocol import kernel
+from rlightning_aio.protocol.columns import fitted_tree, row_reader, row_writer
+from rlightning_aio.protocol.exchange import Row
 from rlightning_aio.protocol.info import PICKLED, InfoSchema, InfoWriter
+from rlightning_aio.types import EnvRet
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from rlightning_aio._core.hosts.messages import OutOfBand
-    from rlightning_aio.protocol.slab import Slab
-    from rlightning_aio.types import Autoreset
+    from numpy.typing import NDArray
 
-__all__ = ["RowWriter", "infos_out_of_band"]
+    from rlightning_aio._core.hosts.messages import OutOfBand
+    from rlightning_aio._core.hosts.running.env_steps import GetInput, StepWith
+    from rlightning_aio.envs.base import BareResult, BareStep
+    from rlightning_aio.protocol.slab import Slab
+    from rlightning_aio.types import Autoreset, MultiAgentEnvRet
+
+__all__ = ["RowWriter", "ShownResult", "infos_out_of_band"]
 
 
 def infos_out_of_band(schema: InfoSchema) -> int:
     """Stand in for `announce`, so that no info is packed into the row."""
     del schema
     return PICKLED
+
+
+@dataclass(frozen=True)
+class ShownResult:
+    """A result taken out of its row.
+
+    Attributes:
+        observation, info: of the result.
+        whole: the result itself, where it was returned without a copy.
+        returns, lengths, over: of the current episodes, in the shape of the row's columns.
+    """
+
+    observation: Any
+    info: dict[str, Any]
+    whole: Any
+    returns: NDArray[Any]
+    lengths: NDArray[Any]
+    over: NDArray[Any]
 
 
 class RowWriter:
@@ -43,14 +73,14 @@ class RowWriter:
         autoreset: when sub-environments reset themselves; see `EnvMeta`.
         announce: sends a new schema of infos to the trainer, and returns its number.
         partial_of: the number of sub-environments, if a result is of some of them only; else 0.
-        copies: data out of band stays in this process, so it must be copied.
+        stays_here: data out of band stays in this process: it must be copied, and tensors, which
+            become NumPy arrays elsewhere, are handed over as they are.
 
     Attributes:
-        write_observation: writes into the row; None if observations travel out of band.
-        write_info: writes into the row and returns the mark (see `protocol.info`).
-        read_info: reads the last info from the row, given its mark.
-        out_of_band: the last data out of band.
+        whole: the last result if it was handed over whole, because it holds tensors that stay in
+            this process; otherwise None.
         partial_results: a result is of some of the sub-environments only.
+        is_bypassed: the function of `short_stepper` writes into the row, too.
     """
 
     def __init__(
@@ -62,23 +92,25 @@ class RowWriter:
         autoreset: Autoreset,
         announce: Callable[[InfoSchema], int],
         partial_of: int = 0,
-        copies: bool = False,
+        stays_here: bool = False,
     ) -> None:
         self._slab = slab
         self._row = row
         self._env_id = env_id
-        self._copies = copies
+        self._autoreset = autoreset
+        self._stays_here = stays_here
         layout = slab.layout
-        self.write_observation: Callable[[Any], None] | None = None
+        self._hands_over = layout.observations_out_of_band
+        self._write_observation: Callable[[Any], None] | None = None
         if slab.observation is not None:
-            self.write_observation = row_writer(
+            self._write_observation = row_writer(
                 layout.observation_space, slab.observation, row, "observation"
             )
-        infos = InfoWriter(memoryview(slab.info[row]), announce)
-        self.write_info, self.read_info = infos.write, infos.read
-        self.out_of_band: OutOfBand = {}
-        self._whole: Any = None
-        self._whole_since = 0
+        self._infos = InfoWriter(memoryview(slab.info[row]), announce)
+        self._last_out_of_band: OutOfBand = {}
+        self.whole: Any = None
+        self.is_bypassed = False
+        self._times = _view(slab.times[row])
         # With an ellipsis, an element of a plain column is a view, too.
         self._reward, self._flags = slab.reward[row, ...], slab.flags[row, ...]
         self._terminated, self._truncated = slab.terminated[row, ...], slab.truncated[row, ...]
@@ -86,33 +118,145 @@ class RowWriter:
         self.partial_results = partial_of > 0
         self._sums = _sums(slab, row, autoreset, partial_of)
 
-    def begin_episode(self, info: Mapping[str, Any]) -> None:
-        """Mark the row as a reset: no reward, no end, sums of 0."""
+    def write_step(
+        self,
+        result: BareResult,
+        busy_ns: int,
+        extra: dict[str, Any] | None = None,
+        whole: EnvRet | MultiAgentEnvRet | None = None,
+    ) -> OutOfBand | None:
+        """Write the result of a step, and return the part that is out of band.
+
+        Args:
+            result: observation, reward, both ends and info. Reward and ends may be tensors, dicts
+                by agent, or have an extra axis of length one. Values that a result leaves out
+                (0.0 and False, a dict without agents) apply to all. An observation that is handed
+                over is not copied: `fresh_results` says that the env doesn't use it again.
+            busy_ns: how long the env took.
+            extra: `_extra` of the result.
+            whole: the result, if there is one already.
+
+        Raises:
+            ValueError: a shape doesn't fit.
+        """
+        self._write_times(busy_ns)
+        if self.is_bypassed:
+            self._sums.row_changed()
+        _, reward, terminated, truncated, info = result
+        self._write_ends(reward, terminated, truncated, info)
+        return self._write_data(result, extra, whole, is_fresh=True)
+
+    def write_reset(
+        self,
+        result: BareResult,
+        busy_ns: int,
+        extra: dict[str, Any] | None = None,
+        whole: EnvRet | MultiAgentEnvRet | None = None,
+        *,
+        is_loss: bool = False,
+    ) -> OutOfBand | None:
+        """Write the first result of an episode, and return the part that is out of band.
+
+        It has no reward and no end, whatever `result` says, and its sums are 0. With `is_loss` it
+        marks the loss of the episode before, which is cut short and not counted. All else is as of
+        `write_step`.
+        """
+        self._write_times(busy_ns)
+        self._write_no_transition()
+        if is_loss:
+            self._truncated[...] = True
+        if self.partial_results:
+            # The first observations of the others will come as results of steps.
+            begun = np.asarray(result[-1]["env_id"])
+            self._sums.begin(begun)
+            self._show_sums(begun)
+        else:
+            self._sums.begin()
+        return self._write_data(result, extra, whole, is_fresh=False)
+
+    def write_shown(self, shown_result: ShownResult) -> OutOfBand | None:
+        """Write what `shown_result` has returned, and return the part that is out of band.
+
+        It is no transition. Observation, info and the sums are as before.
+        """
+        self._write_times(0)
+        self._write_no_transition()
+        slab, row, whole = self._slab, self._row, shown_result.whole
+        slab.over[row, ...] = shown_result.over
+        slab.episode_return[row, ...] = shown_result.returns
+        slab.episode_length[row, ...] = shown_result.lengths
+        self._sums.row_changed()
+        if whole is not None:
+            self.whole = _without_transition(whole)
+            return {"ret": self.whole}
+        result = shown_result.observation, 0.0, False, False, shown_result.info
+        return self._write_data(result, None, None, is_fresh=False)
+
+    def shown_result(self) -> ShownResult:
+        """Return a copy of the row and of what was out of band."""
+        slab, row, whole = self._slab, self._row, self.whole
+        mark = int(slab.info_mark[row])
+        last = self._last_out_of_band
+        info = last.get("info", {}) if mark == PICKLED else self._infos.read(mark)
+        observation = None
+        if slab.observation is None:
+            observation = last.get("observation")
+        elif whole is None:
+            observation = row_reader(slab.layout.observation_space, slab.observation, row)()
+        sums = (slab.episode_return, slab.episode_length, slab.over)
+        return ShownResult(observation, info, whole, *(column[row, ...].copy() for column in sums))
+
+    def short_stepper(self, step: BareStep, get_input: GetInput) -> StepWith | None:
+        """Return a function that steps the env by `step` and writes the result by itself.
+
+        It is for an env of one agent and one sub-environment. None if this writer is needed.
+        """
+        slab, row, write_observation = self._slab, self._row, self._write_observation
+        resets_itself = self._autoreset == "same_step"
+        is_single = not slab.layout.head and not self.partial_results
+        if not is_single or write_observation is None or self.whole is not None:
+            return None
+        if self._autoreset != "disabled" and not resets_itself:
+            return None
+        self.is_bypassed = True
+        one = slice(row, row + 1)
+        plain = type(slab.observation) is np.ndarray
+        in_row = Row(
+            reward=_view(slab.reward[one]),
+            flags=_view(slab.flags[row]),
+            episode_return=_view(slab.episode_return[one]),
+            episode_length=_view(slab.episode_length[one]),
+            info_mark=_view(slab.info_mark[one]),
+            times=self._times,
+            observation=cast("Any", slab.observation)[row, ...] if plain else None,
+        )
+        return kernel.row_step(
+            in_row,
+            step,
+            get_input,
+            write_observation,
+            self._number,
+            self._infos.write,
+            self._kept,
+            resets_itself,
+        )
+
+    # -- columns ------------------------------------------------------------------
+
+    def _write_times(self, busy_ns: int) -> None:
+        """Write that the result is ready now (monotonic), and how long the env took, in ns."""
+        self._times[0] = time.monotonic_ns()
+        self._times[1] = busy_ns
+
+    def _write_no_transition(self) -> None:
         self._reward[...] = 0.0
         self._flags[...] = False
         self._is_reset[...] = True
-        if self.partial_results:
-            # The first observations of the others will come as results of steps.
-            self._sums.begin(begun=np.asarray(info["env_id"]))
-            self._show_sums(np.asarray(info["env_id"]))
-        else:
-            self._sums.begin()
 
-    def row_changed(self) -> None:
-        """Read what others wrote into the row."""
-        self._sums.row_changed()
-
-    def write_ends(
+    def _write_ends(
         self, reward: Any, terminated: Any, truncated: Any, info: Mapping[str, Any]
     ) -> None:
-        """Write reward and ends, and add the step to the sums.
-
-        They may be tensors, dicts by agent, or have an extra axis of length one. Values that a
-        result leaves out (0.0 and False, a dict without agents) apply to all.
-
-        Raises:
-            ValueError: a shape doesn't fit; nothing was written.
-        """
+        """Write reward and ends, and add the step to the sums."""
         reward = self._checked("reward", reward)
         terminated = self._checked("terminated", terminated)
         truncated = self._checked("truncated", truncated)
@@ -160,7 +304,7 @@ class RowWriter:
             )
         return array
 
-    def number(self, what: str, value: Any) -> float:
+    def _number(self, what: str, value: Any) -> float:
         """Return the one number in `value`, such as an array of shape (1,).
 
         Raises:
@@ -173,50 +317,46 @@ class RowWriter:
                 f"{what} of env {self._env_id!r} must be a number, not {value!r}"
             ) from None
 
-    def write_times(self, done_ns: int, busy_ns: int) -> None:
-        """Write when the result was ready (monotonic) and how long the env took, in ns."""
-        self._slab.times[self._row] = done_ns, busy_ns
-
-    def write_data(
-        self, observation: Any, info: dict[str, Any], extra: dict[str, Any] | None = None
+    def _write_data(
+        self,
+        result: BareResult,
+        extra: dict[str, Any] | None,
+        whole: EnvRet | MultiAgentEnvRet | None,
+        *,
+        is_fresh: bool,
     ) -> OutOfBand | None:
-        """Write an observation and an info, and return the part that is out of band."""
-        if self._slab.layout.observations_out_of_band:
-            return self.keep(self.hand_over(observation, info))
+        """Write observation and info, and return the part that is out of band.
+
+        Where `is_fresh`, what is handed over is not copied.
+        """
+        observation, info = result[0], result[4]
+        self.whole = None
+        if type(observation) is not np.ndarray and holds_tensor(observation):
+            if self._stays_here:
+                self.whole = result_of(self._env_id, result) if whole is None else whole
+                return {"ret": self.whole}
+            observation = as_numpy(observation)
+        if self._hands_over:
+            space = self._slab.layout.observation_space
+            observation = fitted_tree(space, observation, "observation")
+            return self._kept({"observation": observation, "info": info}, is_fresh=is_fresh)
         out_of_band: OutOfBand = {}
-        if self.write_observation is None:
+        if self._write_observation is None:
             out_of_band["observation"] = observation
         else:
-            self.write_observation(observation)
-        mark = self._slab.info_mark[self._row] = self.write_info(info)
+            self._write_observation(observation)
+        mark = self._slab.info_mark[self._row] = self._infos.write(info)
         if mark == PICKLED:
             out_of_band["info"] = as_numpy(info)
         if extra:
             out_of_band["extra"] = extra
-        return self.keep(out_of_band) if out_of_band else None
+        return self._kept(out_of_band) if out_of_band else None
 
-    def hand_over(self, observation: Any, info: dict[str, Any]) -> OutOfBand:
-        """Return observation and info for the trainer to use without a copy."""
-        space = self._slab.layout.observation_space
-        observation = fitted_tree(space, observation, "observation")
-        self.out_of_band = {"observation": observation, "info": info}
-        return self.out_of_band
-
-    def hand_over_whole(self, result: Any) -> OutOfBand:
-        """Return a result for the trainer to use without a copy; its times are in the row."""
-        self._whole, self._whole_since = result, int(self._slab.done_ns[self._row])
-        return {"ret": result}
-
-    @property
-    def whole(self) -> Any:
-        """The last result if it was handed over whole, otherwise None."""
-        # Not every path to the row passes here, but all of them write their times.
-        return self._whole if self._slab.done_ns[self._row] == self._whole_since else None
-
-    def keep(self, out_of_band: OutOfBand) -> OutOfBand:
+    def _kept(self, out_of_band: OutOfBand, *, is_fresh: bool = False) -> OutOfBand:
         """Return `out_of_band` for the trainer to keep; pickling copies it for other processes."""
-        self.out_of_band = copied(out_of_band) if self._copies else out_of_band
-        return self.out_of_band
+        copies = self._stays_here and not is_fresh
+        self._last_out_of_band = copied(out_of_band) if copies else out_of_band
+        return self._last_out_of_band
 
 
 def _sums(slab: Slab, row: int, autoreset: Autoreset, partial_of: int) -> EpisodeSums:
@@ -233,3 +373,17 @@ def _sums(slab: Slab, row: int, autoreset: Autoreset, partial_of: int) -> Episod
         slab.over[row, ...],
         autoreset,
     )
+
+
+def _without_transition(result: EnvRet | MultiAgentEnvRet) -> EnvRet | MultiAgentEnvRet:
+    """Copy a result without its reward and ends."""
+    nothing: dict[str, Any] = {}
+    reward, end = (0.0, False) if isinstance(result, EnvRet) else (nothing, nothing)
+    ends = {"last_terminated": end, "last_truncated": end}
+    return result.model_copy(update={"last_reward": reward, **ends})
+
+
+def _view(array: NDArray[Any]) -> memoryview[Any]:
+    """Return a memoryview of an array."""
+    # NumPy's types know that arrays are buffers from Python 3.12 on.
+    return memoryview(array)  # pyright: ignore[reportArgumentType]

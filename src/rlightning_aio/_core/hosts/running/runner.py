@@ -1,7 +1,7 @@
 """`EnvRunner`: executes requests on one env and puts the results into its row.
 
 The same code runs in a worker process and, for inline placement, in the trainer. A step of a plain
-Gymnasium env takes a short way (`env_steps.ShortWay`).
+Gymnasium env takes a short way (`RowWriter.short_stepper`).
 """
 
 from __future__ import annotations
@@ -27,9 +27,8 @@ from rlightning_aio._core.hosts.messages import (
 )
 from rlightning_aio._core.hosts.running.checkpoint import Checkpoints, Saver
 from rlightning_aio._core.hosts.running.env_calls import call_env
-from rlightning_aio._core.hosts.running.env_steps import ShortWay, followed, step_in_halves, view
+from rlightning_aio._core.hosts.running.env_steps import followed, step_in_halves
 from rlightning_aio._core.hosts.running.row_writer import RowWriter
-from rlightning_aio.envs.base import result_of
 from rlightning_aio.envs.results import (
     has_preprocess_fn,
     input_of,
@@ -39,7 +38,6 @@ from rlightning_aio.envs.results import (
     step_of,
 )
 from rlightning_aio.envs.state import versions_of
-from rlightning_aio.envs.tensors import as_numpy, holds_tensor
 from rlightning_aio.protocol.columns import leaves, row_reader
 from rlightning_aio.protocol.entries import Operation
 from rlightning_aio.protocol.info import InfoSchemas
@@ -53,7 +51,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.running.checkpoint import Send
     from rlightning_aio._core.hosts.running.env_steps import Execute, GetInput, StepWith
     from rlightning_aio.config import VideoConfig
-    from rlightning_aio.envs.base import BareResult, BareStep, BaseEnv
+    from rlightning_aio.envs.base import BaseEnv
     from rlightning_aio.protocol.info import InfoSchema
     from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet
 
@@ -113,12 +111,12 @@ class EnvRunner:
         self.meta: EnvMeta = env.initialised()
         self.restarts = 0
         self._inline = inline
-        self._hands_over_tensors = False
         self.step: Execute = self._not_attached
         self.begin_step: Callable[[], Execute] | None = None
         self._step_with: StepWith
         self._reset_env: Execute = self._not_attached
         self._input = input_of(env)
+        self._bare_reset = None if env.bare_step() is None else env.bare_reset()
         self._checkpoints: Checkpoints
         self._saver: Saver | None = None
         self._camera = None if video is None else _camera(env, video)
@@ -169,27 +167,25 @@ class EnvRunner:
             autoreset=self.meta.autoreset,
             announce=announce,
             partial_of=num_envs if num_envs > self.meta.num_envs else 0,
-            copies=self._inline,
+            stays_here=self._inline,
         )
         self._checkpoints = Checkpoints(self.env, slab, row, self._writer)
         self._read_action: Callable[[], Any] | None = None
         if slab.action is not None:
             self._read_action = row_reader(layout.action_space, slab.action, row)
-        # There is a short way, which writes behind the back of the writer.
-        self._has_short_way = False
         self._send_checkpoint = send_checkpoint
-        self._bind(layout, send_checkpoint)
+        self._bind()
         if self._camera is not None:
             self._start_filming(self._camera)
 
-    def _bind(self, layout: RowLayout, send_checkpoint: Send | None) -> None:
+    def _bind(self) -> None:
         """Choose the functions that execute requests."""
         self._reset_env = self._reset_from_row
-        self.step = self._step_with = self._stepper(layout)
+        self.step = self._step_with = self._stepper()
         every = self.env.config.snapshot_every
-        if every is not None and send_checkpoint is not None:
+        if every is not None and self._send_checkpoint is not None:
             over = self._slab.over[self._row, ...]
-            self._saver = saver = Saver(self._checkpoints, over, every, send_checkpoint)
+            self._saver = saver = Saver(self._checkpoints, over, every, self._send_checkpoint)
             self.step = saver.wrap(Operation.STEP, self.step)
             self._reset_env = saver.wrap(Operation.RESET, self._reset_env)
             # A step in halves would bypass the saver.
@@ -270,17 +266,17 @@ class EnvRunner:
 
     # -- steps --------------------------------------------------------------------
 
-    def _stepper(self, layout: RowLayout) -> StepWith:
+    def _stepper(self) -> StepWith:
         bare, get_input = self.env.bare_step(), self._input_getter()
         if bare is None:
             return self._plain_stepper(get_input)
+        store, clock = self._writer.write_step, time.monotonic_ns
         halves = self.env.bare_step_async()
-        single = not layout.head and self.meta.autoreset in ("disabled", "same_step")
-        single = single and halves is None and not self._hands_over_tensors
-        if single and self._writer.write_observation is not None:
-            return self._short_stepper(bare, get_input, self._writer.write_observation)
-        store, clock = self._bare_store(layout), time.monotonic_ns
-        if halves is not None:
+        if halves is None:
+            short = self._writer.short_stepper(bare, get_input)
+            if short is not None:
+                return short
+        else:
             self.begin_step = step_in_halves(*halves, get_input, store)
 
         def step(get_input: GetInput = get_input) -> OutOfBand | None:
@@ -304,7 +300,7 @@ class EnvRunner:
         step_env, method = step_of(env), "step"
 
         def store(returned: Any, busy_ns: int) -> OutOfBand | None:
-            return self._store(one_result(env, method, returned), busy_ns, stepped=True)
+            return self._write(one_result(env, method, returned), busy_ns, stepped=True)
 
         if is_async_first(env):
             method = "collect_async"
@@ -315,38 +311,6 @@ class EnvRunner:
             return store(step_env(get_input()), clock() - began)
 
         return step
-
-    def _short_stepper(
-        self, bare: BareStep, get_input: GetInput, write_observation: Callable[[Any], None]
-    ) -> StepWith:
-        resets_itself = self.meta.autoreset == "same_step"
-        self._has_short_way = True
-        short = ShortWay(self._slab, self._row, self._writer, resets_itself=resets_itself)
-        bare_reset = self.env.bare_reset()
-        if bare_reset is not None:
-            take_seed, store = self._take_seed, self._store_reset
-            reset = short.resetter(bare_reset, take_seed, write_observation, store)
-            self._reset_env = followed(reset, self._checkpoints.note_result)
-        return short.stepper(bare, get_input, write_observation)
-
-    def _bare_store(self, layout: RowLayout) -> Callable[[BareResult, int], OutOfBand | None]:
-        """Return a function that puts a bare result, and the ns it took, into the row."""
-        writer, slab, row, clock = self._writer, self._slab, self._row, time.monotonic_ns
-        done_times, busy_times = view(slab.done_ns), view(slab.busy_ns)
-        env_id = self.env.env_id
-        # Not copied: `fresh_results` says that the env doesn't use these arrays again.
-        store_data = writer.hand_over if layout.observations_out_of_band else writer.write_data
-
-        def store(result: BareResult, busy_ns: int) -> OutOfBand | None:
-            observation, reward, terminated, truncated, info = result
-            if type(observation) is not np.ndarray and holds_tensor(observation):
-                return self._store(result_of(env_id, result), busy_ns, stepped=True)
-            done_times[row] = clock()
-            busy_times[row] = busy_ns
-            writer.write_ends(reward, terminated, truncated, info)
-            return store_data(observation, info)
-
-        return store
 
     def _step(self, action: Any, extras: dict[str, Any]) -> OutOfBand | None:
         """Step with an action that didn't come through the row, or with extras."""
@@ -371,17 +335,11 @@ class EnvRunner:
         if self._camera is not None:
             self._camera.close()
         out_of_band = self._checkpoints.show()
-        if self._has_short_way and self._writer.whole is not None:
-            self._leave_short_way()
+        self._note_reset()
         return out_of_band
 
     def _reset_from_row(self) -> OutOfBand | None:
         return self._reset(self._slab.take_seed(self._row), None)
-
-    def _take_seed(self) -> int | None:
-        seed = self._slab.take_seed(self._row)
-        self._seed_generators(seed)
-        return seed
 
     def _seed_generators(self, seed: int | None) -> None:
         """Seed the global generators for an episode that begins with a seed.
@@ -396,45 +354,38 @@ class EnvRunner:
         """Start a new episode."""
         self._checkpoints.forget_result()
         self._seed_generators(seed)
+        bare = self._bare_reset if options is None else None
         began = time.monotonic_ns()
-        returned = self.env.reset(seed=seed, options=options)
-        busy_ns = time.monotonic_ns() - began
-        self._checkpoints.note_result()
-        return self._store(one_result(self.env, "reset", returned), busy_ns, stepped=False)
+        if bare is not None:
+            observation, info = bare(seed=seed, options=None)
+            busy_ns = time.monotonic_ns() - began
+            result = observation, 0.0, False, False, info
+            out_of_band = self._writer.write_reset(result, busy_ns)
+        else:
+            returned = self.env.reset(seed=seed, options=options)
+            busy_ns = time.monotonic_ns() - began
+            whole = one_result(self.env, "reset", returned)
+            out_of_band = self._write(whole, busy_ns, stepped=False)
+        self._note_reset()
+        return out_of_band
 
-    def _store_reset(
-        self, observation: Any, info: dict[str, Any], busy_ns: int
-    ) -> OutOfBand | None:
-        result = result_of(self.env.env_id, (observation, 0.0, False, False, info))
-        return self._store(result, busy_ns, stepped=False)
-
-    def _store(
+    def _write(
         self, result: EnvRet | MultiAgentEnvRet, busy_ns: int, *, stepped: bool
     ) -> OutOfBand | None:
-        writer = self._writer
-        writer.write_times(time.monotonic_ns(), busy_ns)
-        if self._has_short_way:
-            writer.row_changed()
-        if stepped:
-            ends = result.last_reward, result.last_terminated, result.last_truncated
-            writer.write_ends(*ends, result.info)
-        else:
-            writer.begin_episode(result.info)
-        observation = result.observation
-        if holds_tensor(observation):
-            if self._inline:
-                if self._has_short_way:
-                    self._leave_short_way()
-                return writer.hand_over_whole(result)
-            observation = as_numpy(observation)
-        return writer.write_data(observation, result.info, result._extra)  # pyright: ignore[reportPrivateUsage]
+        ends = result.last_reward, result.last_terminated, result.last_truncated
+        parts = result.observation, *ends, result.info
+        write = self._writer.write_step if stepped else self._writer.write_reset
+        return write(parts, busy_ns, result._extra, result)  # pyright: ignore[reportPrivateUsage]
 
-    def _leave_short_way(self) -> None:
-        """Step by `_store` from now on: the results hold tensors, which stay in this process."""
-        self._hands_over_tensors, self._has_short_way = True, False
-        self._bind(self.layout, self._send_checkpoint)
-        if self._camera is not None:
-            self._film(self._camera)
+    def _note_reset(self) -> None:
+        """Record that the row holds the first result of an episode."""
+        self._checkpoints.note_result()
+        if self._writer.is_bypassed and self._writer.whole is not None:
+            # The results hold tensors that stay here, so the writer is needed from now on.
+            self._writer.is_bypassed = False
+            self._bind()
+            if self._camera is not None:
+                self._film(self._camera)
 
 
 _Placed = TypeVar("_Placed", "EnvRunner", "EnvStarted")
