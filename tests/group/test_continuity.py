@@ -135,6 +135,20 @@ def test_an_env_that_dies_while_it_resumes_resumes_again() -> None:
     assert continuity.take_answers(SLOT) == [Report(0, "was killed again", None, 0)]
 
 
+def test_the_steps_before_a_restore_are_not_lost_by_a_death_after_it() -> None:
+    """An env that dies before it has shown a restored state is back in that state."""
+    continuity = new_continuity()
+    for number in range(3):
+        continuity.save(0, b"a step", number, before=False, is_step=True)
+        continuity.returned(SLOT, (), continuity.judge(SLOT, ()))
+    continuity.save(0, b"restored", 4, before=False, is_step=False)
+    continuity.note_shows([0], [Position(1, is_cut=False)])
+    continuity.lose([0], "was killed", from_checkpoint=True)
+    assert continuity.checkpoints([0]) == (b"restored",)
+    continuity.report_losses(SLOT, ~STEP)
+    assert continuity.take_answers(SLOT) == [Report(0, "was killed", None, 0)]
+
+
 @pytest.mark.parametrize("shown", [LossPhase.SHOWING, LossPhase.RESUMING])
 def test_the_steps_of_an_episode_that_could_not_be_shown_do_not_count(shown: LossPhase) -> None:
     """The reset after that begins at 0, whatever position was to be shown."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import logging
 import os
+import signal
 import traceback
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
@@ -100,6 +101,8 @@ def run_twice(program: Program) -> Run:
 
 def prepare() -> None:
     """Make a process ready for many runs."""
+    # Envs press Ctrl-C, also where it is ignored: in the background of a shell.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     watch(transitions)
     logging.getLogger("rlightning_aio").setLevel(logging.CRITICAL)
     gc.collect()

@@ -324,10 +324,12 @@ class Continuity:
         """Record that resets which show restored states at `positions` are about to be sent."""
         for slot, position in zip(slots, positions, strict=True):
             self._move(slot, LossEvent.SHOW_SENT).position = position
+            self._num_steps[slot] = position.num_steps  # That is what a death loses from now on.
             checkpoint = self._pending.pop(slot, None)
             if checkpoint is not None:  # Of the state that was put back.
                 checkpoint.num_steps = position.num_steps
                 self._checkpoints[slot] = checkpoint
+        self._margin = 0
 
     # -- replies ----------------------------------------------------------------------
 
