@@ -66,6 +66,11 @@ class Entry:
     max_restarts: int
     min_results: int | None
 
+    @property
+    def own_limit(self) -> float:
+        """Steps after which an env truncates its episodes by itself, as `TimeLimit` does."""
+        return self.limit if self.limit and self.form in ("gym", "stacked") else math.inf
+
 
 class Host:
     """Envs that die together.
@@ -150,9 +155,7 @@ class State:
     """
 
     def __init__(self, codes: Sequence[int], entry: Entry) -> None:
-        # Gymnasium's own wrapper applies the limit of an entry of its envs.
-        limit = entry.limit if entry.form == "gym" and entry.limit else math.inf
-        self.scripts = Scripts(codes, entry.mode, limit)
+        self.scripts = Scripts(codes, entry.mode, entry.own_limit)
         self.count, self.cut = 0, False
         self.returns, self.lengths = [0.0] * len(codes), [0] * len(codes)
         self.counted = [False] * len(codes)

@@ -553,15 +553,16 @@ class Play(Session):
     async def op_enter(self, rng: Random) -> None:
         if self.nested:
             return
-        limit = rng.choice([math.inf, math.inf, None, 1, 2, 3, 5])
+        entries = [env.entry for env in self.model.envs.values()]
+        lacks = any(e.limit is None and e.mode == "disabled" for e in entries)
+        limit = rng.choice([math.inf, math.inf, 1, 2, 3, 5, *[None] * (1 if lacks else 6)])
         on_done, marks = rng.random() < 0.7, rng.random() < 0.3
         context = self.group.auto_reset(limit, on_done, marks)
         if self.context is not None:
             with self.expected(RuntimeError, "a nested auto_reset"):
                 context.__enter__()
             return
-        entries = [env.entry for env in self.model.envs.values()]
-        if limit is None and any(e.limit is None and e.mode == "disabled" for e in entries):
+        if limit is None and lacks:
             with self.expected(ValueError, "an auto_reset without a limit"):
                 context.__enter__()
             return
@@ -810,15 +811,16 @@ class Play(Session):
         if (envs := self.ready()) and rng.random() < 0.5:
             env = rng.choice(envs)
             await self.mark(env, rng.choice(self.marks(env)))
-        if "die" in self.features and rng.random() < 0.3:
+        if "die" in self.features and rng.random() < (0.6 if "resume" in self.features else 0.3):
             self.kill_soon(rng, self.ready())
             await (self.op_step(rng) if rng.random() < 0.5 else self.rest())
 
     async def op_restore(self, rng: Random) -> None:
-        if not self.snapshots:
+        if not self.snapshots or rng.random() < 0.3:
             await self.op_snapshot(rng)
+        if not self.snapshots:
             return
-        data, states = rng.choice(self.snapshots)
+        data, states = self.snapshots[-1] if rng.random() < 0.5 else rng.choice(self.snapshots)
         envs = self.targets(rng, [env for env, _ in states])
         if not all(env.idle for env in envs):
             await self.op_collect(rng)
@@ -834,6 +836,10 @@ class Play(Session):
             if saved[0].scripts.subs[0].mark == DEADLY:
                 env.host.ask()
         await self.restore(data, pairs)
+        # Up to a limit, of which a restored env may have reached a part.
+        for _ in range(rng.randint(0, 4)):
+            if ready := [env for env in self.ready() if env in envs]:
+                await self.step_on(ready)
 
     async def restore(
         self, data: bytes, pairs: Sequence[tuple[Env, list[State], list[State]]]

@@ -32,6 +32,7 @@ THEMES: tuple[tuple[str, ...], ...] = (
     ("async", "snapshots", "cancel", "timeouts"),
     ("snapshots", "calls", "several envs", "faults", "interrupts"),
     ("resume", "die", "processes", "ends", "stacked"),
+    ("resume", "processes", "faults", "several envs", "calls"),
     ("auto_reset", "stacked", "ends"),
     ("several envs", "extras", "infos", "partial steps"),
 )
@@ -84,7 +85,7 @@ class Plan:
             del found["step_timeout"], found["reset_timeout"]
         if self.every is not None:
             found["snapshot_every"] = self.every
-        if self.limit is not None:
+        if self.limit is not None and self.form != "stacked":  # Those have their own.
             found["max_episode_steps"] = self.limit
         if self.form == "base":
             kwargs = {"layout": self.layout, "controls": self.controls}
@@ -97,7 +98,7 @@ class Plan:
         makers: list[Any] = []
         for worker in range(self.num_workers):
             codes = self.codes(number, worker)
-            own: tuple[Any, ...] = (codes, self.mode) if self.form == "stacked" else (codes[0],)
+            own = (codes, self.mode, self.limit) if self.form == "stacked" else (codes[0],)
             makers.append(partial(make, *own, self.layout, self.controls))
         if self.start:
             makers[-1] = partial(broken, self.start, make, *makers[-1].args)
@@ -231,7 +232,7 @@ def draw(seed: int, *, without: frozenset[str] = frozenset(), num_ops: int = 60)
     first = [Op("reset", rng.getrandbits(32))] if begins else []
     kinds = ["deaths", "stops", "lags", "starts", "fork_servers"]
     kinds += ["interrupts"] * ("async" not in features and "interrupts" in features)
-    chances = {kind: rng.choice([0.02, 0.1, 0.4]) for kind in kinds if rng.random() < 0.4}
+    chances = {kind: rng.choice([0.01, 0.03, 0.1, 0.4]) for kind in kinds if rng.random() < 0.4}
     faults = Faults(**chances) if "faults" in features else Faults()
     return Program(seed, kind, features, tuple(plans), (*first, *ops), faults)
 
@@ -259,7 +260,7 @@ def _plan(rng: Random, features: frozenset[str], name: str) -> Plan:
     plan = Plan(
         name, form, rng.choice([*layouts]), rng.choice(controls),
         num_workers=rng.randint(1, 3) if "several envs" in features else 1,
-        limit=rng.choice([None, 3]) if form != "stacked" else None,
+        limit=rng.choice([None, 3]),
     )  # fmt: skip
     if form == "stacked":
         modes = ["disabled", "next_step", "same_step"]
@@ -280,5 +281,5 @@ def _plan(rng: Random, features: frozenset[str], name: str) -> Plan:
     if "raise deaths" in features and rng.random() < 0.3:
         return replace(plan, on_death="raise")
     if "resume" in features and form != "awaitable" and rng.random() < 0.5:
-        return replace(plan, on_death="resume", every=rng.randint(1, 4))
+        return replace(plan, on_death="resume", every=rng.choice([1, 2, 3, 4, 4]))
     return plan

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array, iterate
 
@@ -225,7 +226,7 @@ def _changing(token: int) -> dict[str, Any]:
     """An entry of an info whose key and type depend on the token."""
     kinds: tuple[dict[str, Any], ...] = (
         {"success": token % 8 > 3}, {"extra": token / 2}, {"text": f"t{token}"},
-        {"array": np.full(3, token, np.float32)}, {"extra": token},
+        {"array": np.full(3, token, np.float32)}, {"extra": token}, {"extra": token / 4},
     )  # fmt: skip
     return kinds[token % len(kinds)]
 
@@ -559,10 +560,14 @@ class Awaitable(_Single):
 
 
 class Stacked(_Body, gym.vector.VectorEnv[Any, Any, Any]):
-    """Several scripts as a vector env of Gymnasium."""
+    """Several scripts as a vector env of Gymnasium, which cuts their episodes itself."""
 
-    def __init__(self, codes: Sequence[int], mode: str, layout: str, controls: str) -> None:
+    def __init__(
+        self, codes: Sequence[int], mode: str, limit: int | None, layout: str, controls: str
+    ) -> None:
         super().__init__(codes, mode, layout, controls)
+        self.scripts = Scripts(codes, mode, limit or math.inf)
+        self.spec = EnvSpec("Stacked-v0", max_episode_steps=limit)
         self.num_envs = len(codes)
         self.metadata = {"autoreset_mode": AutoresetMode[mode.upper()]}
         self.single_observation_space = deepcopy(LAYOUTS[layout].space)

@@ -238,7 +238,7 @@ class Session:
         features, token = self.features, rng.randrange(TOKENS)
         effects = ["plain"] * 6
         effects += ["end", "cut", "both"] * ("ends" in features)
-        effects += ["info", "nested"] * ("infos" in features)
+        effects += ["info", "info", "info", "nested"] * ("infos" in features)
         effects += ["slow"] * ("slow" in features)
         effect = rng.choice(effects)
         if plain or rng.random() > 0.15:

@@ -106,7 +106,8 @@ class Trail:
             if before.step > 0 or not is_begun(before):
                 require(self.resumes and before in self._sums, "an invented state", last, made)
             elif before not in self._sums:
-                self._sums = {before: (0.0, 0)}
+                # It may resume from before an end that others of its env have not seen.
+                self._sums = {**(self._sums if self.resumes else {}), before: (0.0, 0)}
         total, length = self._sums[before]
         total, length = total + made.reward, length + 1
         self._sums[made.after] = total, length

@@ -54,11 +54,6 @@ class InContext(Session):
     async def finish(self) -> None:
         self.context.__exit__(None, None, None)
 
-    def own_limit(self, env: Env) -> float:
-        """Steps after which an env truncates its episodes by itself."""
-        entry = env.entry
-        return entry.limit if entry.form == "gym" and entry.limit else math.inf
-
     def lose(self, fault: WorkerDied) -> None:
         """Note envs whose worker is not replaced."""
         for env_id in fault.env_ids:
@@ -85,7 +80,7 @@ class Training(InContext):
 
     def _begin_with(self, group: Any) -> None:
         self.trails = {
-            env.first + k: Trail(code, self.own_limit(env), self.limit)
+            env.first + k: Trail(code, env.entry.own_limit, self.limit)
             for env in self.envs
             for k, code in enumerate(env.codes)
         }
@@ -356,7 +351,7 @@ class Evaluations(InContext):
 
     def played(self, env: Env, k: int, seed: int, options: Any) -> tuple[float, int]:
         """Return and length of an episode that is played alone."""
-        script = Script(env.codes[k], self.own_limit(env))
+        script = Script(env.codes[k], env.entry.own_limit)
         script.reset(seed, options)
         total, length = 0.0, 0
         while True:

@@ -56,7 +56,7 @@ class Vectors(Session):
             codes = plan.codes(0, worker)
             tail = plan.layout, plan.controls
             if plan.form == "stacked":
-                makers.append(partial(Stacked, codes, plan.mode, *tail))
+                makers.append(partial(Stacked, codes, plan.mode, plan.limit, *tail))
             else:
                 makers.append(partial(Scripted, codes[0], *tail))
         fields = plan.config(0)
