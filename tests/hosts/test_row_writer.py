@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -158,7 +159,7 @@ def test_the_short_way_writes_the_same_rows(kind: type[Plain], history: list[Any
         observation = np.array([count, -count], float)
         if what == "reset":
             env.next = then
-            found = runner.reset_from_row()
+            found = runner.execute(Operation.RESET, None)
             expected = begin(writer, then, observation)
         else:
             row.slab.action[1] = 2
@@ -182,9 +183,9 @@ def test_requests_out_of_band_have_the_same_effect_as_those_in_the_row(
     for number, (what, then) in enumerate(history):
         env.next = other_env.next = then
         if what == "reset":
-            found = runner.reset_from_row()
+            found = runner.execute(Operation.RESET, None)
             op, arguments = Operation.RESET, (None, {})
-            in_row = other.reset_from_row
+            in_row = partial(other.execute, op, None)
         else:
             found = runner.step()
             op, arguments = Operation.STEP, (NO_ACTION, {})
@@ -214,8 +215,8 @@ def test_the_seed_of_a_reset_is_the_one_in_the_row() -> None:
     runner, env, row = runner_and_row()
     env.next = {}
     row.slab.seed[1] = 7 + 1
-    runner.reset_from_row()
-    runner.reset_from_row()
+    runner.execute(Operation.RESET, None)
+    runner.execute(Operation.RESET, None)
     assert env.seeds == [7, None]
 
 
@@ -223,7 +224,7 @@ def test_infos_of_an_inline_env_are_copied() -> None:
     """An info may be a dict that the env continues to change."""
     runner, env, _ = runner_and_row(inline=True)
     env.next = {"nested": {"list": [1]}}
-    out_of_band = runner.reset_from_row()
+    out_of_band = runner.execute(Operation.RESET, None)
     env.next["nested"]["list"].append(2)
     assert out_of_band == {"info": {"nested": {"list": [1]}}}
 

@@ -1008,13 +1008,12 @@ static PyObject *
 row_step_call(PyObject *object, PyObject *args, PyObject *kwargs)
 {
     RowStep *self = (RowStep *)object;
-    static char *names[] = {"get_input", NULL};
-    PyObject *get_input = self->functions[GET_INPUT];
-    if ((kwargs != NULL || PyTuple_Size(args) > 0) &&
-        !PyArg_ParseTupleAndKeywords(args, kwargs, "|O:execute", names, &get_input))
+    if (kwargs != NULL || PyTuple_Size(args) > 0) {
+        PyErr_SetString(PyExc_TypeError, "a step takes no arguments");
         return NULL;
+    }
     int64_t began = now_ns();
-    PyObject *input = PyObject_CallNoArgs(get_input);
+    PyObject *input = PyObject_CallNoArgs(self->functions[GET_INPUT]);
     if (input == NULL)
         return NULL;
     PyObject *result = PyObject_CallFunctionObjArgs(self->functions[STEP_ENV], input, NULL);

@@ -482,11 +482,11 @@ def row_step(
     write_info: Callable[[dict[str, Any]], int],
     keep: Callable[[dict[str, Any]], dict[str, Any]],
     resets_itself: bool,
-) -> Callable[..., dict[str, Any] | None]:
+) -> Callable[[], dict[str, Any] | None]:
     """Make a function that steps an env and writes the result into its row.
 
-    The function may be given another `get_input`. It returns the part of the result that is out of
-    band. What it must know of the steps before is in the row.
+    The function returns the part of the result that is out of band. What it must know of the steps
+    before is in the row.
 
     Args:
         row: of the env.
@@ -503,7 +503,7 @@ def row_step(
     in_row = np.empty(0) if observation_in_row is None else observation_in_row
     can_copy, shape, dtype = observation_in_row is not None, in_row.shape, in_row.dtype
 
-    def execute(get_input: Callable[[], Any] = get_input) -> dict[str, Any] | None:
+    def execute() -> dict[str, Any] | None:
         began = clock()
         observation, reward, terminated, truncated, info = step(get_input())
         times[0] = done = clock()

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     import gymnasium as gym
     from numpy.typing import NDArray
 
+    from rlightning_aio.types import EnvMeta
+
 __all__ = [
     "AS_BEFORE",
     "AS_RESTORED",
@@ -74,6 +76,27 @@ class RowLayout:
         observations = structure(self.observation_space), self.observations_out_of_band
         key = (*observations, structure(self.action_space, limits=True), self.head, self.agents)
         object.__setattr__(self, "key", key)
+
+    @classmethod
+    def of(cls, meta: EnvMeta, *, observations_out_of_band: bool = False) -> RowLayout:
+        """Return the layout of the row of an env.
+
+        Args:
+            meta: of the env.
+            observations_out_of_band: see the class; without effect on observations that don't fit
+                a row anyway.
+
+        Raises:
+            TypeError: the env reports no observation space, or no action space.
+        """
+        observations, actions = meta.observation_space, meta.action_space
+        if observations is None or actions is None:
+            missing = "observation" if observations is None else "action"
+            raise TypeError(f"env {meta.env_id!r} reports no {missing} space")
+        agents = (len(meta.agents),) if meta.agents else ()
+        sub_envs = (meta.num_envs,) if meta.num_envs > 1 else ()
+        hands_over = observations_out_of_band and leaves(observations) is not None
+        return cls(observations, actions, (*agents, *sub_envs), meta.agents, hands_over)
 
     @property
     def observation_leaves(self) -> tuple[Leaf, ...] | None:

@@ -40,7 +40,6 @@ from rlightning_aio.protocol.slab import RowLayout, Slab
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    import gymnasium as gym
     from numpy.typing import NDArray
 
     from rlightning_aio._core.hosts.base import Wiring
@@ -328,14 +327,7 @@ class EnvServerHost:
 
 def _slab_for(meta: EnvMeta, max_rows: int) -> Slab:
     """Return rows for clients of one kind, in memory of this process alone."""
-    agents = (len(meta.agents),) if meta.agents else ()
-    sub_envs = (meta.num_envs,) if meta.num_envs > 1 else ()
-    layout = RowLayout(
-        cast("gym.Space[Any]", meta.observation_space),
-        cast("gym.Space[Any]", meta.action_space),
-        (*agents, *sub_envs),
-        meta.agents,
-    )
+    layout = RowLayout.of(meta)
     # Unused rows cost no memory.
     rows = max(1, min(max_rows, MAX_BYTES_IN_ALL // layout.size(1)))
     memory = mmap.mmap(-1, layout.size(rows), mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)

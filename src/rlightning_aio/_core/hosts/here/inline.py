@@ -100,10 +100,9 @@ class InlineHost:
         for position, entry in enumerate(asked):
             index = slot_of(entry) - self.first_slot
             runner = self._runners[index]
-            if arguments is not None:
-                execute = partial(runner.execute, op_of(entry), arguments[position])
-            elif op_of(entry) != _STEP:
-                execute = runner.reset_from_row
+            given = None if arguments is None else arguments[position]
+            if given is not None or op_of(entry) != _STEP:
+                execute = partial(runner.execute, op_of(entry), given)
             elif runner.begin_step is None or runner.env.steps_briefly:
                 execute = runner.step
             else:

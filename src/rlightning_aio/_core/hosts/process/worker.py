@@ -170,9 +170,9 @@ class Worker:
         if self._timed:
             self._rings.begin(request, time.monotonic_ns())
         index = slot_of(request) - self._first_slot
-        is_step = op_of(request) == _STEP
+        op, runner = op_of(request), self._runners[index]
         try:  # As `exchange.serve` does; `execute` would take a microsecond more.
-            outcome = self._steps[index]() if is_step else self._runners[index].reset_from_row()
+            outcome = self._steps[index]() if op == _STEP else runner.execute(op, None)
         except BaseException as error:
             outcome = error
         if outcome is None and not self._is_child:

@@ -9,10 +9,8 @@ worker; `group.continuity` decides when it is used.
 from __future__ import annotations
 
 import pickle
-from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from rlightning_aio.protocol.entries import Operation
 from rlightning_aio.protocol.pickling import dumped
 
 if TYPE_CHECKING:
@@ -21,7 +19,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio._core.hosts.messages import OutOfBand
-    from rlightning_aio._core.hosts.running.env_steps import Execute
     from rlightning_aio._core.hosts.running.row_writer import RowWriter, ShownResult
     from rlightning_aio.envs.base import BaseEnv
     from rlightning_aio.protocol.slab import Slab
@@ -123,23 +120,16 @@ class Saver:
         self._checkpoints, self._over, self._every, self._send = checkpoints, over, every, send
         self._num_steps = 0
 
-    def wrap(self, op: int, execute: Execute) -> Execute:
-        """Return `execute`, a step or a reset, with the checkpoints that belong to it."""
-        return partial(self._reset if op == Operation.RESET else self._step, execute)
-
-    def _step(self, step: Execute) -> OutOfBand | None:
-        outcome = step()
+    def after_step(self) -> None:
+        """Send a checkpoint after a step, if it is due."""
         self._num_steps += 1
         if self._num_steps >= self._every or self._over.all():
             self.save()
-        return outcome
 
-    def _reset(self, reset: Execute) -> OutOfBand | None:
+    def before_reset(self) -> None:
+        """Send a checkpoint before a reset, if a step came before it."""
         if self._num_steps:
             self.save(before=True)
-        outcome = reset()
-        self.save()
-        return outcome
 
     def save(self, *, before: bool = False) -> None:
         """Send a checkpoint, which is from `before` the current request or after it."""

@@ -3,25 +3,19 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rlightning_aio._core.hosts.messages import OutOfBand
 
-__all__ = ["Execute", "GetInput", "StepWith", "followed", "step_in_halves"]
+__all__ = ["Execute", "GetInput", "followed", "step_in_halves"]
 
 Execute: TypeAlias = "Callable[[], OutOfBand | None]"
 """Executes a step or a reset; returns the part of the result that is out of band."""
 GetInput: TypeAlias = "Callable[[], Any]"
 """Returns the input of one step."""
-
-
-class StepWith(Protocol):
-    """Steps with the result of `get_input`; by default with the action in the row."""
-
-    def __call__(self, get_input: GetInput = ...) -> OutOfBand | None: ...
 
 
 def step_in_halves(

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rlightning_aio._core.hosts.messages import OutOfBand
-    from rlightning_aio._core.hosts.running.env_steps import GetInput, StepWith
+    from rlightning_aio._core.hosts.running.env_steps import Execute, GetInput
     from rlightning_aio.envs.base import BareResult, BareStep
     from rlightning_aio.protocol.slab import Slab
     from rlightning_aio.types import Autoreset, MultiAgentEnvRet
@@ -206,7 +206,7 @@ class RowWriter:
         sums = (slab.episode_return, slab.episode_length, slab.over)
         return ShownResult(observation, info, whole, *(column[row, ...].copy() for column in sums))
 
-    def short_stepper(self, step: BareStep, get_input: GetInput) -> StepWith | None:
+    def short_stepper(self, step: BareStep, get_input: GetInput) -> Execute | None:
         """Return a function that steps the env by `step` and writes the result by itself.
 
         It is for an env of one agent and one sub-environment. None if this writer is needed.

@@ -11,13 +11,14 @@ import pickle
 import random
 import time
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias, TypeVar
 
 import numpy as np
 
 from rlightning_aio._core.hosts.messages import (
     NO_ACTION,
     RECORD_VIDEO,
+    STEP_IN_ROW,
     Attached,
     EnvStarted,
     ErrorText,
@@ -38,7 +39,7 @@ from rlightning_aio.envs.results import (
     step_of,
 )
 from rlightning_aio.envs.state import versions_of
-from rlightning_aio.protocol.columns import leaves, row_reader
+from rlightning_aio.protocol.columns import row_reader
 from rlightning_aio.protocol.entries import Operation
 from rlightning_aio.protocol.info import InfoSchemas
 from rlightning_aio.protocol.slab import RowLayout, Slab
@@ -49,11 +50,11 @@ if TYPE_CHECKING:
     from rlightning_aio._core.hosts.filming.camera import Camera
     from rlightning_aio._core.hosts.messages import AttachOrder, Completion
     from rlightning_aio._core.hosts.running.checkpoint import Send
-    from rlightning_aio._core.hosts.running.env_steps import Execute, GetInput, StepWith
+    from rlightning_aio._core.hosts.running.env_steps import Execute
     from rlightning_aio.config import VideoConfig
     from rlightning_aio.envs.base import BaseEnv
     from rlightning_aio.protocol.info import InfoSchema
-    from rlightning_aio.types import EnvMeta, EnvRet, MultiAgentEnvRet
+    from rlightning_aio.types import EnvMeta
 
 __all__ = [
     "EnvRunner",
@@ -81,6 +82,11 @@ def seed_generators(*entropy: int) -> None:
     words = np.random.SeedSequence(entropy or None).generate_state(8)
     np.random.seed(words)  # noqa: NPY002
     random.seed(words.tobytes())
+
+
+Finish: TypeAlias = "Callable[[Any, int], Any]"
+"""Finishes a request: takes what the env has returned and the ns that it took; returns the part of
+the result that is out of band, or for a call its value."""
 
 
 class EnvRunner:
@@ -113,10 +119,14 @@ class EnvRunner:
         self._inline = inline
         self.step: Execute = self._not_attached
         self.begin_step: Callable[[], Execute] | None = None
-        self._step_with: StepWith
-        self._reset_env: Execute = self._not_attached
+        bare = env.bare_step()
+        self._step_env: Callable[[Any], Any] = bare or (
+            env.step if self.is_awaitable else step_of(env)
+        )
+        self._is_bare = bare is not None
+        self._bare_reset = env.bare_reset() if self._is_bare else None
         self._input = input_of(env)
-        self._bare_reset = None if env.bare_step() is None else env.bare_reset()
+        self._read_action: Callable[[], Any] = _no_action
         self._checkpoints: Checkpoints
         self._saver: Saver | None = None
         self._camera = None if video is None else _camera(env, video)
@@ -131,23 +141,9 @@ class EnvRunner:
     @property
     def layout(self) -> RowLayout:
         """The row that this env needs."""
-        meta = self.meta
-        sub_envs = (meta.num_envs,) if meta.num_envs > 1 else ()
-        agents = (len(meta.agents),) if meta.agents else ()
-        if meta.observation_space is None or meta.action_space is None:
-            raise TypeError(
-                f"env {meta.env_id!r} reports no "
-                f"{'observation' if meta.observation_space is None else 'action'} space"
-            )
         # The results of bare steps are handed over if the env doesn't use their arrays again.
-        hands_over = self._inline and self.env.fresh_results and self.env.bare_step() is not None
-        return RowLayout(
-            meta.observation_space,
-            meta.action_space,
-            (*agents, *sub_envs),
-            meta.agents,
-            observations_out_of_band=hands_over and leaves(meta.observation_space) is not None,
-        )
+        hands_over = self._inline and self.env.fresh_results and self._is_bare
+        return RowLayout.of(self.meta, observations_out_of_band=hands_over)
 
     def attach(
         self,
@@ -170,26 +166,30 @@ class EnvRunner:
             stays_here=self._inline,
         )
         self._checkpoints = Checkpoints(self.env, slab, row, self._writer)
-        self._read_action: Callable[[], Any] | None = None
         if slab.action is not None:
             self._read_action = row_reader(layout.action_space, slab.action, row)
-        self._send_checkpoint = send_checkpoint
-        self._bind()
+        every = self.env.config.snapshot_every
+        if every is not None and send_checkpoint is not None:
+            self._saver = Saver(self._checkpoints, slab.over[row, ...], every, send_checkpoint)
         if self._camera is not None:
-            self._start_filming(self._camera)
+            self._watch(self._camera)
+        self._bind()
+
+    def _watch(self, camera: Camera) -> None:
+        camera.watch(self._slab, self._row, self.meta.autoreset, self.meta.max_episode_steps)
 
     def _bind(self) -> None:
-        """Choose the functions that execute requests."""
-        self._reset_env = self._reset_from_row
-        self.step = self._step_with = self._stepper()
-        every = self.env.config.snapshot_every
-        if every is not None and self._send_checkpoint is not None:
-            over = self._slab.over[self._row, ...]
-            self._saver = saver = Saver(self._checkpoints, over, every, self._send_checkpoint)
-            self.step = saver.wrap(Operation.STEP, self.step)
-            self._reset_env = saver.wrap(Operation.RESET, self._reset_env)
-            # A step in halves would bypass the saver.
+        """Choose the functions that step the env with the action in its row."""
+        self.begin_step = None
+        step = self._stepper()
+        followers = [] if self._saver is None else [self._saver.after_step]
+        if self._camera is not None:
+            followers.append(self._camera.see)
+        for then in followers:
+            step = followed(step, then)
+            # A step in halves would bypass them.
             self.begin_step = None
+        self.step = step
 
     def execute(self, op: int, arguments: Any) -> Any:
         """Execute a request.
@@ -200,22 +200,36 @@ class EnvRunner:
 
         Returns the part of the result that is out of band; for a call, its value.
         """
-        if arguments is None:
-            return self.step() if op == Operation.STEP else self.reset_from_row()
+        if arguments is None and op == Operation.STEP:
+            return self.step()
+        call, finish = self.request(op, arguments)
+        began = time.monotonic_ns()
+        returned = call()
+        return finish(returned, time.monotonic_ns() - began)
+
+    def request(self, op: int, arguments: Any) -> tuple[Callable[[], Any], Finish]:
+        """Return the call that a request makes, and a function that finishes the request.
+
+        The call may run code of the env and, if the env is awaitable, return an awaitable. The
+        other function gets what the call has returned at last and the ns that it took, and returns
+        what `execute` does. The arguments are those of `execute`.
+        """
         arguments = loaded(arguments)
-        if op == Operation.CALL:
-            if arguments[0] == RECORD_VIDEO:
-                return self._record_video(*arguments[1])
-            return call_env(self.env, *arguments)
+        if op == Operation.STEP:
+            action, extras = arguments or STEP_IN_ROW
+            return partial(self._step_with, action, extras), self._finish_step
+        if op == Operation.RESET:
+            return self._reset_request(arguments)
         if op == Operation.SNAPSHOT:
-            return versions_of(self.env), self._checkpoints.has_result, self._checkpoints.take()
+            return self._snapshot, _outcome
         if op == Operation.RESTORE:
-            return self._restore(*arguments)
-        execute = partial(self._reset if op == Operation.RESET else self._step, *arguments)
-        outcome = execute() if self._saver is None else self._saver.wrap(op, execute)()
-        if self._camera is not None:
-            self._camera.see()
-        return outcome
+            return partial(self._restore, *arguments), _outcome
+        if arguments[0] == RECORD_VIDEO:
+            return partial(self._record_video, *arguments[1]), _outcome
+        return partial(call_env, self.env, *arguments), _outcome
+
+    def _snapshot(self) -> tuple[dict[str, str], bool, bytes]:
+        return versions_of(self.env), self._checkpoints.has_result, self._checkpoints.take()
 
     def _restore(self, checkpoint: bytes, show: bool) -> None:
         self._checkpoints.load(checkpoint, show=show)
@@ -245,101 +259,86 @@ class EnvRunner:
         """Film episodes from the next one on, or stop filming; the current film ends here."""
         camera = None if video is None else _camera(self.env, video)
         former, self._camera = self._camera, camera
-        if former is not None:
-            self.step, self._reset_env, self.begin_step = self._unfilmed
         if camera is not None:
-            self._start_filming(camera)
+            self._watch(camera)
+        self._bind()
         if former is not None:
             former.close()
 
-    def _start_filming(self, camera: Camera) -> None:
-        """Have the camera see each result."""
-        camera.watch(self._slab, self._row, self.meta.autoreset, self.meta.max_episode_steps)
-        self._film(camera)
-
-    def _film(self, camera: Camera) -> None:
-        self._unfilmed = self.step, self._reset_env, self.begin_step
-        self.step = followed(self.step, camera.see)
-        self._reset_env = followed(self._reset_env, camera.see)
-        # A step in halves would bypass the camera.
-        self.begin_step = None
-
     # -- steps --------------------------------------------------------------------
 
-    def _stepper(self) -> StepWith:
-        bare, get_input = self.env.bare_step(), self._input_getter()
-        if bare is None:
-            return self._plain_stepper(get_input)
-        store, clock = self._writer.write_step, time.monotonic_ns
-        halves = self.env.bare_step_async()
-        if halves is None:
-            short = self._writer.short_stepper(bare, get_input)
+    def _stepper(self) -> Execute:
+        """Return a function that steps with the action in the row; set `begin_step`."""
+        env, step_env, store, clock = self.env, self._step_env, self._store_step, time.monotonic_ns
+        if self._is_bare:
+            halves, store = env.bare_step_async(), self._writer.write_step
+        else:
+            halves = (env.step_async, env.collect_async) if is_async_first(env) else None
+        read_action, make = self._read_action, self._input
+        is_action = self._is_bare and not has_preprocess_fn(env)
+        get_input = read_action if is_action else lambda: make(read_action(), {})
+        if halves is not None:
+            self.begin_step = step_in_halves(*halves, get_input, store)
+        elif self._is_bare:
+            short = self._writer.short_stepper(step_env, get_input)
             if short is not None:
                 return short
-        else:
-            self.begin_step = step_in_halves(*halves, get_input, store)
 
-        def step(get_input: GetInput = get_input) -> OutOfBand | None:
-            began = clock()
-            return store(bare(get_input()), clock() - began)
-
-        return step
-
-    def _input_getter(self) -> GetInput:
-        """Return a function that returns the env's input, made of the action in the row."""
-        read_action, make = self._read_action, self._input
-        if read_action is None:
-            return lambda: make(None, {})
-        if self.env.bare_step() is not None and not has_preprocess_fn(self.env):
-            return read_action
-        return lambda: make(read_action(), {})
-
-    def _plain_stepper(self, get_input: GetInput) -> StepWith:
-        """Return the stepper of an env that makes its own `EnvRet`."""
-        env, clock = self.env, time.monotonic_ns
-        step_env, method = step_of(env), "step"
-
-        def store(returned: Any, busy_ns: int) -> OutOfBand | None:
-            return self._write(one_result(env, method, returned), busy_ns, stepped=True)
-
-        if is_async_first(env):
-            method = "collect_async"
-            self.begin_step = step_in_halves(env.step_async, env.collect_async, get_input, store)
-
-        def step(get_input: GetInput = get_input) -> OutOfBand | None:
+        def step() -> OutOfBand | None:
             began = clock()
             return store(step_env(get_input()), clock() - began)
 
         return step
 
-    def _step(self, action: Any, extras: dict[str, Any]) -> OutOfBand | None:
+    def _step_with(self, action: Any, extras: dict[str, Any]) -> Any:
         """Step with an action that didn't come through the row, or with extras."""
         if action is NO_ACTION:
-            action = self._action_in_row()
-        return self._step_with(partial(self._input, action, extras))
+            action = self._read_action()
+        return self._step_env(self._input(action, extras))
 
-    def _action_in_row(self) -> Any:
-        """Return a copy of the action in the row."""
-        if self._read_action is None:
-            raise RuntimeError("actions of this env don't travel in its row")
-        return self._read_action()
+    def _store_step(self, returned: Any, busy_ns: int) -> OutOfBand | None:
+        """Write what a step has returned."""
+        if self._is_bare:
+            return self._writer.write_step(returned, busy_ns)
+        method = "collect_async" if is_async_first(self.env) else "step"
+        return self._write(method, returned, busy_ns)
+
+    def _finish_step(self, returned: Any, busy_ns: int) -> OutOfBand | None:
+        out_of_band = self._store_step(returned, busy_ns)
+        if self._saver is not None:
+            self._saver.after_step()
+        if self._camera is not None:
+            self._camera.see()
+        return out_of_band
 
     # -- resets -------------------------------------------------------------------
 
-    def reset_from_row(self) -> OutOfBand | None:
-        """Start a new episode with the seed in the row, or show the restored result there."""
-        return self._show() if self._checkpoints.must_show() else self._reset_env()
+    def _reset_request(self, arguments: Any) -> tuple[Callable[[], Any], Finish]:
+        """Start a new episode, or show the restored result if the reset in the row asks for it."""
+        if arguments is None and self._checkpoints.must_show():
+            return _no_call, self._finish_shown
+        if self._saver is not None:
+            self._saver.before_reset()
+        self._checkpoints.forget_result()
+        seed, options = self._seed_and_options(arguments)
+        bare = self._bare_reset if options is None else None
+        finish = partial(self._finish_reset, is_bare=bare is not None)
+        return partial(bare or self.env.reset, seed=seed, options=options), finish
 
-    def _show(self) -> OutOfBand | None:
-        """Return the restored result; frames that follow aren't of the episode being filmed."""
+    def _seed_and_options(self, arguments: Any) -> tuple[int | None, dict[str, Any] | None]:
+        """Return what to reset the env with, and seed the generators."""
+        seed, options = arguments or (self._slab.take_seed(self._row), None)
+        self._seed_generators(seed)
+        return seed, options
+
+    def _finish_shown(self, returned: None, busy_ns: int) -> OutOfBand | None:
+        """Show the restored result; frames that follow aren't of the episode being filmed."""
+        del returned, busy_ns
         if self._camera is not None:
             self._camera.close()
         out_of_band = self._checkpoints.show()
         self._note_reset()
         return out_of_band
-
-    def _reset_from_row(self) -> OutOfBand | None:
-        return self._reset(self._slab.take_seed(self._row), None)
 
     def _seed_generators(self, seed: int | None) -> None:
         """Seed the global generators for an episode that begins with a seed.
@@ -350,31 +349,26 @@ class EnvRunner:
         if seed is not None and not self._inline:
             seed_generators(seed, self.restarts)
 
-    def _reset(self, seed: int | None, options: dict[str, Any] | None) -> OutOfBand | None:
-        """Start a new episode."""
-        self._checkpoints.forget_result()
-        self._seed_generators(seed)
-        bare = self._bare_reset if options is None else None
-        began = time.monotonic_ns()
-        if bare is not None:
-            observation, info = bare(seed=seed, options=None)
-            busy_ns = time.monotonic_ns() - began
+    def _finish_reset(self, returned: Any, busy_ns: int, *, is_bare: bool) -> OutOfBand | None:
+        if is_bare:
+            observation, info = returned
             result = observation, 0.0, False, False, info
             out_of_band = self._writer.write_reset(result, busy_ns)
         else:
-            returned = self.env.reset(seed=seed, options=options)
-            busy_ns = time.monotonic_ns() - began
-            whole = one_result(self.env, "reset", returned)
-            out_of_band = self._write(whole, busy_ns, stepped=False)
+            out_of_band = self._write("reset", returned, busy_ns)
         self._note_reset()
+        if self._saver is not None:
+            self._saver.save()
+        if self._camera is not None:
+            self._camera.see()
         return out_of_band
 
-    def _write(
-        self, result: EnvRet | MultiAgentEnvRet, busy_ns: int, *, stepped: bool
-    ) -> OutOfBand | None:
+    def _write(self, method: str, returned: Any, busy_ns: int) -> OutOfBand | None:
+        """Write what `method` of the env has returned."""
+        result = one_result(self.env, method, returned)
         ends = result.last_reward, result.last_terminated, result.last_truncated
         parts = result.observation, *ends, result.info
-        write = self._writer.write_step if stepped else self._writer.write_reset
+        write = self._writer.write_reset if method == "reset" else self._writer.write_step
         return write(parts, busy_ns, result._extra, result)  # pyright: ignore[reportPrivateUsage]
 
     def _note_reset(self) -> None:
@@ -384,8 +378,20 @@ class EnvRunner:
             # The results hold tensors that stay here, so the writer is needed from now on.
             self._writer.is_bypassed = False
             self._bind()
-            if self._camera is not None:
-                self._film(self._camera)
+
+
+def _no_action() -> None:
+    """Return the action of an env whose actions don't travel in its row."""
+
+
+def _no_call() -> None:
+    """Do nothing, in place of a call of the env."""
+
+
+def _outcome(returned: Any, busy_ns: int) -> Any:
+    """Finish a request that is answered by a value."""
+    del busy_ns
+    return returned
 
 
 _Placed = TypeVar("_Placed", "EnvRunner", "EnvStarted")
