@@ -428,8 +428,6 @@ class FakeGroup:
         )
         size = sum(rows)
         self.env_ids = [f"fake-{k}" for k in range(size)]
-        completions: Completions = deque()
-        arena = Arena()
         bell_memory = memoryview(bytearray(bell_size(len(rows))))
         bell = TrainerBell(bell_memory, len(rows))
         envs = EnvTable([self.config] * size, self.env_ids)
@@ -439,15 +437,20 @@ class FakeGroup:
         layout = SlabLayout(size)
         continuity = Continuity(envs, conditions)
         lifetime = Lifetime(conditions)
-        tables = Tables(envs, requests, layout, continuity, conditions, observed, lifetime)
-        supervisor = Supervisor(
-            tables,
-            arena,
-            completions.append,
-            mixed_actions=False,
+        tables = Tables(
+            envs,
+            requests,
+            layout,
+            continuity,
+            conditions,
+            observed,
+            lifetime,
+            Arena(),
             clock=lambda: self.now,
         )
-        poller = Poller(requests, bell, 0, clock=lambda: self.now)
+        completions, arena = tables.completions, tables.arena
+        supervisor = Supervisor(tables)
+        poller = Poller(requests, bell, 0, clock=tables.clock)
         rings: list[Ring | None] = [None] * len(rows)
         self.shared = shared = Shared(completions, arena, bell, bell_memory, rings, len(rows))
         self.hosts: list[Any] = []

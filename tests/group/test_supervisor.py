@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, TypeGuard
 
@@ -182,7 +181,6 @@ class Fleet:
         self, counts: tuple[int, ...] = (1, 1), *, awaits: bool = False, **fields: Any
     ) -> None:
         self.now = 1000.0
-        self.completions: deque[Any] = deque()
         self.log: list[str] = []
         self.losses: list[HostLoss | None] = []
         self.running: list[Running] = []
@@ -202,14 +200,11 @@ class Fleet:
             conditions,
             Observed(conditions),
             self.lifetime,
-        )
-        self.supervisor = Supervisor(
-            tables,
             Arena(),
-            self.completions.append,
-            mixed_actions=False,
             clock=lambda: self.now,
         )
+        self.completions = tables.completions
+        self.supervisor = Supervisor(tables)
         self.hosts: list[StandIn] = []
         for host_id, count in enumerate(counts):
             host = StandIn(host_id, sum(counts[:host_id]), count, self.completions.append, self.log)

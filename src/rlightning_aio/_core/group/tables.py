@@ -1,31 +1,44 @@
-"""`Tables`: the state of a group, which its parts share."""
+"""`Tables`: the state of a group, which all its parts share: each gets it whole."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import deque
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from rlightning_aio._core.group.episodes.continuity import Continuity
     from rlightning_aio._core.group.state.conditions import Conditions
     from rlightning_aio._core.group.state.env_table import EnvTable
+    from rlightning_aio._core.group.state.host_record import HostRecord
     from rlightning_aio._core.group.state.lifetime import Lifetime
     from rlightning_aio._core.group.state.observed import Observed
     from rlightning_aio._core.group.state.requests import Requests
     from rlightning_aio._core.group.state.slab_layout import SlabLayout
+    from rlightning_aio._core.hosts.arena import Arena
+    from rlightning_aio._core.hosts.base import Shared
+    from rlightning_aio._core.hosts.messages import Completion, Completions
 
 __all__ = ["Tables"]
 
 
 @dataclass(frozen=True)
 class Tables:
-    """The state of a group, which knows no hosts.
+    """The state of a group.
 
     Attributes:
         envs, requests, layout, continuity: tables over the slots.
         conditions: the reasons why a step can't take the fast path.
         observed: holds the observer.
         lifetime: whether the group is open.
+        arena: the memory that hosts share with the group.
+        clock: monotonic seconds, for the parts that can't be given the time.
+        mixed_actions: the actions of envs may differ in shape.
+        records: of the hosts, in the order of their slots; complete when the group starts.
+        completions: the queue to which hosts post.
+        resources: shared by hosts, see `base.Wiring`.
     """
 
     envs: EnvTable
@@ -35,3 +48,9 @@ class Tables:
     conditions: Conditions
     observed: Observed
     lifetime: Lifetime
+    arena: Arena
+    clock: Callable[[], float]
+    mixed_actions: bool = False
+    records: list[HostRecord] = field(default_factory=list["HostRecord"])
+    completions: Completions = field(default_factory=deque["Completion"])
+    resources: dict[object, Shared] = field(default_factory=dict[object, "Shared"])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections import deque
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
 
     from rlightning_aio._core.group.setup.plan import Plan
     from rlightning_aio._core.hosts.base import Watcher
-    from rlightning_aio._core.hosts.messages import Completions, StartOrder
+    from rlightning_aio._core.hosts.messages import StartOrder
     from rlightning_aio.protocol.exchange import Ring
 
 __all__ = ["assemble"]
@@ -59,34 +58,35 @@ def assemble(plan: Plan, watcher: Watcher, *, shares_thread: bool) -> Core:
                 f"{config.placement!r}; use placement: process, whose workers run awaitable envs "
                 "on event loops of their own, or the asynchronous group"
             )
-    arena = Arena()
+    cores = num_cores()
+    orders = start_orders(plan, cores)
+    tables = _tables(plan, orders)
     try:
-        return _assembled(plan, watcher, arena, shares_thread=shares_thread)
+        return _assembled(plan, orders, tables, watcher, cores, shares_thread=shares_thread)
     except BaseException:
-        arena.close()
+        tables.arena.close()
         raise
 
 
-def _assembled(plan: Plan, watcher: Watcher, arena: Arena, *, shares_thread: bool) -> Core:
-    cores = num_cores()
-    orders = start_orders(plan, cores)
+def _assembled(
+    plan: Plan,
+    orders: Sequence[StartOrder],
+    tables: Tables,
+    watcher: Watcher,
+    cores: int,
+    *,
+    shares_thread: bool,
+) -> Core:
+    arena = tables.arena
     bell_offset = arena.append(bell_size(len(orders)))
     bell_memory = map_shared(arena.descriptor, bell_offset, bell_size(len(orders)))
     bell = TrainerBell(bell_memory, len(orders))
-    tables = _tables(plan, orders)
-    completions: Completions = deque()
-    supervisor = Supervisor(
-        tables,
-        arena,
-        completions.append,
-        mixed_actions=plan.mixed_actions,
-        clock=time.monotonic,
-    )
-    supervisor.resources["bell"] = bell
-    poller = Poller(tables.requests, bell, cores, clock=time.monotonic)
+    tables.resources["bell"] = bell
+    supervisor = Supervisor(tables)
+    poller = Poller(tables.requests, bell, cores, clock=tables.clock)
     rings: list[Ring | None] = [None] * len(orders)
     wiring = Wiring(
-        completions=completions,
+        completions=tables.completions,
         watcher=watcher,
         arena=arena,
         bell=bell,
@@ -96,7 +96,7 @@ def _assembled(plan: Plan, watcher: Watcher, arena: Arena, *, shares_thread: boo
         configs=[order.config for order in orders],
         objection=lambda meta: supervisor.members.objection(meta, supervisor.metas),
         is_idle=tables.requests.is_idle,
-        resources=supervisor.resources,
+        resources=tables.resources,
         shares_thread=shares_thread,
     )
     first_slot = 0
@@ -105,7 +105,7 @@ def _assembled(plan: Plan, watcher: Watcher, arena: Arena, *, shares_thread: boo
         supervisor.add(host, order.config)
         poller.add(host)
         first_slot += host.num_envs
-    parts = Parts(tables, supervisor, poller, bell, rings, completions, watcher)
+    parts = Parts(tables, supervisor, poller, bell, rings, tables.completions, watcher)
     return Core(parts, zero_copy=plan.zero_copy, shares_thread=shares_thread)
 
 
@@ -129,4 +129,7 @@ def _tables(plan: Plan, orders: Sequence[StartOrder]) -> Tables:
         conditions=conditions,
         observed=Observed(conditions),
         lifetime=Lifetime(conditions),
+        arena=Arena(),
+        clock=time.monotonic,
+        mixed_actions=plan.mixed_actions,
     )

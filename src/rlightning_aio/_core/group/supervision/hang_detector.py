@@ -17,13 +17,10 @@ from rlightning_aio._core.group.supervision.fault_messages import culprits_of
 from rlightning_aio.protocol.entries import slot_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.state.host_record import HostRecord
-    from rlightning_aio._core.group.state.observed import Observed
-    from rlightning_aio._core.group.state.requests import Requests
+    from rlightning_aio._core.group.tables import Tables
 
 __all__ = ["HangDetector", "has_news"]
 
@@ -38,27 +35,16 @@ killed it hangs, too. Only an overloaded machine needs a tenth of it.
 class HangDetector:
     """See the module.
 
-    Args:
-        records: of the group's hosts; the list grows until the group starts.
-        clock: monotonic seconds; asked when a host was killed.
-
     Attributes:
         timed: some requests have a time limit.
         any_ending: a killed host has not reported its exit, or requests to a host that can be
             killed were aborted. If neither holds, nothing needs to be checked.
     """
 
-    def __init__(
-        self,
-        records: Sequence[HostRecord],
-        requests: Requests,
-        observed: Observed,
-        clock: Callable[[], float],
-    ) -> None:
-        self._records = records
-        self._requests = requests
-        self._observed = observed
-        self._clock = clock
+    def __init__(self, group: Tables) -> None:
+        self._group = group
+        self._records = group.records
+        self._requests = group.requests
         self.any_ending = False
         self._now = 0.0
         self.timed = False
@@ -165,8 +151,9 @@ class HangDetector:
         busy = self._requests.owed(np.array(record.slots, np.intp))
         record.culprit, record.suspects = culprits_of(record, (entry,), self._requests, busy)
         slot = record.blamed[0]
-        if self._observed.observer is not None and slot is not None:
-            self._observed.observer.note_fate("hung", record.host.host_id, slot, "")
+        observer = self._group.observed.observer
+        if observer is not None and slot is not None:
+            observer.note_fate("hung", record.host.host_id, slot, "")
         self.kill(record, dump=True)
 
     def _check_dying(self) -> None:
@@ -176,7 +163,7 @@ class HangDetector:
                 continue
             if record.die_by is None:
                 # The trainer may have been stopped until it was killed.
-                record.die_by = self._clock() + _OBEY_SECONDS
+                record.die_by = self._group.clock() + _OBEY_SECONDS
             elif self._now >= record.die_by and not has_news(record):
                 assert record.killable is not None
                 record.die_by = None

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from rlightning_aio._core.group.state.env_table import EnvTable
+    from rlightning_aio._core.group.tables import Tables
     from rlightning_aio._core.hosts.base import Membership
     from rlightning_aio.types import EnvMeta
 
@@ -30,9 +30,9 @@ class Members:
         server_ids: of the hosts that envs join, in order.
     """
 
-    def __init__(self, envs: EnvTable, *, mixed_actions: bool) -> None:
-        self._envs = envs
-        self._mixed_actions = mixed_actions
+    def __init__(self, group: Tables) -> None:
+        self._group = group
+        self._envs = group.envs
         self._servers: list[Membership] = []
         self.possible = False
 
@@ -90,7 +90,7 @@ class Members:
         known = [one for one in local if one.action_space is not None]
         known += [one for server in self._servers for one in server.members().values()]
         try:
-            if not self._mixed_actions:
+            if not self._group.mixed_actions:
                 check_actions([*known[:1], meta])
         except ConfigError as error:
             return str(error)

@@ -13,13 +13,10 @@ from rlightning_aio._core.group.drivers.wait import Procedure, Wait
 from rlightning_aio._core.group.state.host_record import Stage
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from rlightning_aio._core.group.state.host_record import HostRecord
-    from rlightning_aio._core.group.state.lifetime import Lifetime
-    from rlightning_aio._core.group.state.slab_layout import SlabLayout
-    from rlightning_aio._core.hosts.arena import Arena
-    from rlightning_aio._core.hosts.base import Shared
+    from rlightning_aio._core.group.tables import Tables
 
 __all__ = ["Shutdown"]
 
@@ -35,35 +32,17 @@ _END_SECONDS: Final = 1.5
 
 
 class Shutdown:
-    """See the module.
+    """See the module."""
 
-    Args:
-        lifetime: of the group.
-        records: of its hosts; the list grows until the group starts.
-        resources: shared by hosts, see `base.Wiring`.
-        layout, arena: of the group; released with the hosts.
-    """
-
-    def __init__(
-        self,
-        lifetime: Lifetime,
-        records: Sequence[HostRecord],
-        resources: Mapping[object, Shared],
-        layout: SlabLayout,
-        arena: Arena,
-    ) -> None:
-        self._lifetime = lifetime
-        self._records = records
-        self._resources = resources
-        self._layout = layout
-        self._arena = arena
+    def __init__(self, group: Tables) -> None:
+        self._group = group
 
     def close(self, now: float) -> Procedure[None]:
         """Close all envs, and kill workers that take too long. Idempotent."""
-        if self._lifetime.closed:
+        if self._group.lifetime.closed:
             return
-        self._lifetime.end()
-        alive = [r for r in self._records if r.stage not in (Stage.NEW, Stage.CLOSED)]
+        self._group.lifetime.end()
+        alive = [r for r in self._group.records if r.stage not in (Stage.NEW, Stage.CLOSED)]
         for record in alive:
             record.held, record.restart_at = [], None
             if record.stage in (Stage.FAILED, Stage.DOWN):
@@ -73,7 +52,7 @@ class Shutdown:
         try:
             yield from self._until_closed(alive, now)
         finally:
-            stuck = any(r.stage not in (Stage.NEW, Stage.CLOSED) for r in self._records)
+            stuck = any(r.stage not in (Stage.NEW, Stage.CLOSED) for r in self._group.records)
             self._let_go(_KILL_SECONDS if stuck else _END_SECONDS)
 
     def _until_closed(self, records: Sequence[HostRecord], now: float) -> Procedure[None]:
@@ -98,28 +77,28 @@ class Shutdown:
             now = yield Wait(until)
 
     def _let_go(self, seconds: float) -> None:
-        for record in self._records:
+        for record in self._group.records:
             record.host.release()
-        for shared in self._resources.values():
+        for shared in self._group.resources.values():
             shared.release(seconds)
-        self._layout.release()
-        self._arena.close()
+        self._group.layout.release()
+        self._group.arena.close()
 
     def disown(self) -> None:
         """Release this process's copies after a fork, without affecting the parent's group."""
-        self._lifetime.end()
-        for record in self._records:
+        self._group.lifetime.end()
+        for record in self._group.records:
             if record.killable is not None:
                 record.host.release()
-        for shared in self._resources.values():
+        for shared in self._group.resources.values():
             shared.disown()
 
     def abandon(self) -> None:
         """Release everything immediately: the group was garbage-collected without a close."""
-        if self._lifetime.closed:
+        if self._group.lifetime.closed:
             return
-        self._lifetime.end()
-        started = any(r.stage is not Stage.NEW for r in self._records)
+        self._group.lifetime.end()
+        started = any(r.stage is not Stage.NEW for r in self._group.records)
         self._let_go(_END_SECONDS)
         if started:
             # The garbage collector calls this, so no caller's line would help.

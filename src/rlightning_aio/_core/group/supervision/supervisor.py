@@ -47,7 +47,7 @@ from rlightning_aio.errors import ConfigError, GroupClosed, RemoteTraceback, Sta
 from rlightning_aio.types import EnvMeta
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
     from typing import Any
 
     from numpy.typing import NDArray
@@ -55,8 +55,7 @@ if TYPE_CHECKING:
     from rlightning_aio._core.group.state.host_loss import HostLoss
     from rlightning_aio._core.group.state.observed import Fate
     from rlightning_aio._core.group.tables import Tables
-    from rlightning_aio._core.hosts.arena import Arena
-    from rlightning_aio._core.hosts.base import Host, Shared
+    from rlightning_aio._core.hosts.base import Host
     from rlightning_aio.config import EnvConfig
 
 __all__ = ["LOOK_SECONDS", "Lifecycle", "Supervisor"]
@@ -79,13 +78,6 @@ Lifecycle: TypeAlias = Built | NotBuilt | Attached | Closed
 class Supervisor:
     """The hosts of one group and the memory that they share with it.
 
-    Args:
-        tables: of the group.
-        arena: of the group.
-        post: appends the death of a replacement that could not be started to the queue.
-        mixed_actions: the actions of envs may differ in shape.
-        clock: monotonic seconds; asked when a host has died, or was ordered to start or to die.
-
     Attributes:
         hosts: in the order of their slots; records: of them.
         members: the envs that join and leave.
@@ -95,41 +87,26 @@ class Supervisor:
         metas: one for each local env, and for each host that envs join; empty before the start.
         any_deaths: a worker died, and its replacement has not completed a step yet.
         close_errors: env id and error of each env whose `close` raised.
-        resources: shared by hosts, see `base.Wiring`.
         look_by: time by which a trainer that never waits must call `check`.
     """
 
-    def __init__(
-        self,
-        tables: Tables,
-        arena: Arena,
-        post: Callable[[Died], object],
-        *,
-        mixed_actions: bool,
-        clock: Callable[[], float],
-    ) -> None:
+    def __init__(self, group: Tables) -> None:
         self.hosts: list[Host] = []
-        self.records: list[HostRecord] = []
+        self.records = group.records
         self.any_deaths = False
         self.metas: list[EnvMeta] = []
         self.close_errors: list[tuple[str, ErrorText]] = []
-        self.resources: dict[object, Shared] = {}
         self.look_by = 0.0
-        self._envs = tables.envs
-        self._requests = tables.requests
-        self._layout = tables.layout
-        self._continuity = tables.continuity
-        self._conditions = tables.conditions
-        self._observed = tables.observed
-        self._lifetime = tables.lifetime
-        self._arena = arena
-        self._post = post
-        self._clock = clock
-        self._mixed_actions = mixed_actions
-        self.members = Members(self._envs, mixed_actions=mixed_actions)
-        self.detector = HangDetector(self.records, self._requests, self._observed, clock)
-        self.shutdown = Shutdown(self._lifetime, self.records, self.resources, self._layout, arena)
-        self.workers = Workers(self.records, self._envs, self._requests)
+        self._group = group
+        self._envs = group.envs
+        self._requests = group.requests
+        self._continuity = group.continuity
+        self._lifetime = group.lifetime
+        self._clock = group.clock
+        self.members = Members(group)
+        self.detector = HangDetector(group)
+        self.shutdown = Shutdown(group)
+        self.workers = Workers(group)
         self.hints = Hints(self.records)
         self.crash_log = CrashLog()
         self._start_fault: Exception | None = None
@@ -227,13 +204,14 @@ class Supervisor:
         """Give each env a row in the slab of its layout."""
         started = [env for record in self.records for env in record.started]
         self.metas = [env.meta for env in started]
-        if not self._mixed_actions:
+        if not self._group.mixed_actions:
             check_actions(self.metas)
-        self._layout.place(started, self._arena)
+        layout = self._group.layout
+        layout.place(started, self._group.arena)
         self._envs.note_started(started)
         for record in self.records:
             count = len(record.started)
-            record.order = self._layout.order_for(record.slots.start, count)
+            record.order = layout.order_for(record.slots.start, count)
 
     def handle(self, completion: Lifecycle) -> None:
         """Apply a completion about the life of a host; `handle_exit` applies deaths."""
@@ -433,7 +411,9 @@ class Supervisor:
         record.refusals += 1
         pause = restart_pause(record.refusals + 1)
         if now + pause > record.refused_since + _SHORTAGE_SECONDS:
-            self._post(Died(record.host.host_id, Death(f"could not be replaced: {refusal}")))
+            self._group.completions.append(
+                Died(record.host.host_id, Death(f"could not be replaced: {refusal}"))
+            )
             return
         _log.warning("%s; the next attempt is in %g s", refusal, pause)
         record.restart_at = now + pause
@@ -476,8 +456,9 @@ class Supervisor:
         self.records[host_id].lost_slots.add(slot)
 
     def _note_fate(self, fate: Fate, host_id: int, cause: str = "", slot: int = -1) -> None:
-        if self._observed.observer is not None:
-            self._observed.observer.note_fate(fate, host_id, slot, cause)
+        observer = self._group.observed.observer
+        if observer is not None:
+            observer.note_fate(fate, host_id, slot, cause)
 
     def note_step(self, slot: int) -> None:
         """Record that an env completed a step, so it is not what its worker died of."""
@@ -494,7 +475,7 @@ class Supervisor:
 
     def _note_deaths(self, any_deaths: bool) -> None:
         self.any_deaths = any_deaths
-        self._conditions.note(DEATH, any_deaths or self._any_given_up)
+        self._group.conditions.note(DEATH, any_deaths or self._any_given_up)
 
 
 def _refusal(record: HostRecord, why: OSError | str) -> str:

@@ -12,9 +12,8 @@ from rlightning_aio.registry import placement_of
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rlightning_aio._core.group.state.env_table import EnvTable
     from rlightning_aio._core.group.state.host_record import HostRecord
-    from rlightning_aio._core.group.state.requests import Requests
+    from rlightning_aio._core.group.tables import Tables
 
 __all__ = ["Workers"]
 
@@ -29,27 +28,21 @@ _STATES: Final = {
 
 
 class Workers:
-    """See the module.
+    """See the module."""
 
-    Args:
-        records: of the group's hosts; the list grows until the group starts.
-        envs, requests: of the group.
-    """
-
-    def __init__(self, records: Sequence[HostRecord], envs: EnvTable, requests: Requests) -> None:
-        self._records = records
-        self._envs = envs
-        self._requests = requests
+    def __init__(self, group: Tables) -> None:
+        self._group = group
+        self._envs = group.envs
 
     def describe(self, now_ns: int) -> list[dict[str, Any]]:
         """Describe each host and its outstanding requests, as `EnvGroup.get_workers`.
 
         `now_ns` is from the monotonic clock.
         """
-        return [self._described(record, now_ns) for record in self._records]
+        return [self._described(record, now_ns) for record in self._group.records]
 
     def _described(self, record: HostRecord, now_ns: int) -> dict[str, Any]:
-        env_ids, requests = self._envs.env_ids, self._requests
+        env_ids, requests = self._envs.env_ids, self._group.requests
         slots = np.array(record.slots, np.intp)
         busy = requests.owed(slots)
         lost = record.slots if record.stage is Stage.FAILED else sorted(record.lost_slots)
@@ -69,19 +62,21 @@ class Workers:
 
         `now_ns` is from the monotonic clock.
         """
-        starting = [r for r in self._records if r.is_starting]
+        starting = [r for r in self._group.records if r.is_starting]
         if starting:
             names = [self._envs.env_ids[slot] for record in starting for slot in record.slots]
             return f"not started yet: {_listed(names)}"
-        env_ids, sent_ns = self._envs.env_ids, self._requests.sent_ns
-        busy: list[int] = self._requests.owed(np.arange(len(self._envs))).tolist()
-        names = [f"{env_ids[k]} (for {(now_ns - sent_ns.item(k)) / 1e9:.1f} s)" for k in busy]
+        env_ids, requests = self._envs.env_ids, self._group.requests
+        busy: list[int] = requests.owed(np.arange(len(self._envs))).tolist()
+        names = [
+            f"{env_ids[k]} (for {(now_ns - requests.sent_ns.item(k)) / 1e9:.1f} s)" for k in busy
+        ]
         return f"no reply yet from {_listed(names)}" if names else "no env owes a reply"
 
     def summary(self) -> str:
         """Summarise entries, envs, placement and worker processes in one line."""
         entries: dict[str, list[HostRecord]] = {}
-        for record in self._records:
+        for record in self._group.records:
             entries.setdefault(record.config.name, []).append(record)
         return "; ".join(f"{name}: {_entry(own)}" for name, own in entries.items())
 
