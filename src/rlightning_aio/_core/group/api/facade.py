@@ -9,9 +9,8 @@ import warnings
 import weakref
 from typing import TYPE_CHECKING, Any, Final
 
-from rlightning_aio._core.group.drivers.driver import this_process
 from rlightning_aio._core.group.drivers.scope import Scope
-from rlightning_aio._core.group.drivers.wait import CollectRules
+from rlightning_aio._core.group.drivers.wait import CollectRules, this_process
 from rlightning_aio._core.group.engine.checked import DEBUG, CheckedSteps
 from rlightning_aio._core.group.engine.steps import Steps
 from rlightning_aio._core.group.setup.build import assemble
@@ -28,8 +27,7 @@ if TYPE_CHECKING:
 
     import gymnasium as gym
 
-    from rlightning_aio._core.group.drivers.driver import Driver
-    from rlightning_aio._core.group.drivers.wait import Procedure
+    from rlightning_aio._core.group.drivers.wait import Driver, Procedure
     from rlightning_aio._core.group.engine.core import Core
     from rlightning_aio._core.group.setup.plan import Plan
 

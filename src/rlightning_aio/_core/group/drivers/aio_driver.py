@@ -7,7 +7,7 @@ import os
 import time
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from rlightning_aio._core.group.drivers.driver import forked_from, this_process
+from rlightning_aio._core.group.drivers.wait import forked_from, this_process
 from rlightning_aio.errors import RLightningError
 
 if TYPE_CHECKING:

@@ -17,8 +17,7 @@ from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, TypeVar, TypeVarTuple
 
-from rlightning_aio._core.group.drivers.driver import forked_from, this_process
-from rlightning_aio._core.group.drivers.wait import TURN
+from rlightning_aio._core.group.drivers.wait import TURN, forked_from, this_process
 from rlightning_aio.errors import RLightningError
 
 if TYPE_CHECKING:
