@@ -11,9 +11,7 @@ from collections import Counter, deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-import numpy as np
-
-from rlightning_aio._core.group.state.host_loss import HostLoss, last_lines
+from rlightning_aio._core.group.state.host_record import HostLoss, last_lines
 from rlightning_aio._core.hosts.base import Killable
 from rlightning_aio.errors import EnvHung, StartFailed, WorkerDied
 from rlightning_aio.protocol.entries import Operation, slot_of
@@ -21,6 +19,7 @@ from rlightning_aio.protocol.entries import Operation, slot_of
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    import numpy as np
     from numpy.typing import NDArray
 
     from rlightning_aio._core.group.state.env_table import EnvTable
@@ -144,6 +143,7 @@ def host_loss(
     requests: Requests,
     record: HostRecord,
     death: Death,
+    owed: NDArray[np.intp],
     outcome: str,
     *,
     replaced: bool,
@@ -163,7 +163,7 @@ def host_loss(
     return HostLoss(
         host_id=record.host.host_id,
         slots=record.slots,
-        owed=requests.owed(np.array(record.slots, np.intp)),
+        owed=owed,
         death=death,
         replaced=replaced,
         resets=not record.is_hardware,

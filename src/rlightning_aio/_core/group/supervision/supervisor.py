@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from rlightning_aio._core.group.state.host_loss import HostLoss
+    from rlightning_aio._core.group.state.host_record import HostLoss
     from rlightning_aio._core.group.state.observed import Fate
     from rlightning_aio._core.group.tables import Tables
     from rlightning_aio._core.hosts.base import Host
@@ -435,7 +435,7 @@ class Supervisor:
         if is_fault and replaced and record.is_hardware:
             outcome += "; it moves nothing until you reset it"
         death = replace(death, cause=cause_of(record, death, requests))
-        loss = host_loss(self._envs, requests, record, death, outcome, replaced=replaced)
+        loss = host_loss(self._envs, requests, record, death, owed, outcome, replaced=replaced)
         self._note_fate("died" if replaced else "given up", loss.host_id, death.cause)
         if not is_fault:
             _log.info("%s", loss.message)
