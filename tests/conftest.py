@@ -17,6 +17,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import _pytest.runner
 import pytest
 import pytest_asyncio
 import uvloop
@@ -24,6 +25,8 @@ from hypothesis import HealthCheck, settings
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator
+
+    from rlightning_aio._core.hosts.process import spares
 
 # The first loop of a process opens pipes that libuv keeps, so it is made before the tests.
 uvloop.new_event_loop().close()
@@ -33,6 +36,10 @@ os.environ["PYTHONASYNCIODEBUG"] = "1"
 
 # Every group that a test builds checks what happens to its requests: `group/engine/checked.py`.
 os.environ["RLIGHTNING_AIO_DEBUG"] = "1"
+
+# A group continues with the fork server of the one before only if the environment is the same, and
+# pytest would write the name of each test there.
+_pytest.runner._update_current_test_var = lambda *_: None
 
 # The tests start a thousand interpreters; they must not compile all modules again.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -101,17 +108,25 @@ def _repeats(item: pytest.Item) -> bool:
     return synchronous and on_uvloop
 
 
+def _spares() -> list[spares.Spare]:
+    """Return the fork servers that are kept for the next group."""
+    from rlightning_aio._core.hosts.process import spares
+
+    return spares.kept()
+
+
 def _children() -> dict[str, str]:
     """Return child processes, zombies included, with their commands. A process that has just been
     forked may still have the command of this one.
     """
     found: dict[str, str] = {}
+    kept = {str(spare.process.pid) for spare in _spares()}
     for children in Path("/proc/self/task").glob("*/children"):
         try:
-            pids = children.read_text().split()
+            pids = set(children.read_text().split())
         except (FileNotFoundError, ProcessLookupError):
             continue  # The thread has ended since it was listed.
-        for pid in pids:
+        for pid in pids - kept:
             try:
                 command = Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ")
             except (FileNotFoundError, ProcessLookupError):
@@ -123,7 +138,10 @@ def _children() -> dict[str, str]:
 
 def _descriptors() -> set[str]:
     found: set[str] = set()
+    kept = {str(spare.messages.fileno()) for spare in _spares()}
     for descriptor in Path("/proc/self/fd").iterdir():
+        if descriptor.name in kept:
+            continue
         try:
             target = descriptor.readlink()
         except FileNotFoundError:

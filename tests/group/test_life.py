@@ -19,15 +19,17 @@ from group import sample_envs
 
 import rlightning_aio
 from rlightning_aio import BatchedData, GroupClosed, PolicyResponse, StartFailed, sync
+from rlightning_aio._core.hosts.process import spares
 
 PROBE = {"name": "probe", "backend": "probe", "task": "x", "num_workers": 3}
 
 
 def children() -> set[str]:
+    """Return the pids of child processes, without fork servers that are kept for other groups."""
     found: set[str] = set()
     for path in Path("/proc/self/task").glob("*/children"):
         found |= set(path.read_text().split())
-    return found
+    return found - {str(spare.process.pid) for spare in spares.kept()}
 
 
 # -- start and close

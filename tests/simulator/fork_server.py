@@ -76,6 +76,10 @@ class ForkServer(Living):
         self.world.counts["fork servers killed"] += 1
         self.end(-signal.SIGKILL)
 
+    def poll(self) -> int | None:
+        """See `Popen.poll`."""
+        return None if self.alive else self._exit_code
+
     def wait(self, timeout: float | None = None) -> int:
         """See `Popen.wait`."""
         self.world.wait_for(lambda: not self.alive, timeout)

@@ -51,6 +51,7 @@ from rlightning_aio import sharing
 from rlightning_aio._core.group.engine import first_observations
 from rlightning_aio._core.hosts.awaiting import worker_loop as awaiting
 from rlightning_aio._core.hosts.process import host as process_hosts
+from rlightning_aio._core.hosts.process import spares
 from rlightning_aio.protocol import exchange, kernel, rings
 
 if TYPE_CHECKING:
@@ -184,6 +185,7 @@ class World:
             (select, "epoll", lambda: Epoll(self)),
             (socket, "socketpair", self.sockets.pair),
             (subprocess, "Popen", partial(ForkServer, self)),
+            (spares, "_spares", {}),
             (os, "close", self.sockets.close_descriptor),
             (os, "eventfd", self.sockets.event_descriptor),
             (os, "eventfd_read", self.sockets.read_event),

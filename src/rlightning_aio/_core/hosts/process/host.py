@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rlightning_aio._core.hosts.arena import map_shared
 from rlightning_aio._core.hosts.messages import Closed, Death, Died, ErrorText, WorkerPlace
+from rlightning_aio._core.hosts.process import spares
 from rlightning_aio._core.hosts.process.fork_messages import (
     Exited,
     Fork,
@@ -107,6 +108,7 @@ class ForkServerHandle:
         self._hosts: dict[int, ProcessHost] = {}
         self._messages: MessageSocket | None = None
         self._process: subprocess.Popen[bytes] | None = None
+        self._key: spares.Key = ()
         self._ready = False
         # The reason of its exit, if that says more than the exit code.
         self._failure: str | None = None
@@ -117,7 +119,7 @@ class ForkServerHandle:
         return self._messages.fileno()
 
     def fork(self, host: ProcessHost, channel: socket.socket, arena: Arena, order: Fork) -> None:
-        """Start a worker for `host`, and first the fork server if it isn't running.
+        """Start a worker for `host`, and first a fork server if none is running.
 
         Args:
             host: of the worker.
@@ -156,13 +158,29 @@ class ForkServerHandle:
         return ", ".join(self._preload) or "its modules"
 
     def _launch(self) -> MessageSocket:
-        self._ready = False
         self._failure = None
+        self._key = (self._preload, self._interpreter, *self._env_vars.items())
+        self._key += spares.surroundings()
+        spare = spares.take(self._key)
+        self._ready = spare is not None
+        messages, self._process = self._started() if spare is None else spare
+        self._messages = messages
+        try:
+            self._watcher.watch(self)
+        except BaseException:
+            self._end(0.0)
+            raise
+        if spare is None:
+            path = None if self._interpreter else list(sys.path)
+            messages.send(Preload(path, self._preload))
+        return messages
+
+    def _started(self) -> spares.Spare:
         package = str(Path(__file__).parents[3])
         command = [self._interpreter or sys.executable, "-c", BOOTSTRAP, package]
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
-            self._process = subprocess.Popen(
+            process = subprocess.Popen(
                 [*command, str(theirs.fileno()), str(os.getpid())],
                 pass_fds=[theirs.fileno()],
                 env={**os.environ, **_ONE_THREAD, **self._env_vars},
@@ -175,15 +193,7 @@ class ForkServerHandle:
             raise
         finally:
             theirs.close()
-        messages = self._messages = MessageSocket(ours)
-        try:
-            self._watcher.watch(self)
-        except BaseException:
-            self._end(0.0)
-            raise
-        path = None if self._interpreter else list(sys.path)
-        messages.send(Preload(path, self._preload))
-        return messages
+        return spares.Spare(MessageSocket(ours), process)
 
     def on_readable(self) -> None:
         """Read messages of the fork server, and pass them to the hosts of its workers."""
@@ -221,8 +231,17 @@ class ForkServerHandle:
             host.on_fork_server_lost(why.rstrip())
 
     def release(self, seconds: float) -> None:
-        """End the fork server, which ends its workers within `seconds`."""
-        self._end(seconds)
+        """Keep the fork server for another group if it has no workers and is well; otherwise end
+        it, which ends its workers within `seconds`.
+        """
+        messages, process = self._messages, self._process
+        is_well = self._ready and self._failure is None and not self._hosts
+        if messages is None or process is None or not is_well or messages.waiting:
+            self._end(seconds)
+            return
+        self._watcher.unwatch(self)
+        self._messages = self._process = None
+        spares.keep(self._key, spares.Spare(messages, process))
 
     def disown(self) -> None:
         if self._messages is not None:

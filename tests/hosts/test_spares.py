@@ -1,0 +1,129 @@
+"""Fork servers that are kept for the next group."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from rlightning_aio import EnvConfig, sync
+from rlightning_aio._core.hosts.process import spares
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+HANG = 60.0
+
+
+@pytest.fixture(autouse=True)
+def none_kept() -> Iterator[None]:
+    """Begin and end without spares."""
+    spares.end_all()
+    yield
+    spares.end_all()
+
+
+def parent_of_a_worker(**fields: Any) -> int:
+    """Build a group, close it, and return the pid of its fork server."""
+    config = EnvConfig(name="e", backend="gymnasium", task="CartPole-v1", **fields)
+    with sync.build_env_group([config]) as group:
+        group.reset()
+        (worker,) = group.get_workers()
+        status = Path(f"/proc/{worker['pid']}/status").read_text()
+    return int(status.partition("PPid:")[2].split()[0])
+
+
+def test_the_next_group_continues_with_the_fork_server() -> None:
+    """Its workers are new; one fork server is kept, however many groups there were."""
+    first = parent_of_a_worker()
+    assert [parent_of_a_worker() for _ in range(3)] == [first] * 3
+    assert [spare.process.pid for spare in spares.kept()] == [first]
+
+
+@pytest.mark.parametrize("change", ["environment", "folder", "env_vars", "sys.path", "cores"])
+def test_other_surroundings_need_another_fork_server(
+    change: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A worker has what it would inherit from a trainer that starts it now."""
+    first, fields = parent_of_a_worker(), {}
+    cores = os.sched_getaffinity(0)
+    if change == "environment":
+        monkeypatch.setenv("A_VARIABLE", "1")
+    elif change == "folder":
+        monkeypatch.chdir(tmp_path)
+    elif change == "env_vars":
+        fields["env_vars"] = {"A_VARIABLE": "1"}
+    elif change == "sys.path":
+        monkeypatch.syspath_prepend(tmp_path)
+    elif len(cores) == 1:
+        pytest.skip("there is one core only")
+    try:
+        if change == "cores":
+            os.sched_setaffinity(0, {min(cores)})
+        assert parent_of_a_worker(**fields) != first
+    finally:
+        os.sched_setaffinity(0, cores)
+    assert len(spares.kept()) == 2
+
+
+def test_a_few_are_kept() -> None:
+    """The one that was used longest ago ends."""
+    used = [parent_of_a_worker(env_vars={"A_VARIABLE": str(k)}) for k in range(4)]
+    assert [spare.process.pid for spare in spares.kept()] == used[1:]
+    assert not Path(f"/proc/{used[0]}").exists()
+
+
+def test_one_that_has_died_is_not_used() -> None:
+    first = parent_of_a_worker()
+    os.kill(first, signal.SIGKILL)
+    spares.kept()[0].process.wait(HANG)
+    assert parent_of_a_worker() != first
+
+
+def test_the_one_that_replaced_a_dead_one_is_kept() -> None:
+    config = EnvConfig(name="e", backend="gymnasium", task="CartPole-v1")
+    with sync.build_env_group([config]) as group:
+        group.reset()
+        (worker,) = group.get_workers()
+        status = Path(f"/proc/{worker['pid']}/status").read_text()
+        os.kill(int(status.partition("PPid:")[2].split()[0]), signal.SIGKILL)
+        group.reset()
+    (spare,) = spares.kept()
+    assert spare.process.poll() is None
+
+
+def test_none_outlives_the_program_and_a_forked_child_has_none() -> None:
+    """The child builds a group of its own; both leave no process."""
+    script = """
+import os, sys
+from rlightning_aio import EnvConfig, sync
+from rlightning_aio._core.hosts.process import spares
+
+def play():
+    with sync.build_env_group([EnvConfig(name="e", backend="gymnasium", task="CartPole-v1")]) as g:
+        g.reset()
+
+play()
+(spare,) = spares.kept()
+print(spare.process.pid, flush=True)
+child = os.fork()
+if not child:
+    assert not spares.kept()
+    play()
+    print(spares.kept()[0].process.pid, flush=True)
+    sys.exit()
+assert os.waitpid(child, 0)[1] == 0
+assert spare.process.poll() is None
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=HANG, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    pids = done.stdout.split()
+    assert len(set(pids)) == 2
+    assert not any(Path(f"/proc/{pid}").exists() for pid in pids)
